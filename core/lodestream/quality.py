@@ -6,12 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from .errors import OptionError
-from .target import Tolerance
+from .target import Limit, Tolerance
 
 __all__ = ["Limit", "Quality"]
-
-#: What stands for a tolerance where people write one: a number in the surface's unit, or a text for `Tolerance.parse`.
-Limit = Tolerance | float | str
 
 
 @dataclass(frozen=True, kw_only=True)

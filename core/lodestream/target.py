@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
 
 from .errors import OptionError
 
-__all__ = ["Order", "Region", "Target", "Tolerance", "check_spans"]
+__all__ = ["ChannelLimit", "Limit", "Limits", "Order", "Region", "Target", "Tolerance", "check_spans"]
 
 Order = Literal["quality", "level"]
 #: Rows and columns, half-open, in full-resolution indices.
@@ -92,6 +93,14 @@ class Tolerance:
         return self.value * extent if self.relative else self.value
 
 
+#: What stands for a tolerance where people write one: a number in the surface's unit, or a text for `Tolerance.parse`.
+Limit: TypeAlias = Tolerance | float | str
+#: An error of the whole surface, or errors of channels by name.
+Limits: TypeAlias = Limit | Mapping[str, Limit]
+#: A channel or an attribute by name, which of its errors is meant, and the largest that is allowed, in its unit.
+ChannelLimit: TypeAlias = tuple[str, Literal["rms", "max"], float]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Target:
     """What to decode or receive, where to stop, and in which order; by default the whole surface.
@@ -100,9 +109,12 @@ class Target:
     ----------
     level : int or None
         Levels up to this one and nothing finer; cannot be combined with the other limits.
-    until_rms, until_max : Tolerance or None
-        Stop at the first layer with an error of at most this. Of a region, the error inside counts, as far as its bound
-        tells (`View.bound`).
+    until_rms, until_max : Tolerance, number, text, mapping or None
+        Stop at the first layer with an error of at most this; a number or a text is taken by `Tolerance.of`. Of a
+        region, the error inside counts, as far as its bound tells (`View.bound`). A mapping has errors of single
+        channels: of coordinates (x, y, z), of attributes, and of their components (``wind_0``), in their units. Then
+        the stream stops where all of them are met. The errors of an attribute with components are those of the
+        distance; its maximum is known to be at most the root of the sum of the squares.
     max_bytes : int or None
         Stop at the last layer that ends within so many bytes of the container.
     seconds : float or None
@@ -117,6 +129,12 @@ class Target:
     first : ((int, int), (int, int)) or None
         The data that this region needs come first, then the rest; rows and columns as in `region`.
 
+    Raises
+    ------
+    OptionError
+        If a value is not allowed, or two contradict each other: a level and other limits, a level or errors of channels
+        and a region, errors of channels and of the whole surface.
+
     Examples
     --------
     >>> import lodestream
@@ -124,11 +142,13 @@ class Target:
     0.5
     >>> lodestream.Target(region=((0, 40), (0, 40)), attributes=()).order
     'quality'
+    >>> lodestream.Target(until_rms={"speed": 0.1}, until_max={"z": 2}).channels
+    (('speed', 'rms', 0.1), ('z', 'max', 2.0))
     """
 
     level: int | None = None
-    until_rms: Tolerance | None = None
-    until_max: Tolerance | None = None
+    until_rms: Limits | None = field(default=None, hash=False)
+    until_max: Limits | None = field(default=None, hash=False)
     max_bytes: int | None = None
     seconds: float | None = None
     order: Order = "quality"
@@ -137,6 +157,8 @@ class Target:
     first: Region | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "until_rms", _limits(self.until_rms))
+        object.__setattr__(self, "until_max", _limits(self.until_max))
         limits = (self.until_rms, self.until_max, self.max_bytes, self.seconds)
         if self.level is not None and any(limit is not None for limit in limits):
             raise OptionError("expected either a level or other limits, got both")
@@ -154,3 +176,36 @@ class Target:
             check_spans(self.region)
         if self.first is not None:
             check_spans(self.first)
+        if self.channels and self.whole != (None, None):
+            raise OptionError("expected either an error of the whole surface or errors of channels, got both")
+        if self.channels and self.region is not None:
+            raise OptionError("expected either errors of channels or a region, of which they are not known, got both")
+
+    @property
+    def whole(self) -> tuple[Tolerance | None, Tolerance | None]:
+        """The RMS and the maximum error of the whole surface at which to stop; None where there is no such limit."""
+        rms, worst = (limit if isinstance(limit, Tolerance) else None for limit in (self.until_rms, self.until_max))
+        return rms, worst
+
+    @property
+    def channels(self) -> tuple[ChannelLimit, ...]:
+        """The errors of channels at which to stop, by name."""
+        found: list[ChannelLimit] = []
+        if isinstance(self.until_rms, Mapping):
+            found += [(name, "rms", Tolerance.of(limit).value) for name, limit in self.until_rms.items()]
+        if isinstance(self.until_max, Mapping):
+            found += [(name, "max", Tolerance.of(limit).value) for name, limit in self.until_max.items()]
+        return tuple(sorted(found))
+
+
+def _limits(given: Limits | None) -> Tolerance | dict[str, Tolerance] | None:
+    if given is None:
+        return None
+    if not isinstance(given, Mapping):
+        return Tolerance.of(given)
+    found = {name: Tolerance.of(limit) for name, limit in given.items()}
+    for name, limit in found.items():
+        if limit.relative:
+            # The extent is one of lengths; a channel has its own unit.
+            raise OptionError(f"expected an error of {name!r} in its own unit, got {limit}, which is times the extent")
+    return found or None

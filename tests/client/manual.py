@@ -51,14 +51,17 @@ What all commands have in common:
 `decode` and `pull`:
 
 - If a limit such as `--until-rms` cannot be reached, the result is the complete surface, with a note.
+- `--until-rms z=0.5 --until-rms speed=0.1` stops where both errors are met, each in its own unit. Of an attribute with
+  components (`wind`) the error is that of the distance; `info` tells the names and errors of all channels.
 - `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
   combined with each other and with the limits; `--roi` cannot be combined with `--level`.
 - Errors of a window are bounds until it is exact: `--until-rms` and `--until-max` stop where the error inside is at
   most the limit for certain. `info` tells errors of the whole surface only.
 - With `--json` they print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes` (everything that
-  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `seconds` and `ended`: complete,
-  level, rms, max, bytes, seconds, stopped or truncated.
+  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `channels` (where there are
+  several: the two errors of each by its name), `seconds` and `ended`: complete, level, rms, max, channels, bytes,
+  seconds, stopped or truncated.
 
 `pull --watch`:
 

@@ -72,3 +72,32 @@ def test_targets_that_make_no_sense_are_refused(limits: dict[str, Any]) -> None:
 def test_a_target_without_limits_is_the_whole_surface() -> None:
     assert Target() == Target(order="quality")
     assert Target().level is None
+
+
+@pytest.mark.parametrize("limit", [0.5, "0.5", Tolerance(0.5), np.float32(0.5)])
+def test_an_error_is_a_number_a_text_or_a_tolerance(limit: Any) -> None:
+    target = Target(until_rms=limit)
+    assert target.until_rms == Tolerance(0.5)
+    assert target == Target(until_rms=Tolerance(0.5))
+    assert Target(until_max={"b": limit, "a": "2"}).channels == (("a", "max", 2.0), ("b", "max", 0.5))
+
+
+def test_no_errors_of_channels_are_no_limit() -> None:
+    assert Target(until_rms={}) == Target()
+    assert Target(until_rms={}).channels == ()
+
+
+@pytest.mark.parametrize(
+    ("limits", "expected"),
+    [
+        ({"until_rms": {"a": "1e-3d"}}, "an error of 'a' in its own unit, got 0.001d"),
+        ({"until_rms": {"a": -1}}, "an error of 0 or more, got -1"),
+        ({"until_rms": {"a": 1}, "until_max": 2}, "either an error of the whole surface or errors of channels"),
+        ({"until_rms": {"a": 1}, "region": ((0, 1), (0, 1))}, "either errors of channels or a region"),
+        ({"until_rms": {"a": 1}, "level": 2}, "either a level or other limits"),
+        ({"until_rms": "much"}, "a number such as 0.5"),
+    ],
+)
+def test_errors_that_make_no_sense_are_refused(limits: dict[str, Any], expected: str) -> None:
+    with pytest.raises(OptionError, match=expected):
+        Target(**limits)

@@ -34,10 +34,11 @@ _DIGEST = "0123456789abcdef" * 4
 _EVENTS: list[Event] = [
     Open(Target(level=3), 1000, ((0, 96), (200, 1)), _DIGEST, "lode_dG9rZW4"),
     Open(Target(until_rms=Tolerance(1e-3, True), max_bytes=20000, region=((0, 4), (2, 9)), attributes=("a",)), 0),
+    Open(Target(until_rms={"speed": 0.5}, until_max={"speed": 2.0, "z": 1.0}), 0),
     Credit(5),
     Stop(),
     Bye(),
-    Opened(_DIGEST, 2**40, 12345, 1.5, (2**39, 500), (13000, 1), True),
+    Opened(_DIGEST, 2**40, 12345, 1.5, (2**39, 500), (13000, 1), True, channels=True),
     Segments(7, bytes(range(40))),
     Layer(0, 2, 96, 0.125, 3.5),
     End("complete"),
@@ -47,6 +48,9 @@ _VALUES: list[Any] = [
     None, True, False, 0, 1, -1, 2**31, 2**53, 2**53 + 1, 2**63, 0.5, float("nan"), float("inf"), "", "quality",
     "level", "x" * 300, _DIGEST, b"", b"a", [], [1], [1, 2], [0, 0], [[1, 2], [3, 4]], [[1, 2]], [0.5, True],
     [-1.0, False], {}, {"level": 1}, {"level": 1, "max_bytes": 5}, {"order": "other"}, {"until_max": [1, False]},
+    [["a", "rms", 1]], [["a", "min", 1]], {"channels": [["a", "max", 1], ["a", "max", 2]]},
+    {"channels": [["a", "rms"]]},
+    {"channels": [["a", "rms", 1]], "until_max": [1, False]}, {"channels": [["a", "rms", 1], ["a", "max", 2]]},
 ]  # fmt: skip
 
 

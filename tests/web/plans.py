@@ -68,7 +68,7 @@ def target(random: Random, index: Index) -> Target:
     options: dict[str, Any] = {"order": order}
     if random.random() < 0.3:
         options["first"] = _region(random, header.shape)
-    kind = random.choice(["whole", "level", "rms", "max", "bytes", "both", "region", "attributes"])
+    kind = random.choice(["whole", "level", "rms", "max", "bytes", "both", "region", "attributes", "channels"])
     errors = [layer.rms for layer in index.layers] + [0.0, 1e9]
     if kind == "level":
         options["level"] = random.randrange(header.levels + 2)
@@ -83,7 +83,14 @@ def target(random: Random, index: Index) -> Target:
         if random.random() < 0.6:
             limit = Tolerance(10 ** random.uniform(-4, 0), relative=True)
             options[random.choice(["until_rms", "until_max"])] = limit
-    if kind == "attributes" or (kind in ("region", "level") and random.random() < 0.3):
+    if kind == "channels":
+        names = [*header.channel_names, *(attribute.name for attribute in header.attributes)]
+        for which in ("until_rms", "until_max"):
+            wanted = [name for name in names if random.random() < 0.4]
+            options[which] = {name: 10 ** random.uniform(-4, 2) for name in wanted}
+        if random.random() < 0.1:
+            options["until_rms"]["nothing"] = 1.0
+    if kind == "attributes" or (kind in ("region", "level", "channels") and random.random() < 0.3):
         names = [attribute.name for attribute in header.attributes]
         options["attributes"] = tuple(name for name in [*names, "nothing"] if random.random() < 0.4)
     return Target(**options)
@@ -116,8 +123,10 @@ def _region(random: Random, shape: tuple[int, int]) -> Region:
 
 
 def _options(asked: Target) -> dict[str, Any]:
-    def limit(tolerance: Tolerance | None) -> Any:
-        return None if tolerance is None else {"value": tolerance.value, "relative": tolerance.relative}
+    def limit(given: Any) -> Any:
+        if isinstance(given, dict):
+            return {name: limit(own) for name, own in given.items()}
+        return None if given is None else {"value": given.value, "relative": given.relative}
 
     options = {
         "level": asked.level,
@@ -151,6 +160,7 @@ def _told(made: Plan) -> dict[str, Any]:
                 "bytes": mark.bytes,
                 "rms": number(mark.rms),
                 "maxError": number(mark.max_error),
+                "channels": mark.channels,
             }
             for mark in made.marks
         ],

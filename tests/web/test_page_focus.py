@@ -175,6 +175,21 @@ def test_status_and_errors_are_of_one_moment_while_detail_is_blended_in(tabs: Ta
         assert (status == "Complete: exact") == (rms == "0 m" and largest == "0 m"), tab.beside
 
 
+def test_a_target_may_be_the_error_of_an_attribute(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("attribute"))
+    tab.shown("Below a pixel: paused", "Complete: exact")
+    tab.view.get_by_label("Stop when below a pixel").uncheck()
+    row = tab.view.get_by_label("Error of", exact=True)
+    assert not row.is_visible()
+    tab.choose("Target", "RMS error")
+    tab.choose("Error of", "temperature")
+    tab.view.get_by_label("Target value").fill("100")
+    tab.view.get_by_label("Target value").press("Enter")
+    tab.shown("Target met", "Complete: exact")
+    tab.choose("Target", "Kilobytes")
+    assert not row.is_visible()
+
+
 def test_a_target_is_met_and_the_values_are_within_its_error(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(rate=5_000.0)) as (tab, _):
         tab.view.get_by_label("Stop when below a pixel").uncheck()

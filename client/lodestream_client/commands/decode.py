@@ -21,7 +21,7 @@ from ..terminal.interrupts import interruptible
 from ..terminal.output import note, progress_bar
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, standard_output_once
 from .inputs import input_files, named
-from .outcome import Outcome, check_grid, check_out, note_unmet
+from .outcome import Outcome, channel_errors, check_grid, check_out, note_unmet
 from .target_options import add_target_options, target_of
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
             raise named(error, options.container) from None
     view = job.view or job.decoder.view()
     assert job.decoder.header is not None, "there is a view, so there is a header"
-    note_unmet(target, job.ended, view, job.decoder.header.extent)
+    note_unmet(target, job.ended, view, job.decoder.header)
     outcome = Outcome(
         view.surface(target.level, job.decoder.metadata or job.metadata),
         view.bytes,
@@ -107,6 +107,7 @@ def run(args: argparse.Namespace) -> int:
         view.bound,
         time.monotonic() - started,
         job.ended,
+        channel_errors(view, job.decoder.header),
     )
     outcome.write(options.out)
     outcome.report(options.json)
@@ -220,12 +221,11 @@ class _Job:
         self.decoder.finish()
 
     def _met(self, view: View) -> str:
+        from lodestream.planning.limits import ErrorLimits
+
         header = self.decoder.header
         assert header is not None, "there is a view, so there is a header"
         if view.complete:
             return "complete"
-        if self._target.until_rms is not None and view.rms <= self._target.until_rms.absolute(header.extent):
-            return "rms"
-        if self._target.until_max is not None and view.max_error <= self._target.until_max.absolute(header.extent):
-            return "max"
-        return "complete"
+        limits = ErrorLimits.of(self._target, header)
+        return limits.met(view.rms, view.max_error, view.channels) or "complete"

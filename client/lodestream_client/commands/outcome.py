@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from lodestream.decoding.decoder import View
     from lodestream.surface import Surface
 
-__all__ = ["Outcome", "check_grid", "check_out", "note_unmet", "write_surface"]
+__all__ = ["Outcome", "channel_errors", "check_grid", "check_out", "note_unmet", "write_surface"]
 
 
 def check_out(out: str) -> None:
@@ -67,14 +68,21 @@ def write_surface(surface: Surface, out: str) -> None:
         formats.write(surface, out)
 
 
-def note_unmet(target: Target, ended: str, view: View, extent: float) -> None:
+def note_unmet(target: Target, ended: str, view: View, header: Header) -> None:
     """Report a limit that could not be reached although everything arrived."""
     if ended != "complete":
         return
+    from lodestream.planning.limits import ErrorLimits
+
     what = "window is only known to have at most" if view.bound else "surface has"
-    for limit, found, name in ((target.until_rms, view.rms, "RMS"), (target.until_max, view.max_error, "maximum")):
-        if limit is not None and found > limit.absolute(extent):
-            note(f"the requested {name} error cannot be reached: the complete {what} {found:.6g}")
+    for which, name, found in ErrorLimits.of(target, header).unmet(view.rms, view.max_error, view.channels):
+        error = {"rms": "RMS", "max": "maximum"}[which] + " error" + ("" if name is None else f" of {name}")
+        note(f"the requested {error} cannot be reached: the complete {what} {found:.6g}")
+
+
+def channel_errors(view: View, header: Header) -> dict[str, tuple[float, float]]:
+    """RMS and maximum error of each channel that the view tells, by name."""
+    return dict(zip(header.channel_names, view.channels, strict=False))
 
 
 @dataclass(frozen=True)
@@ -95,6 +103,7 @@ class Outcome:
     bound: bool
     seconds: float
     ended: str
+    channels: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def write(self, out: str) -> None:
         """Write the surface; to standard output as NPY."""
@@ -111,6 +120,7 @@ class Outcome:
                     "rms": None if math.isnan(self.rms) else self.rms,
                     "max": None if math.isnan(self.max_error) else self.max_error,
                     "bound": self.bound,
+                    **({"channels": dict(self.channels)} if self.channels else {}),
                     "seconds": round(self.seconds, 6),
                     "ended": self.ended,
                 }

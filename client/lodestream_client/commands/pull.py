@@ -34,7 +34,7 @@ from .arguments import (
     token_of,
 )
 from .keeping import Kept
-from .outcome import Outcome, check_grid, check_out, note_unmet
+from .outcome import Outcome, channel_errors, check_grid, check_out, note_unmet
 from .receiving import Metadata, Progress
 from .target_options import add_target_options, target_of
 from .values import parse_seconds, parse_source
@@ -296,7 +296,7 @@ def _outcome(options: PullOptions, stream: Stream, metadata: Metadata, arrived: 
     header, ended = decoder.header, stream.ended
     assert header is not None, "there is a view, so there is a header"
     assert ended is not None, "the iteration has ended"
-    note_unmet(target, ended, view, header.extent)
+    note_unmet(target, ended, view, header)
     return Outcome(
         view.surface(target.level, values),
         view.bytes,
@@ -308,6 +308,7 @@ def _outcome(options: PullOptions, stream: Stream, metadata: Metadata, arrived: 
         view.bound,
         seconds,
         ended,
+        channel_errors(view, header),
     )
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from lodestream.errors import OptionError
-from lodestream.target import Target
+from lodestream.target import Limits, Target, Tolerance
 
-from .values import parse_level, parse_names, parse_positive_seconds, parse_region, parse_size, parse_tolerance
+from .values import parse_level, parse_limit, parse_names, parse_positive_seconds, parse_region, parse_size
 
 __all__ = ["add_target_options", "target_of"]
 
@@ -17,15 +18,19 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "target",
         "What to decode and where to stop. The first limit that is met ends it. E is a number in the surface's unit, "
-        "or 1e-3d for 1e-3 times its extent.",
+        "or 1e-3d for 1e-3 times its extent. NAME=E is the error of an attribute, a coordinate (z) or a component "
+        "(wind_0), a number in its own unit; it may be repeated, and all of them have to be met.",
     )
     group.add_argument("--level", type=parse_level, metavar="K", help="levels 0 to K only; OUT is the grid of level K")
-    group.add_argument(
-        "--until-rms", type=parse_tolerance, metavar="E", help="stop when the root mean square error is at most E"
-    )
-    group.add_argument(
-        "--until-max", type=parse_tolerance, metavar="E", help="stop when the maximum error is at most E"
-    )
+    for option, error in (("--until-rms", "root mean square"), ("--until-max", "maximum")):
+        group.add_argument(
+            option,
+            action="append",
+            default=[],
+            type=parse_limit,
+            metavar="[NAME=]E",
+            help=f"stop when the {error} error is at most E",
+        )
     group.add_argument(
         "--max-bytes", type=parse_size, metavar="N", help="stop at the last layer that ends within N bytes"
     )
@@ -50,13 +55,24 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _limits(given: Sequence[tuple[str | None, Tolerance]]) -> Limits | None:
+    """What an option that may be repeated says: an error of the whole surface, or errors of channels."""
+    found = dict(given)
+    if len(found) < len(given):
+        raise OptionError("expected each error once, got one given twice")
+    whole = found.pop(None, None)
+    if whole is not None and found:
+        raise OptionError("expected either an error of the whole surface or errors of channels, got both")
+    return whole or {name: limit for name, limit in found.items() if name is not None}
+
+
 def target_of(args: argparse.Namespace) -> Target:
     """The target of the command line; ends the program if its limits exclude each other."""
     try:
         target = Target(
             level=args.level,
-            until_rms=args.until_rms,
-            until_max=args.until_max,
+            until_rms=_limits(args.until_rms),
+            until_max=_limits(args.until_max),
             max_bytes=args.max_bytes,
             seconds=args.seconds,
             order=args.order,

@@ -17,6 +17,7 @@ from ..requests import addresses
 __all__ = [
     "parse_count",
     "parse_level",
+    "parse_limit",
     "parse_names",
     "parse_pair",
     "parse_pictures",
@@ -198,6 +199,14 @@ def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
     return checked
 
 
+def _limit(text: str) -> tuple[str | None, Tolerance]:
+    # A name may hold an equals sign, a number does not.
+    name, equals, error = text.rpartition("=")
+    if equals and not name:
+        raise OptionError(f"expected E or NAME=E, got {text!r}")
+    return name if equals else None, Tolerance.parse(error)
+
+
 def _precision(text: str) -> str:
     if "" in Quality.parse([text]).attributes:
         raise OptionError(f"expected P or NAME=P, got {text!r}")
@@ -205,6 +214,7 @@ def _precision(text: str) -> str:
 
 
 parse_tolerance = _checked(Tolerance.parse)
+parse_limit = _checked(_limit)
 parse_precision = _checked(_precision)
 parse_server = _checked(addresses.surfaces_url)
 parse_surface = _checked(addresses.surface_url)

@@ -9,7 +9,7 @@ import type { PlainStreamOptions, Progress, StreamState } from "./transfer/optio
 import type { Price } from "./transfer/prices";
 import type { Description, Kept, Opening, Told } from "./transfer/questions";
 import type { SocketClass } from "./transfer/socket";
-import type { Region, Surface, ViewInfo } from "./types";
+import type { ChannelErrors, Region, Surface, ViewInfo } from "./types";
 
 /** Options of `connect`; times in seconds. */
 export interface ConnectOptions extends PlainStreamOptions {
@@ -46,6 +46,7 @@ export class SurfaceView implements ViewInfo {
   readonly maxError: number;
   readonly bound: boolean;
   readonly complete: boolean;
+  readonly channels: ChannelErrors;
 
   constructor(
     info: ViewInfo,
@@ -59,6 +60,7 @@ export class SurfaceView implements ViewInfo {
     this.maxError = info.maxError;
     this.bound = info.bound;
     this.complete = info.complete;
+    this.channels = info.channels;
   }
 
   /**

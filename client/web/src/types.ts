@@ -70,7 +70,7 @@ export interface Errors {
   readonly rms: number;
   readonly maximum: number;
   /** RMS and maximum of each channel by itself; empty where there is only one channel. */
-  readonly channels: readonly (readonly [rms: number, maximum: number])[];
+  readonly channels: ChannelErrors;
 }
 
 /** One channel's lattice: affine values are origin + step q, decimal ones (origin + q) / step. */
@@ -141,6 +141,12 @@ export interface Tolerance {
   readonly relative: boolean;
 }
 
+/** RMS and maximum error of each channel by itself. */
+export type ChannelErrors = readonly (readonly [rms: number, maximum: number])[];
+
+/** A channel or an attribute by name, which of its errors is meant, and the largest that is allowed, in its unit. */
+export type ChannelLimit = readonly [name: string, which: "rms" | "max", most: number];
+
 /** What to receive, where to stop, and in which order; by default the whole surface. See `Target` of the Python library. */
 export interface Target {
   /** Levels up to this one and nothing finer; not together with other limits. */
@@ -148,6 +154,8 @@ export interface Target {
   /** Stop at the first layer with an error of at most this. */
   readonly untilRms?: Tolerance;
   readonly untilMax?: Tolerance;
+  /** Stop at the first layer that meets all of these; not together with errors of the whole surface, or a region. */
+  readonly channels?: readonly ChannelLimit[];
   /** Stop at the last layer that ends within so many bytes of the container. */
   readonly maxBytes?: number;
   /** Stop after so much time; the receiver takes care of this. */
@@ -176,6 +184,8 @@ export interface ViewInfo {
   readonly bound: boolean;
   /** Whether this is the last state. */
   readonly complete: boolean;
+  /** Errors of each channel; empty where there is one channel, in a window, and where they are not known. */
+  readonly channels: ChannelErrors;
 }
 
 /** Values at the points of a block, or the points themselves: an array (rows, columns, components) in C order. */

@@ -26,6 +26,8 @@ export class Sender {
   private provided = 0;
   private most = 0;
   private ended = "complete";
+  /** Whether this is a server that knows errors of channels. */
+  knowsChannels = true;
 
   constructor(
     private readonly index: Index,
@@ -58,7 +60,13 @@ export class Sender {
   private plan(event: Open): void {
     const said = event.held.length > 0 || event.container !== undefined;
     if (said) this.held = new RangeSet(event.held);
-    const chosen = plan(this.index, event.target, said ? this.held : new RangeSet([...this.held, ...this.given]));
+    const { channels, ...rest } = event.target;
+    const known = this.knowsChannels && channels !== undefined;
+    const chosen = plan(
+      this.index,
+      known ? event.target : rest,
+      said ? this.held : new RangeSet([...this.held, ...this.given]),
+    );
     const before = chosen.before.reduce((sum, place) => sum + place.length, 0);
     this.slices = slicesOf(chosen).map(({ offset, length }) => [offset, length] as const);
     this.marks = chosen.marks.filter((mark) => mark.sent > 0).map((mark) => [this.provided + before + mark.sent, mark]);
@@ -72,6 +80,7 @@ export class Sender {
       index: [this.index.index.offset, this.index.index.length],
       metadata: [this.index.metadata.offset, this.index.metadata.length],
       prefix: chosen.prefix,
+      channels: known || undefined,
     });
     if (this.slices.length === 0) this.outbox.push({ type: "end", why: this.ended });
   }

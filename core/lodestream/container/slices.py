@@ -23,7 +23,8 @@ class State(NamedTuple):
 
     ``all_planes`` says that nothing but residual is missing; ``whole_level`` is the level to which, counted from the
     coarsest, everything is there where levels come one after another, else -1. ``whole_near`` says that nothing but
-    residual is missing in the region that comes first.
+    residual is missing in the region that comes first. ``channels`` are the errors of each channel, where these are
+    known.
     """
 
     number: int
@@ -35,6 +36,7 @@ class State(NamedTuple):
     all_planes: bool
     whole_level: int = -1
     whole_near: bool = False
+    channels: tuple[tuple[float, float], ...] = ()
 
 
 class Slices:
@@ -189,11 +191,12 @@ class Slices:
             size = record.end if self._in_file else self._bytes
             finest = self._layer_level[layer]
             all_planes = last and finest == self._index.header.levels
-            return State(layer, finest, size, record.rms, record.max_error, False, all_planes)
+            known = record.errors
+            return State(layer, finest, size, *known[:2], False, all_planes, channels=known.channels)
         level = self._by_level.whole(self._received)
         if level is not None and level < self._index.header.levels and not self._in_file:
-            known = self._index.levels[level]
-            return State(level, level, self._bytes, known.rms, known.max_error, False, False, level)
+            known = self._index.levels[level].errors
+            return State(level, level, self._bytes, *known[:2], False, False, level, channels=known.channels)
         # Out of order, what is whole stands beside parts of what comes later.
         if not risen:
             return None
@@ -215,7 +218,7 @@ class Slices:
     def _end(self, number: int) -> State:
         last = self._index.levels[-1]
         size = self._index.surface_end if self._in_file else self._bytes
-        return State(number, last.level, size, last.rms, last.max_error, True, True)
+        return State(number, last.level, size, last.rms, last.max_error, True, True, channels=last.channels)
 
     def hold_chunk(self, chunk: Chunk) -> State | None:
         """Note a chunk of residual; the complete state, if everything is there.

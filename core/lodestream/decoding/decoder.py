@@ -296,7 +296,8 @@ class Decoder:
         last = number + 1 == header.layer_count
         complete = last and not header.corrected
         whole = complete or (last and self._level == header.levels)
-        self._show(State(number, self._level, frame.end, errors.rms, errors.maximum, complete, whole))
+        figures = errors.rms, errors.maximum
+        self._show(State(number, self._level, frame.end, *figures, complete, whole, channels=errors.channels))
 
     def _take_residual(self, frame: Frame, header: Header) -> None:
         if len(self.layers) != header.layer_count or not header.corrected:
@@ -304,7 +305,8 @@ class Decoder:
         errors, chunks = sections.parse_chunks(frame.payload, frame.payload_offset, header)
         for number, chunk in enumerate(chunks):
             self._reconstruction.correct(number, *chunk)
-        self._show(State(len(self.layers), header.levels, frame.end, errors.rms, errors.maximum, True, True))
+        number, figures = len(self.layers), (errors.rms, errors.maximum)
+        self._show(State(number, header.levels, frame.end, *figures, True, True, channels=errors.channels))
 
     def _take_metadata(self, values: dict[str, Any]) -> None:
         if DIGEST in values:
@@ -342,6 +344,7 @@ class Decoder:
                 self._values,
                 self._digest,
                 self._selection,
+                channels=made.channels if window is None else (),
             )
         )
 

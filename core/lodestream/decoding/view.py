@@ -43,6 +43,9 @@ class View:
         container tells errors of the whole surface, and bounds of those of its parts. Else they were measured.
     complete : bool
         Whether this is the last state.
+    channels : tuple of (rms, max_error)
+        Errors of each channel by itself, in its unit and in the order of `Header.channel_names`; empty where there is
+        one channel, in a window, and where they are not known.
 
     Examples
     --------
@@ -69,6 +72,7 @@ class View:
     _metadata: dict[str, Any] = field(repr=False, compare=False)
     _digest: dict[str, Any] = field(repr=False, compare=False)
     _selection: Selection = field(repr=False, compare=False)
+    channels: tuple[tuple[float, float], ...] = field(default=(), repr=False)
 
     @property
     def points(self) -> NDArray[Any]:

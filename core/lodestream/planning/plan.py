@@ -9,8 +9,8 @@ from ..container.model import ByteRange
 
 __all__ = ["Mark", "Plan", "Reason"]
 
-#: Why a stream ends; `plan` knows the first five, the others happen on the way.
-Reason = Literal["complete", "level", "rms", "max", "bytes", "seconds", "stopped", "truncated"]
+#: Why a stream ends; `plan` knows the first six, the others happen on the way.
+Reason = Literal["complete", "level", "rms", "max", "channels", "bytes", "seconds", "stopped", "truncated"]
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,8 @@ class Mark:
     """A state that the receiver reaches when it has received ``sent`` bytes of the plan's ranges.
 
     ``number`` is that of the layer (quality order) or level (level order). ``bytes`` counts what the receiver then has
-    of the container.
+    of the container. ``channels`` are RMS and maximum of each channel by itself, empty where there is one, or where
+    they are not known.
     """
 
     sent: int
@@ -27,6 +28,7 @@ class Mark:
     bytes: int
     rms: float
     max_error: float
+    channels: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import groupby
 
-from ..container.model import ByteRange, Index
+from ..container.model import ByteRange, Errors, Header, Index
 from ..errors import OptionError
 from ..target import Region, Target
 from .byte_ranges import RangeSet
+from .limits import ErrorLimits
 from .plan import Mark, Plan, Reason
 from .region_first import region_first
 from .selection import select, selection_of
@@ -49,7 +50,7 @@ def plan(
     Raises
     ------
     OptionError
-        If there is no such level or region, or not even the first layer fits into the allowed bytes.
+        If there is no such level, region or channel, or not even the first layer fits into the allowed bytes.
     """
     chosen = _whole(index, target, windows, bounded)
     if target.first is not None:
@@ -75,21 +76,21 @@ def _whole(index: Index, target: Target, windows: WindowErrors | None, bounded: 
 
 def _prefix(index: Index, target: Target) -> Plan:
     """Quality order: the file's own."""
-    marks = [Mark(r.end, r.number, r.level, r.end, r.rms, r.max_error) for r in index.layers]
+    marks = [Mark(r.end, r.number, r.level, r.end, *r.errors) for r in index.layers]
     if index.residual:
         marks.append(_exact(index, len(marks), index.surface_end))
-    marks, ended = _until(marks, target, index.header.extent)
+    marks, ended = _until(marks, target, index.header)
     return Plan((), (ByteRange(0, marks[-1].sent),), (index.metadata,), tuple(marks), ended, prefix=True)
 
 
 def _exact(index: Index, number: int, size: int) -> Mark:
     last = index.levels[-1]
-    return Mark(size, number, last.level, size, last.rms, last.max_error)
+    return Mark(size, number, last.level, size, *last.errors)
 
 
-def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark], Reason]:
+def _until(marks: list[Mark], target: Target, header: Header) -> tuple[list[Mark], Reason]:
     """The marks up to the first limit met."""
-    rms, worst = (None if t is None else t.absolute(extent) for t in (target.until_rms, target.until_max))
+    limits = ErrorLimits.of(target, header)
     kept: list[Mark] = []
     for mark in marks:
         if target.max_bytes is not None and mark.bytes > target.max_bytes:
@@ -101,10 +102,8 @@ def _until(marks: list[Mark], target: Target, extent: float) -> tuple[list[Mark]
         kept.append(mark)
         if mark is marks[-1]:
             break  # complete, even if it meets a tolerance too
-        if rms is not None and mark.rms <= rms:
-            return kept, "rms"
-        if worst is not None and mark.max_error <= worst:
-            return kept, "max"
+        if (met := limits.met(mark.rms, mark.max_error, mark.channels)) is not None:
+            return kept, met
     return kept, "complete"
 
 
@@ -120,11 +119,11 @@ def _slices_of_layers(index: Index, level: int) -> Plan:
                 size += segment.range.length
         record = index.layers[layer]
         if record.level <= level:
-            marks.append(Mark(size, layer, record.level, size, record.rms, record.max_error))
+            marks.append(Mark(size, layer, record.level, size, *record.errors))
     state = index.levels[level]
     # Layers that add nothing up to this level end where the level does: its own state, with its errors, says it better.
     marks = [mark for mark in marks if mark.sent < size]
-    marks.append(Mark(size, level, level, size, state.rms, state.max_error))
+    marks.append(Mark(size, level, level, size, *state.errors))
     return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), "level")
 
 
@@ -143,10 +142,10 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
         if state.level == index.header.levels and index.residual:
             _append(ranges, index.residual)
             size += index.residual.length
-        marks.append(Mark(size, state.level, state.level, size, state.rms, state.max_error))
+        marks.append(Mark(size, state.level, state.level, size, *state.errors))
     if target.level is not None:
         return Plan((index.index,), tuple(ranges), (index.metadata,), tuple(marks), _level_end(index, level))
-    marks, ended = _until(marks, target, index.header.extent)
+    marks, ended = _until(marks, target, index.header)
     return Plan((index.index,), _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
 
 
@@ -173,43 +172,41 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
         if target.order == "level":
             if after is None or tiles[after.tile].level > own:
                 state = index.levels[own]
-                marks.append(Mark(size, own, own, size, *within(state.rms, state.max_error)))
+                marks.append(Mark(size, own, own, size, *within(state.errors)))
         elif after is None or after.layer > segment.layer:
             # Layers of which nothing is wanted are there as well.
             record = index.layers[-1 if after is None else after.layer - 1]
             if target.level is None or level <= target.level:
-                figures = within(record.rms, record.max_error, record.number)
-                marks.append(Mark(size, record.number, level, size, *figures))
+                marks.append(Mark(size, record.number, level, size, *within(record.errors, record.number)))
     if finest < index.header.levels:
         state = index.levels[finest]
-        last, ended = Mark(size, finest, finest, size, state.rms, state.max_error), "level"
+        last, ended = Mark(size, finest, finest, size, *state.errors), "level"
     else:
         for chunk in chosen.chunks.values():
             _append(ranges, chunk.range)
             size += chunk.range.length
         state, number = index.levels[-1], len(index.layers) if chosen.chunks else len(index.layers) - 1
-        figures = state.rms, state.max_error
+        figures = state.errors if target.region is None else Errors(state.rms, state.max_error)
         if bounded or target.region is None:
-            figures = within(*figures, None if chosen.chunks else number)
+            figures = within(figures, None if chosen.chunks else number)
         last, ended = Mark(size, number, finest, size, *figures), "complete"
     # A state of the same bytes as the last is the last.
     marks = [mark for mark in marks if mark.sent < size] + [last]
     if target.level is None:
-        marks, ended = _until(marks, target, index.header.extent)
+        marks, ended = _until(marks, target, index.header)
     section = window_section(index) if target.region is not None and windows is not None and bounded else None
     before = (index.index,) if section is None else (index.index, section)
     return Plan(before, _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
 
 
-def _figures(
-    index: Index, region: Region | None, windows: WindowErrors | None, bounded: bool
-) -> Callable[..., tuple[float, float]]:
+def _figures(index: Index, region: Region | None, windows: WindowErrors | None, bounded: bool) -> Callable[..., Errors]:
     """What a receiver knows of the errors of its selection, from those of the whole surface (and the layer)."""
     if region is None:
-        return lambda rms, max_error, layer=None: (rms, max_error)
+        return lambda errors, layer=None: errors
     if not bounded:
-        return lambda rms, max_error, layer=None: (math.nan, math.nan)
-    return WindowFigures(index.header, region, windows).within
+        return lambda errors, layer=None: Errors(math.nan, math.nan)
+    figures = WindowFigures(index.header, region, windows)
+    return lambda errors, layer=None: Errors(*figures.within(errors.rms, errors.maximum, layer))
 
 
 def _level_end(index: Index, level: int) -> Reason:

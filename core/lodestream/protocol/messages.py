@@ -188,6 +188,9 @@ class Opened:
     window_errors : (offset, length) or None
         Of a window: the section with bounds of its errors, which comes behind the index, or a length of 0 where the
         container has none. None: the server tells no errors of windows before their end.
+    channels : bool or None
+        True: the server stops by the errors of channels that the target names. None: it names none, or the server does
+        not know them and sends everything.
     """
 
     type: ClassVar[str] = "header"
@@ -200,6 +203,7 @@ class Opened:
     prefix: bool
     credit: int | None = None
     window_errors: tuple[int, int] | None = None
+    channels: bool | None = None
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import msgpack
 
 from ..errors import OptionError, UnsupportedVersionError
-from ..target import Region, Target, Tolerance
+from ..target import ChannelLimit, Region, Target, Tolerance
 from .messages import (
     BASE_CREDIT,
     MAX_DATA,
@@ -138,6 +138,15 @@ def _names(value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
+def _channels(value: Any) -> tuple[ChannelLimit, ...]:
+    if not isinstance(value, list) or not all(isinstance(limit, list) and len(limit) == 3 for limit in value):
+        raise _MismatchError("a list of [name, rms or max, number]")
+    for name, which, _ in value:
+        if not isinstance(name, str) or which not in ("rms", "max"):
+            raise _MismatchError("a list of [name, rms or max, number]")
+    return tuple((name, which, _number(error)) for name, which, error in value)
+
+
 def _error(value: Any) -> float:
     return math.nan if value is None else _number(value)
 
@@ -146,6 +155,7 @@ _TARGET: Mapping[str, _Read] = {
     "level": _integer,
     "until_rms": _tolerance,
     "until_max": _tolerance,
+    "channels": _channels,
     "max_bytes": _integer,
     "order": _text,
     "region": _region,
@@ -157,13 +167,19 @@ _TARGET: Mapping[str, _Read] = {
 def _target(value: Any) -> Target:
     if not isinstance(value, dict):
         raise _MismatchError("a map")
-    return Target(
-        **{
-            name: _value(f"target.{name}", read, value[name])
-            for name, read in _TARGET.items()
-            if value.get(name) is not None
-        }
-    )
+    fields = {
+        name: _value(f"target.{name}", read, value[name])
+        for name, read in _TARGET.items()
+        if value.get(name) is not None
+    }
+    for name, which, error in fields.pop("channels", ()):
+        limits = fields.setdefault(f"until_{which}", {})
+        if not isinstance(limits, dict):
+            raise OptionError("expected either an error of the whole surface or errors of channels, got both")
+        if name in limits:
+            raise OptionError(f"expected one {which} error of {_show(name)}, got two")
+        limits[name] = error
+    return Target(**fields)
 
 
 _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
@@ -188,6 +204,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
         "prefix": _flag,
         "credit": _credit,
         "window_errors": _section,
+        "channels": _flag,
     },
     Segments: {"offset": _integer, "data": _data},
     Layer: {"number": _integer, "level": _integer, "bytes": _integer, "rms": _error, "max": _error},
@@ -198,7 +215,8 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit, and
-#: those of earlier releases say nothing of errors of windows, nor servers how much they keep of the credit.
+#: those of earlier releases say nothing of errors of windows, nor servers how much they keep of the credit, or that
+#: they know errors of channels.
 _OPTIONAL = {
     (Open, "target"),
     (Open, "held"),
@@ -207,6 +225,7 @@ _OPTIONAL = {
     (Open, "window_errors"),
     (Opened, "credit"),
     (Opened, "window_errors"),
+    (Opened, "channels"),
 }
 #: What is left out where it is not known.
 _UNKNOWN = {(Layer, "rms"), (Layer, "max")}
@@ -296,9 +315,12 @@ def _value(place: str, read: _Read, value: Any) -> Any:
 def _plain(value: Any) -> Any:
     if isinstance(value, Target):
         chosen = {name: _plain(getattr(value, name)) for name in _TARGET}
+        chosen["channels"] = value.channels or None
         return {name: item for name, item in chosen.items() if item is not None}
     if isinstance(value, Tolerance):
         return [value.value, value.relative]
+    if isinstance(value, Mapping):
+        return None  # errors of channels have a key of their own
     # An error that is not known, of a window that is not complete.
     return None if isinstance(value, float) and math.isnan(value) else value
 

@@ -13,6 +13,7 @@ from .receiver_state import Ended, ReceiverState
 
 if TYPE_CHECKING:
     from ..decoding.decoder import Decoder
+    from ..decoding.view import View
     from .receiver_state import DownloadEvent
 
 __all__ = ["Download", "Ended"]
@@ -183,7 +184,7 @@ class Download:
 
         Parameters
         ----------
-        why : "stopped" or "seconds"
+        why : "stopped", "seconds" or "channels"
             Reason given by `Ended` when the server has stopped.
         """
         if self._turning or self._connection.state in (State.OPENED, State.STREAMING):
@@ -257,7 +258,7 @@ class Download:
         self._grant(now)
         self.reception.identify(event.container, event.size)
         places = event.index, event.metadata, event.window_errors
-        return [*self.reception.expect(event.planned, *places, prefix=event.prefix)]
+        return [*self._until_met(self.reception.expect(event.planned, *places, prefix=event.prefix))]
 
     def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
         stopped = self._connection.state is State.STOPPING
@@ -265,7 +266,21 @@ class Download:
         views = self.reception.take(event.offset, event.data)
         self.window.arrive(len(event.data), now)
         self._grant(now)
-        return [*views] if shown else []
+        return [*self._until_met(views)] if shown else []
+
+    def _until_met(self, views: list[View]) -> list[View]:
+        """The views up to the first that meets errors of channels, where the server does not know these: the last."""
+        header = self.decoder.header
+        if not self.target.channels or self._turning or header is None or self.answer is None or self.answer.channels:
+            return views
+        from ..planning.limits import ErrorLimits
+
+        limits = ErrorLimits.of(self.target, header)
+        for number, view in enumerate(views):
+            if not view.complete and limits.met(view.rms, view.max_error, view.channels) is not None:
+                self.stop("channels")
+                return views[: number + 1]
+        return views
 
     def _grant(self, now: float | None) -> None:
         grant = self.window.due(self._connection.credit)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ..container import sections
 from ..container.frames import section_extent
+from ..planning.limits import ErrorLimits
 
 if TYPE_CHECKING:
     from ..decoding.decoder import Decoder
@@ -49,6 +50,8 @@ def sure(target: Target, decoder: Decoder, position: int, run: int, read: Callab
     ------
     CorruptStreamError
         When no section begins there.
+    OptionError
+        When the surface has no channel that the target names.
     """
     if position == 0:
         return _SIGNATURE if run >= _SIGNATURE else 0
@@ -64,8 +67,10 @@ def _met(target: Target, decoder: Decoder, end: int) -> bool:
     """Whether the target is met without the layer that ends there."""
     if target.max_bytes is not None and end > target.max_bytes:
         return True
-    if decoder.header is None or not decoder.layers:
+    if decoder.header is None:
         return False
-    view, extent = decoder.layers[-1], decoder.header.extent
-    limits = ((target.until_rms, view.rms), (target.until_max, view.max_error))
-    return any(limit is not None and error <= limit.absolute(extent) for limit, error in limits)
+    limits = ErrorLimits.of(target, decoder.header)
+    if not decoder.layers:
+        return False
+    view = decoder.layers[-1]
+    return limits.met(view.rms, view.max_error, view.channels) is not None

@@ -203,6 +203,7 @@ class Sender:
                 chosen.prefix,
                 None if self._connection.most == BASE_CREDIT else self._connection.most,
                 _place(None if windows is None else window_section(index)) if bounded else None,
+                True if event.target.channels else None,
             )
         )
         self._end_if_done()
@@ -248,6 +249,6 @@ def _as_cached(chosen: Plan) -> list[Mark]:
     ahead, unknown = chosen.bytes - sum(place.length for place in chosen.ranges), float("nan")
     cached = [ahead + mark.sent for mark in chosen.marks]
     return [
-        mark if mark.bytes == size else replace(mark, bytes=size, rms=unknown, max_error=unknown)
+        mark if mark.bytes == size else replace(mark, bytes=size, rms=unknown, max_error=unknown, channels=())
         for mark, size in zip(chosen.marks, cached, strict=True)
     ]

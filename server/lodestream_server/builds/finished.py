@@ -111,7 +111,7 @@ def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, 
     digest = hashlib.sha256()
     with job.files[0].open("rb") as source:
         found = inspect(source, max_vertices=job.max_vertices, progress=progress)
-        checked(found.index, describe(found.index))
+        checked(found.index, describe(found.index, channels=True))
         source.seek(0)
         with NewFile(path) as target:
             while block := source.read(_BLOCK):
@@ -134,7 +134,7 @@ def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Pa
     """
     from lodestream.container import describe
 
-    info: dict[str, Any] = plain(describe(index))
+    info: dict[str, Any] = plain(describe(index, channels=True))
     errors = (known or {}).get(ERRORS)
     if errors in (CHECKED, TOLD):
         info[ERRORS] = errors

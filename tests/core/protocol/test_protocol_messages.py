@@ -39,11 +39,14 @@ EVENTS: list[Event] = [
     Open(Target(region=((0, 3), (1, 5))), window_errors=True),
     Open(token="lode_dG9rZW4"),
     Open(Target(until_rms=Tolerance(1e-3, True), until_max=Tolerance(2.5), max_bytes=20000, order="level"), 0),
+    Open(Target(until_rms={"speed": 0.1, "z": 2}, until_max={"speed": 1.5}, attributes=("speed",))),
+    Open(Target(attributes=())),
     Credit(1),
     Stop(),
     Bye(),
     Opened(DIGEST, 2**40, 12345, 1e305, (2**39, 500), (13000, 1), True),
     Opened(DIGEST, 100, 90, 1.0, (90, 5), (80, 1), True, BASE_CREDIT + 1),
+    Opened(DIGEST, 100, 90, 1.0, (90, 5), (80, 1), False, channels=True),
     Segments(7, bytes(range(256))),
     Segments(0, bytes(MAX_DATA)),
     Layer(0, 2, 96, 0.125, 3.5),
@@ -57,12 +60,21 @@ integers = st.integers(0, 2**53)
 places = st.tuples(integers, st.integers(1, 2**53))
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 tolerances = st.none() | st.builds(Tolerance, st.floats(0, 1e300), st.booleans())
-targets = st.builds(Target, level=st.none() | integers) | st.builds(
-    Target,
-    until_rms=tolerances,
-    until_max=tolerances,
-    max_bytes=st.none() | st.integers(1, 2**53),
-    order=st.sampled_from(["quality", "level"]),
+targets = (
+    st.builds(Target, level=st.none() | integers)
+    | st.builds(
+        Target,
+        until_rms=tolerances,
+        until_max=tolerances,
+        max_bytes=st.none() | st.integers(1, 2**53),
+        order=st.sampled_from(["quality", "level"]),
+    )
+    | st.builds(
+        Target,
+        until_rms=st.dictionaries(st.text(max_size=8), st.floats(0, 1e300), max_size=4),
+        until_max=st.dictionaries(st.text(max_size=8), st.floats(0, 1e300), max_size=4),
+        max_bytes=st.none() | st.integers(1, 2**53),
+    )
 )
 events = st.one_of(
     st.builds(Open, targets, integers, st.lists(places, max_size=5).map(tuple), st.none() | st.just(DIGEST)),
@@ -167,6 +179,10 @@ def test_whole_numbers_are_taken_where_a_float_is_meant() -> None:
         (packed(type="open", version=1, credit=1, target={"level": "2"}), r"target\.level"),
         (packed(type="open", version=1, credit=1, target={"until_rms": 0.1}), r"target\.until_rms"),
         (packed(type="open", version=1, credit=1, target={"until_max": [0.1, 1]}), r"target\.until_max"),
+        (packed(type="open", version=1, credit=1, target={"channels": [["a", "rms"]]}), r"target\.channels"),
+        (packed(type="open", version=1, credit=1, target={"channels": [["a", "mean", 1]]}), r"target\.channels"),
+        (packed(type="open", version=1, credit=1, target={"channels": [[1, "rms", 1]]}), r"target\.channels"),
+        (packed(type="open", version=1, credit=1, target={"channels": [["a", "rms", "1"]]}), r"target\.channels"),
         (packed(type="header", container="../../etc/passwd", size=1, planned=1, extent=1.0), r"header\.container"),
         (packed(type="header", container=DIGEST, size=1, planned=1, extent=float("nan")), r"header\.extent"),
         (packed(**PLACED, metadata=[5], prefix=True), r"header\.metadata"),
@@ -193,6 +209,11 @@ def test_what_is_not_a_message_is_refused(message: bytes, expected: str) -> None
         {"order": "alphabetical"},
         {"max_bytes": 0},
         {"until_rms": [-1.0, False]},
+        {"channels": [["a", "rms", -1.0]]},
+        {"channels": [["a", "rms", 1.0], ["a", "rms", 2.0]]},
+        {"channels": [["a", "rms", 1.0]], "until_rms": [1.0, False]},
+        {"channels": [["a", "rms", 1.0]], "until_max": [1.0, False]},
+        {"channels": [["a", "rms", 1.0]], "region": [[0, 1], [0, 1]]},
     ],
 )
 def test_a_target_that_contradicts_itself_has_a_code_of_its_own(target: dict[str, Any]) -> None:

@@ -140,6 +140,16 @@ export class Header extends HeaderFields {
     return this.layout.levels;
   }
 
+  /** Name of each channel: z of heights; x, y, z; of an attribute its name, numbered where it has components. */
+  get channelNames(): string[] {
+    const own = this.pointChannels === 1 ? ["z"] : ["x", "y", "z"].slice(0, this.pointChannels);
+    for (let number = 0; own.length < this.pointChannels; number += 1) own.push(`attribute_${number}`);
+    const others = this.attributes.flatMap(({ name, components }) =>
+      components > 0 ? Array.from({ length: components }, (_, part) => `${name}_${part}`) : [name],
+    );
+    return [...own, ...others];
+  }
+
   /** Type of each channel. */
   get dtypes(): DType[] {
     const own = Array.from({ length: this.pointChannels }, () => this.dtype);

@@ -2,7 +2,7 @@
 
 import { CorruptStreamError } from "../errors";
 import type { SelectedSlices } from "../planning/selection";
-import type { Chunk, Segment } from "../types";
+import type { ChannelErrors, Chunk, Segment } from "../types";
 import { ByteBuffer } from "./buffer";
 import { type Frame, wholeSection } from "./frames";
 import type { Index } from "./model";
@@ -15,6 +15,8 @@ export interface State {
   readonly bytes: number;
   readonly rms: number;
   readonly maxError: number;
+  /** Errors of each channel, where they are known. */
+  readonly channels: ChannelErrors;
   readonly complete: boolean;
   /** Nothing but the residual is missing. */
   readonly allPlanes: boolean;
@@ -211,6 +213,7 @@ export class Slices {
         bytes: this.#inFile ? record.end : this.#bytes,
         rms: record.errors.rms,
         maxError: record.errors.maximum,
+        channels: record.errors.channels,
         complete: false,
         allPlanes: last && level === header.levels,
         wholeLevel: -1,
@@ -225,6 +228,7 @@ export class Slices {
         bytes: this.#bytes,
         rms: levels[level]!.errors.rms,
         maxError: levels[level]!.errors.maximum,
+        channels: levels[level]!.errors.channels,
         complete: false,
         allPlanes: false,
         wholeLevel: level,
@@ -239,6 +243,7 @@ export class Slices {
       bytes: this.#bytes,
       rms: Number.NaN,
       maxError: Number.NaN,
+      channels: [],
       complete: false,
       allPlanes: false,
       wholeLevel: -1,
@@ -283,6 +288,7 @@ export class Slices {
       bytes: this.#inFile ? this.#index.surfaceEnd : this.#bytes,
       rms: last.errors.rms,
       maxError: last.errors.maximum,
+      channels: last.errors.channels,
       complete: true,
       allPlanes: true,
       wholeLevel: -1,

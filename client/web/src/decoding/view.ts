@@ -8,7 +8,7 @@ import { coordinatesOf, levelPlacement, type Nodes, windowMetadata, windowPlane 
 import { CorruptStreamError, InputError, OptionError } from "../errors";
 import { levelPositions, type Positions, patchesByBlock } from "../grid/patches";
 import { checkSelection, restoredRegion, type Selection, selectedChannels, selectedTiles } from "../planning/selection";
-import type { Block, Closed, PointArray, Region, Shape, Span, Surface, ViewInfo } from "../types";
+import type { Block, ChannelErrors, Closed, PointArray, Region, Shape, Span, Surface, ViewInfo } from "../types";
 import { clearGrid, cutGrid, type Grid, newGrid } from "./grids";
 import type { BlockGrids, Known, Reconstruction } from "./reconstruction";
 
@@ -34,6 +34,7 @@ export class View implements ViewInfo {
   readonly maxError: number;
   readonly bound: boolean;
   readonly complete: boolean;
+  readonly channels: ChannelErrors;
   readonly #shared: Shared;
   readonly #known: Known;
   readonly #selection: Selection;
@@ -46,6 +47,7 @@ export class View implements ViewInfo {
     this.maxError = state.maxError;
     this.bound = state.bound;
     this.complete = state.complete;
+    this.channels = state.channels;
     this.#shared = shared;
     this.#known = known;
     this.#selection = selection;
@@ -53,8 +55,8 @@ export class View implements ViewInfo {
 
   /** What is known of the state without decoding it, in plain values. */
   get info(): ViewInfo {
-    const { number, level, bytes, rms, maxError, bound, complete } = this;
-    return { number, level, bytes, rms, maxError, bound, complete };
+    const { number, level, bytes, rms, maxError, bound, complete, channels } = this;
+    return { number, level, bytes, rms, maxError, bound, complete, channels };
   }
 
   /**

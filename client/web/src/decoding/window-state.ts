@@ -53,10 +53,10 @@ export class WindowState {
   }
 
   /** The errors of a state in the window, and whether they are bounds. */
-  figures(made: State): { rms: number; maxError: number; bound: boolean } {
+  figures(made: State): { rms: number; maxError: number; bound: boolean; channels: [] } {
     const layer = made.wholeLevel < 0 && made.number < this.#header.layerCount ? made.number : undefined;
     const { rms, maxError } = this.#figures.within(made, layer);
-    return { rms, maxError, bound: !this.#figures.whole && maxError !== 0 && !Number.isNaN(rms) };
+    return { rms, maxError, bound: !this.#figures.whole && maxError !== 0 && !Number.isNaN(rms), channels: [] };
   }
 
   /** Whether nothing but the residual is missing of the whole surface in this state. */

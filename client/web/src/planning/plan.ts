@@ -1,9 +1,9 @@
 /** The parts of a plan. */
 
-import type { ByteRange } from "../types";
+import type { ByteRange, ChannelErrors } from "../types";
 
-/** Why a stream ends; a plan knows the first five, the others happen on the way. */
-export type Ended = "complete" | "level" | "rms" | "max" | "bytes" | "seconds" | "stopped" | "truncated";
+/** Why a stream ends; a plan knows the first six, the others happen on the way. */
+export type Ended = "complete" | "level" | "rms" | "max" | "channels" | "bytes" | "seconds" | "stopped" | "truncated";
 
 /**
  * A state that the receiver reaches when it has received `sent` bytes of the plan's ranges.
@@ -18,6 +18,8 @@ export interface Mark {
   readonly bytes: number;
   readonly rms: number;
   readonly maxError: number;
+  /** Errors of each channel; empty where there is one, or where they are not known. */
+  readonly channels: ChannelErrors;
 }
 
 /** Slices of a container in sending order, without what is cached. */

@@ -4,14 +4,15 @@
  * A server makes the same plan; a client that reads by HTTP Range or from a file makes its own.
  */
 
+import type { Header } from "../container/header";
 import type { Index } from "../container/model";
 import { OptionError } from "../errors";
 import type { ByteRange, LevelRecord, Region, Target } from "../types";
 import type { RangeSet } from "./byte-ranges";
+import { ErrorLimits } from "./limits";
 import { type Ended, endOf, type Mark, type Plan } from "./plan";
 import { regionFirst } from "./region-first";
 import { select } from "./selection";
-import { absolute } from "./target";
 import { type Figures, type WindowErrors, WindowFigures, windowSection } from "./window-errors";
 
 /** What a plan of a window takes from beside the index. */
@@ -60,12 +61,13 @@ function prefix(index: Index, target: Target): Plan {
     bytes: record.end,
     rms: record.errors.rms,
     maxError: record.errors.maximum,
+    channels: record.errors.channels,
   }));
   if (index.residual !== null) {
     const end = index.residual.offset + index.residual.length;
     marks.push(markOfLevel(index.levels[index.levels.length - 1]!, end, marks.length));
   }
-  const [kept, ended] = until(marks, target, index.header.extent);
+  const [kept, ended] = until(marks, target, index.header);
   const length = kept[kept.length - 1]!.sent;
   return {
     before: [],
@@ -78,9 +80,8 @@ function prefix(index: Index, target: Target): Plan {
 }
 
 /** The marks up to the first limit met. */
-function until(marks: readonly Mark[], target: Target, extent: number): [Mark[], Ended] {
-  const rms = target.untilRms && absolute(target.untilRms, extent);
-  const worst = target.untilMax && absolute(target.untilMax, extent);
+function until(marks: readonly Mark[], target: Target, header: Header): [Mark[], Ended] {
+  const limits = new ErrorLimits(target, header);
   const kept: Mark[] = [];
   for (const [number, mark] of marks.entries()) {
     if (target.maxBytes !== undefined && mark.bytes > target.maxBytes) {
@@ -93,8 +94,8 @@ function until(marks: readonly Mark[], target: Target, extent: number): [Mark[],
     }
     kept.push(mark);
     if (number === marks.length - 1) break;
-    if (rms !== undefined && mark.rms <= rms) return [kept, "rms"];
-    if (worst !== undefined && mark.maxError <= worst) return [kept, "max"];
+    const met = limits.met(mark);
+    if (met !== undefined) return [kept, met];
   }
   return [kept, "complete"];
 }
@@ -117,6 +118,7 @@ function slicesOfLayers(index: Index, level: number): Plan {
         bytes: slices.total,
         rms: record.errors.rms,
         maxError: record.errors.maximum,
+        channels: record.errors.channels,
       });
     }
   }
@@ -147,7 +149,7 @@ function byLevel(index: Index, target: Target, level: number): Plan {
   if (target.level !== undefined) {
     return { ...parts, ranges: slices.ranges, marks, ended: level === finest ? "complete" : "level" };
   }
-  const [kept, ended] = until(marks, target, index.header.extent);
+  const [kept, ended] = until(marks, target, index.header);
   return { ...parts, ranges: cut(slices.ranges, kept[kept.length - 1]!.sent), marks: kept, ended };
 }
 
@@ -178,10 +180,10 @@ function selected(index: Index, target: Target, options: WindowOptions): Plan {
     } else if (after === undefined || after.layer > segment.layer) {
       // Layers of which nothing is wanted are there as well.
       const record = after === undefined ? index.layers[index.layers.length - 1]! : index.layers[after.layer - 1]!;
-      const { rms, maximum: maxError } = record.errors;
+      const { rms, maximum: maxError, channels } = record.errors;
       if (target.level === undefined || level <= target.level) {
         const figures = within({ rms, maxError }, record.number);
-        marks.push({ sent: slices.total, number: record.number, level, bytes: slices.total, ...figures });
+        marks.push({ sent: slices.total, number: record.number, level, bytes: slices.total, ...figures, channels });
       }
     }
   }
@@ -198,7 +200,8 @@ function selected(index: Index, target: Target, options: WindowOptions): Plan {
     ended = "complete";
   }
   marks = [...marks.filter((mark) => mark.sent < slices.total), last];
-  if (target.level === undefined) [marks, ended] = until(marks, target, index.header.extent);
+  if (target.region !== undefined) marks = marks.map((mark) => ({ ...mark, channels: [] }));
+  if (target.level === undefined) [marks, ended] = until(marks, target, index.header);
   const ranges = cut(slices.ranges, marks[marks.length - 1]!.sent);
   const section = target.region !== undefined && windows !== null && bounded ? windowSection(index) : null;
   const before = section === null ? [index.index] : [index.index, section];
@@ -219,8 +222,8 @@ function figuresOf(
 }
 
 function markOfLevel(state: LevelRecord, bytes: number, number: number = state.level): Mark {
-  const { rms, maximum: maxError } = state.errors;
-  return { sent: bytes, number, level: state.level, bytes, rms, maxError };
+  const { rms, maximum: maxError, channels } = state.errors;
+  return { sent: bytes, number, level: state.level, bytes, rms, maxError, channels };
 }
 
 /** Slices of the surface after its header, joined where they touch; `total` is their length. */

@@ -96,7 +96,7 @@ function* reordered(steps: readonly Step[]): Generator<Mark> {
         const sent = inRegion ? size : end.ahead + size;
         // Figures are those of a state by itself: all of it, and nothing else, is there.
         const alone = inRegion ? step.behind === 0 : step.ahead === end.ahead;
-        const unknown = { bytes: sent, rms: Number.NaN, maxError: Number.NaN };
+        const unknown = { bytes: sent, rms: Number.NaN, maxError: Number.NaN, channels: [] };
         yield { ...step.mark, sent, ...(alone ? {} : unknown) };
       }
       before = size;

@@ -1,13 +1,19 @@
 /** Targets as callers write them, checked: how far to refine a surface, and in which order. */
 
 import { OptionError } from "../errors";
-import type { Region, Target, Tolerance } from "../types";
+import type { ChannelLimit, Region, Target, Tolerance } from "../types";
 
-/** A target as callers write it: a tolerance is a number in the surface's unit, `"1e-3d"` (times the extent), or both. */
+/** An error: a number in the surface's unit, `"1e-3d"` (times the extent), or both. */
+export type Limit = number | string | Tolerance;
+
+/** An error of the whole surface, or errors of channels by name, each in its own unit. */
+export type Limits = Limit | Readonly<Record<string, Limit>>;
+
+/** A target as callers write it. Of errors of channels all have to be met; of other limits the first one counts. */
 export interface TargetOptions {
   readonly level?: number | undefined;
-  readonly untilRms?: number | string | Tolerance | undefined;
-  readonly untilMax?: number | string | Tolerance | undefined;
+  readonly untilRms?: Limits | undefined;
+  readonly untilMax?: Limits | undefined;
   readonly maxBytes?: number | undefined;
   readonly seconds?: number | undefined;
   readonly order?: "quality" | "level" | undefined;
@@ -24,9 +30,11 @@ export interface TargetOptions {
 export function makeTarget(options: TargetOptions = {}): Target {
   const { level, maxBytes, seconds, region, attributes, first } = options;
   const order = options.order ?? "quality";
-  const untilRms = options.untilRms === undefined ? undefined : tolerance(options.untilRms);
-  const untilMax = options.untilMax === undefined ? undefined : tolerance(options.untilMax);
-  const limited = [untilRms, untilMax, maxBytes, seconds].some((limit) => limit !== undefined);
+  const untilRms = ofWhole(options.untilRms);
+  const untilMax = ofWhole(options.untilMax);
+  const limits = [...ofChannels(options.untilRms, "rms"), ...ofChannels(options.untilMax, "max")];
+  const channels = limits.length > 0 ? limits : undefined;
+  const limited = [untilRms, untilMax, channels, maxBytes, seconds].some((limit) => limit !== undefined);
   if (level !== undefined && limited) throw new OptionError("expected either a level or other limits, got both");
   if (level !== undefined && !(Number.isInteger(level) && level >= 0)) {
     throw new OptionError(`expected a level of 0 or more, got ${level}`);
@@ -45,8 +53,34 @@ export function makeTarget(options: TargetOptions = {}): Target {
     checkSpans(region);
   }
   if (first !== undefined) checkSpans(first);
-  const values = { level, untilRms, untilMax, maxBytes, seconds, order, region, attributes, first };
+  if (channels !== undefined && (untilRms ?? untilMax) !== undefined) {
+    throw new OptionError("expected either an error of the whole surface or errors of channels, got both");
+  }
+  if (channels !== undefined && region !== undefined) {
+    throw new OptionError("expected either errors of channels or a region, of which they are not known, got both");
+  }
+  const values = { level, untilRms, untilMax, channels, maxBytes, seconds, order, region, attributes, first };
   return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== undefined));
+}
+
+function ofWhole(given: Limits | undefined): Tolerance | undefined {
+  return given === undefined || byName(given) ? undefined : tolerance(given);
+}
+
+function ofChannels(given: Limits | undefined, which: "rms" | "max"): ChannelLimit[] {
+  if (given === undefined || !byName(given)) return [];
+  return Object.entries(given).map(([name, limit]) => {
+    const { value, relative } = tolerance(limit);
+    if (relative) {
+      throw new OptionError(`expected an error of ${name} in its own unit, got ${value}d, which is times the extent`);
+    }
+    return [name, which, value];
+  });
+}
+
+/** Whether errors are those of channels; one of these may be called `value`. */
+function byName(given: Limits): given is Readonly<Record<string, Limit>> {
+  return typeof given === "object" && typeof given.relative !== "boolean";
 }
 
 /**

@@ -125,6 +125,8 @@ export interface Header {
    * has none. Left out: the server tells no errors of windows before their end.
    */
   readonly window_errors?: Place | undefined;
+  /** True: the server stops by errors of channels. Left out: the target has none, or the server does not know them. */
+  readonly channels?: boolean | undefined;
 }
 
 /** From the server: a slice of the container that starts at `offset`. */

@@ -9,8 +9,8 @@ import { encode } from "@msgpack/msgpack";
 import { OptionError, UnsupportedVersionError } from "../errors";
 import { unpack } from "../msgpack";
 import type { Place } from "../planning/byte-ranges";
-import { makeTarget } from "../planning/target";
-import type { Region, Span, Target, Tolerance } from "../types";
+import { makeTarget, type TargetOptions } from "../planning/target";
+import type { ChannelLimit, Region, Span, Target, Tolerance } from "../types";
 import {
   BASE_CREDIT,
   type Event,
@@ -110,6 +110,17 @@ const names: Read = (value) => {
   return value;
 };
 
+const limits: Read = (value): ChannelLimit[] => {
+  const expected = "a list of [name, rms or max, number]";
+  if (!Array.isArray(value)) throw new Mismatch(expected);
+  return value.map((limit: unknown) => {
+    if (!Array.isArray(limit) || limit.length !== 3) throw new Mismatch(expected);
+    const [name, which, most] = limit as unknown[];
+    if (typeof name !== "string" || (which !== "rms" && which !== "max")) throw new Mismatch(expected);
+    return [name, which, number(most)];
+  });
+};
+
 const measured: Read = (value) => (value === null || value === undefined ? Number.NaN : number(value));
 
 /** The keys of a target: how the wire and how `Target` calls them, and how each is read. */
@@ -117,6 +128,7 @@ const TARGET: readonly (readonly [wire: string, key: keyof Target, read: Read])[
   ["level", "level", count],
   ["until_rms", "untilRms", tolerance],
   ["until_max", "untilMax", tolerance],
+  ["channels", "channels", limits],
   ["max_bytes", "maxBytes", count],
   ["order", "order", text],
   ["region", "region", region],
@@ -131,8 +143,22 @@ const target: Read = (value) => {
     const given = value[wire];
     if (given !== undefined && given !== null) found[key] = checked(`target.${wire}`, read, given);
   }
-  return makeTarget(found as Target);
+  const { channels, ...rest } = found as Target;
+  return makeTarget(channels === undefined ? rest : { ...rest, ...byName(channels, rest) });
 };
+
+/** Errors of channels as callers write them. */
+function byName(channels: readonly ChannelLimit[], rest: Target): TargetOptions {
+  if ((rest.untilRms ?? rest.untilMax) !== undefined) {
+    throw new OptionError("expected either an error of the whole surface or errors of channels, got both");
+  }
+  const of = (which: string) => channels.filter((limit) => limit[1] === which).map(([name, , most]) => [name, most]);
+  const found = { untilRms: Object.fromEntries(of("rms")), untilMax: Object.fromEntries(of("max")) };
+  if (Object.keys(found.untilRms).length + Object.keys(found.untilMax).length < channels.length) {
+    throw new OptionError("expected one error of each channel, got two");
+  }
+  return found;
+}
 
 const FIELDS: Readonly<Record<EventType, readonly (readonly [name: string, read: Read])[]>> = {
   open: [
@@ -156,6 +182,7 @@ const FIELDS: Readonly<Record<EventType, readonly (readonly [name: string, read:
     ["prefix", flag],
     ["credit", credit],
     ["window_errors", section],
+    ["channels", flag],
   ],
   segments: [
     ["offset", count],
@@ -185,6 +212,7 @@ const DEFAULTS: Readonly<Record<string, unknown>> = {
   "open.window_errors": undefined,
   "header.credit": undefined,
   "header.window_errors": undefined,
+  "header.channels": undefined,
   "layer.rms": Number.NaN,
   "layer.max": Number.NaN,
 };

@@ -2,6 +2,7 @@
 
 import { RemoteError, TruncatedStreamError } from "../errors";
 import type { Place } from "../planning/byte-ranges";
+import { ErrorLimits } from "../planning/limits";
 import { sameRegion } from "../planning/target";
 import { Connection } from "../protocol/connection";
 import { Window } from "../protocol/flow-control";
@@ -148,7 +149,7 @@ export class Download<View extends ViewInfo> {
   }
 
   /** Ask the server to stop sending, at once. A second call, or one after the end, does nothing. */
-  stop(why: "stopped" | "seconds" = "stopped"): void {
+  stop(why: "stopped" | "seconds" | "channels" = "stopped"): void {
     if (this.turning || this.running) this.reception.stoppedFor = why;
     if (this.running) this.outbox.push(this.connection.send({ type: "stop" }));
     this.turning = this.aiming = false;
@@ -217,7 +218,7 @@ export class Download<View extends ViewInfo> {
     this.reception.identify(event.container, event.size);
     // What answers the last target says nothing of the one that is asked for next.
     if (this.aiming) return [];
-    return this.reception.expect(event);
+    return this.untilMet(this.reception.expect(event));
   }
 
   private take(event: Segments, now: number | undefined): View[] {
@@ -225,7 +226,18 @@ export class Download<View extends ViewInfo> {
     const views = this.reception.take(event.offset, event.data);
     this.window.arrive(event.data.length, now);
     this.grant(now);
-    return !stopped || this.turning ? views : [];
+    return !stopped || this.turning ? this.untilMet(views) : [];
+  }
+
+  /** The views up to the first that meets errors of channels, where the server does not know these: the last. */
+  private untilMet(views: View[]): View[] {
+    const { target, decoder } = this.reception;
+    if (target.channels === undefined || this.turning || this.header?.channels || !decoder.header) return views;
+    const limits = new ErrorLimits(target, decoder.header);
+    const last = views.findIndex((view) => !view.complete && limits.met(view) !== undefined);
+    if (last < 0) return views;
+    this.stop("channels");
+    return views.slice(0, last + 1);
   }
 
   private grant(now: number | undefined): void {

@@ -283,7 +283,7 @@ export class RangeDownload<View extends ViewInfo> {
     const { target, cached } = this.reception;
     if (!inFileOrder(target) || cached.total > 0) return HEAD;
     if (target.maxBytes !== undefined) return Math.min(Math.max(target.maxBytes, HEAD), FIRST_MOST);
-    const limited = target.untilRms ?? target.untilMax ?? target.seconds;
+    const limited = target.untilRms ?? target.untilMax ?? target.channels ?? target.seconds;
     return limited === undefined ? FIRST_MOST : FIRST;
   }
 

@@ -71,7 +71,7 @@ export class ReceiverState<View extends ViewInfo> {
   /** Why the stream ended; undefined while it has not. */
   ended: Ended | undefined;
   /** Why this side stopped: stopped or seconds. */
-  stoppedFor: "stopped" | "seconds" | undefined;
+  stoppedFor: "stopped" | "seconds" | "channels" | undefined;
 
   private store: Store | undefined;
   private readonly sink: Sink | undefined;

@@ -7,7 +7,7 @@
 
 import { sectionExtent } from "../container/frames";
 import { KIND, SIGNATURE_LENGTH } from "../container/sections";
-import { absolute } from "../planning/target";
+import { ErrorLimits } from "../planning/limits";
 import type { Target, ViewInfo } from "../types";
 import type { StreamDecoder } from "./decoding";
 
@@ -29,6 +29,7 @@ export function inFileOrder(target: Target): boolean {
  * @param run How many bytes have come from there on.
  * @param read Gives bytes that have come.
  * @throws CorruptStreamError when no section begins there.
+ * @throws OptionError when the surface has no channel that the target names.
  */
 export function sure(
   target: Target,
@@ -48,10 +49,7 @@ export function sure(
 function met(target: Target, decoder: StreamDecoder<ViewInfo>, end: number): boolean {
   if (target.maxBytes !== undefined && end > target.maxBytes) return true;
   const view = decoder.layers[decoder.layers.length - 1];
-  if (decoder.header === null || view === undefined) return false;
-  const { extent } = decoder.header;
-  return (
-    (target.untilRms !== undefined && view.rms <= absolute(target.untilRms, extent)) ||
-    (target.untilMax !== undefined && view.maxError <= absolute(target.untilMax, extent))
-  );
+  if (decoder.header === null) return false;
+  const limits = new ErrorLimits(target, decoder.header);
+  return view !== undefined && limits.met(view) !== undefined;
 }

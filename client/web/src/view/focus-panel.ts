@@ -68,6 +68,14 @@ export class FocusPanel {
     "aria-label": "Target value",
     hidden: true,
   });
+  private readonly attribute = html("select", { class: "grow", id: "attribute" });
+  private readonly attributeRow = html(
+    "div",
+    { class: "row", hidden: true },
+    html("label", { for: "attribute" }, "Error of"),
+    this.attribute,
+  );
+  private attributes = "";
   private readonly rate = html("select", { id: "rate", class: "grow" }, ...options(RATES));
   private readonly below = html("input", { type: "checkbox", checked: true, id: "below" });
   private readonly button = html("button", { type: "button", class: "primary" }, "Stop");
@@ -90,6 +98,7 @@ export class FocusPanel {
     html("div", { class: "row end" }, this.axis),
     html("div", { class: "row" }, html("label", { for: "moment" }, "Moment"), this.slider, this.shown),
     html("div", { class: "row" }, html("label", { for: "target" }, "Target"), this.target, this.amount),
+    this.attributeRow,
     html("div", { class: "row" }, html("label", { for: "rate" }, "Link"), this.rate),
     html("div", { class: "row check" }, html("label", {}, this.below, "Stop when below a pixel")),
     html("div", { class: "row" }, this.button),
@@ -102,6 +111,7 @@ export class FocusPanel {
     this.target.addEventListener("change", () => this.chooseTarget());
     this.amount.addEventListener("change", () => this.sendTarget());
     this.rate.addEventListener("change", () => actions.throttle(this.chosenRate));
+    this.attribute.addEventListener("change", () => this.sendTarget());
     this.below.addEventListener("change", () => actions.stopBelowPixel(this.below.checked));
   }
 
@@ -122,6 +132,7 @@ export class FocusPanel {
    * @param rate - Bytes a second that an address asks for, if it is one of those that can be chosen.
    */
   begin(rate?: number): void {
+    this.attribute.value = ""; // another surface may have others
     if (RATES.some(([known]) => known === rate)) this.rate.value = String(rate);
     if (this.target.value !== "all") this.sendTarget();
     this.last = null;
@@ -165,6 +176,7 @@ export class FocusPanel {
     const unit = info?.unit ?? "";
     setText(this.status, statusText(state));
     setText(this.detail, detailText(state));
+    this.offer(info?.attributes.map(({ name }) => name) ?? []);
     const total = progress.planned || info?.size || 0;
     this.done.style.width = `${total > 0 ? Math.min(100, (100 * progress.bytes) / total) : 0}%`;
     setText(this.rms, drawn === null ? "–" : errorText(drawn.rms, unit));
@@ -183,6 +195,18 @@ export class FocusPanel {
     this.button.hidden = isWhole(state);
   }
 
+  /** Lets an error be that of an attribute, where there are any. */
+  private offer(names: readonly string[]): void {
+    const known = JSON.stringify(names);
+    if (known !== this.attributes) {
+      this.attributes = known;
+      const all: [string, string][] = [["", "the surface"], ...names.map((name): [string, string] => [name, name])];
+      this.attribute.replaceChildren(...options(all));
+    }
+    const { value } = this.target;
+    this.attributeRow.hidden = names.length === 0 || (value !== "rms" && value !== "max");
+  }
+
   private slide(to: number): void {
     this.actions.show(to >= Number(this.slider.max) ? null : to);
   }
@@ -190,6 +214,7 @@ export class FocusPanel {
   private chooseTarget(): void {
     const kind = this.target.value;
     this.amount.hidden = kind === "all";
+    this.offer(this.last?.info?.attributes.map(({ name }) => name) ?? []);
     const drawn = this.last?.drawn;
     const suggestion: Readonly<Record<string, number>> = {
       rms: (drawn?.rms ?? 1) / 4,
@@ -212,7 +237,10 @@ export class FocusPanel {
         level: Math.min(Math.round(amount), this.last?.info?.levels ?? Number.POSITIVE_INFINITY),
       });
     else if (kind === "bytes") this.actions.setTarget({ bytes: Math.round(amount * 1000) });
-    else this.actions.setTarget(kind === "rms" ? { rms: amount } : { max: amount });
+    else {
+      const of = this.attribute.value === "" ? {} : { attribute: this.attribute.value };
+      this.actions.setTarget(kind === "rms" ? { rms: amount, ...of } : { max: amount, ...of });
+    }
   }
 }
 

@@ -179,9 +179,11 @@ export class Receiver {
   }
 
   private options(): TargetOptions {
-    const { level, rms, max, bytes } = this.target;
+    const { level, rms, max, bytes, attribute } = this.target;
     const first = this.decoder?.header?.blocks.length === 1 ? (this.region ?? undefined) : undefined;
-    return { level, untilRms: rms, untilMax: max, maxBytes: bytes, first };
+    const of = (error: number | undefined) =>
+      error === undefined || attribute === undefined ? error : { [attribute]: error };
+    return { level, untilRms: of(rms), untilMax: of(max), maxBytes: bytes, first };
   }
 
   /** Takes views until the stream ends; only one of these runs. */

@@ -14,6 +14,8 @@ export interface Target {
   rms?: number;
   /** A maximum error in the surface's unit. */
   max?: number;
+  /** The attribute that the error is of, in its own unit; without it the surface. */
+  attribute?: string;
   /** Bytes of the surface. */
   bytes?: number;
 }

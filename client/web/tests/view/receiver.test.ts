@@ -1,5 +1,6 @@
 import { afterEach, expect, it, vi } from "vitest";
 import { Decoder } from "../../src/decoding/decoder";
+import type { View } from "../../src/decoding/view";
 import { loadKernels } from "../../src/kernels/instance";
 import { Receiver } from "../../src/view/receiver";
 import type { Moment, Progress } from "../../src/view/source";
@@ -84,4 +85,22 @@ it("a file that was cut short is of no use to another attempt, also when it is w
   const again = receive();
   await again.receiver.open("http://host/a.lode", null);
   await expect.poll(() => again.progress.at(-1)?.state).toBe("complete");
+});
+
+it("a target may be the error of an attribute", async () => {
+  const sample = containerOf("large-attributes");
+  const decoder = new Decoder(await loadKernels());
+  const views = decoder.feed(sample);
+  const { attributes, pointChannels } = decoder.header!;
+  const own = Math.max(attributes[0]!.components, 1);
+  const errorOf = ({ channels }: View) =>
+    Math.hypot(...channels.slice(pointChannels, pointChannels + own).map(([rms]) => rms));
+  const limit = 1.000001 * errorOf(views[Math.floor(views.length / 2)]!);
+  host(sample);
+  const { receiver, moments, progress } = receive();
+  receiver.setTarget({ rms: limit, attribute: attributes[0]!.name });
+  await receiver.open("http://host/a.lode", null);
+  await expect.poll(() => progress.at(-1)?.state).toBe("target");
+  const met = views.findIndex((view) => errorOf(view) <= limit);
+  expect(moments.map(({ bytes }) => bytes)).toEqual(views.slice(0, met + 1).map(({ bytes }) => bytes));
 });
