@@ -44,7 +44,7 @@ def surface(name: str) -> ls.Surface:
     if name == "line":
         return ls.Surface(heights[100:101], metadata=metadata)
     if name == "round":
-        longitudes = np.arange(0.75, 360, 1.5, np.float32)
+        longitudes = np.arange(0.75, 360, 1.5).astype(np.float32)
         crs = 'GEOGCRS["WGS 84",ID["EPSG",4326]]'
         placed = {"geotransform": [0.0, 1.5, 0.0, -90.0, 0.0, 1.5], "crs": crs}
         return ls.Surface(np.tile(longitudes, (120, 1)), (False, True), metadata={**metadata, **placed})

@@ -18,7 +18,7 @@ from lodestream.container.sections import MAGIC
 from lodestream.errors import InputError, OptionError
 from lodestream.quality import Quality
 from lodestream.surface import Surface
-from lodestream.target import Target, Tolerance
+from lodestream.target import Target
 
 from ..requests.addresses import is_url
 from ..viewer.sources import FileSource, MemorySource, RemoteSource, Source, read_fully
@@ -147,9 +147,10 @@ def limit_of(target: Target | None, header: Header) -> dict[str, float]:
     if not isinstance(target, Target):
         raise OptionError(f"expected a lodestream.Target or None, got {type(target).__name__}")
     others = (target.seconds, target.region, target.attributes, target.first)
-    errors = {"rms": target.until_rms, "max": target.until_max}
     limits: dict[str, float] = {
-        key: Tolerance.of(error).absolute(header.extent) for key, error in errors.items() if error is not None
+        key: error.absolute(header.extent)
+        for key, error in zip(("rms", "max"), target.whole, strict=True)
+        if error is not None
     }
     if target.max_bytes is not None:
         limits["bytes"] = target.max_bytes
@@ -157,9 +158,9 @@ def limit_of(target: Target | None, header: Header) -> dict[str, float]:
         if target.level > header.levels:
             raise OptionError(f"expected a level of 0 to {header.levels}, got {target.level}")
         limits["level"] = target.level
-    if len(limits) > 1 or any(other is not None for other in others) or target.order != "quality":
+    if len(limits) > 1 or target.channels or any(other is not None for other in others) or target.order != "quality":
         raise OptionError(
-            "expected a target of one limit (level, until_rms, until_max or max_bytes) and nothing else, as the viewer "
-            f"has it, got {target}"
+            "expected a target of one limit (level, until_rms or until_max of the whole surface, or max_bytes) and "
+            f"nothing else, as the viewer has it, got {target}"
         )
     return limits

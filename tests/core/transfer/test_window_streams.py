@@ -141,8 +141,8 @@ def test_a_stream_goes_on_at_a_server_that_tells_more(stored: bool, pieces: int)
 def test_errors_of_windows_that_are_told_and_not_there_are_not_waited_for() -> None:
     reception = ReceiverState(ls.Target(region=REGION), store=MemoryStore())
     reception.follow(index())
-    places = ((place.offset, place.length) for place in (index().index, index().metadata))
-    reception.expect(1, *places, windows=(10, 20), prefix=False)
+    root, metadata = ((place.offset, place.length) for place in (index().index, index().metadata))
+    reception.expect(1, root, metadata, windows=(10, 20), prefix=False)
     for place in plan(index(), reception.target).slices:
         reception.take(place.offset, read(place.offset, place.length))
     reception.take(10, read(10, 20))
