@@ -6,6 +6,7 @@ coarser level, and of several blocks, everything is decoded at the first access.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import threading
 import weakref
@@ -25,7 +26,7 @@ from lodestream.container.capacity import Capacity
 from lodestream.container.model import ByteRange, Header
 from lodestream.coordinates.height_fields import level_metadata
 from lodestream.decoding.decoder import Decoder, View
-from lodestream.errors import InputError, OptionError
+from lodestream.errors import InputError, LodestreamError, OptionError
 from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
 from lodestream.planning.planner import plan
@@ -171,7 +172,11 @@ class Container:
         self.header: Header = self._index.header
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Container, self._given
+        return _opened_again, (*self._given, self._mark())
+
+    def _mark(self) -> str:
+        """What the header and the index are known by again."""
+        return hashlib.sha256(b"".join(data for _, data in self._kept)).hexdigest()
 
     def _first(self, offset: int, length: int) -> bytes:
         data = self._read(offset, length)
@@ -267,6 +272,21 @@ class Container:
                 start = place.offset - run[0].offset
                 decoder.feed_at(place.offset, data[start : start + place.length])
         return decoder.view()
+
+
+def _opened_again(place: str, token: str | None, max_vertices: int | None, mark: str) -> Container:
+    """A container that was pickled.
+
+    Raises
+    ------
+    LodestreamError
+        If another one is there now, whose values would mix with those of the one before.
+    """
+    container = Container(place, token, max_vertices)
+    if container._mark() != mark:
+        container.close()
+        raise LodestreamError(f"expected {place} as it was when it was opened first, got another: it has changed")
+    return container
 
 
 def _runs(places: Sequence[ByteRange]) -> list[list[ByteRange]]:

@@ -129,6 +129,16 @@ def test_dask_computes_windows_in_threads_and_copies_go_to_other_processes(path:
     assert again.header.shape == (ROWS, COLUMNS)
 
 
+def test_a_copy_of_a_file_that_has_changed_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.lode"
+    file.write_bytes(ls.encode(np.arange(900.0).reshape(30, 30) ** 2))
+    copy = pickle.dumps(opened(file))
+    assert pickle.loads(copy).z.shape == (30, 30)
+    file.write_bytes(ls.encode(np.arange(900.0).reshape(30, 30) ** 3))
+    with pytest.raises(ls.LodestreamError, match="as it was when it was opened first"):
+        pickle.loads(copy)
+
+
 def test_points_in_space_are_lazy_too(tmp_path: Path) -> None:
     surface = ls.Surface(torus(90, 120), (True, True), metadata={"unit": "mm"})
     (tmp_path / "a.lode").write_bytes(ls.encode(surface))

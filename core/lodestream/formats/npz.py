@@ -17,7 +17,7 @@ from ..errors import FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
 from .notes import listing, warn
 from .npy import NpyHeader, read_header, read_values
-from .npz_writer import HEIGHTS, MASK, POINTS, WORDS
+from .npz_writer import COORDINATES, HEIGHTS, MASK, POINTS, WORDS
 from .placed import Coordinate, place
 from .source import Source, number, refuse_array
 
@@ -29,7 +29,6 @@ READ_OPTIONS = {
     "y": "name of the array of y (default: y, lat, latitude or northing)",
 }
 
-_NAMES = {"x": ("x", "lon", "longitude", "easting"), "y": ("y", "lat", "latitude", "northing")}
 _DEGREES = ("lon", "longitude")
 _BOUNDS = (("dx", "xmin", "xmax"), ("dy", "ymin", "ymax"))
 
@@ -145,7 +144,7 @@ class _Contents:
             fitting = (
                 name
                 for name, header in self.headers.items()
-                if name.lower() in _NAMES[letter] and header.shape in shapes and header.dtype.kind in "iuf"
+                if name.lower() in COORDINATES[letter] and header.shape in shapes and header.dtype.kind in "iuf"
             )
             name = next(fitting, heights)
             if name == heights:
@@ -241,7 +240,7 @@ def _choose(contents: _Contents) -> str:
         if name not in contents.headers:
             raise OptionError(f"expected array= one of {contents.listing}, got {name!r}")
         return name
-    beside = {*_NAMES["x"], *_NAMES["y"]}
+    beside = {*COORDINATES["x"], *COORDINATES["y"]}
     beside |= {str(contents.source.options[letter]) for letter in "xy" if letter in contents.source.options}
     surfaces = [name for name, header in contents.headers.items() if refuse_array(header.shape, header.dtype) is None]
     others = [name for name in surfaces if name.lower() not in beside and name not in beside]

@@ -14,10 +14,13 @@ from .archives import new_archive, new_member
 from .notes import listing, metadata_left_out, warn, warn_left_out
 from .npy import with_holes, write_array
 
-__all__ = ["HEIGHTS", "MASK", "POINTS", "WORDS", "write"]
+__all__ = ["COORDINATES", "HEIGHTS", "MASK", "POINTS", "WORDS", "write"]
 
 #: Names of the arrays of a surface: heights (H, W), or points (H, W, C); where a point is no hole, bool (H, W).
 HEIGHTS, POINTS, MASK = "heights", "points", "mask"
+
+#: What x and y are called in archives: no attribute may have such a name, or it would be read as one of them.
+COORDINATES = {"x": ("x", "lon", "longitude", "easting"), "y": ("y", "lat", "latitude", "northing")}
 
 #: Texts of the metadata that are arrays too, of one element.
 WORDS = ("crs", "unit")
@@ -43,10 +46,10 @@ def write(surface: Surface, file: BinaryIO) -> None:
         arrays[MASK] = surface.mask
     held = [key for key in WORDS if isinstance(surface.metadata.get(key), str)]
     arrays |= {key: np.array(surface.metadata[key]) for key in held}
-    renamed = []
+    renamed, kept = [], {HEIGHTS, POINTS, *COORDINATES["x"], *COORDINATES["y"]}
     for name, values in surface.attributes.items():
         free = _UNSAFE.sub("_", name)
-        while free in arrays:
+        while free in arrays or free.lower() in kept:
             free += "_"
         arrays[free] = values
         renamed += [f"{name} as {free}"] * (free != name)

@@ -29,6 +29,14 @@ MARK = "lodestream"
 #: Metadata that coordinates say, or that stand in attributes of the CF conventions.
 _TOLD = ("geotransform", "grid", "axes", "nodes", "crs", "unit", "tags")
 
+#: What tags say of the values of a file, which are decoded here, and what xarray has in the encoding of a variable.
+_OF_THE_FILE = frozenset(
+    (
+        *("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned", "dtype"),
+        *("valid_min", "valid_max", "valid_range", "coordinates", "grid_mapping"),
+    )
+)
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -171,7 +179,8 @@ def _said(metadata: Mapping[str, Any], name: str) -> dict[str, Any]:
     if not isinstance(texts, Mapping):
         return {}
     start = f"{name}#"
-    return {key.removeprefix(start): text for key, text in texts.items() if str(key).startswith(start)}
+    found = {key.removeprefix(start): text for key, text in texts.items() if str(key).startswith(start)}
+    return {key: text for key, text in found.items() if key not in _OF_THE_FILE}
 
 
 @dataclass(frozen=True)
@@ -262,7 +271,10 @@ def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
     tags = grid.metadata.get("tags")
     if not isinstance(tags, Mapping):
         return {}
-    starts = ("NC_GLOBAL#", *(f"{part.attribute or part.name}#" for part in parts if not part.coordinate))
+    names = [part.attribute or part.name for part in parts if not part.coordinate]
+    told = {f"{name}#{key}" for name in names for key in _said(grid.metadata, name)}
     texts = tags.get("")
-    plain = {k: v for k, v in texts.items() if not str(k).startswith(starts)} if isinstance(texts, Mapping) else texts
+    plain = texts
+    if isinstance(texts, Mapping):
+        plain = {k: v for k, v in texts.items() if not str(k).startswith("NC_GLOBAL#") and k not in told}
     return {key: value for key, value in {**tags, "": plain}.items() if value}

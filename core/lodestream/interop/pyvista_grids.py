@@ -126,6 +126,7 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
     faces: list[dict[str, Any]] = []
     words: dict[str, str] = {}
     left_out: list[str] = []
+    no_numbers: list[str] = []
     for grid in grids:
         if not isinstance(grid, pv.StructuredGrid | pv.RectilinearGrid | pv.ImageData):
             if isinstance(grid, pv.DataObject):
@@ -136,8 +137,10 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
         faces.append(face)
         words |= _words(grid)
         left_out += [name for name in grid.cell_data if not name.startswith(_OWN)]
+        no_numbers += _no_numbers(grid)
     if left_out:
         warn(f"left out data that do not belong to points: {listing(dict.fromkeys(left_out))}")
+    _warn_no_numbers(no_numbers)
     metadata: dict[str, Any] = dict(words)
     if any(faces):
         metadata["faces"] = faces if len(faces) > 1 else faces[0]
@@ -181,6 +184,16 @@ def _kept(name: str, values: Any) -> bool:
     return not name.startswith(_OWN) and np.asarray(values).dtype.kind in "iuf"
 
 
+def _no_numbers(data: Any) -> list[str]:
+    """Names of data of the points that are no attributes, such as flags and texts."""
+    return [name for name, values in data.point_data.items() if not name.startswith(_OWN) and not _kept(name, values)]
+
+
+def _warn_no_numbers(names: list[str]) -> None:
+    if names:
+        warn(f"left out data of the points that are no numbers: {listing(dict.fromkeys(names))}")
+
+
 def _words(grid: Any) -> dict[str, str]:
     """Name, unit and CRS of the field data."""
     words: dict[str, str] = {}
@@ -212,4 +225,5 @@ def _of_polygons(data: Any) -> Surface:
     left_out = [name for name in data.cell_data if not name.startswith(_OWN)]
     if left_out:
         warn(f"left out data that do not belong to points: {listing(left_out)}")
+    _warn_no_numbers(_no_numbers(data))
     return surface_of_mesh(Mesh(np.array(data.points), corners, attributes), _words(data))

@@ -2,7 +2,8 @@
 
 The name of the codec is ``lodestream``. Its configuration may have a ``precision``; without one, chunks come back bit
 for bit. A chunk begins with its kind: ``C``, a container follows; or ``Z``, values by zlib, in the order of C
-and little-endian, where a container would be longer or could not hold them (all NaN, or NaN with unusual bits).
+and little-endian, where a container would be longer or could not hold them: all NaN, NaN with unusual bits, doubles
+too large for it, or a precision that is too fine for the type. So every chunk can be written.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from zarr.abc.codec import ArrayBytesCodec  # this module is for zarr alone, whi
 
 from ..decoding.decoder import decode
 from ..encoding.encoder import encode
-from ..errors import CorruptStreamError, OptionError
+from ..errors import CorruptStreamError, InputError, OptionError
 from ..surface import DTYPES, Surface
 from ..target import Tolerance
 
@@ -115,7 +116,10 @@ class LodestreamCodec(ArrayBytesCodec):
         plain = _PLAIN + zlib.compress(plane.astype(plane.dtype.newbyteorder("<"), copy=False).tobytes())
         if plane.size < 2 or (plane.dtype.kind == "f" and not np.isfinite(plane).any()) or _odd_nan(plane):
             return plain
-        container = _CONTAINER + encode(Surface(plane), precision=self.precision)
+        try:
+            container = _CONTAINER + encode(Surface(plane), precision=self.precision)
+        except InputError:
+            return plain
         return min(container, plain, key=len)
 
 
@@ -150,7 +154,7 @@ def _inflated(body: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDAr
         content = decoder.decompress(body, size)
     except zlib.error as error:
         raise CorruptStreamError(f"expected values compressed by zlib, got others: {error}", 1) from None
-    if len(content) != size or decoder.unconsumed_tail:
-        raise CorruptStreamError(f"expected {size} bytes of values, got {len(content)} or more", 1)
+    if len(content) != size or not decoder.eof or decoder.unused_data:
+        raise CorruptStreamError(f"expected {size} bytes of values, got {len(content)}, or more, or no end of them", 1)
     values = np.frombuffer(content, dtype.newbyteorder("<")).astype(dtype.newbyteorder("="))
     return values.reshape(shape[-2:])

@@ -189,6 +189,49 @@ def test_what_lies_in_the_folder_of_a_vtm_is_never_deleted(tmp_path: Path) -> No
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tail", "wing"]
 
 
+def test_a_folder_without_its_vtm_is_of_somebody_else(tmp_path: Path) -> None:
+    (tmp_path / "wing").mkdir()
+    (tmp_path / "wing" / "wing_0.vts").write_text("mine")
+    (tmp_path / "wing" / "wing_7.vts").write_text("mine")
+    with pytest.raises(FormatError, match=r"expected no folder 'wing' with files beside wing\.vtm"):
+        formats.write(wing(), tmp_path / "wing.vtm")
+    assert [path.read_text() for path in (tmp_path / "wing").iterdir()] == ["mine", "mine"]
+    assert [path.name for path in tmp_path.iterdir()] == ["wing"]
+
+
+def test_a_folder_with_the_name_of_a_block_is_not_deleted(tmp_path: Path) -> None:
+    formats.write(wing(), tmp_path / "wing.vtm")
+    (tmp_path / "wing" / "wing_2.vts").mkdir()
+    (tmp_path / "wing" / "wing_2.vts" / "notes.txt").write_text("keep")
+    with pytest.raises(FormatError, match=r"got 'wing_2\.vts' in it"):
+        formats.write(wing(), tmp_path / "wing.vtm")
+    assert (tmp_path / "wing" / "wing_2.vts" / "notes.txt").read_text() == "keep"
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_a_vtm_that_is_interrupted_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, earlier: bool
+) -> None:
+    if earlier:
+        formats.write(wing(), tmp_path / "wing.vtm")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    rename, renamed = Path.rename, 0
+
+    def interrupt(*given: Any) -> Any:
+        nonlocal renamed
+        found = rename(*given)
+        renamed += 1
+        if renamed == 1:
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(Path, "rename", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        formats.write(Surface(blocks=[block(5)]), tmp_path / "wing.vtm")
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert len(list(tmp_path.iterdir())) == 2 * earlier
+
+
 @pytest.mark.parametrize("step", ["block", "rename"])
 def test_a_vtm_that_cannot_be_written_leaves_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str

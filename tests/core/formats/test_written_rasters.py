@@ -274,3 +274,21 @@ def test_single_numbers_that_are_left_out_are_not_taken_for_an_attribute(tmp_pat
     with pytest.warns(FormatWarning, match="without single numbers .scalars: mach, alpha., which"):
         formats.write(surface, tmp_path / "a.npz")
     assert set(formats.read(tmp_path / "a.npz").attributes) == {"scalars"}
+
+
+@pytest.mark.parametrize("names", [("x", "y"), ("lon", "Latitude"), ("heights", "points")])
+@pytest.mark.parametrize("width", [0, 3])
+def test_attributes_with_the_names_of_coordinates_stay_attributes_in_npz(
+    tmp_path: Path, names: tuple[str, str], width: int
+) -> None:
+    rows, columns = np.mgrid[0:5.0, 0:6.0]
+    heights = rows * columns
+    points = np.stack((columns, rows, heights), axis=-1) if width else heights
+    attributes = {name: (heights + number).astype("f4") for number, name in enumerate(names)}
+    with pytest.warns(FormatWarning, match="with the attribute"):
+        formats.write(Surface(points, attributes=attributes), tmp_path / "a.npz")
+    again = formats.read(tmp_path / "a.npz")
+    assert np.array_equal(again.points, points)
+    assert list(again.attributes) == [f"{name}_" for name in names]
+    for name, values in attributes.items():
+        assert np.array_equal(again.attributes[f"{name}_"], values)

@@ -144,3 +144,13 @@ def test_a_container_is_read_whole_or_at_a_level(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(ls.TruncatedStreamError):
         pyvista_grids.read(path)
+
+
+@pytest.mark.parametrize("polygons", [False, True])
+def test_data_that_are_no_numbers_are_left_out_with_a_note(polygons: bool) -> None:
+    rows, columns = np.mgrid[0:4.0, 0:5.0]
+    grid: Any = ls.Surface(np.stack((columns, rows, rows * columns), axis=-1)).to_pyvista()
+    grid.point_data["flag"] = np.ones(20, bool)
+    with pytest.warns(ls.FormatWarning, match="no numbers: flag"):
+        found = ls.Surface.from_pyvista(grid.extract_surface(algorithm=None) if polygons else grid)
+    assert "flag" not in found.attributes

@@ -185,6 +185,19 @@ def test_tags_are_attributes_and_other_metadata_come_back() -> None:
     assert_same(ls.Surface.from_xarray(found), surface)
 
 
+def test_tags_about_how_a_file_packs_its_values_change_none(tmp_path: Path) -> None:
+    packing = {"scale_factor": "0.1", "add_offset": "5", "_FillValue": "3", "valid_range": "0 9", "grid_mapping": "crs"}
+    tags = {"": {f"{name}#{key}": text for name in ("z", "speed") for key, text in packing.items()}}
+    surface = heights(crs='LOCAL_CS["site"]', geotransform=[0, 1, 0, 0, 0, 1], tags=tags)
+    found = dataset(surface)
+    assert not set(packing) & {*found.z.attrs, *found.speed.attrs}
+    assert_same(ls.Surface.from_xarray(found), surface)
+    found.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as again:
+        assert np.array_equal(again.speed, surface.attributes["speed"])
+        assert np.array_equal(again.z, found.z, equal_nan=True)
+
+
 def test_what_json_cannot_hold_is_left_out_with_a_note() -> None:
     with pytest.warns(ls.FormatWarning, match="without foreign"):
         heights(foreign={"me": b"\0"}).to_xarray()

@@ -80,6 +80,19 @@ def test_a_precision_is_kept_in_the_metadata_and_holds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("values", "precision"),
+    [
+        (np.linspace(-1, 1, 64).reshape(8, 8) * 1.7e308, None),
+        ((np.linspace(-1, 1, 64).reshape(8, 8) * 3e38).astype("f4"), 0.5),
+        ((np.arange(64).reshape(8, 8) * 1_000_003**2 % 2**31).astype("i4"), 0.5),
+    ],
+)
+def test_chunks_that_no_container_holds_come_back_exactly(values: Any, precision: Any, tmp_path: Path) -> None:
+    made(tmp_path / "a.zarr", values, (8, 8), precision=precision)
+    assert stored(tmp_path / "a.zarr").tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize(
     ("shape", "chunks", "dtype"), [((8, 8, 8), (2, 4, 4), "f4"), ((9,), (3,), "f4"), ((8, 8), (4, 4), "complex64")]
 )
 def test_other_chunks_and_types_are_refused(shape: Any, chunks: Any, dtype: str, tmp_path: Path) -> None:
@@ -104,6 +117,7 @@ def damaged() -> list[tuple[bytes, str]]:
     other = ls.encode(np.zeros((3, 3), "f4"))
     small = zarr_codec._PLAIN + zlib.compress(b"\0" * 3)
     large = zarr_codec._PLAIN + zlib.compress(b"\0" * (1 << 20))
+    whole = zarr_codec._PLAIN + zlib.compress(bytes(range(128)))
     return [
         (b"", "expected a chunk of kind"),
         (b"Xabc", "expected a chunk of kind"),
@@ -112,6 +126,8 @@ def damaged() -> list[tuple[bytes, str]]:
         (b"Zabc", "compressed by zlib"),
         (small, "expected 128 bytes"),
         (large, "expected 128 bytes"),
+        (whole[:-4], "expected 128 bytes"),
+        (whole + b"more", "expected 128 bytes"),
     ]
 
 

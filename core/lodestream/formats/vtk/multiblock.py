@@ -45,17 +45,17 @@ def write_beside(surface: Surface, path: Path) -> None:
     """Write NAME.vtm, and the folder NAME beside it with NAME_0.vts and so on.
 
     Both are written under temporary names and put in place by renaming, the folder first. A folder of that name is
-    replaced if nothing but blocks of an earlier NAME.vtm is in it.
+    replaced if NAME.vtm is there and nothing but its blocks is in the folder, or if it is empty.
 
     Raises
     ------
     FormatError
-        If there is a file of the folder's name, or a folder with other files.
+        If there is a file of the folder's name, or a folder with other files, or with files and without NAME.vtm.
     OSError
         If the disk does not take it; what was there before is there again then.
     """
     folder = path.with_suffix("")
-    _check_folder(folder)
+    _check_folder(folder, path)
     token = secrets.token_hex(4)
     made, old = (path.with_name(f".{folder.name}.{token}.{word}") for word in ("tmp", "old"))
     index = path.with_name(f".{path.name}.{token}.tmp")
@@ -66,33 +66,40 @@ def write_beside(surface: Surface, path: Path) -> None:
             with (made / name).open("xb") as file:
                 writer.write_block(surface, number, file)
         index.write_bytes(_index(folder.name, names))
-        if folder.exists():
-            folder.rename(old)
         try:
+            if folder.exists():
+                folder.rename(old)
             made.rename(folder)
             index.replace(path)
-        except BaseException:
-            if old.exists():
+        finally:  # what is where says how far it came, after an interruption too
+            unplaced = index.exists()
+            if unplaced and not made.exists():
                 shutil.rmtree(folder, ignore_errors=True)
+            if unplaced and old.exists():
                 old.rename(folder)
-            raise
+        shutil.rmtree(old, ignore_errors=True)
     finally:
         index.unlink(missing_ok=True)
-        for left in (made, old):
-            shutil.rmtree(left, ignore_errors=True)
+        shutil.rmtree(made, ignore_errors=True)
 
 
-def _check_folder(folder: Path) -> None:
+def _check_folder(folder: Path, path: Path) -> None:
     """Refuse to replace what a writer of this module has not written."""
     if not folder.exists() and not folder.is_symlink():
         return
     ours = re.compile(re.escape(folder.name) + r"_\d+\.vts")
     if folder.is_symlink() or not folder.is_dir():
         raise FormatError(f"expected a place for the folder {folder.name!r} of the blocks, got a file of that name")
-    other = sorted(entry.name for entry in folder.iterdir() if not ours.fullmatch(entry.name))
+    entries = list(folder.iterdir())
+    other = sorted(entry.name for entry in entries if not ours.fullmatch(entry.name) or not entry.is_file())
     if other:
         raise FormatError(
             f"expected the folder {folder.name!r} with nothing but blocks of an earlier .vtm, got {other[0]!r} in it"
+        )
+    if entries and not path.is_file():
+        raise FormatError(
+            f"expected no folder {folder.name!r} with files beside {path.name}, which is not there, got one: "
+            "move it, or choose another name"
         )
 
 
