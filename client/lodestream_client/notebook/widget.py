@@ -98,6 +98,14 @@ class Widget(AnyWidget):
         If there is no such file.
     StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
         If the container is damaged or too large, or cannot be had.
+
+    Examples
+    --------
+    >>> import lodestream_client, numpy as np
+    >>> widget = lodestream_client.Widget(np.arange(63.0).reshape(7, 9), height=300, lines=True)
+    >>> widget.state, widget.height, widget.lines
+    ('connecting', '300px', True)
+    >>> widget.close()
     UnavailableError
         If anywidget is not installed, or the viewer is not built (in a working tree only).
     """

@@ -84,6 +84,7 @@ def test_all_names_are_there() -> None:
         "Identity",
         "SilenceError",
         "UnreachableError",
+        "Widget",
     }
     with pytest.raises(AttributeError, match="no attribute 'juggle'"):
         _ = lodestream_client.juggle
