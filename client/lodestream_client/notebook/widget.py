@@ -98,6 +98,8 @@ class Widget(AnyWidget):
         If there is no such file.
     StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
         If the container is damaged or too large, or cannot be had.
+    UnavailableError
+        If anywidget is not installed, or the viewer is not built (in a working tree only).
 
     Examples
     --------
@@ -106,8 +108,6 @@ class Widget(AnyWidget):
     >>> widget.state, widget.height, widget.lines
     ('connecting', '300px', True)
     >>> widget.close()
-    UnavailableError
-        If anywidget is not installed, or the viewer is not built (in a working tree only).
     """
 
     # A widget that was refused is closed too.
