@@ -294,6 +294,11 @@ def test_below_a_pixel_it_pauses_and_goes_on_when_one_looks_closer(tabs: Tabs, s
         tab.shown("Below a pixel: paused")
         paused = tab.moments[-1]
         assert not paused["complete"]
-        tab.press(*["+"] * 16)
-        tab.until(lambda: tab.moments[-1]["number"] > paused["number"])
+
+        def closer() -> bool:
+            tab.press("+")
+            return bool(tab.moments[-1]["number"] > paused["number"])
+
+        # A busy machine pauses later, with a smaller error: how close one has to look depends on it.
+        tab.until(closer)
         assert tab.moments[-1]["max"] < paused["max"]
