@@ -103,10 +103,7 @@ def parse_seconds(text: str) -> float:
     ArgumentTypeError
         If it is something else.
     """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _seconds(text)
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"expected a number of seconds, got {text!r}")
     return value
@@ -120,13 +117,17 @@ def parse_positive_seconds(text: str) -> float:
     ArgumentTypeError
         If it is something else.
     """
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _seconds(text)
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"expected a positive number of seconds, got {text!r}")
     return value
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def parse_level(text: str) -> int:
