@@ -26,6 +26,9 @@ SECTIONS = (
     "stream",
 )
 
+#: Sections that take most of an hour: only when they are named.
+LONG = ("scale",)
+
 # Before numpy is loaded: every figure is of one core, but where another number of threads is named.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LODESTREAM_THREADS"):
     os.environ[_variable] = "1"
@@ -47,16 +50,18 @@ def processor() -> str:
 def main() -> int:
     """Print the tables of each section, and then all gates."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("section", nargs="*", help=f"of {', '.join(SECTIONS)}; all when none is named")
+    parser.add_argument(
+        "section", nargs="*", help=f"of {', '.join(SECTIONS)}; all of these when none is named; or {', '.join(LONG)}"
+    )
     chosen = parser.parse_args().section
-    unknown = sorted(set(chosen) - set(SECTIONS))
+    unknown = sorted(set(chosen) - {*SECTIONS, *LONG})
     if unknown:
         parser.error(f"expected sections of {', '.join(SECTIONS)}, got {', '.join(unknown)}")
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "pywavelets"))
     print(f"Lodestream {lodestream.__version__}, Python {platform.python_version()}, {packages}")
     print(f"one core of {processor()}", flush=True)
-    for section in SECTIONS:
-        if not chosen or section in chosen:
+    for section in (*SECTIONS, *LONG):
+        if section in chosen or (not chosen and section in SECTIONS):
             importlib.import_module(f"benchmarks.{section}").main()
     gates()
     return 0

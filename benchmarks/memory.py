@@ -1,4 +1,4 @@
-"""Memory of a decoder, and of a server with clients that do not read."""
+"""Memory of a decoder, of where tiles lie, and of a server with clients that do not read."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ import psutil
 from numpy.typing import NDArray
 
 import lodestream
+from lodestream.entropy.tiles import TileTable
+from lodestream.grid.layout import Grid, Layout
 from lodestream_client import sync
 
 from .arrays import ROOT, fractal
@@ -25,10 +28,12 @@ from .measure import STATUS, Peak, memory, note, table
 
 CHUNK = 1 << 16
 STREAMS = (0, 16, 64)
+#: Rows, and columns, of surfaces whose tiles are placed.
+TILED = (4096, 32768)
 
 
 def main() -> None:
-    """Print both tables."""
+    """Print the tables."""
     sizes: dict[str, NDArray[Any]] = {"2049 x 2049 heights": fractal(2049), "1025 x 1025 xyz": _sphere(1025)}
     with tempfile.TemporaryDirectory() as folder:
         paths = {name: Path(folder, f"{number}.lode") for number, name in enumerate(sizes)}
@@ -39,8 +44,14 @@ def main() -> None:
             head = ["surface", "as float32", "container", "after all input", "with the last surface", "x float32"]
             table("Memory of a Decoder", head, rows)
             note("Peak memory above that of the process before, in a separate process, fed with 64 KiB at a time.")
+            rows = [_tiles_row(side) for side in TILED]
+            table("Where tiles lie", ["surface", "tiles", "memory", "a tile", "seconds"], rows)
+            note(
+                "What every process keeps that opens a container or takes part in a build, as Python counts it, and "
+                "how long that takes."
+            )
         else:
-            print("\nskipped: memory of a Decoder (this system does not tell a process its peak)")
+            print("\nskipped: memory of a Decoder and of tiles (this system does not tell a process its peak)")
         rows = list(_server_rows(Path(folder), fractal(2049)))
     table("Memory of a server", ["streams opened, then not read", "resident", "above idle", "for each stream"], rows)
     note(
@@ -80,6 +91,26 @@ def decode(container: Path) -> None:
     surface = decoder.surface()
     print(peak.above())
     assert surface.points.size
+
+
+def _tiles_row(side: int) -> list[str]:
+    command = [sys.executable, "-m", "benchmarks.memory", "tiles", str(side)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout
+    tiles, taken, nanoseconds = (int(word) for word in output.split())
+    each = f"{taken / tiles:.0f} bytes"
+    return [f"{side:,} x {side:,}", f"{tiles:,}", memory(taken), each, f"{nanoseconds / 1e9:.3f}"]
+
+
+def place_tiles(side: int) -> None:
+    """Print the tiles of a surface of so many rows and columns, the bytes kept for them, and the nanoseconds."""
+    TileTable.of(Layout.single((300, 300), (False, False), (6, 6)))  # loads what is loaded once
+    tracemalloc.start()
+    table = TileTable.of(Layout.single((side, side), (False, False), (6, 6)))
+    taken = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    start = time.perf_counter_ns()
+    TileTable(Layout([Grid((side, side))], (6, 6)))
+    print(len(table.members), taken, time.perf_counter_ns() - start)
 
 
 def _server_rows(folder: Path, points: NDArray[Any]) -> Iterator[list[str]]:
@@ -125,4 +156,7 @@ def _wait(url: str, server: subprocess.Popen[bytes]) -> None:
 
 
 if __name__ == "__main__":
-    decode(Path(sys.argv[1]))
+    if sys.argv[1] == "tiles":
+        place_tiles(int(sys.argv[2]))
+    else:
+        decode(Path(sys.argv[1]))

@@ -31,7 +31,7 @@ from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
 from lodestream.planning.planner import plan
 from lodestream.surface import Block, Surface
-from lodestream.target import Region, Target
+from lodestream.target import Region, Target, check_integer
 
 from .requests.addresses import is_surface, is_url
 from .viewer.sources import FileSource, RemoteSource, Source
@@ -84,7 +84,7 @@ class LodeBackend(BackendEntrypoint):
         Raises
         ------
         OptionError
-            If there is no such level or block, or there are several blocks and none is chosen.
+            If a level or block is no integer or not there, or there are several blocks and none is chosen.
         StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
             If the container is damaged or too large, or cannot be had.
         """
@@ -92,7 +92,7 @@ class LodeBackend(BackendEntrypoint):
         blocks = len(container.header.blocks)
         if block is None and blocks > 1:
             raise OptionError(f"expected block= of 0 to {blocks - 1}, or xarray.open_datatree, for {blocks} blocks")
-        if block is not None and not 0 <= block < blocks:
+        if block is not None and not 0 <= (block := check_integer("a block", block)) < blocks:
             raise OptionError(f"expected a block of 0 to {blocks - 1}, got {block}")
         found = container.dataset(level, block or 0)
         drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
@@ -198,10 +198,10 @@ class Container:
         Raises
         ------
         OptionError
-            If there is no such level.
+            If there is no such level, or it is no integer.
         """
         finest = self.header.levels
-        if level is not None and not 0 <= level <= finest:
+        if level is not None and not 0 <= (level := check_integer("a level", level)) <= finest:
             raise OptionError(f"expected a level of 0 to {finest}, got {level}")
         level = finest if level is None else level
         grid = self._grid(level, block)
@@ -209,11 +209,23 @@ class Container:
         def lazily(part: Part) -> tuple[Any, dict[str, Any]]:
             array = _Lazy(self, part, grid, level, block)
             chunks = dict(zip(part.dims, (*self._chunks(grid), *array.shape[2:]), strict=True))
-            return indexing.LazilyIndexedArray(array), {"preferred_chunks": chunks}
+            packing = self._packing(part) if level == finest else {}
+            return indexing.LazilyIndexedArray(array), {"preferred_chunks": chunks} | packing
 
         found = dataset(grid, lazily)
         found.set_close(self.close)
         return found
+
+    def _packing(self, part: Part) -> dict[str, Any]:
+        """The encoding that makes integers with holes integers again in a file, where the surface says which is none.
+
+        Another value would have to be looked for among all; and those of a level or with errors may be any.
+        """
+        header, nodata = self.header, self._index.metadata_values.get("nodata")
+        integers = part.attribute is None and part.dtype != header.dtype
+        if not (integers and header.exact and isinstance(nodata, int | float) and nodata == header.hole):
+            return {}
+        return {"dtype": header.dtype.name, "_FillValue": header.dtype.type(header.hole)}
 
     def _chunks(self, grid: Grid) -> tuple[int, int]:
         rows, columns = (

@@ -183,8 +183,11 @@ static void join(const struct bundle *w, int64_t from, int64_t to) {
     else if (gap == 1)
         join_line(x, 2 * w->along, w->along, n, d, 1, count);
     else
-        for (int64_t k = 0; k < count; k++)
+        for (int64_t k = 0; k < count; k++) {
+            ask(w, 2 * (from + k) + AHEAD);
+            ask(w, 2 * (from + k) + AHEAD + 1);
             join_line(x + 2 * k * w->along, 1, w->along, n + k * STRIP, d + k * STRIP, STRIP, w->width);
+        }
 }
 
 /* Store a clamped sample. */
@@ -247,7 +250,96 @@ static void update_wide(const int32_t *restrict details, int32_t *restrict nodes
     }
 }
 
+#ifdef __AVX2__
+
+/* Where details fit 16 bits, two neighbours along the line stand in each word: one operation multiplies both by their
+ * taps and adds the products. Half of a word's taps sum to at most 7596 in magnitude, so that no sum leaves int32. */
+typedef int32_t words __attribute__((vector_size(32)));
+typedef int16_t halves __attribute__((vector_size(32)));
+
+enum {
+    WORDS = sizeof(words) / sizeof(int32_t),
+    SHORT = 1 << 15,
+    MOST_PAIRS = CHUNK + 6 * REACH * STRIP, /* of a chunk, the last one of a line being the longest */
+};
+
+/* The taps of a word, as the low and the high halves of the coefficients: of d_i and d_{i + 1}. */
+#define TAP_WORD(first, second) ((int32_t)((uint32_t)((first) & 0xFFFF) | (uint32_t)(second) << 16))
+
+static const int32_t LOW_TAPS[REACH] = {
+    TAP_WORD(-1, 4),    TAP_WORD(-21, 125),   TAP_WORD(-731, 4258), TAP_WORD(-242, -755), TAP_WORD(678, 781),
+    TAP_WORD(781, 678), TAP_WORD(-755, -242), TAP_WORD(4258, -731), TAP_WORD(125, -21),   TAP_WORD(4, -1),
+};
+static const int32_t HIGH_TAPS[4] = {TAP_WORD(-12, 71), TAP_WORD(-412, 2399), TAP_WORD(2399, -412), TAP_WORD(71, -12)};
+
+/* Details and those `gap` behind them in pairs; whether the former all fit. */
+LODE_INLINE bool pair_up(const int32_t *restrict details, int32_t *restrict pairs, int64_t count, int64_t gap) {
+    int32_t bits = 0;
+    for (int64_t i = 0; i < count; i++) {
+        int32_t own = details[i];
+        bits |= own ^ (own >> 31);
+        pairs[i] = (int32_t)(((uint32_t)own & 0xFFFF) | (uint32_t)details[i + gap] << 16);
+    }
+    return bits < SHORT;
+}
+
+LODE_INLINE words times_taps(const int32_t *pairs, int32_t taps) {
+    words pair, tap = {taps, taps, taps, taps, taps, taps, taps, taps};
+    memcpy(&pair, pairs, sizeof pair);
+    return (words)__builtin_ia32_pmaddwd256((halves)pair, (halves)tap);
+}
+
+/* `update_small` of values from `first` on, so many that they fill whole registers; `pairs` begins REACH lines before
+ * their details. Returns how many. */
+LODE_INLINE int64_t update_pairs(const int32_t *pairs, int32_t *nodes, int64_t count, int64_t gap, bool inverse) {
+    int64_t i = 0;
+    for (; i + WORDS <= count; i += WORDS) {
+        words low = {BIAS, BIAS, BIAS, BIAS, BIAS, BIAS, BIAS, BIAS}, high = {0};
+        for (int64_t j = 0; j < REACH; j++)
+            low += times_taps(pairs + i + 2 * j * gap, LOW_TAPS[j]);
+        for (int64_t j = 0; j < 4; j++)
+            high += times_taps(pairs + i + (2 * j + 6) * gap, HIGH_TAPS[j]);
+        words rise = (high + (low >> 11)) >> 13, node;
+        memcpy(&node, nodes + i, sizeof node);
+        node = inverse ? node - rise : node + rise;
+        memcpy(nodes + i, &node, sizeof node);
+    }
+    return i;
+}
+
+/* `update_small` of nodes `from` to `to` - 1 of a chunk; whether their details were short enough. */
+LODE_INLINE bool update_short(const struct bundle *w, int64_t from, int64_t to, int64_t gap, bool inverse) {
+    int32_t pairs[MOST_PAIRS];
+    int64_t lines = to - from, above = 2 * REACH - 2;
+    struct spans all = spans_of(w, from, to + above), own = spans_of(w, from, to);
+    const int32_t *d = w->details + (from - REACH) * gap;
+    struct spans last = {1, w->width};
+    if (lines < 1 || (lines + above) * gap > MOST_PAIRS || magnitude(d + (lines + above) * gap, last, gap, 0) > SHORT)
+        return false;
+    for (int64_t k = 0; k < all.spans; k++)
+        if (!pair_up(d + k * gap, pairs + k * gap, all.count, gap))
+            return false;
+    for (int64_t k = 0; k < own.spans; k++) {
+        int32_t *c = w->nodes + (from + k) * gap;
+        int64_t done = update_pairs(pairs + k * gap, c, own.count, gap, inverse);
+        struct spans rest = {1, own.count - done};
+        update_small(w->details + (from + k) * gap + done, c + done, rest, gap, inverse);
+    }
+    return true;
+}
+
+#else
+
+LODE_INLINE bool update_short(const struct bundle *w, int64_t from, int64_t to, int64_t gap, bool inverse) {
+    (void)w, (void)from, (void)to, (void)gap, (void)inverse;
+    return false;
+}
+
+#endif
+
 LODE_INLINE void update_at(const struct bundle *w, int64_t from, int64_t to, int64_t gap, bool inverse) {
+    if (update_short(w, from, to, gap, inverse))
+        return;
     const int32_t *d = w->details + from * gap;
     int32_t *c = w->nodes + from * gap;
     struct spans of = spans_of(w, from, to);

@@ -56,28 +56,35 @@ struct whole_figures {
     uint32_t worst;
 };
 
-#define ADD_POINTS(counts)                                                                                             \
+/* Sums of the squares of `count` points, into `total`, of any type. */
+#define ADD_POINTS(total, counts)                                                                                      \
     for (int64_t j = 0; j < count; j++) {                                                                              \
         int32_t q = coordinates[j] < r.first ? r.first : coordinates[j] > r.last ? r.last : coordinates[j];            \
         int32_t units = q * r.step + r.origin;                                                                         \
         int32_t value = (units + r.below + ((units >> r.shift) & r.parity)) >> r.shift;                                \
         value = value < r.low ? r.low : value > r.high ? r.high : value;                                               \
         uint32_t delta = (uint32_t)(points[j] - value), square = (counts) ? delta * delta : 0;                         \
-        sum += square;                                                                                                 \
+        total += square;                                                                                               \
         worst = square > worst ? square : worst;                                                                       \
     }
 
+/* 32 bits take less time and hold the sum of most rows. */
 #define WHOLE_ROW(type)                                                                                                \
     static void add_row_##type(const int32_t *restrict coordinates, const type##_t *restrict points,                   \
                                const uint8_t *restrict counted, int64_t count, const struct whole_rule *rule,          \
                                struct whole_figures *figures) {                                                        \
         struct whole_rule r = *rule;                                                                                   \
         uint64_t sum = 0;                                                                                              \
-        uint32_t worst = 0;                                                                                            \
+        uint32_t brief = 0, worst = 0;                                                                                 \
         if (counted)                                                                                                   \
-            ADD_POINTS(counted[j] != 0)                                                                                \
-        else                                                                                                           \
-            ADD_POINTS(true)                                                                                           \
+            ADD_POINTS(sum, counted[j] != 0)                                                                           \
+        else {                                                                                                         \
+            ADD_POINTS(brief, true)                                                                                    \
+            if (worst <= UINT32_MAX / (uint64_t)count)                                                                 \
+                sum = brief;                                                                                           \
+            else                                                                                                       \
+                ADD_POINTS(sum, true)                                                                                  \
+        }                                                                                                              \
         figures->sum += sum;                                                                                           \
         figures->worst = worst > figures->worst ? worst : figures->worst;                                              \
     }

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from .bands.front import encode
     from .decoding.decoder import Decoder, decode
     from .decoding.view import View
-    from .encoding.encoder import encode
     from .errors import (
         CorruptStreamError,
         FormatError,
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from .formats import read, write
     from .planning.selection import Selection
     from .quality import Quality
+    from .sources import Source
     from .surface import Block, Surface
     from .target import Target, Tolerance
     from .transform import paper
@@ -45,7 +46,7 @@ _HOMES = {
     "Decoder": "decoding.decoder",
     "View": "decoding.view",
     "decode": "decoding.decoder",
-    "encode": "encoding.encoder",
+    "encode": "bands.front",
     "CorruptStreamError": "errors",
     "FormatError": "errors",
     "FormatWarning": "errors",
@@ -67,6 +68,7 @@ _HOMES = {
     "coarsen": "transform.least_squares",
     "hierarchy": "transform.least_squares",
     "Selection": "planning.selection",
+    "Source": "sources",
     "Surface": "surface",
     "Target": "target",
     "Tolerance": "target",
@@ -86,6 +88,7 @@ __all__ = [
     "Quality",
     "RemoteError",
     "Selection",
+    "Source",
     "StreamError",
     "Surface",
     "SwitchedOffError",

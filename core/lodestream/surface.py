@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .errors import InputError
 from .joints import Joints
+from .scratch import rows_at_once
 
 if TYPE_CHECKING:
     import pyvista
@@ -110,7 +111,8 @@ class Block:
         if hidden is not None:
             valid = ~(hidden if hidden.ndim == 2 else np.asarray(hidden[..., :3].any(axis=2)))
         if mask is not None:
-            given = np.array(mask)
+            # What is memory-mapped may be larger than memory.
+            given = np.asarray(mask) if isinstance(mask, np.memmap) else np.array(mask)
             if given.shape != self.shape or given.dtype != np.bool_:
                 raise InputError(f"expected a mask of booleans of shape {self.shape}, got {given.dtype} {given.shape}")
             valid = given if valid is None else valid & given
@@ -141,13 +143,15 @@ class Block:
         if self.mask is None or self.points.dtype.kind != "f":
             return None
         coordinates = self.points[..., np.newaxis] if self.points.ndim == 2 else self.points[..., :3]
-        under = coordinates[~self.mask]
-        missing = np.isnan(under)
-        said = np.isinf(under).any(axis=1) | (missing.any(axis=1) & ~missing.all(axis=1))
-        if not said.any():
-            return None
-        kept = np.zeros(self.shape, np.bool_)
-        kept[~self.mask] = said
+        kept: NDArray[np.bool_] | None = None
+        for rows in rows_at_once(coordinates.shape):
+            holes = ~self.mask[rows]
+            under = coordinates[rows][holes]
+            missing = np.isnan(under)
+            said = np.isinf(under).any(axis=1) | (missing.any(axis=1) & ~missing.all(axis=1))
+            if said.any():
+                kept = np.zeros(self.shape, np.bool_) if kept is None else kept
+                kept[rows][holes] = said
         return kept
 
     @property
@@ -297,7 +301,8 @@ class Surface:
         data : Dataset, DataArray or DataTree
             What has chunks of dask is computed.
         attributes : iterable of str, optional
-            Variables that become attributes; None: all over the same two dimensions.
+            Variables that become attributes; None: all over the same two dimensions. Flags (bool) become 0 and 1 of
+            type uint8. What is no number is left out, with a `FormatWarning`.
         closed : (bool, bool), optional
             Which axes are closed; None: as `to_xarray` left it, or those whose longitudes go around the Earth.
         **options
@@ -319,7 +324,9 @@ class Surface:
         """This surface for pyvista (extra ``pyvista``): a StructuredGrid, or a MultiBlock of them for several blocks.
 
         Heights stand over their coordinates. Holes are hidden points, and cells without a face or with a hole for a
-        corner are hidden cells. A closed axis repeats its first points at the end. Name, unit and CRS are field data.
+        corner are hidden cells. A closed axis repeats its first points at the end; longitudes, and the places of
+        heights, go on there and do not jump. Name, unit and CRS are field data, and so is ``lodestream``, JSON of type,
+        closed axes and metadata for `from_pyvista`.
 
         Raises
         ------
@@ -341,7 +348,8 @@ class Surface:
         data : StructuredGrid, RectilinearGrid, ImageData, MultiBlock or PolyData
             A grid has one point along at least one of its three directions: a volume is not a surface. Hidden points
             and cells are holes. A last row or column that repeats the first makes a closed axis. Of polygons see
-            `from_trimesh`. Data of cells are left out, with a `FormatWarning`.
+            `from_trimesh`. Data of cells are left out, with a `FormatWarning`. A grid of `to_pyvista` whose places,
+            holes and cells are as they were becomes heights with their place again, of their type if it holds them.
 
         Raises
         ------
@@ -379,6 +387,14 @@ class Surface:
         ----------
         mesh : trimesh.Trimesh
             Grids whose cells are two triangles each, in any order; open, closed, with poles or holes, one or several.
+
+        Returns
+        -------
+        Surface
+            x, y, z in float64, which is what trimesh holds: heights and other types do not come back from `to_trimesh`.
+            The faces are the same, the grids those that are found in them: blocks that touch may come as one, a grid
+            with many holes as several, and rows as columns. Points without a face are left out, with a
+            `FormatWarning`.
 
         Raises
         ------

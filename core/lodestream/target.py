@@ -3,17 +3,40 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from .errors import OptionError
 
-__all__ = ["ChannelLimit", "Limit", "Limits", "Order", "Region", "Target", "Tolerance", "check_spans"]
+__all__ = ["ChannelLimit", "Limit", "Limits", "Order", "Region", "Target", "Tolerance", "check_integer", "check_spans"]
 
 Order = Literal["quality", "level"]
 #: Rows and columns, half-open, in full-resolution indices.
 Region = tuple[tuple[int, int], tuple[int, int]]
+
+
+def check_integer(what: str, value: Any) -> int:
+    """A number of a level or the like as a plain int, whichever library's integer it is.
+
+    Parameters
+    ----------
+    what : str
+        What the number is of, with its article.
+    value : object
+
+    Raises
+    ------
+    OptionError
+        If it is no integer; a bool is none.
+    """
+    try:
+        if not isinstance(value, bool):  # True is 1, which nobody means
+            return operator.index(value)
+    except TypeError:
+        pass
+    raise OptionError(f"expected {what} as an integer such as 1, got {value!r}")
 
 
 def check_spans(region: Region) -> None:
@@ -162,6 +185,8 @@ class Target:
         limits = (self.until_rms, self.until_max, self.max_bytes, self.seconds)
         if self.level is not None and any(limit is not None for limit in limits):
             raise OptionError("expected either a level or other limits, got both")
+        if self.level is not None:
+            object.__setattr__(self, "level", check_integer("a level", self.level))
         if self.level is not None and self.level < 0:
             raise OptionError(f"expected a level of 0 or more, got {self.level}")
         if self.max_bytes is not None and self.max_bytes < 1:
@@ -203,6 +228,9 @@ def _limits(given: Limits | None) -> Tolerance | dict[str, Tolerance] | None:
         return None
     if not isinstance(given, Mapping):
         return Tolerance.of(given)
+    for name in given:
+        if not isinstance(name, str):
+            raise OptionError(f"expected errors by the names of channels, such as {{'z': 0.5}}, got the key {name!r}")
     found = {name: Tolerance.of(limit) for name, limit in given.items()}
     for name, limit in found.items():
         if limit.relative:

@@ -12,6 +12,7 @@ from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
 import lodestream
+from lodestream.bands.cluster import require_dask
 from lodestream.library import require
 
 from . import problems
@@ -61,10 +62,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     Raises
     ------
     LodestreamError, OSError
-        If the compiled kernels are missing, there is no token although one is needed, or the token file cannot be used.
+        If the compiled kernels are missing, or Dask where it is to build; if there is no token although one is needed,
+        or the token file cannot be used.
     """
     require("serving surfaces")
     chosen = Settings() if settings is None else settings
+    if chosen.dask:
+        require_dask()
     access, metrics, pace = Access(chosen), Metrics(), Pace()
 
     @asynccontextmanager

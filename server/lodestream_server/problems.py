@@ -35,6 +35,7 @@ __all__ = [
     "BusyError",
     "ForeignOriginError",
     "FullError",
+    "LargeLevelError",
     "MissingError",
     "NoTokenError",
     "NotOwnerError",
@@ -44,6 +45,7 @@ __all__ = [
     "SlowUploadError",
     "SmallScopeError",
     "TooManyError",
+    "UnfitLevelError",
     "answer",
     "install",
     "problem",
@@ -58,6 +60,14 @@ class NotReadyError(LodestreamError):
     """The surface is still being built."""
 
     headers: ClassVar = {"retry-after": "1"}
+
+
+class LargeLevelError(TooLargeError):
+    """A level takes more memory, time or bytes as a file than the server gives it."""
+
+
+class UnfitLevelError(FormatError):
+    """A level cannot be written in the format asked for."""
 
 
 class BuildFailedError(LodestreamError):
@@ -138,8 +148,10 @@ class _Answer:
 #: The first row whose class fits says what is answered. The codes of streams (`lodestream.protocol.messages.CODES`) are
 #: the same words where they mean the same.
 _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
+    (LargeLevelError, _Answer(413, "too-large", "The level is too large to be made as a file")),
     (TooLargeError, _Answer(413, "too-large", "The request is too large")),
     (OptionError, _Answer(422, "bad-option", "An option does not exist, or its value is not valid")),
+    (UnfitLevelError, _Answer(422, "bad-file", "The level cannot be written in this format")),
     (FormatError, _Answer(422, "bad-file", "The file cannot be read as a structured surface")),
     (InputError, _Answer(422, "bad-input", "The input cannot be used")),
     (UnavailableError, _Answer(501, "unavailable", "This server lacks a library that this needs")),

@@ -53,22 +53,27 @@ What all commands have in common:
 - If a limit such as `--until-rms` cannot be reached, the result is the complete surface, with a note.
 - `--until-rms z=0.5 --until-rms speed=0.1` stops where both errors are met, each in its own unit. Of an attribute with
   components (`wind`) the error is that of the distance; `info` tells the names and errors of all channels.
+  A limit of an attribute that `--attributes` leaves out is refused. Errors of single channels are kept in two bytes,
+  rounded up by at most 1/32, so the error told of one channel may be a little above that of all of them.
+- `decode --memory` is kept where NPY, GeoTIFF or COG is written from a whole container; what takes more is refused,
+  with the memory that it takes ([large.md](large.md)).
 - `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
-  combined with each other and with the limits; `--roi` cannot be combined with `--level`.
-- Errors of a window are bounds until it is exact: `--until-rms` and `--until-max` stop where the error inside is at
+  combined with each other and with the limits; `--roi` can be combined neither with `--level` nor with errors of
+  channels (NAME=E): a container tells bounds of the errors of windows for all channels together.
+- Errors of a window are bounds until it is exact: `--until-rms E` and `--until-max E` stop where the error inside is at
   most the limit for certain. `info` tells errors of the whole surface only.
 - With `--json` they print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes` (everything that
-  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `channels` (where there are
-  several: the two errors of each by its name), `seconds` and `ended`: complete, level, rms, max, channels, bytes,
-  seconds, stopped or truncated.
+  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `channels` (where the
+  surface has several: the two errors of each that is written, by its name), `seconds` and `ended`: complete, level,
+  rms, max, channels, bytes, seconds, stopped or truncated.
 
 `pull --watch`:
 
 - OUT and the picture of `--picture` are replaced, never changed in place: whoever opens them finds a whole file. A line
   on standard error says when OUT was, and with which error.
-- While they are written the next data arrive; what is written then is the newest state, and others are left out. The
-  last one is always written. Notes on what the format cannot hold come once, with it.
+- They are written beside the stream, which does not wait for them. What is written next is the newest state, and others
+  are left out. The last one is always written. Notes on what the format cannot hold come once, with it.
 - Name and position of the surface are in each of them, since its metadata are requested first.
 
 An interrupted `pull`:

@@ -72,7 +72,7 @@ def test_the_seam_of_a_real_file_comes_back_from_a_server(run: Run, server: str,
     assert back.shape == heights.shape == (540, 1081)
     np.testing.assert_array_equal(back[:, -1], back[:, 0])
     assert np.sqrt(np.mean((back - heights) ** 2)) <= 201
-    for level, shape in (("9", (271, 540)), ("10", (540, 1080))):
+    for level, shape in (("9", (271, 540)), ("10", (540, 1081))):
         assert run("pull", url, tmp_path / "b.npy", "--level", level)[0] == 0
         assert np.load(tmp_path / "b.npy").shape == shape
 

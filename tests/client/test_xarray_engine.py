@@ -83,6 +83,26 @@ def test_whatever_is_indexed_is_exact(path: Path, original: ls.Surface, key: Any
         assert found.wind[3, 4, 1] == 3
 
 
+def test_integers_with_holes_are_integers_again_where_the_surface_has_a_value_for_holes(
+    original: ls.Surface, tmp_path: Path
+) -> None:
+    metadata = original.metadata | {"nodata": -9999}
+    surface = ls.Surface(original.points, mask=original.mask, metadata=metadata)
+    (tmp_path / "exact.lode").write_bytes(ls.encode(surface))
+    (tmp_path / "near.lode").write_bytes(ls.encode(surface, precision=1.0))
+    with opened(tmp_path / "exact.lode") as found:
+        assert found.z.dtype == np.float32
+        back = ls.Surface.from_xarray(found)
+        assert back.dtype == np.int16
+        assert np.array_equal(back.points[surface.mask], surface.points[surface.mask])
+        found.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    with xr.open_dataset(tmp_path / "a.nc", engine="h5netcdf", mask_and_scale=False) as stored:
+        assert stored.z.dtype == np.int16
+        assert stored.z.attrs["_FillValue"] == -9999
+    for other in (opened(tmp_path / "exact.lode", level=1), opened(tmp_path / "near.lode")):
+        assert "_FillValue" not in other.z.encoding
+
+
 def test_a_window_reads_a_part_of_the_file(original: ls.Surface, tmp_path: Path) -> None:
     x = np.mgrid[:2048, :2048][1]
     rough = np.random.default_rng(1).normal(0, 30, x.shape) + x
@@ -180,6 +200,15 @@ def test_several_blocks_are_opened_one_by_one_or_as_a_tree(tmp_path: Path) -> No
         opened(tmp_path / "a.lode", block=2)
     with pytest.raises(ls.OptionError, match="got 'nothing'"):
         xr.open_datatree(tmp_path / "a.lode", engine=LodeBackend, nothing=1)
+
+
+@pytest.mark.parametrize("wrong", ["2", 1.5, True, np.bool_(True), [1]])
+def test_levels_and_blocks_are_integers(path: Path, wrong: Any) -> None:
+    with pytest.raises(ls.OptionError, match="expected a level as an integer such as 1, got "):
+        opened(path, level=wrong)
+    with pytest.raises(ls.OptionError, match="expected a block as an integer such as 1, got "):
+        opened(path, block=wrong)
+    assert opened(path, level=np.int64(2)).z.shape == opened(path, level=2).z.shape
 
 
 def test_what_cannot_be_opened_is_refused(path: Path, tmp_path: Path) -> None:

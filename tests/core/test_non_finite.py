@@ -160,7 +160,7 @@ def test_with_a_precision_or_an_error_infinities_come_back_and_the_rest_nearly(s
     attributes = {name: "0.25" for name in ("t", "flow") if name in surface.blocks[0].attributes}
     error = {"rms": "1e-2d"} if rms else {"precision": "1e-2d"}
     decoder = ls.Decoder()
-    decoder.feed(ls.encode(surface, **error, attribute_precision=attributes))  # type: ignore[arg-type]
+    decoder.feed(ls.encode(surface, **error, attribute_precision=attributes))  # type: ignore[call-overload]
     assert decoder.header is not None
     assert (decoder.rms if rms else decoder.max_error) <= 0.01 * decoder.header.extent
     found = decoder.surface()

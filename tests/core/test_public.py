@@ -91,7 +91,8 @@ def exported(tree: ast.Module) -> Iterator[ast.FunctionDef]:
     ]
     names = ast.literal_eval(said[0]) if said else []
     for node in tree.body:
-        if isinstance(node, ast.FunctionDef) and node.name in names:
+        overload = isinstance(node, ast.FunctionDef) and "overload" in map(ast.unparse, node.decorator_list)
+        if isinstance(node, ast.FunctionDef) and node.name in names and not overload:
             yield node
         if isinstance(node, ast.ClassDef) and node.name in names:
             yield from (

@@ -62,11 +62,23 @@ def test_other_texts_are_refused(text: str) -> None:
         {"seconds": 0.0},
         {"seconds": float("nan")},
         {"order": "best"},
+        {"level": "2"},
+        {"level": 1.5},
+        {"level": True},
+        {"level": np.bool_(True)},
+        {"until_rms": {1: 0.5}},
+        {"until_max": {("z",): 0.5, "z": 1}},
     ],
 )
 def test_targets_that_make_no_sense_are_refused(limits: dict[str, Any]) -> None:
     with pytest.raises(OptionError, match="expected"):
         Target(**limits)
+
+
+def test_a_level_may_be_the_integer_of_any_library() -> None:
+    level = Target(level=np.int8(2)).level  # type: ignore[arg-type]
+    assert level == 2
+    assert type(level) is int
 
 
 def test_a_target_without_limits_is_the_whole_surface() -> None:

@@ -85,7 +85,7 @@ class Crafted:
             if self.tile:
                 patch.setattr(prepared, "tile_exponents", lambda *_: self.tile)
             if self.factor > 1:
-                patch.setattr(encoder, "_COARSER", ())  # no container of fewer bits is tried
+                patch.setattr(encoder, "COARSER", ())  # no container of fewer bits is tried
                 patch.setattr(transformed, "gather", gathered)
             if self.ones:
                 patch.setattr(quantized, "planes_of", planes)

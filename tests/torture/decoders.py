@@ -81,7 +81,7 @@ def run(count: int, most: float | None = None) -> Compared:
     )
     def compare(surface: ls.Surface, options: dict[str, str], layer: int, level: int) -> None:
         if time.monotonic() < end:
-            data = ls.encode(surface, **options)  # type: ignore[arg-type]
+            data = ls.encode(surface, **options)  # type: ignore[call-overload]
             agree_on(data, layer, level)
             done.surfaces += 1
             done.large += reference.read_container(data).header.large > 0

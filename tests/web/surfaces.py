@@ -61,7 +61,8 @@ def encoded(chance: Random, number: int) -> bytes:
         try:
             made = surface(chance, number)
             with all_large() if chance.random() < 0.3 else nullcontext():
-                return ls.encode(made, **options)
+                container: bytes = ls.encode(made, **options)
+                return container
         except InputError:  # as holes everywhere, or an error that integers cannot have
             number += 1_000_003
 

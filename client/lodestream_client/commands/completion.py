@@ -8,7 +8,7 @@ from typing import Any
 
 from lodestream.errors import UnavailableError
 
-from ..terminal.output import say
+from ..terminal.output import say_script
 from .arguments import Subparsers, add_command
 
 __all__ = ["ASKED", "complete", "register", "run"]
@@ -36,7 +36,9 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the shell's code."""
-    say(_library().shellcode(["lodestream"], shell=args.shell).rstrip("\n"))
+    code = _library().shellcode(["lodestream"], shell=args.shell).strip("\n")
+    # The library has one script for bash and zsh, whose first line is a mark for zsh alone.
+    say_script(code.removeprefix("#compdef lodestream\n") if args.shell == "bash" else code)
     return 0
 
 

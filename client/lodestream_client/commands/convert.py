@@ -5,17 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatError
+from lodestream.errors import FormatError, StreamError, TooLargeError
 from lodestream.quality import Quality
 
 from ..terminal.interrupts import interruptible
 from ..terminal.output import note, print_json
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .encode import read_surface
+from .inputs import named
 from .outcome import check_out, write_surface
 from .surface_options import SurfaceOptions, add_reading_options, reading_options
 
@@ -32,8 +33,8 @@ def register(subparsers: Subparsers) -> None:
         "convert",
         run,
         "convert one or several files of a surface into a file of another format",
-        "Reads what encode reads and writes what decode writes, see lodestream formats. The suffix of OUT decides its\n"
-        "format; standard output is NPY. What OUT cannot hold is said.",
+        "Reads what encode reads, or one container, and writes what decode writes, see lodestream formats. The\n"
+        "suffix of OUT decides its format; standard output is NPY. What OUT cannot hold is said.",
     )
     parser.add_argument("files", nargs="+", metavar="FILE", help="file to read; - for standard input")
     parser.add_argument("out", metavar="OUT", help="file to write; - for standard output")
@@ -57,22 +58,51 @@ def _options(args: argparse.Namespace) -> ConvertOptions:
     files = standard_input_once(args, args.files)
     if Path(args.out).suffix.lower() == ".lode":
         args.parser.error(f"expected a file of another format last, got {args.out}: lodestream encode makes containers")
-    for name in files:
-        if Path(name).suffix.lower() == ".lode":
-            args.parser.error(f"expected files of other formats, got {name}: lodestream decode reads containers")
-    return ConvertOptions(files, args.out, reading_options(args, Quality()), args.json)
+    options = reading_options(args, Quality())
+    for name in filter(_is_container, files):
+        if len(files) > 1:
+            args.parser.error(f"expected one container, or files of other formats, got {name} among {len(files)} files")
+        if options != replace(_NO_OPTIONS, name=options.name):
+            args.parser.error(f"expected no --closed, --format and -o, got one for the container {name}")
+    return ConvertOptions(files, args.out, options, args.json)
+
+
+_NO_OPTIONS = SurfaceOptions(Quality(), "auto", None, {})
+
+
+def _is_container(name: str) -> bool:
+    return Path(name).suffix.lower() == ".lode"
+
+
+def _surface(options: ConvertOptions) -> Surface:
+    """The surface of the files, or of the container."""
+    first = options.files[0]
+    if not _is_container(first):
+        return read_surface(options.files, options.surface)
+
+    from lodestream import decode
+
+    try:
+        surface = decode(Path(first).read_bytes())
+    except (StreamError, TooLargeError) as error:
+        raise named(error, first) from None
+    if options.surface.name:
+        surface.metadata["name"] = options.surface.name
+    return surface
 
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
     """Read, write, report."""
+    from lodestream.coordinates.seams import shapes_in_files
+
     options = _options(args)
     check_out(options.out)
     started = time.monotonic()
-    surface = read_surface(options.files, options.surface)
+    surface = _surface(options)
     _check_blocks(surface, options.out)
     write_surface(surface, options.out)
-    shapes = [block.shape for block in surface.blocks]
+    shapes = shapes_in_files(surface)
     if options.json:
         shape = list(shapes[0]) if len(shapes) == 1 else None
         print_json({"out": options.out, "shape": shape, "seconds": round(time.monotonic() - started, 3)})

@@ -18,9 +18,11 @@ from lodestream.errors import (
 from lodestream.target import Target
 
 from ..terminal.interrupts import interruptible
-from ..terminal.output import note, progress_bar
+from ..terminal.output import LONG, note, progress_bar
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, standard_output_once
-from .inputs import input_files, named
+from .building_options import add_memory_option
+from .decode_by_rows import by_rows
+from .inputs import input_files, named, no_container
 from .outcome import Outcome, channel_errors, check_grid, check_out, note_unmet
 from .target_options import add_target_options, target_of
 
@@ -53,6 +55,8 @@ def register(subparsers: Subparsers) -> None:
         action="store_true",
         help="accept a truncated or damaged container, and write its last complete layer",
     )
+    group = parser.add_argument_group("surfaces larger than memory")
+    add_memory_option(group)
     add_json_option(parser)
 
 
@@ -65,6 +69,7 @@ class DecodeOptions:
     target: Target
     max_vertices: int | None
     partial: bool
+    memory: int | None
     json: bool
 
 
@@ -72,7 +77,7 @@ def _options(args: argparse.Namespace) -> DecodeOptions:
     """The options; ends the program if the command line is wrong."""
     target = target_of(args)
     standard_output_once(args, "surface")
-    return DecodeOptions(args.container, args.out, target, args.max_vertices, args.partial, args.json)
+    return DecodeOptions(args.container, args.out, target, args.max_vertices, args.partial, args.memory, args.json)
 
 
 @interruptible()
@@ -81,14 +86,17 @@ def run(args: argparse.Namespace) -> int:
     options = _options(args)
     check_out(options.out)
     target, started = options.target, time.monotonic()
-    with input_files([options.container]) as files, files.paths[0].open("rb") as file, progress_bar() as bar:
+    with input_files([options.container]) as files, files.paths[0].open("rb") as file, progress_bar(LONG) as bar:
         task = bar.add_task("decoding", total=1.0, figures="")
+        if by_rows(files.paths[0], options, started, lambda done: bar.update(task, completed=done)):
+            return 0
         job = _Job(file, options, started, lambda done: bar.update(task, completed=done))
         try:
             job.decode()
         except StreamError as error:
             if not options.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
-                raise named(error, options.container, _advice(options.partial, job, error)) from None
+                advice = no_container(file) or _advice(options.partial, job, error)
+                raise named(error, options.container, advice) from None
             note(f"{named(error, options.container)}; the last complete layer before that is written")
             job.ended = "truncated"
         except TooLargeError as error:
@@ -107,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
         view.bound,
         time.monotonic() - started,
         job.ended,
-        channel_errors(view, job.decoder.header),
+        channel_errors(view, job.decoder.header, target),
     )
     outcome.write(options.out)
     outcome.report(options.json)

@@ -14,12 +14,20 @@ from typing import TYPE_CHECKING, Any
 from lodestream.errors import OptionError
 
 from ..terminal.interrupts import interruptible
-from ..terminal.output import human_size, note, note_holes, print_json, progress_bar, replacing, require_folder
+from ..terminal.output import LONG, human_size, note, note_holes, print_json, progress_bar, require_folder
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
-from .inputs import input_files
+from .building_options import (
+    BuildingOptions,
+    add_building_options,
+    building_options,
+    work_folder,
+)
+from .inputs import input_files, option_hints
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from lodestream.surface import Surface
 
 __all__ = ["EncodeOptions", "read_surface", "register", "run"]
@@ -37,6 +45,7 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("files", nargs="+", metavar="FILE", help="file to read; - for standard input")
     parser.add_argument("out", metavar="OUT.lode", help="container to write; - for standard output")
     add_surface_options(parser)
+    add_building_options(parser)
     add_json_option(parser)
 
 
@@ -47,6 +56,7 @@ class EncodeOptions:
     files: tuple[str, ...]
     out: str
     surface: SurfaceOptions
+    building: BuildingOptions
     json: bool
 
 
@@ -55,12 +65,14 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     if args.out != "-" and Path(args.out).suffix.lower() != ".lode":
         args.parser.error(f"expected a container OUT.lode or - last, got {args.out}")
     standard_output_once(args, "container")
-    return EncodeOptions(standard_input_once(args, args.files), args.out, surface_options(args), args.json)
+    files = standard_input_once(args, args.files)
+    return EncodeOptions(files, args.out, surface_options(args), building_options(args), args.json)
 
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
     """Read, encode, write."""
+    from lodestream.bands.cluster import executor_of
     from lodestream.library import require
 
     options = _options(args)
@@ -68,19 +80,28 @@ def run(args: argparse.Namespace) -> int:
     if options.out != "-":
         require_folder(Path(options.out))
     started = time.monotonic()
-    surface = read_surface(options.files, options.surface)
-    container = _encoded(surface, options)
-    if options.out == "-":
-        sys.stdout.buffer.write(container)
-    else:
-        with replacing(Path(options.out)) as temporary:
-            temporary.write_bytes(container)
-    _report(surface, len(container), time.monotonic() - started, options)
+    with executor_of(options.building.dask) as executor, work_folder(options.building, options.out) as folder:
+        surface = read_surface(options.files, options.surface, folder / "files", options.building.memory)
+        _note_memory(surface, options.building.memory)
+        made = _made(surface, options, folder, executor)
+        size = len(made) if made is not None else Path(options.out).stat().st_size
+        if made is not None:
+            sys.stdout.buffer.write(made)
+        _report(surface, size, time.monotonic() - started, options)
     return 0
 
 
-def read_surface(names: Sequence[str], options: SurfaceOptions) -> Surface:
+def read_surface(
+    names: Sequence[str], options: SurfaceOptions, folder: Path | None = None, memory: int | None = None
+) -> Surface:
     """Read the surface of one or several files; ``-`` is standard input.
+
+    Parameters
+    ----------
+    names : sequence of str
+    options : SurfaceOptions
+    folder : Path, optional
+        Where arrays go that are large beside ``memory``, in bytes; by default all are in memory.
 
     Raises
     ------
@@ -91,32 +112,51 @@ def read_surface(names: Sequence[str], options: SurfaceOptions) -> Surface:
     """
     import lodestream as ls
 
-    with input_files(names) as files:
-        first, *more = files.paths
+    with option_hints(names), input_files(names) as files:
         format_options = _format_options(options.format_options)
-        surface = ls.read(
-            first,
-            *more,
-            closed=options.closed,
-            filename=files.filename,
-            format_name=options.format_name,
-            **format_options,
-        )
+        given: dict[str, Any] = {"closed": options.closed, "filename": files.filename}
+        given["format_name"] = options.format_name
+        if folder is None:
+            first, *more = files.paths
+            surface = ls.read(first, *more, **given, **format_options)
+        else:
+            from lodestream.bands.reading import read_into
+
+            able = options.quality.rms is None
+            surface = read_into(folder, files.paths, memory, able, **given, **format_options)
     if options.name:
         surface.metadata["name"] = options.name
     return surface
 
 
-def _encoded(surface: Surface, options: EncodeOptions) -> bytes:
+def _made(surface: Surface, options: EncodeOptions, folder: Path, executor: Executor | None) -> bytes | None:
+    """Encode into the file, or into bytes for standard output."""
     import lodestream as ls
 
-    with progress_bar() as progress:
+    with progress_bar(LONG) as progress:
         task = progress.add_task("encoding", total=1.0, figures="")
-        return ls.encode(
-            surface,
-            quality=options.surface.quality,
-            progress=lambda fraction: progress.update(task, completed=fraction),
-        )
+
+        def encoded(out: Path | None) -> bytes | None:
+            return ls.encode(
+                surface,
+                quality=options.surface.quality,
+                progress=lambda fraction: progress.update(task, completed=fraction),
+                out=out,
+                memory=options.building.memory,
+                scratch=folder / "build",
+                executor=executor,
+            )
+
+        return encoded(None if options.out == "-" else Path(options.out))
+
+
+def _note_memory(surface: Surface, memory: int | None) -> None:
+    """Say that more memory is taken than was asked for, where less is not enough."""
+    from lodestream.bands.memory import least_memory, whole_memory
+
+    least = min(least_memory(surface), whole_memory(surface))
+    if memory is not None and memory < least:
+        note(f"--memory {human_size(memory)} is exceeded: this surface takes about {human_size(least)} at least")
 
 
 def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions) -> None:
@@ -142,7 +182,7 @@ def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions)
 
 def _format_options(options: Mapping[str, str]) -> dict[str, Any]:
     # Parameters of `read` that are no options of any format.
-    for key in ("path", "closed", "max_vertices", "filename", "allowed", "format_name"):
+    for key in ("path", "closed", "max_vertices", "filename", "allowed", "format_name", "room", "folder", "memory"):
         if key in options:
             raise OptionError(f"{key} is not an option of any format")
     return dict(options)

@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
             "name": format_.name,
             "suffixes": list(format_.suffixes),
             "read": format_.read is not None,
-            "write": format_.write is not None,
+            "write": bool(format_.suffixes_out),
             "more": format_.more or None,
             "options": dict(format_.options),
             "media_type": format_.media_type,

@@ -13,7 +13,7 @@ from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
 from ..requests import addresses
 from ..terminal.output import cell, console, human_size, point_words, print_json
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
-from .inputs import input_files, named
+from .inputs import input_files, named, no_container
 
 __all__ = ["InfoOptions", "register", "run"]
 
@@ -90,10 +90,10 @@ def _of_file(options: InfoOptions) -> Mapping[str, Any]:
         try:
             return describe(read_index(read, size, Capacity(options.max_vertices)), channels=True)
         except (StreamError, TooLargeError) as error:
-            cut = isinstance(error, TruncatedStreamError)
-            raise named(
-                error, options.what, "lodestream decode --partial writes its last complete layer" if cut else ""
-            ) from None
+            advice = no_container(file)
+            if isinstance(error, TruncatedStreamError):
+                advice = "lodestream decode --partial writes its last complete layer"
+            raise named(error, options.what, advice) from None
 
 
 def _show(what: str, details: Mapping[str, Any]) -> None:
@@ -112,6 +112,10 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
             out.print()
             exact = details.get("bytes") if kind == "layers" and details.get("exact") else None
             out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal, exact))
+    more = len(details.get("channel_names") or []) - _MOST_CHANNELS
+    if more > 0:
+        out.print()
+        out.print(f"and {more} more channels, whose errors --json tells")
 
 
 def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:

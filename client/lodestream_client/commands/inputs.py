@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
-from lodestream.errors import LodestreamError
+from lodestream.errors import FormatWarning, LodestreamError
 
-__all__ = ["Inputs", "input_files", "named"]
+__all__ = ["Inputs", "input_files", "named", "no_container", "option_hints", "option_words"]
 
 _STANDARD_INPUT = "standard input"
 
@@ -45,3 +48,48 @@ def named(error: LodestreamError, name: str, advice: str = "") -> LodestreamErro
     words = f"{_STANDARD_INPUT if name == '-' else name}: {error}" + (f"; {advice}" if advice else "")
     error.args = (words, *error.args[1:])
     return error
+
+
+@contextmanager
+def option_hints(names: Sequence[str]) -> Iterator[None]:
+    """Have errors and notes name options of formats as the command line has them: ``-o encoding=grey``.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the files; one that an error begins with is left as it is.
+    """
+    with warnings.catch_warnings():
+        show = warnings.showwarning
+
+        def worded(message: Warning | str, category: type[Warning], *more: Any) -> None:
+            noted = issubclass(category, FormatWarning)
+            show(FormatWarning(option_words(str(message), names)) if noted else message, category, *more)
+
+        warnings.showwarning = worded  # type: ignore[assignment]  # the parameters after these two are handed on
+        try:
+            yield
+        except LodestreamError as error:
+            words = option_words(str(error), names)
+            error.args = tuple(words if part == str(error) else part for part in error.args)
+            raise
+
+
+def option_words(text: str, names: Sequence[str] = ()) -> str:
+    """A message of a reader with ``-o`` before options of formats; see `option_hints`."""
+    from lodestream.formats import formats
+
+    keys = {key for format_ in formats() for key in format_.options}
+    called = (f"{word}: " for name in names for word in (name, Path(name).name))  # by servers without folder
+    file = next((words for words in called if text.startswith(words)), "")
+    hint = re.compile(rf"(?<!-o )(?<=[ (])(?:{'|'.join(sorted(keys))})=")
+    return file + hint.sub(r"-o \g<0>", text[len(file) :])
+
+
+def no_container(file: BinaryIO) -> str:
+    """Advice where a file is no container but one of another format; empty otherwise."""
+    from lodestream.container.sections import SIGNATURE, is_container
+
+    file.seek(0)
+    other = not is_container(file.read(len(SIGNATURE)))
+    return "lodestream encode makes a container of a file of another format" if other else ""

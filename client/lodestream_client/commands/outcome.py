@@ -80,9 +80,12 @@ def note_unmet(target: Target, ended: str, view: View, header: Header) -> None:
         note(f"the requested {error} cannot be reached: the complete {what} {found:.6g}")
 
 
-def channel_errors(view: View, header: Header) -> dict[str, tuple[float, float]]:
-    """RMS and maximum error of each channel that the view tells, by name."""
-    return dict(zip(header.channel_names, view.channels, strict=False))
+def channel_errors(view: View, header: Header, target: Target) -> dict[str, tuple[float, float]]:
+    """RMS and maximum error of each channel that the target includes and the view tells, by name."""
+    from lodestream.planning.selection import selection_of
+
+    told = zip(header.channel_names, view.channels, selection_of(target).channels(header), strict=False)
+    return {name: errors for name, errors, wanted in told if wanted}
 
 
 @dataclass(frozen=True)

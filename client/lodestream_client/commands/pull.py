@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -272,8 +273,8 @@ def _receive(
         metadata = Metadata(stream, kept, options.token, arrived)
         watch = Watch(options.out, options.picture, options.target, metadata, options.url) if options.watch else None
         try:
-            with stream:
-                for number, view in enumerate(stream.latest() if watch is not None else stream):
+            with watch or nullcontext(), stream:
+                for number, view in enumerate(stream):
                     header = stream.decoder.header
                     if number == 0 and header is not None:
                         check_grid(options.out, header)
@@ -308,7 +309,7 @@ def _outcome(options: PullOptions, stream: Stream, metadata: Metadata, arrived: 
         view.bound,
         seconds,
         ended,
-        channel_errors(view, header),
+        channel_errors(view, header, target),
     )
 
 

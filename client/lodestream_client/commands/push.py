@@ -13,7 +13,7 @@ from lodestream.errors import LodestreamError
 from ..errors import UnreachableError
 from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
-from .inputs import input_files
+from .inputs import input_files, option_hints, option_words
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
 from .values import parse_server
 
@@ -43,8 +43,8 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--each",
         action="store_true",
-        help="each file is a surface of its own: prints one URL a line; a file that fails does not end it, but makes "
-        "the exit code 1",
+        help="each file is a surface of its own: prints URL and FILE on one line; a file that fails does not end "
+        "it, but makes the exit code 1",
     )
     parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has stored the upload")
     add_token_option(parser)
@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     if options.each:
         return _run_each(options)
     surface = _uploaded(options)
-    note_details(surface.details)
+    note_details(surface.details, words=option_words)
     if options.json:
         print_json({**surface.details, "url": surface.url})
     else:
@@ -98,6 +98,7 @@ def _run_each(options: PushOptions) -> int:
     made: list[dict[str, object]] = []
     failed: list[dict[str, str]] = []
     for name in options.files:
+        file = _STANDARD_INPUT if name == "-" else name
         try:
             surface = _uploaded(replace(options, files=(name,)))
         except UnreachableError:
@@ -105,12 +106,12 @@ def _run_each(options: PushOptions) -> int:
         except (LodestreamError, OSError) as error:
             reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
             failed.append({"file": name, "reason": reason})
-            note(reason if name in reason else f"{name}: {reason}")
+            note(reason if file in reason else f"{file}: {reason}")
             continue
-        note_details(surface.details)
-        made.append({**surface.details, "url": surface.url})
+        note_details(surface.details, f"{file}: ", option_words)
+        made.append({**surface.details, "url": surface.url, "file": name})
         if not options.json:
-            say(surface.url)
+            say(f"{surface.url} {file}")
     if options.json:
         print_json({"surfaces": made, "failed": failed})
     elif failed:
@@ -142,7 +143,7 @@ def _uploaded(options: PushOptions) -> Description:
     from .. import sync
 
     wanted = options.surface
-    with input_files(options.files) as files, ExitStack() as stack, progress_bar() as bar:
+    with option_hints(options.files), input_files(options.files) as files, ExitStack() as stack, progress_bar() as bar:
         # Standard input has no name of its own to tell.
         sources: list[Source] = [
             stack.enter_context(path.open("rb")) if name == "-" else path

@@ -6,6 +6,7 @@ import argparse
 
 from ..terminal.output import note_details, print_json, progress_bar, say
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
+from .inputs import option_words
 from .values import parse_surface
 
 __all__ = ["register", "run"]
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
             progress=lambda stage, fraction: bar.update(task, description=stage, completed=fraction),
             token=token_of(args),
         )
-    note_details(surface.details)
+    note_details(surface.details, words=option_words)
     if args.json:
         print_json({**surface.details, "url": surface.url})
     else:

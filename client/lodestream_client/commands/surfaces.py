@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..terminal.output import cell, console, human_size, note, print_json
+from ..requests.states import STATES
+from ..terminal.output import human_size, note, print_json, say_columns
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
 from .values import parse_server, parse_surface
 
@@ -14,9 +15,6 @@ if TYPE_CHECKING:
     from ..requests.api import Description
 
 __all__ = ["register", "run_list", "run_rm"]
-
-# Wider than any line: an address that is cut is none.
-_WIDTH = 1 << 20
 
 
 def register(subparsers: Subparsers) -> None:
@@ -27,7 +25,7 @@ def register(subparsers: Subparsers) -> None:
         run_list,
         "list the surfaces of a server",
         "One line for each: URL, state, shape, size of the container (of the upload, before there is one), name,\n"
-        "owner, and why it is not ready.",
+        "owner (where the server tells owners; - if it has none), and why it is not ready.",
     )
     parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
     parser.add_argument(
@@ -35,7 +33,7 @@ def register(subparsers: Subparsers) -> None:
         metavar="TEXT",
         help="only those with this text in their name, file names, owner, URL or reason, in upper or lower case",
     )
-    parser.add_argument("--state", metavar="S", help="only those in this state, such as ready, waiting or failed")
+    parser.add_argument("--state", choices=STATES, help="only those in this state")
     parser.add_argument("--sort", choices=tuple(_KEYS), help="order of the lines (default: the server's)")
     parser.add_argument("--reverse", action="store_true", help="the other way round")
     add_token_option(parser)
@@ -55,23 +53,21 @@ def run_list(args: argparse.Namespace) -> int:
         print_json({"surfaces": [{**surface.details, "url": surface.url} for surface in surfaces]})
         return 0
 
-    from rich.table import Table
-
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for surface in surfaces:
-        details = surface.details
-        shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
-        size = human_size(_size(surface)) if _size(surface) is not None else "-"
-        owner, reason = details.get("owner") or "", details.get("reason") or ""
-        words = (surface.url, surface.state, shape, size, _name(surface), owner, reason)
-        table.add_row(*map(cell, words))
     if surfaces:
-        screen = console()
-        screen.width = _WIDTH
-        screen.print(table)
+        # Where the server tells no owners there is no column of them.
+        owned = any(surface.details.get("owner") for surface in surfaces)
+        say_columns([_row(surface, owned) for surface in surfaces])
     else:
         note("no such surfaces" if args.search or args.state else "no surfaces")
     return 0
+
+
+def _row(surface: Description, owned: bool) -> tuple[str, ...]:
+    details = surface.details
+    shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
+    size = human_size(_size(surface)) if _size(surface) is not None else "-"
+    owner = str(details.get("owner") or "-") if owned else ""
+    return surface.url, surface.state, shape, size, _name(surface), owner, str(details.get("reason") or "")
 
 
 def _name(surface: Description) -> str:

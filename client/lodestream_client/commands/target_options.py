@@ -19,7 +19,8 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
         "target",
         "What to decode and where to stop. The first limit that is met ends it. E is a number in the surface's unit, "
         "or 1e-3d for 1e-3 times its extent. NAME=E is the error of an attribute, a coordinate (z) or a component "
-        "(wind_0), a number in its own unit; it may be repeated, and all of them have to be met.",
+        "(wind_0), a number in its own unit; it may be repeated, and all of them have to be met; it cannot be "
+        "combined with --roi, since containers tell errors of windows for all channels together.",
     )
     group.add_argument("--level", type=parse_level, metavar="K", help="levels 0 to K only; OUT is the grid of level K")
     for option, error in (("--until-rms", "root mean square"), ("--until-max", "maximum")):
@@ -39,7 +40,8 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
         "--roi",
         type=parse_region,
         metavar="R0:R1,C0:C1",
-        help="this window only: rows R0 to R1 - 1 and columns C0 to C1 - 1 of the full grid; OUT is the window",
+        help="this window only: rows R0 to R1 - 1 and columns C0 to C1 - 1 of the full grid; OUT is the window, and E "
+        "is the error in it",
     )
     group.add_argument(
         "--attributes",

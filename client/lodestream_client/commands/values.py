@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
+from lodestream import sizes
 from lodestream.errors import OptionError
 from lodestream.quality import Quality
 from lodestream.target import Region, Tolerance
@@ -18,6 +19,7 @@ __all__ = [
     "parse_count",
     "parse_level",
     "parse_limit",
+    "parse_memory",
     "parse_names",
     "parse_pair",
     "parse_pictures",
@@ -26,6 +28,7 @@ __all__ = [
     "parse_precision",
     "parse_rate",
     "parse_region",
+    "parse_scheduler",
     "parse_seconds",
     "parse_server",
     "parse_size",
@@ -48,11 +51,10 @@ def parse_size(text: str) -> int:
     ArgumentTypeError
         If it is something else.
     """
-    number, unit = _amount(text)
-    factor = _PREFIXES.get(unit.lower().removesuffix("b"))
-    if factor is None:
-        raise argparse.ArgumentTypeError(f"expected a number of bytes such as 20000, 20kB or 1MiB, got {text!r}")
-    size = round(number * factor)
+    try:
+        size = sizes.parse_size(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     if size < 1:
         raise argparse.ArgumentTypeError(f"expected at least one byte, got {text!r}")
     return size
@@ -208,6 +210,18 @@ def _limit(text: str) -> tuple[str | None, Tolerance]:
     return name if equals else None, Tolerance.parse(error)
 
 
+def _memory(text: str) -> int:
+    from lodestream.bands.memory import checked_memory
+
+    return checked_memory(text)
+
+
+def _scheduler(text: str) -> str:
+    from lodestream.bands.cluster import checked_address  # which most commands need not import
+
+    return checked_address(text)
+
+
 def _precision(text: str) -> str:
     if "" in Quality.parse([text]).attributes:
         raise OptionError(f"expected P or NAME=P, got {text!r}")
@@ -217,6 +231,8 @@ def _precision(text: str) -> str:
 parse_tolerance = _checked(Tolerance.parse)
 parse_limit = _checked(_limit)
 parse_precision = _checked(_precision)
+parse_memory = _checked(_memory)
+parse_scheduler = _checked(_scheduler)
 parse_server = _checked(addresses.surfaces_url)
 parse_surface = _checked(addresses.surface_url)
 parse_source = _checked(addresses.source_url)

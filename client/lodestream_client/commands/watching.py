@@ -6,6 +6,7 @@ import stat
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from threading import Lock, Thread
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import FormatWarning, InputError
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
     from lodestream.target import Target
+
+    _State = tuple[View, Layout, Mapping[str, Any]]
 
 __all__ = ["Watch", "check_picture", "check_watched"]
 
@@ -54,7 +57,9 @@ def check_picture(picture: Path) -> None:
 
 
 class Watch:
-    """The surface as far as it has come, in OUT and in a picture.
+    """The surface as far as it has come, in OUT and in a picture; a context manager that waits for what it has begun.
+
+    A thread writes and draws, so that nothing waits for it: of the states that come meanwhile the newest is next.
 
     Parameters
     ----------
@@ -65,7 +70,7 @@ class Watch:
     target : Target
         What of the surface is written.
     metadata : callable
-        Returns the metadata of the surface; called when the first state is written.
+        Returns the metadata of the surface; called with each state, in the caller's thread.
     name : str
         What the surface is called in the picture if its metadata do not say.
     """
@@ -78,29 +83,73 @@ class Watch:
         self._target = target
         self._metadata = metadata
         self._name = name
+        self._lock = Lock()
+        self._next: _State | None = None
+        self._thread: Thread | None = None
+        self._failed: Exception | None = None
+
+    def __enter__(self) -> Watch:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        with self._lock:
+            self._next, thread = None, self._thread
+        if thread is not None:
+            thread.join()
+        if kind is None:
+            self._check()
 
     def write(self, view: View, layout: Layout) -> None:
-        """Write and draw a state that better ones follow.
+        """Have a state written and drawn that better ones follow, unless one of them comes first.
 
         What the format leaves out is not told here, since it is told of the last state.
 
         Raises
         ------
-        FormatError, CorruptStreamError
-            If the surface cannot be written, or has no value.
+        FormatError, CorruptStreamError, OSError
+            If an earlier one could not be written, or had no value.
         """
+        self._check()
+        state = view, layout, self._metadata()
+        with self._lock:
+            self._next = state
+            if self._thread is None:
+                self._thread = Thread(target=self._work, name="lodestream-watch")
+                self._thread.start()
+
+    def _check(self) -> None:
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            raise failed
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                state, self._next = self._next, None
+                if state is None:
+                    self._thread = None
+                    return
+            try:
+                self._write(*state)
+            except Exception as error:  # the caller's thread raises it
+                self._failed = error
+
+    def _write(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FormatWarning)
-            write_surface(view.surface(self._target.level, self._metadata()), self._out)
-        self.draw(view, layout)
+            write_surface(view.surface(self._target.level, metadata), self._out)
+        self._draw(view, layout, metadata)
         within = "at most " if view.bound else ""
         note(f"{self._out}: {human_size(view.bytes)}, level {view.level}, RMS error {within}{view.rms:.4g}")
 
     def draw(self, view: View, layout: Layout) -> None:
         """Draw a state, if a picture is wanted."""
+        self._draw(view, layout, self._metadata())
+
+    def _draw(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
         if self._picture is not None:
             from ..viewer.pictures import draw
 
-            name = self._metadata().get("name")
+            name = metadata.get("name")
             window = self._target.region is not None
             draw(view, None if window else layout, name if isinstance(name, str) else self._name, self._picture)

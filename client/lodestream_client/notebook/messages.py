@@ -16,6 +16,7 @@ way is bounded, and a page that stops gets no more than the parts it has asked f
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from lodestream.errors import LodestreamError, RemoteError
 from ..viewer.sources import Source
 
 __all__ = ["LONGEST", "Answers", "Message"]
+
+_log = logging.getLogger(__name__)
 
 #: The most bytes of one answer.
 LONGEST = 1 << 20
@@ -68,6 +71,10 @@ class Answers:
         except (LodestreamError, OSError) as error:
             code = error.code if isinstance(error, RemoteError) else ""
             content, data = {"kind": "refused", "detail": str(error), "code": code}, []
+        except Exception as error:  # the page waits for an answer, whatever it is
+            _log.exception("a question of the page of a widget failed")
+            detail = f"the kernel failed, see its log: {type(error).__name__}: {error}"
+            content, data = {"kind": "refused", "detail": detail, "code": ""}, []
         return {**content, "id": question["id"]}, data
 
     def _answer(self, question: Mapping[str, Any]) -> Message:

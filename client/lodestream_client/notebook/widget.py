@@ -147,18 +147,18 @@ class Widget(AnyWidget):
         name: str | None = None,
         **look: Any,
     ) -> None:
-        modules = page.widget_modules()
-        if modules is None:
-            raise UnavailableError(page.HOW_TO_BUILD)
         if unknown := sorted(set(look) - _SETTABLE):
             raise OptionError(f"expected options among {', '.join(sorted(_SETTABLE))}, got {', '.join(unknown)}")
-        widget, element = modules
         shown = opened(source, token=token, quality=quality, name=name)
-        self._shown = shown
-        self.fields = field_names(shown.header)
-        self._answers = Answers(shown.source, element)
-        self._chosen = target
         try:
+            modules = page.widget_modules()
+            if modules is None:
+                raise UnavailableError(page.HOW_TO_BUILD)
+            widget, element = modules
+            self._shown = shown
+            self.fields = field_names(shown.header)
+            self._answers = Answers(shown.source, element)
+            self._chosen = target
             limit = limit_of(target, shown.header)
             esm = widget.read_text(encoding="utf-8")
             super().__init__(_esm=esm, _program=element.name, _target=limit, name=shown.source.name, **look)

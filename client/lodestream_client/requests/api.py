@@ -20,6 +20,7 @@ from . import addresses, problems
 from .answers import LONGEST_ANSWER, Answer, check_figures, parse
 from .bodies import Body
 from .calls import Call, Flow, Pause
+from .states import ENDS, STATES
 
 __all__ = [
     "Description",
@@ -42,10 +43,6 @@ Progress: TypeAlias = Callable[[str, float], None]
 # Seconds between looks at a surface that is being built: soon at first, since most builds are short, then rarely.
 _LOOKS = (0.05, 0.1, 0.2, 0.4, 0.8)
 _LOOKS_AFTER = 1.5
-
-_STATES = ("queued", "building", "ready", "failed", "waiting", "missing")
-# What a surface does not leave by itself.
-_ENDS = ("failed", "waiting", "missing")
 
 # What a container is called becomes the name of a file.
 _CONTAINER = re.compile(r"[0-9a-f]{64}")
@@ -145,7 +142,7 @@ def _followed(surface: Description, wait: bool, progress: Progress | None) -> Fl
     """Wait until a surface is ready, or will not become so by itself."""
     looks = itertools.chain(_LOOKS, itertools.repeat(_LOOKS_AFTER))
     while wait and not surface.ready:
-        if surface.state in _ENDS:
+        if surface.state in ENDS:
             reason = str(_reason(surface.details))
             if surface.state != "failed":
                 reason = f"{surface.url} is {surface.state}: {reason}"
@@ -340,7 +337,7 @@ def _own_address(entry: Mapping[str, Any], page: str) -> str:
 
 def _described(document: Mapping[str, Any], url: str) -> Description:
     state, name = document.get("state"), document.get("id")
-    if state not in _STATES or not isinstance(name, str):
+    if state not in STATES or not isinstance(name, str):
         raise RemoteProtocolError(
             f"expected a surface's id and state from {url}, got id {name!a:.80} and state {state!a:.80}"
         )

@@ -1,8 +1,8 @@
 """Output of the commands: results to standard output, everything else to standard error, files by renaming.
 
 No other module of the client writes to a terminal. Messages contain text from files and servers, so all text passes
-`printable` here: lines in `note` and `say`, table cells in `cell`, which also keeps brackets from being taken for
-markup. JSON is ASCII with JSON's own escapes, and exact.
+`printable` here: lines in `note`, `say` and `say_columns`, table cells in `cell`, which also keeps brackets from being
+taken for markup. JSON is ASCII with JSON's own escapes, and exact.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import os
 import secrets
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 __all__ = [
+    "LONG",
     "Parser",
     "Progress",
     "cell",
@@ -46,7 +47,13 @@ __all__ = [
     "replacing",
     "require_folder",
     "say",
+    "say_columns",
+    "say_script",
 ]
+
+
+#: For `progress_bar`, of work that may take hours: its steps are minutes apart.
+LONG = 900.0
 
 
 def note(text: str) -> None:
@@ -57,6 +64,28 @@ def note(text: str) -> None:
 def say(text: str) -> None:
     """Print one line of the result."""
     print(printable(text))
+
+
+def say_columns(rows: Sequence[Sequence[str]]) -> None:
+    """Print each row on one line, however long, in columns; without those that are empty in all rows.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of str
+        All of one length.
+    """
+    from rich.cells import cell_len
+
+    lines = [[printable(text) for text in row] for row in rows]
+    widths = [max(map(cell_len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        padded = (text + " " * (width - cell_len(text)) for text, width in zip(line, widths, strict=True) if width)
+        print("  ".join(padded).rstrip())
+
+
+def say_script(text: str) -> None:
+    """Print the lines of a script as they are; none of them may come from files or servers."""
+    print(text)
 
 
 def cell(*lines: object) -> Text:
@@ -117,19 +146,22 @@ def _points(details: Mapping[str, Any]) -> int:
     return sum(math.prod(block["shape"]) for block in details["blocks"])
 
 
-def note_holes(holes: int, total: int) -> None:
-    """Report how many points are holes, if any are."""
+def note_holes(holes: int, total: int, of: str = "") -> None:
+    """Report how many points are holes, if any are; `of` stands before it."""
     if holes:
-        note(f"{holes} of {total} points are holes")
+        note(f"{of}{holes} of {total} points are holes")
 
 
-def note_details(details: Mapping[str, Any]) -> None:
-    """Report the notes of a server's build: what was left out or chosen, and holes."""
+def note_details(details: Mapping[str, Any], of: str = "", words: Callable[[str], str] = str) -> None:
+    """Report the notes of a server's build: what was left out or chosen, and holes; `of` stands before each.
+
+    ``words`` puts a note as the command line has it.
+    """
     notes = (details.get("metadata") or {}).get("notes")
     for text in notes if isinstance(notes, list) else ():  # in a container somebody may have put anything there
-        note(str(text))
+        note(f"{of}{words(str(text))}")
     if details.get("blocks"):
-        note_holes(details.get("holes") or 0, _points(details))
+        note_holes(details.get("holes") or 0, _points(details), of)
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -190,19 +222,24 @@ class _Unseen:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
+def progress_bar(period: float = 30.0) -> Iterator[Progress]:
     """A progress bar on standard error; not shown if that is not a terminal.
 
     If a task has a field ``limit``, it is the maximum number of seconds that it may take.
+
+    Parameters
+    ----------
+    period : float
+        Seconds of the past from which the time left is estimated; what is told less than twice in them has none.
     """
     if sys.stderr.isatty():
-        with _drawn() as bar:
+        with _drawn(period) as bar:
             yield bar
     else:
         yield _Unseen()
 
 
-def _drawn() -> rich.progress.Progress:
+def _drawn(period: float = 30.0) -> rich.progress.Progress:
     from rich import progress
     from rich.text import Text
 
@@ -221,6 +258,7 @@ def _drawn() -> rich.progress.Progress:
         progress.TextColumn("{task.fields[figures]}", markup=False),
         TimeLeft(),
         console=console(stderr=True),
+        speed_estimate_period=period,
         transient=True,
     )
 
@@ -243,7 +281,7 @@ def require_folder(path: Path) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary file beside `path`, with the same suffix, that replaces it if the block succeeds."""
     require_folder(path)
-    temporary = path.with_name(f".{path.stem[:100]}-{secrets.token_hex(6)}{path.suffix}")
+    temporary = path.with_name(f".{path.stem[:50]}-{secrets.token_hex(6)}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

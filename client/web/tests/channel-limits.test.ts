@@ -75,8 +75,8 @@ describe("errors of channels", () => {
 
   it("may be those of a channel that is called value", () => {
     expect(makeTarget({ untilRms: { value: 1, relative: 2 } }).channels).toEqual([
-      ["value", "rms", 1],
       ["relative", "rms", 2],
+      ["value", "rms", 1],
     ]);
     expect(makeTarget({ untilRms: { value: 1, relative: true } }).untilRms).toEqual({ value: 1, relative: true });
   });

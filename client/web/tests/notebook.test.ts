@@ -13,18 +13,26 @@ afterEach(() => vi.unstubAllGlobals());
 type Heard = (content: Record<string, unknown>, buffers?: Buffers) => void;
 
 /** A model whose messages are kept; `say` is what the kernel says. */
-function fakeModel(): { model: Model; sent: Record<string, unknown>[]; say: Heard; heard: Set<Heard> } {
+function fakeModel(): {
+  model: Model;
+  sent: Record<string, unknown>[];
+  say: Heard;
+  heard: Set<Heard>;
+  lost: Set<() => void>;
+} {
   const sent: Record<string, unknown>[] = [];
   const heard = new Set<Heard>();
+  const lost = new Set<() => void>();
+  const of = (event: string): Set<Heard | (() => void)> => (event === "msg:custom" ? heard : lost);
   const model: Model = {
     get: () => undefined,
     set: () => {},
     save_changes: () => {},
-    on: (event, callback) => event === "msg:custom" && heard.add(callback),
-    off: (_, callback) => heard.delete(callback),
+    on: (event, callback) => of(event).add(callback),
+    off: (event, callback) => of(event).delete(callback),
     send: (content) => sent.push(content as Record<string, unknown>),
   };
-  return { model, sent, say: (...given) => [...heard].map((callback) => callback(...given)), heard };
+  return { model, sent, say: (...given) => [...heard].map((callback) => callback(...given)), heard, lost };
 }
 
 it("answers go to the place that has asked, whatever their order", async () => {
@@ -54,6 +62,19 @@ it("a refusal says why, and closing says so to all that wait", async () => {
   await expect(empty).rejects.toThrow("expected bytes from the kernel");
   await expect(waiting).rejects.toThrow("the widget was closed");
   expect(heard.size).toBe(0);
+});
+
+it("what waits for a kernel that dies is refused, and another one is asked anew", async () => {
+  const { model, sent, say, lost } = fakeModel();
+  const comm = new Comm(model, () => {});
+  const waiting = [comm.read(0, 2), comm.program()];
+  for (const tell of lost) tell();
+  for (const one of waiting) await expect(one).rejects.toThrow("the kernel is gone: run the cell again");
+  const again = comm.read(0, 2);
+  say({ kind: "part", id: sent[2]!.id, size: 6, tag: "t" }, [Uint8Array.of(1, 2)]);
+  expect([...(await again).data]).toEqual([1, 2]);
+  comm.close();
+  expect(lost.size).toBe(0);
 });
 
 it("commands are for every place", () => {

@@ -24,7 +24,7 @@ KNOWN = {
 _OF_RULE = (None, DIFFERENCES, DIFFERENCES, OFFSETS)
 
 
-def needed_codecs(header: Header, chunks: Iterable[bytes]) -> tuple[int, ...]:
+def needed_codecs(header: Header, chunks: Iterable[bytes | memoryview]) -> tuple[int, ...]:
     """What a container of this header with these chunks of residual needs, by rising number."""
     needed = {codec for chunk in chunks if (codec := chunk_codec(chunk)) is not None}
     if header.masked:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..surface import Block
 
-__all__ = ["DIGEST", "values_digest"]
+__all__ = ["DIGEST", "little_endian", "values_digest"]
 
 #: Its key in a container's metadata.
 DIGEST = "values_sha256"
@@ -24,6 +26,10 @@ def values_digest(blocks: Iterable[Block]) -> str:
     digest = hashlib.sha256()
     for block in blocks:
         for array in (block.points, *block.attributes.values()):
-            little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-            digest.update(np.ascontiguousarray(little).data)
+            digest.update(little_endian(array))
     return digest.hexdigest()
+
+
+def little_endian(array: NDArray[Any]) -> memoryview:
+    """The bytes of an array that are hashed, of any shape."""
+    return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).data

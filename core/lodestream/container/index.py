@@ -204,7 +204,7 @@ def parse_index(pages: Frame, root: Frame, header: Header) -> Index:
     segments = _parse_segments(_pages_of(pages, told.segment_pages), header, [place for place, _ in told.layers])
     finest, layers = 0, []
     for number, ((place, errors), own) in enumerate(zip(told.layers, segments, strict=True)):
-        finest = max([finest, *(header.layout.tiles[segment.tile].level for segment in own)])
+        finest = max(finest, header.layout.level_of(max([0, *(segment.tile for segment in own)])))
         layers.append(LayerRecord(number, place.offset, place.end, finest, *errors))
     return Index(
         header,

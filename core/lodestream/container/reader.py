@@ -100,8 +100,9 @@ def index_of(pages: Frame, root: Frame, header: Header) -> Index:
     """
     index = parse_index(pages, root, header)
     sizes = [0] * len(index.levels)
+    levels_of = index.header.layout.tile_levels.data
     for segment in index.segments:
-        sizes[index.header.layout.tiles[segment.tile].level] += segment.range.length
+        sizes[levels_of[segment.tile]] += segment.range.length
     total, levels = index.header.length, []
     for level, size in zip(index.levels, sizes, strict=True):
         total += size

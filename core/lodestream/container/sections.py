@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import msgpack
@@ -40,7 +40,7 @@ __all__ = [
     "read_errors",
     "section",
     "section_start",
-    "serialize_chunks",
+    "serialize_chunk_table",
     "serialize_footer",
     "serialize_layer",
     "serialize_metadata",
@@ -203,13 +203,13 @@ def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
     return values
 
 
-def serialize_chunks(errors: Errors, chunks: Sequence[bytes]) -> bytes:
-    """Payload of the residual section: the errors that are left, the chunks' lengths, then the chunks."""
+def serialize_chunk_table(errors: Errors, chunks: Iterable[bytes | memoryview]) -> bytes:
+    """What the payload of the residual section begins with: the errors that are left, the chunks' lengths."""
     out = FieldWriter()
     write_errors(out, errors)
     for chunk in chunks:
         out.varint(len(chunk))
-    return bytes(out.data) + b"".join(chunks)
+    return bytes(out.data)
 
 
 def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[memoryview, int]]]:

@@ -76,9 +76,9 @@ class Slices:
         self._reached: list[int] | None = None  # None while all comes in order
         self._segments, self._chunks = len(segments), len(chunks)
         self._corrected = 0
-        tiles = index.header.layout.tiles
         self._wanted = segments
-        self._levels = [tiles[s.tile].level for s in segments]
+        self._level_of = index.header.layout.tile_levels.data
+        self._levels = [self._level_of[s.tile] for s in segments]
         self._layer_level = _running_levels([s.layer for s in segments], self._levels, len(index.layers))
         self._by_layer = _Groups([s.layer for s in segments], len(index.layers))
         self._by_level = _Groups(self._levels, len(index.levels))
@@ -170,7 +170,7 @@ class Slices:
         return self.state()
 
     def _count(self, segment: Segment) -> None:
-        level = self._index.header.layout.tiles[segment.tile].level
+        level = self._level_of[segment.tile]
         self._received += 1
         self._finest = max(self._finest, level)
         self._by_layer.hold(segment.layer)

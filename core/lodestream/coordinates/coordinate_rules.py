@@ -48,7 +48,11 @@ def evaluate(
     if len(rule) == 3:
         return np.asarray((place * float(rule[1]) + float(rule[0])) / float(rule[2]))
     origin, across, by_row, shift = map(float, rule)
-    return np.asarray((column + shift) * across + (row + shift) * by_row + origin)
+    # A step of zero needs no plane: a grid that is not rotated has a line for each coordinate.
+    columns, rows = (
+        (places + shift) * step if step else np.full((1, 1), step) for places, step in ((column, across), (row, by_row))
+    )
+    return np.asarray(columns + rows + origin)
 
 
 def are_rules(rules: object) -> bool:

@@ -93,8 +93,8 @@ def to_xyz(surface: Surface, kept: NDArray[np.bool_] | None = None) -> Surface:
     return Surface(points, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
 
 
-def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
-    """x and y of a height field, each of shape (H, W).
+def coordinates(surface: Surface, rows: slice | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
+    """x and y of a height field, each of shape (H, W); or of some of its rows, as a slice with a start and a stop.
 
     By the metadata's ``grid`` (then in the type of the heights), ``axes`` or ``geotransform`` (of the centres of the
     cells), else x is the column and y the row; at the places that ``nodes`` gives for a coarser level.
@@ -105,7 +105,7 @@ def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
         When the metadata do not hold such rules.
     """
     try:
-        return _coordinates(surface)
+        return _coordinates(surface, slice(0, surface.shape[0]) if rows is None else rows)
     except InputError:
         raise
     except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
@@ -114,7 +114,7 @@ def coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
         raise InputError(f"expected rules of coordinates in the metadata, got {str(said)[:80]!a}") from None
 
 
-def _coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
+def _coordinates(surface: Surface, rows: slice) -> tuple[NDArray[Any], NDArray[Any]]:
     metadata, shape = surface.metadata, surface.shape
     nodes = metadata.get("nodes") or [None, None]
     row, column = (
@@ -135,13 +135,15 @@ def _coordinates(surface: Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     planes = []
     for channel, rule in enumerate(rules):
         try:
-            values = evaluate(rule, row[:, None], column[None, :], down=(channel == 1) != swapped)
+            at = row if rule[-1] is True else row[rows]  # that rule depends on the number of places
+            values = evaluate(rule, at[:, None], column[None, :], down=(channel == 1) != swapped)
+            values = values[rows] if at is row and len(values) == len(row) else values
         except (TypeError, ValueError, IndexError):
             raise InputError(f"expected two rules of coordinates in the metadata, got {str(rules)[:80]}") from None
         for angle in metadata.get("angles", ()):
             if angle["channel"] == channel:
                 values = wrapped(values, angle["period"], angle["low"])
-        planes.append(np.broadcast_to(rounded(values, dtype), shape))
+        planes.append(np.broadcast_to(rounded(values, dtype), (rows.stop - rows.start, shape[1])))
     return planes[0], planes[1]
 
 
@@ -302,7 +304,9 @@ def window_axes(axes: Any, shape: tuple[int, int], rows: tuple[int, int], column
     result = dict(axes)
     for name, rule, down in (("x", rules[0], swapped), ("y", rules[1], not swapped)):
         place, still = np.arange(shape[0 if down else 1], dtype=np.float64), np.zeros((1, 1))
-        values = evaluate(rule, place[:, None] if down else still, still if down else place[None, :], down).ravel()
+        at = place[:, None] if down else place[None, :]
+        values = evaluate(rule, at if down else still, still if down else at, down)
+        values = np.broadcast_to(values, at.shape).ravel()
         result[name] = [*values[slice(*(rows if down else columns))].tolist(), VALUES]
     return result
 

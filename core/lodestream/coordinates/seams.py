@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..surface import DTYPES, Block, Closed, Surface
 
-__all__ = ["merge", "restore", "unwrap", "wrapped"]
+__all__ = ["merge", "restore", "shapes_in_files", "unwrap", "wrapped"]
 
 _WORDS: Mapping[Closed, str] = {(True, False): "rows", (False, True): "cols", (True, True): "both"}
 _AXES: Mapping[str, Closed] = {word: closed for closed, word in _WORDS.items()}
@@ -214,16 +214,13 @@ def restore(surface: Surface) -> Surface:
     if dtype is not None and dtype not in DTYPES:
         # Whoever made the container may have written anything: a long text, of which each point would be one.
         raise InputError(f"expected a type of points in the metadata, got {dtype!a:.80}")
-    words = [seam] if isinstance(seam, str) else list(seam or ())
-    words += [""] * (len(surface.blocks) - len(words))
     blocks, nodes = [], []
-    for block, word in zip(surface.blocks, words, strict=False):
+    for block, repeat in zip(surface.blocks, _repeated(surface), strict=True):
         points = block.points.copy() if angles else block.points
         for angle in angles:
             channel = points[..., angle["channel"]]
             channel[:] = wrapped(channel, angle["period"], angle["low"])
         points = points.astype(dtype or points.dtype, copy=False)
-        repeat = _AXES.get(word, (False, False))
         points = _with_last(points, repeat, None if heights else turn)
         attributes = {name: _with_last(array, repeat) for name, array in block.attributes.items()}
         mask = None if block.mask is None else _with_last(block.mask, repeat)
@@ -234,6 +231,22 @@ def restore(surface: Surface) -> Surface:
     restored = Surface(blocks=blocks, metadata=metadata)
     restored.joints = None if surface.joints is None else surface.joints.at(nodes)
     return restored
+
+
+def shapes_in_files(surface: Surface) -> list[tuple[int, int]]:
+    """Rows and columns of each block with those that `restore` repeats."""
+    return [
+        (block.shape[0] + rows, block.shape[1] + columns)
+        for block, (rows, columns) in zip(surface.blocks, _repeated(surface), strict=True)
+    ]
+
+
+def _repeated(surface: Surface) -> list[Closed]:
+    """For each block, whether its first row and its first column are repeated at the end."""
+    seam = surface.metadata.get("seam")
+    words = [seam] if isinstance(seam, str) else list(seam or ())
+    words += [""] * (len(surface.blocks) - len(words))
+    return [_AXES.get(word, (False, False)) for word in words[: len(surface.blocks)]]
 
 
 def _with_last(array: NDArray[Any], repeat: Closed, turn: tuple[int, float, int] | None = None) -> NDArray[Any]:

@@ -33,7 +33,7 @@ class Coded(NamedTuple):
     channel: int
     first: int
     passes: int
-    data: bytes
+    data: bytes | memoryview
     offset: int
 
 
@@ -43,7 +43,7 @@ def batch_length(layout: Layout, segments: Sequence[Coded]) -> int:
     A segment that comes after a child has looked for its planes in vain, as no writer of ours puts it, begins the next
     batch: what it tells must not be known before.
     """
-    parents, channels = layout.parents, 1 + max((segment.channel for segment in segments), default=0)
+    parents, channels = layout.parents.data, 1 + max((segment.channel for segment in segments), default=0)
     lowest: dict[int, int] = {}  # the lowest plane that was looked at, by the number of a unit
     for number, (tile, channel, first, passes, _, _) in enumerate(segments):
         seen = lowest.get(tile * channels + channel)
@@ -72,13 +72,13 @@ def _rounds(tiles: Tiles, runs: list[Run]) -> Iterator[list[Reading]]:
     if sum([len(run.data) for run in runs]) <= (_LITTLE if threads() == 1 else _WORTH):
         yield tiles.readings(runs, [len(runs)])
         return
-    levels = tiles.table.layout.tiles
+    level_of = tiles.table.level_of
     ends: list[list[int]] = [[]]
     begin = 0
     while begin < len(runs):
-        level, end = levels[runs[begin].tile].level, begin
+        level, end = level_of(runs[begin].tile), begin
         size, own = 0, []
-        while end < len(runs) and levels[runs[end].tile].level == level:
+        while end < len(runs) and level_of(runs[end].tile) == level:
             if size >= _WORTH and runs[end].tile != runs[end - 1].tile:
                 own.append(end)
                 size = 0

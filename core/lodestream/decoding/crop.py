@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.model import Header
-from ..entropy.tiles import Tiles
+from ..entropy.band_fields import COLUMNS, KIND, ROWS
+from ..entropy.tiles import Tiles, TileTable
 from ..grid.axis import AxisStep
 from ..target import Region
 from ..transform.lifting import FRACTION_BITS, REACH, inverse_step
@@ -148,22 +149,31 @@ def _put(
     ``finer``: they are multiplied by 2**`FRACTION_BITS`.
     ``places``: of each axis the first node and detail, nodes that are taken, and nodes that there are.
     """
-    table = tiles.table
-    for number in table.layout.tiles_of(level):
-        for band_number, band in enumerate(table.members[number], start=table.first[number]):
-            spans = [
-                _span(*axis) for axis in zip(band.kind, (band.rows, band.columns), places, canvas.shape, strict=True)
-            ]
-            if all(stop > start for _, start, stop in spans):
-                values = tiles.band(band_number, state, finer)
-                (above, top, bottom), (before, left, right) = spans
-                canvas[top:bottom, left:right] = values[above : above + bottom - top, before : before + right - left]
+    table, own = tiles.table, tiles.table.layout.tiles_of(level)
+    numbers = np.arange(table.first[own.start], table.first[own.stop])
+    rows, columns = (
+        _spans(table, numbers, axis, place, length)
+        for axis, (place, length) in enumerate(zip(places, canvas.shape, strict=True))
+    )
+    taken = np.flatnonzero((rows[:, 2] > rows[:, 1]) & (columns[:, 2] > columns[:, 1]))
+    for k in taken.tolist():
+        (above, top, bottom), (before, left, right) = rows[k].tolist(), columns[k].tolist()
+        values = tiles.band(int(numbers[k]), state, finer)
+        canvas[top:bottom, left:right] = values[above : above + bottom - top, before : before + right - left]
 
 
-def _span(details: bool, span: tuple[int, int], place: tuple[int, int, int], length: int) -> tuple[int, int, int]:
-    """Where a band begins in itself to be taken, and from where to where it goes along an axis of what is taken."""
+def _spans(
+    table: TileTable, numbers: NDArray[np.int64], axis: int, place: tuple[int, int, int], length: int
+) -> NDArray[np.int64]:
+    """Where bands begin in themselves to be taken, and from where to where they go along an axis of what is taken.
+
+    int64, shape (band, 3); where nothing is taken the third is at most the second.
+    """
     first, taken, nodes = place
-    offset = taken - nodes - first if details else -first
-    least, most = (taken, length) if details else (0, taken)
-    start, stop = max(span[0] + offset, least), min(span[1] + offset, most)
-    return start - offset - span[0], start, stop
+    begin = table.origins[numbers, 1 + axis]
+    end = begin + table.bands[numbers, (ROWS, COLUMNS)[axis]]
+    details = (table.bands[numbers, KIND] & (2, 1)[axis]) > 0
+    offset = np.where(details, taken - nodes - first, -first)
+    start = np.maximum(begin + offset, np.where(details, taken, 0))
+    stop = np.minimum(end + offset, np.where(details, length, taken))
+    return np.stack([start - offset - begin, start, stop], axis=1)

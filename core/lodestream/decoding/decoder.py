@@ -291,7 +291,7 @@ class Decoder:
         self.capacity.take(_ENTRY * len(entries))
         segments = self._progress.advance_all(entries, frame.payload, start, frame.payload_offset)
         finest = entries[-1].tile if entries else 0  # tiles stand by level
-        self._level = max(self._level, header.layout.tiles[finest].level)
+        self._level = max(self._level, header.layout.level_of(finest))
         self._reconstruction.add(segments)
         last = number + 1 == header.layer_count
         complete = last and not header.corrected

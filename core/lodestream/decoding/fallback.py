@@ -90,7 +90,7 @@ class PlainReconstruction(Reconstruction):
                     vars(thing).update(attributes)
             self._before = self._taken, [(thing, _copied(vars(thing))) for thing in self._decoder.changing(number)]
             top = segment.first // 2 + 1 if self._decoder.remaining[number] < 0 else None
-            self._decoder.add(reference.Segment(number, segment.passes, top, segment.data))
+            self._decoder.add(reference.Segment(number, segment.passes, top, bytes(segment.data)))
             self._taken += 1
             self._forget(self._taken)
 

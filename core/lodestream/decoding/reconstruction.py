@@ -40,6 +40,8 @@ __all__ = [
 
 #: Bytes of segments that are worth decoding before anybody asks for points.
 _WORTH = 1 << 13
+#: Bytes of a segment from which on a window of those that arrived takes less memory than a copy.
+_WINDOW = 256
 
 
 class Reconstruction:
@@ -73,6 +75,11 @@ class Reconstruction:
         """Take a chunk of the residual section, which stands at ``offset``."""
         if data:
             self._chunks[number] = data, offset
+
+    def drop(self) -> None:
+        """Forget all that was added and is not decoded: for whoever asks for no values."""
+        self._queue.clear()
+        self._chunks.clear()
 
     def prepare(self, length: int) -> None:
         """Decode the first ``length`` segments, if those that wait are worth the calls that this takes."""
@@ -286,7 +293,7 @@ class Progress:
     def advance_all(self, entries: Sequence[Entry], payload: memoryview, start: int, offset: int) -> list[Coded]:
         """Note the segments of a layer, whose bytes stand in its payload one after another from ``start`` on.
 
-        The payload stands at ``offset``. See `advance`.
+        The payload, of bytes that never change, stands at ``offset``. See `advance`.
         """
         state, segments = self.state, []
         for tile, channel, top, passes, length in entries:
@@ -297,7 +304,8 @@ class Progress:
                 state[tile, channel] = below - passes
                 first = below - 1
             end = start + length
-            segments.append(Coded(tile, channel, first, passes, bytes(payload[start:end]), offset + start))
+            data = payload[start:end] if length >= _WINDOW else bytes(payload[start:end])
+            segments.append(Coded(tile, channel, first, passes, data, offset + start))
             start = end
         return segments
 
@@ -314,12 +322,13 @@ def initial_state(header: Header) -> NDArray[np.int8]:
 
     What has no coefficient, or none other than 0 in its whole level, is known.
     """
-    tiles = header.layout.tiles
-    levels = np.array([tile.level for tile in tiles])
-    known = ((np.array(header.empty, dtype=object)[None, :] >> levels[:, None]) & 1).astype(bool)
-    known[:, : header.geometric] |= np.array([not tile.bands for tile in tiles])[:, None]
-    known[:, header.geometric :] |= np.array([not tile.whole for tile in tiles])[:, None]
-    return np.where(known, 0, UNANNOUNCED).astype(np.int8)
+    layout, channels = header.layout, slice(0, header.geometric)
+    zeros = [[bits >> level & 1 for bits in header.empty] for level in range(layout.levels + 1)]
+    known = np.array(zeros, np.bool_).reshape(-1, header.channels)[layout.tile_levels]
+    for coordinate in (True, False):
+        known[:, channels] |= (np.diff(TileTable.of(layout, coordinate).first) == 0)[:, None]
+        channels = slice(header.geometric, None)
+    return np.where(known, np.int8(0), np.int8(UNANNOUNCED))
 
 
 @dataclass

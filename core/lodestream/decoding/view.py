@@ -150,7 +150,8 @@ class View:
         Parameters
         ----------
         level : int, optional
-            A level; None: full resolution. The geotransform of a coarser level spans the same area.
+            A level; None: full resolution. The geotransform of a coarser level spans the same area. Files of the
+            finest level repeat the rows and columns that the source repeats, files of coarser ones do not.
         metadata : mapping, optional
             Used instead of the container's metadata, which may not have arrived yet.
 
@@ -168,7 +169,7 @@ class View:
         if region is not None and shown != header.levels:
             raise OptionError(f"expected the finest level, {header.levels}, for a window, got {shown}")
         values = dict(self._metadata if metadata is None else metadata)
-        if level is not None:  # the grid of that level, without what a seam repeats
+        if shown != header.levels:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
         surface, values = self._positioned(Surface(blocks=self._blocks(shown)), values, shown)
         self._check_digest(surface, shown)
@@ -229,10 +230,12 @@ class View:
         header, region = self._reconstruction.header, self._selection.region
         finest = level == header.levels
         if not finest and len(surface.blocks) == 1 and header.point_channels == 1:
-            steps = header.levels - level
+            steps, told = header.levels - level, values.get("geotransform") is not None
             values = level_metadata({**values, **_plane(header)}, header.shape, surface.shape, header.closed, steps)
             if header.plane is not None:
                 surface.metadata.update({key: values.pop(key) for key in ("grid", "nodes") if key in values})
+                if not told:
+                    del values["geotransform"]  # of indices: these points have an x and a y of their own
         else:
             surface.metadata.update(_plane(header))
             if header.plane is not None and region is not None:

@@ -88,7 +88,7 @@ class WindowState:
             told[: self._header.layout.tiles_of(made.whole_level).stop] = 0
             state[outside] = told[outside]
         elif self._known_from is not None:
-            levels = np.array([tile.level for tile in self._header.layout.tiles])
+            levels = self._header.layout.tile_levels
             told = initial_state(self._header)
             told[self._known_from[levels] <= made.number] = 0
             state[outside] = told[outside]
@@ -98,7 +98,7 @@ class WindowState:
 def _known_from(index: Index) -> NDArray[np.int64]:
     """The first layer with which every tile of a level is known, int64, shape (level, channel)."""
     header = index.header
-    levels = [tile.level for tile in header.layout.tiles]
+    levels = header.layout.tile_levels.data
     unknown = initial_state(header) == UNANNOUNCED
     left = np.zeros(unknown.shape, np.int64)
     first = np.zeros((header.levels + 1, header.channels), np.int64)

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from ..container.model import Header
 from ..entropy.band_fields import COLUMNS, ROWS
 from ..entropy.bitplanes import pass_count, pass_gains
-from ..entropy.tile_coder import Strings, TileCoder
-from ..entropy.tiles import Tiles
+from ..entropy.tile_coder import Channel, Strings, TileCoder
+from ..entropy.tiles import Tiles, TileTable
 from ..parallel import spread
 from .allocation import TileCurve, assign_layers
 from .header import header_of
 from .large_units import large_level
 from .quantized import Quantized
 
-__all__ = ["Allocated", "State", "allocate"]
+__all__ = ["Allocated", "State", "allocate", "unit_curve"]
 
 #: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
 #: whose tiles are all known is inverted without errors of rounding.
@@ -67,7 +67,8 @@ def allocate(quantized: Quantized) -> Allocated:
     curves = list(_curves(quantized, coder))
     states = assign_layers(curves, layout, len(channels), quantized.quantiser is not None)
     coefficient_bytes = sum(float(curve.bits.sum()) for curve in curves) / 8
-    header = header_of(quantized, large)
+    tops = [channel.top for channel in channels]
+    header = header_of(quantized.prepared, quantized.lattices, quantized.predictors, tops, quantized.quantiser, large)
     quantized = _without_large(quantized, coder)
     return Allocated(quantized, header, tuple(coder.tiles), coder.strings, tuple(states), coefficient_bytes)
 
@@ -94,12 +95,31 @@ def _curves(quantized: Quantized, coder: TileCoder) -> Iterator[TileCurve]:
 def _curve(quantized: Quantized, coder: TileCoder, tile: int, number: int) -> TileCurve:
     """Code a unit as a whole."""
     channel, table = quantized.channels[number], quantized.tables[number]
-    rounding = _ROUNDING if quantized.quantiser is None else 0.0
+    rounded = quantized.quantiser is None
+    bits, gains = unit_curve(coder, tile, number, channel, table, rounded)
+    return TileCurve(tile, number, bits, gains)
+
+
+def unit_curve(
+    coder: TileCoder, tile: int, number: int, channel: Channel, table: TileTable, rounded: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Code all passes of a unit that has a bit-plane: bits and gains, float64, shape (pass,), see `TileCurve`.
+
+    Parameters
+    ----------
+    coder : TileCoder
+        Of ``channel`` by its ``number``, in places of ``table``; it knows the unit's parent.
+    tile, number : int
+    rounded : bool
+        The coefficients are not quantised, so that a level of which all is known has no errors of rounding.
+    """
     passes = pass_count(int(channel.top[tile]))
     costs = np.zeros(passes, np.float64)
     coder.code(tile, number, passes, passes, costs)
-    bits = np.diff(costs[::-1], prepend=0.0)[::-1]
+    bits = costs.copy()
+    bits[:-1] -= costs[1:]
     rows, weights = table.of_tile(tile), channel.weights[table.first[tile] : table.first[tile + 1]]
     gains = np.diff(pass_gains(rows, weights, passes, channel.true, coder.tiles[number].early))
-    gains[0] += rounding * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
-    return TileCurve(tile, number, bits, gains)
+    if rounded:
+        gains[0] += _ROUNDING * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
+    return bits, gains

@@ -68,8 +68,8 @@ def hull_slopes(curve: TileCurve, worth: Callable[[float], float] = lambda slope
     """
     runs: list[tuple[float, float, int]] = []  # bits, gain, passes
     known = 0.0
-    for bits, gain in zip(curve.bits[::-1], curve.gains[::-1], strict=True):
-        run = (max(float(bits), 1e-9), max(float(gain), 0.0), 1)
+    for bits, gain in zip(curve.bits[::-1].tolist(), curve.gains[::-1].tolist(), strict=True):
+        run = (max(bits, 1e-9), max(gain, 0.0), 1)
         known += run[0]
         while runs:
             last = runs[-1]
@@ -140,8 +140,9 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: b
 
 def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: Layout) -> None:
     """Give a parent's passes of a plane at least the slope of its children's, from the finest level down."""
+    parents = layout.parents.data
     for (tile, channel), own in sorted(slopes.items(), reverse=True):
-        parent = slopes.get((layout.tiles[tile].parent, channel))
+        parent = slopes.get((parents[tile], channel))
         if parent is None:
             continue
         # A plane's passes have the numbers 2 p + 1 and 2 p: the parent's second comes before the child's first.

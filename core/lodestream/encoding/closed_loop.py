@@ -84,7 +84,7 @@ class ClosedLoop:
 def _bands(table: TileTable) -> Iterator[tuple[int, dict[int, NDArray[np.int64]]]]:
     """Level by level, interfaces before patches that take their sides from them: the numbers of each grid's bands."""
     layout = table.layout
-    levels = np.array([tile.level for tile in layout.tiles])[table.origins[:, 0]]
+    levels = layout.tile_levels[table.origins[:, 0]]
     every = list(range(len(layout.grids)))
     interfaces = sum(grid.interface for grid in layout.grids)
     for level in range(layout.levels + 1):

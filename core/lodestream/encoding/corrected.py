@@ -10,7 +10,7 @@ from ..decoding.reconstruction import to_values
 from .measured import Measured
 from .residual_encoder import chunk_size, encode_chunks
 
-__all__ = ["Corrected", "correct"]
+__all__ = ["Corrected", "correct", "remaining_errors"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +47,12 @@ def correct(measured: Measured) -> Corrected:
     chunk = chunk_size(prepared, header, restored, measured.coefficient_bytes)
     header = replace(header, chunk=chunk)
     chunks, exact = encode_chunks(prepared, header, restored)
-    last = _remaining(measured.layers[-1].errors, exact, prepared.geometric)
+    last = remaining_errors(measured.layers[-1].errors, exact, prepared.geometric)
     kept = replace(measured, last=())
     return Corrected(kept, header, (*measured.levels, last), tuple(chunks), tuple(exact))
 
 
-def _remaining(errors: Errors, exact: Sequence[bool], geometric: int) -> Errors:
+def remaining_errors(errors: Errors, exact: Sequence[bool], geometric: int) -> Errors:
     """The errors of the complete surface, of which some channels are exact."""
     channels = tuple((0.0, 0.0) if known else pair for known, pair in zip(exact, errors.channels, strict=False))
     return Errors(0.0, 0.0, channels) if all(exact[:geometric]) else errors._replace(channels=channels)

@@ -25,10 +25,10 @@ from .quantized import NoQuantiserError, quantize
 from .transformed import transform
 from .written import write
 
-__all__ = ["encode"]
+__all__ = ["COARSER", "check", "chosen_quality", "encode", "longest", "rising"]
 
 #: Bits of a channel's range that the lattice keeps where coding does not pay, in the order in which they are tried.
-_COARSER = (8, 4, 0)
+COARSER = (8, 4, 0)
 
 
 #: Is told the fraction done, 0 to 1.
@@ -43,73 +43,34 @@ def encode(
     attribute_precision: Mapping[str, Limit] | None = None,
     quality: Quality | None = None,
     progress: Callable[[float], None] | None = None,
+    stacklevel: int = 2,
 ) -> bytes:
-    """Encode a surface into a container.
+    """Encode a surface into a container, in one piece.
 
-    >>> import numpy as np, lodestream
-    >>> heights = np.add.outer(np.arange(9) ** 2, np.arange(9))
-    >>> container = lodestream.encode(heights)
-    >>> bool((lodestream.decode(container).points == heights).all())
-    True
-
-    Parameters
-    ----------
-    surface : Surface or array
-        An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``.
-    precision : float, str, Tolerance or None
-        Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
-        the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
-        unless `attribute_precision` names them.
-    rms : float, str, Tolerance or None
-        Encode for one root mean square error instead: a container as short as possible whose complete surface has at
-        most this error. Quantization steps are chosen for this error alone, and there are few layers before the last.
-    attribute_precision : mapping of str to float, str or Tolerance, optional
-        Maximum error of attributes, by name; or of single channels: of a coordinate ("x", "y" or "z"), of a component
-        of an attribute ("wind_0"), relative to the range of that channel. A coordinate that is named keeps to its own
-        precision, whatever `precision` is; if that is None, the other coordinates come back bit for bit.
-    quality : Quality, optional
-        In place of the three before, which are a shorthand for ``Quality.of(precision, rms, attribute_precision)``.
-    progress : callable, optional
-        Called from time to time with the fraction done, 0 to 1.
-
-    Returns
-    -------
-    bytes
-        A container, see ``docs/format.md``. Values of attributes at holes of the points are not kept; if there are any,
-        a `FormatWarning` says so.
-
-    Raises
-    ------
-    InputError
-        If the surface cannot be encoded, or not with this precision, or if its metadata are larger than
-        `lodestream.container.metadata.MAX_BYTES`.
-    TooLargeError
-        If a block has more rows or columns than kernels can count.
-    OptionError
-        If there is no attribute or channel of a given name, an error is no number of 0 or more, both a precision and an
-        error are given, or a quality and one of these.
-    UnavailableError
-        If the compiled kernels are missing; it says how to get them.
+    Parameters, result and errors are those of `lodestream.encode`, which chooses between this and building by bands: an
+    array has the shape (row, column) or (row, column, channel). ``stacklevel`` says whom a warning names, as
+    `warnings.warn` counts; 0: there is none.
     """
     require("encoding")
-    quality = _chosen(quality, precision, rms, attribute_precision)
+    quality = chosen_quality(quality, precision, rms, attribute_precision)
     if not isinstance(surface, Surface):
         surface = Surface(surface)
-    _check(surface, quality)
-    rising = _rising(progress or (lambda fraction: None))
-    left_out = at_holes(surface)
+    check(surface, quality)
+    told = rising(progress or (lambda fraction: None))
+    left_out = at_holes(surface) if stacklevel else None
     if left_out is not None:
-        warnings.warn(left_out, FormatWarning, stacklevel=2)
-    container = None if quality.rms is None else _for_one_error(surface, quality, rising)
+        warnings.warn(left_out, FormatWarning, stacklevel=stacklevel)
+    container = None if quality.rms is None else _for_one_error(surface, quality, told)
     if container is None:
-        container = _progressive(surface, replace(quality, rms=None), rising)
-    rising(1.0)
+        container = _progressive(surface, replace(quality, rms=None), told)
+    told(1.0)
     return container
 
 
-def _chosen(
+def chosen_quality(
     quality: Quality | None, precision: Limit | None, rms: Limit | None, attributes: Mapping[str, Limit] | None
 ) -> Quality:
+    """The quality that was given, or that the shorthand says; `OptionError` is raised if there are both."""
     if quality is None:
         return Quality.of(precision, rms, attributes)
     if precision is not None or rms is not None or attributes:
@@ -117,8 +78,16 @@ def _chosen(
     return quality
 
 
-def _check(surface: Surface, quality: Quality) -> None:
-    """Refuse what cannot be encoded before anything takes time."""
+def check(surface: Surface, quality: Quality) -> None:
+    """Refuse what cannot be encoded before anything takes time.
+
+    Raises
+    ------
+    TooLargeError
+        If a block has more rows or columns than kernels can count.
+    InputError, OptionError
+        If its metadata are too large, or there is no attribute or channel of a name that the quality has.
+    """
     metadata.check(surface.metadata)
     most = max(length for block in surface.blocks for length in block.shape)
     if most > LONGEST_AXIS:
@@ -155,7 +124,7 @@ def _progressive(surface: Surface, quality: Quality, progress: _Progress) -> byt
     prepared = prepare(surface, quality)
     container = _stages(prepared, exact_lattices(prepared), progress)
     raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
-    for bits in _COARSER:
+    for bits in COARSER:
         if prepared.precision is not None or len(container) <= longest(raw):
             break
         # What looks like noise is not worth coding: the lattice keeps the highest bits, the residual stores the rest.
@@ -179,7 +148,7 @@ def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> b
     return container
 
 
-def _rising(progress: _Progress) -> _Progress:
+def rising(progress: _Progress) -> _Progress:
     """Tell fractions that never fall, whatever is tried one after another."""
     highest = 0.0
 

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from .. import kernels
 from ..grid.layout import Layout
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed
 from ..transform.lifting import forward_step
 from ..transform.predictors import predictor
 from ..transform.pyramid import allocate, forward, inverse
 
-__all__ = ["fill_holes", "settle_holes"]
+__all__ = ["fill_channel", "fill_holes", "settle_holes"]
 
 #: Sweeps, there and back, of the finest grid; each coarser one has so many more.
 _SWEEPS = 4
@@ -56,21 +57,42 @@ def fill_holes(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed) ->
     filled = values.copy()
     if mask.all():
         return filled
-    if not mask.any():
-        filled[...] = 0
-        return filled
     channels = filled[..., np.newaxis] if filled.ndim == 2 else filled
-    known = np.ascontiguousarray(mask)
     for channel in range(channels.shape[2]):
-        own = channels[..., channel]
-        low, high = own[known].min(), own[known].max()
-        heights = np.where(known, own, 0).astype(np.float64, order="C")
-        _fill(heights, known, closed, _SWEEPS)
-        if values.dtype.kind in "iu":
-            np.rint(heights, out=heights)
-        inside = np.clip(heights[~known], float(low), float(high)).astype(values.dtype)
-        own[~known] = np.clip(inside, low, high)
+        fill_channel(channels[..., channel], mask, closed)
     return filled
+
+
+def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, room: Room = IN_MEMORY) -> None:
+    """Fill the holes of one channel in place; `fill_holes` says how.
+
+    Parameters
+    ----------
+    values : integers or floats, shape (row, column)
+    mask : bool, shape (row, column)
+        True where a point is valid; some are not.
+    closed : (bool, bool)
+    room : Room
+        Where large arrays go.
+    """
+    if not mask.any():
+        values[...] = 0
+        return
+    known = np.ascontiguousarray(mask)
+    strips = list(rows_at_once(values.shape))
+    ends = [(own.min(), own.max()) for rows in strips if (own := values[rows][known[rows]]).size]
+    low, high = min(least for least, _ in ends), max(most for _, most in ends)
+    heights = room.empty(values.shape, np.float64)
+    for rows in strips:
+        heights[rows] = np.where(known[rows], values[rows], 0)
+    _fill(heights, known, closed, _SWEEPS, room)
+    for rows in strips:
+        hidden = ~known[rows]
+        found = heights[rows][hidden]
+        if values.dtype.kind in "iu":
+            np.rint(found, out=found)
+        inside = np.clip(found, float(low), float(high)).astype(values.dtype)
+        values[rows][hidden] = np.clip(inside, low, high)
 
 
 def settle_holes(coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout: Layout) -> NDArray[np.int32]:
@@ -122,14 +144,16 @@ def _forward_again(values: NDArray[np.int32], layout: Layout, predictors: NDArra
                 forward_step(values[:rows, :columns], axis, step, rule)
 
 
-def _fill(values: NDArray[np.float64], known: NDArray[np.bool_], closed: Closed, sweeps: int) -> None:
+def _fill(
+    values: NDArray[np.float64], known: NDArray[np.bool_], closed: Closed, sweeps: int, room: Room = IN_MEMORY
+) -> None:
     """Fill one grid by way of coarser ones, in place."""
     shape = ((values.shape[0] + 1) // 2, (values.shape[1] + 1) // 2)
-    coarser, found = np.empty(shape, np.float64), np.empty(shape, np.bool_)
+    coarser, found = room.empty(shape, np.float64), room.empty(shape, np.bool_)
     for first, last in _runs(coarser.size):
         kernels.pull(values, known, *values.shape, first, last, coarser, found)
     if not found.all():
-        _fill(coarser, found, closed, sweeps + _MORE)
+        _fill(coarser, found, closed, sweeps + _MORE, room)
     for first, last in _runs(values.size):
         kernels.push(values, known, *values.shape, first, last, *closed, coarser)
     for first, last in _runs(2 * sweeps * values.size):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,23 +10,36 @@ from numpy.typing import NDArray
 
 from ..container.model import Header
 from ..grid.layout import Layout
+from ..quantization.band_steps import Quantiser
 from ..surface import Surface
+from .lattice_coordinates import Lattices
 from .prepared import Prepared
-from .quantized import Quantized
 
 __all__ = ["header_of"]
 
 
-def header_of(quantized: Quantized, large: int) -> Header:
+def header_of(
+    prepared: Prepared,
+    lattices: Lattices,
+    predictors: NDArray[np.int8],
+    tops: Sequence[NDArray[np.int8]],
+    quantiser: Quantiser | None,
+    large: int,
+) -> Header:
     """The header, with the largest chunks, and without what is known when all layers are coded.
 
     Parameters
     ----------
-    quantized : Quantized
+    prepared : Prepared
+    lattices : Lattices
+    predictors : int8, shape (channel, level, axis, 2)
+    tops : sequence of int8 arrays, shape (tile,), one for each channel
+        Bit-planes.
+    quantiser : Quantiser or None
     large : int
         The coarsest level whose units are large; 0: none are.
     """
-    prepared, surface = quantized.prepared, quantized.prepared.surface
+    surface = prepared.surface
     masks = [block.mask for block in surface.blocks]
     return Header(
         dtype=surface.dtype,
@@ -34,10 +48,10 @@ def header_of(quantized: Quantized, large: int) -> Header:
         point_channels=prepared.point_channels,
         flat=surface.blocks[0].points.ndim == 2,
         attributes=prepared.kinds,
-        lattices=quantized.lattices.channels,
-        predictors=quantized.predictors,
+        lattices=lattices.channels,
+        predictors=predictors,
         extent=prepared.extent,
-        empty=tuple(_empty_levels(prepared.layout, channel.top) for channel in quantized.channels),
+        empty=tuple(_empty_levels(prepared.layout, top) for top in tops),
         tile=prepared.layout.tile,
         chunk=prepared.chunks[-1],
         large=large,
@@ -48,7 +62,7 @@ def header_of(quantized: Quantized, large: int) -> Header:
         masked=any(mask is not None for mask in masks),
         hole=_hole(surface),
         holes=tuple(block.holes for block in surface.blocks),
-        quantiser=quantized.quantiser,
+        quantiser=quantiser,
         joint_changes=prepared.joint_changes,
         mask_data=tuple(b"" if mask is None else _encode_mask(mask) for mask in masks),
         **_kept(prepared),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Block
 
 __all__ = ["Arrays", "filled", "given_arrays", "given_channel", "known_values", "valid_points"]
@@ -37,21 +38,24 @@ def given_channel(block: Block, channel: int) -> NDArray[Any]:
     raise IndexError(channel)
 
 
-def filled(block: Block) -> Arrays:
+def filled(block: Block, room: Room = IN_MEMORY) -> Arrays:
     """Points and attributes of a block, finite everywhere; C-contiguous, shape (row, column, channel).
 
-    What has no holes is not copied.
+    What has no holes is not copied; large copies go where there is room.
     """
     arrays = []
     for number, array in enumerate(given_arrays(block)):
         known = [known_values(array[..., k], block, not number and k < 3) for k in range(array.shape[2])]
         if not all(mask is None or mask.all() for mask in known):
-            from .fill import fill_holes  # only where there is one
+            from .fill import fill_channel  # only where there is one
 
-            array = array.copy()
+            copy = room.empty(array.shape, array.dtype)
+            for rows in rows_at_once(array.shape):
+                copy[rows] = array[rows]
+            array = copy
             for channel, mask in enumerate(known):
-                if mask is not None:
-                    array[..., channel] = fill_holes(array[..., channel], mask, block.closed)
+                if mask is not None and not mask.all():
+                    fill_channel(array[..., channel], mask, block.closed, room)
         arrays.append(np.ascontiguousarray(array))
     return arrays
 
@@ -84,7 +88,7 @@ def known_values(values: NDArray[Any], block: Block, coordinate: bool) -> NDArra
     return valid
 
 
-def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]]) -> NDArray[Any]:
+def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]], room: Room = IN_MEMORY) -> NDArray[Any]:
     """The valid points of all blocks, shape (row, column) or (row, column, channel).
 
     Parameters
@@ -92,14 +96,22 @@ def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]]) -> NDA
     blocks : sequence of Block
     points : for each block, shape (row, column, channel)
         As `filled` returns them. Those of one block without holes are not copied.
+    room : Room
+        Where large arrays go.
     """
     flat = blocks[0].points.ndim == 2
     if len(blocks) == 1 and blocks[0].mask is None:
         valid = points[0]
     else:
-        chosen = [
-            array.reshape(-1, array.shape[2]) if block.mask is None else array[block.mask]
-            for block, array in zip(blocks, points, strict=True)
+        masks = [
+            np.ones(array.shape[:2], np.bool_) if b.mask is None else b.mask
+            for b, array in zip(blocks, points, strict=True)
         ]
-        valid = np.concatenate(chosen)[:, np.newaxis]
+        count = sum(int(np.count_nonzero(mask)) for mask in masks)
+        valid, done = room.empty((count, 1, points[0].shape[2]), points[0].dtype), 0
+        for array, mask in zip(points, masks, strict=True):
+            for rows in rows_at_once(array.shape):
+                chosen = array[rows][mask[rows]]
+                valid[done : done + len(chosen), 0] = chosen
+                done += len(chosen)
     return valid[..., 0] if flat else valid

@@ -7,15 +7,17 @@ much; and on a few surfaces the neighbours in the same plane tell more than thos
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
 from ..entropy.tile_coder import Channel, TileCoder
 from ..entropy.tiles import TileTable
+from ..grid.layout import Layout
 from ..parallel import spread
 from ..quantization.band_steps import Quantiser
 
-__all__ = ["large_level"]
+__all__ = ["candidate", "large_level", "unit_size", "worth"]
 
 #: Points that all grids have together at the coarsest level whose units are large.
 _LARGE = 1 << 15
@@ -26,26 +28,37 @@ _MOST, _TRIED = 1.05, 2
 def large_level(tables: list[TileTable], channels: list[Channel], geometric: int, quantiser: Quantiser | None) -> int:
     """The coarsest level whose units should be large; 0: none should. Parameters are those of `TileCoder`."""
     layout = tables[0].layout
-    level = next((level for level in range(1, layout.levels + 1) if layout.points(level) >= _LARGE), 0)
+    level, tiles = candidate(layout)
     coded = [k for k in range(len(channels)) if quantiser is None or k >= geometric]
     if not level or not coded:
         return 0
-    tiles = layout.tiles_of(layout.levels)
-    tried = [tiles[len(tiles) * (2 * i + 1) // (2 * _TRIED)] for i in range(_TRIED)]
     coders = [TileCoder(tables, channels, geometric, quantiser, large) for large in (level, 0)]
-    units = itertools.product(coders, sorted(set(tried)), coded)
-    sizes = spread(lambda unit: _size(*unit, channels[unit[2]]), units)
+    units = itertools.product(coders, tiles, coded)
+    parents = layout.tile_arrays.parents(np.array(tiles))
+    above = dict(zip(tiles, parents.tolist(), strict=True))
+    sizes = spread(lambda unit: unit_size(unit[0], unit[1], above[unit[1]], unit[2], channels[unit[2]]), units)
     half = len(sizes) // 2
-    return level if sum(sizes[:half]) <= _MOST * sum(sizes[half:]) else 0
+    return level if worth(sizes[:half], sizes[half:]) else 0
 
 
-def _size(coder: TileCoder, tile: int, number: int, channel: Channel) -> int:
-    """Bytes of one unit whose parent is known."""
+def candidate(layout: Layout) -> tuple[int, list[int]]:
+    """The coarsest level whose units may be large, 0 if there is none, and the tiles on which that is tried."""
+    level = next((level for level in range(1, layout.levels + 1) if layout.points(level) >= _LARGE), 0)
+    tiles = layout.tiles_of(layout.levels)
+    return level, sorted({tiles[len(tiles) * (2 * i + 1) // (2 * _TRIED)] for i in range(_TRIED)})
+
+
+def worth(large: Sequence[int], small: Sequence[int]) -> bool:
+    """Whether units should be large that take so many bytes as large ones and as small ones."""
+    return sum(large) <= _MOST * sum(small)
+
+
+def unit_size(coder: TileCoder, tile: int, parent: int, number: int, channel: Channel) -> int:
+    """Bytes of one unit whose parent, -1 if it has none, is known. ``channel`` is that of ``number`` in the coder."""
     planes = int(channel.top[tile])
     if not planes:
         return 0
     tiles = coder.tiles[number]
-    parent = tiles.table.layout.tiles[tile].parent
     if parent >= 0:
         for place, stride, rows, columns in tiles.table.of_tile(parent)[:, :4].tolist():
             span = slice(place, place + (rows - 1) * stride + columns)

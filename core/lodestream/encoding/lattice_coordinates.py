@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..grid.connectivity import stored
+from ..grid.layout import Layout
 from ..quantization.lattice import Lattice, find_lattice, offset_lattice, precision_lattice, short_lattice
 from ..quantization.lattice_choice import attribute_lattices, channel_of, choose_lattices
 from ..transform.pyramid import allocate
@@ -16,8 +18,18 @@ from .arranging import lines
 from .holes import given_channel, known_values
 from .prepared import Prepared
 
-__all__ = ["Lattices", "exact_lattices", "fine_lattices", "lattice_coordinates", "lies_on_coarse_lattice"]
+__all__ = [
+    "Lattices",
+    "coordinates_of_strip",
+    "exact_lattices",
+    "fine_lattices",
+    "lattice_coordinates",
+    "lies_on_coarse_lattice",
+    "strips",
+]
 
+#: Points under whose holes coordinates are chosen together; of larger surfaces, points and rows of a strip.
+_TOGETHER, _STRIP, _LEAST_ROWS = 1 << 24, 1 << 22, 256
 #: Lattice steps in the error of a coordinate that a stream is made for, at most and at least.
 _FINEST, _COARSEST = 128, 8
 
@@ -116,8 +128,30 @@ def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> l
 
 
 def _of_one_grid(prepared: Prepared, channel: int, lattice: Lattice, array: NDArray[np.int32]) -> None:
-    lattice.coordinates(prepared.channel(0, channel), out=array)
-    block = prepared.surface.blocks[0]
+    for rows in strips(prepared):
+        coordinates_of_strip(prepared, channel, lattice, rows, array[slice(*rows)])
+
+
+def strips(prepared: Prepared) -> list[tuple[int, int]]:
+    """The rows of a surface of one grid, half-open, whose lattice coordinates are found together.
+
+    Without holes each row is for itself. Those under holes are chosen for what is around them: a surface that is not
+    very large is one strip, and what they are then follows from its shape alone, not from the memory that there is.
+    """
+    rows, columns = prepared.layout.shape(0, prepared.layout.levels)
+    if prepared.surface.blocks[0].mask is None or rows * columns <= _TOGETHER:
+        return [(0, rows)]
+    each = max(_STRIP // columns, _LEAST_ROWS)
+    starts = range(0, max(rows - each // 2, 1), each)
+    return list(pairwise([*starts, rows]))
+
+
+def coordinates_of_strip(
+    prepared: Prepared, channel: int, lattice: Lattice, rows: tuple[int, int], out: NDArray[np.int32]
+) -> None:
+    """Put coordinates of one of the `strips` into ``out``, int32, shape (row, column); or of any rows without holes."""
+    block, within = prepared.surface.blocks[0], slice(*rows)
+    lattice.coordinates(prepared.channel(0, channel)[within], out=out)
     if block.mask is None:
         return
     from .fill import settle_holes  # only where there is one
@@ -126,7 +160,10 @@ def _of_one_grid(prepared: Prepared, channel: int, lattice: Lattice, array: NDAr
     if block.kept is not None:
         mask = known_values(given_channel(block, channel), block, channel < prepared.geometric)
     assert mask is not None  # there are holes
-    array[...] = settle_holes(array, mask, prepared.layout)
+    layout = prepared.layout
+    if rows != (0, layout.shape(0, layout.levels)[0]):
+        layout = Layout.single(out.shape, (False, block.closed[1]), layout.tile)
+    out[...] = settle_holes(out, mask[within], layout)
 
 
 def _of_patches(prepared: Prepared, channel: int, lattice: Lattice, arrays: list[NDArray[np.int32]]) -> None:

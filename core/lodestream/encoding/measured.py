@@ -23,7 +23,7 @@ from .prepared import Prepared
 from .quantized import Quantized
 from .states import StateReconstructor
 
-__all__ = ["Measured", "MeasuredLayer", "all_passes", "measure"]
+__all__ = ["Measured", "MeasuredLayer", "all_passes", "kept_layers", "level_states", "measure", "shown_states"]
 
 #: Canvases of several threads have at most so many points together, unless one alone has more.
 _POINTS = 1 << 23
@@ -94,19 +94,19 @@ def measure(allocated: Allocated, progress: Callable[[float], None]) -> Measured
     """
     quantized, header = allocated.quantized, allocated.header
     measuring = _Measuring(allocated)
-    states = _shown(allocated)
-    levels = _level_states(quantized.prepared, header)
+    states = shown_states(header, allocated.states, all_passes([channel.top for channel in quantized.channels]))
+    levels = level_states(header)
     found = measuring.every([*states[:-1], *levels])
     found[len(states) - 1 : len(states) - 1] = [measuring.errors(states[-1])]
-    layers = _kept_layers(header, allocated.states, found[: len(states)])
+    layers = kept_layers(header, allocated.states, found[: len(states)])
     progress(0.75)
     last, told_levels = measuring.coordinates(states[-1]), tuple(errors for errors, _ in found[len(states) :])
     return Measured(quantized, header, allocated.strings, tuple(layers), told_levels, last, allocated.coefficient_bytes)
 
 
-def all_passes(quantized: Quantized) -> State:
-    """Passes of every tile and channel, int8, shape (tile, channel)."""
-    return np.stack([np.maximum(2 * channel.top - 1, 0) for channel in quantized.channels], axis=1)
+def all_passes(tops: Sequence[NDArray[np.int8]]) -> State:
+    """Passes of every tile and channel, int8, shape (tile, channel), from their bit-planes, shape (tile,)."""
+    return np.stack([np.maximum(2 * top - 1, 0) for top in tops], axis=1).astype(np.int8)
 
 
 class _Measuring:
@@ -190,25 +190,43 @@ def _others(prepared: Prepared) -> list[tuple[list[Original], int]]:
     return other_originals(prepared.arrangement, arrays, [block.mask for block in blocks], prepared.geometric)
 
 
-def _shown(allocated: Allocated) -> list[State]:
-    """What a receiver knows after each layer; tiles of which it has heard nothing are `UNANNOUNCED` until the last."""
-    start, announced = initial_state(allocated.header), all_passes(allocated.quantized)
-    shown = [np.where(state < announced, state, start).astype(np.int8) for state in allocated.states[:-1]]
-    return [*shown, allocated.states[-1]]
+def shown_states(header: Header, states: Sequence[State], passes: State) -> list[State]:
+    """What a receiver knows after each layer; tiles of which it has heard nothing are `UNANNOUNCED` until the last.
+
+    Parameters
+    ----------
+    header : Header
+    states : sequence of int8 arrays, shape (tile, channel)
+        Passes still to come after each layer.
+    passes : int8, shape (tile, channel)
+        All that there are.
+    """
+    start = initial_state(header)
+    shown = [np.where(state < passes, state, start).astype(np.int8) for state in states[:-1]]
+    return [*shown, states[-1]]
 
 
-def _level_states(prepared: Prepared, header: Header) -> list[State]:
-    """The states that hold all levels up to one, but for the last."""
+def level_states(header: Header) -> list[State]:
+    """The states that hold all levels up to one, but for the last: int8, shape (tile, channel)."""
     start, states = initial_state(header), []
-    for level in range(prepared.layout.levels):
+    for level in range(header.layout.levels):
         state = start.copy()
-        state[: prepared.layout.tiles_of(level).stop] = 0
+        state[: header.layout.tiles_of(level).stop] = 0
         states.append(state)
     return states
 
 
-def _kept_layers(header: Header, states: Sequence[State], found: Sequence[Found]) -> list[MeasuredLayer]:
-    """The layers that lower the RMS error, and the last one."""
+def kept_layers(header: Header, states: Sequence[State], found: Sequence[Found]) -> list[MeasuredLayer]:
+    """The layers that lower the RMS error, and the last one.
+
+    Parameters
+    ----------
+    header : Header
+    states : sequence of int8 arrays, shape (tile, channel)
+        Passes still to come after each layer.
+    found : sequence of (Errors, list of float64 arrays)
+        Of each: its errors, and the distances in cells, see `coordinate_distances`.
+    """
     kept: list[int] = []
     rms = [errors.rms for errors, _ in found]
     for number in range(len(states)):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..entropy.tiles import TileTable
-from ..quantization.band_steps import Quantiser, lifting_steps_along
+from ..quantization.band_steps import Quantiser, band_step, lifting_steps_along
 
 __all__ = ["FILTERS", "feedback_rules"]
 
@@ -43,26 +43,19 @@ def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32
         quantization steps; f_1 and f_2 along axis 0; f_1 and f_2 along axis 1. A weight of one is that of a squared
         error of `Quantiser.base` in one point of the surface.
     """
-    steps = table.steps(quantiser)
-    found: dict[tuple[int, int, tuple[bool, bool]], tuple[float, ...]] = {}  # many tiles have bands of the same kind
+    layout, (classes, of_band) = table.layout, table.classes()
     rules = []
-    number = 0
-    for tile, bands in zip(table.layout.tiles, table.members, strict=True):
-        for band in bands:
-            key = tile.level, band.grid, band.kind
-            if key not in found:
-                step = int(steps[number])
-                weight, taps = (step / quantiser.base) ** 2, []
-                for axis in range(2):
-                    count, detail = lifting_steps_along(band, tile.level, table.layout, axis)
-                    alone = table.layout.grids[band.grid].interface and axis == 1
-                    first, second, gain = _alone(count) if alone else _filter(count, detail)
-                    weight *= gain
-                    taps += [first, second]
-                found[key] = ((step + 1) // 2 / step, weight, *taps)
-            rules.append(found[key])
-            number += 1
-    return np.array(rules, np.float32).reshape(-1, 6)
+    for level, grid, kind in classes:
+        step = band_step(level, grid, kind, layout, quantiser)
+        weight, taps = (step / quantiser.base) ** 2, []
+        for axis in range(2):
+            count, detail = lifting_steps_along(level, grid, kind[axis], layout, axis)
+            alone = layout.grids[grid].interface and axis == 1
+            first, second, gain = _alone(count) if alone else _filter(count, detail)
+            weight *= gain
+            taps += [first, second]
+        rules.append(((step + 1) // 2 / step, weight, *taps))
+    return np.array(rules, np.float32).reshape(-1, 6)[of_band]
 
 
 def _filter(count: int, detail: bool) -> tuple[float, float, float]:

@@ -23,6 +23,7 @@ from ..quantization.lattice import find_lattice
 from ..quantization.lattice_choice import DEFAULT_DIVISIONS, choose_lattices
 from ..quantization.lattice_depth import default_divisions
 from ..quantization.measure import extent_of
+from ..scratch import IN_MEMORY, Room
 from ..surface import Block, Surface
 from ..target import Tolerance
 from ..transform.pyramid import PADDING
@@ -146,15 +147,18 @@ class Prepared:
         return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
 
 
-def prepare(surface: Surface, quality: Quality) -> Prepared:
-    """Prepare a surface; `InputError` is raised if it cannot be encoded with this precision."""
+def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepared:
+    """Prepare a surface; `InputError` is raised if it cannot be encoded with this precision.
+
+    Large arrays that are needed beside the surface's own go where there is ``room``.
+    """
     given, (surface, plane) = surface, _heights(surface)
     blocks, first = surface.blocks, surface.blocks[0]
-    arrays = tuple(filled(block) for block in blocks)
+    arrays = tuple(filled(block, room) for block in blocks)
     points = [own[0] for own in arrays]
     point_channels = points[0].shape[2]
     geometric = min(point_channels, 3)
-    valid = valid_points(blocks, points)
+    valid = valid_points(blocks, points, room)
     extent = extent_of(valid, geometric) if plane is None else _extent_given(given.blocks[0])
     precision, rms = quality.precision, None
     if precision is not None and precision.relative and not extent:

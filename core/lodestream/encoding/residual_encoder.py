@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
@@ -17,13 +19,20 @@ from ..surface import Block, Surface
 from .holes import given_channel
 from .prepared import Prepared
 
-__all__ = ["as_returned", "chunk_size", "encode_chunks"]
+__all__ = ["ChunkCoder", "Restored", "as_returned", "chunk_sample", "chunk_size", "encode_chunks"]
 
 #: Bytes of tables for each chunk, and what small chunks may cost: a share of all bytes.
 _TABLES, _WORTH = 8, 0.01
 
 
-def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) -> tuple[list[bytes], list[bool]]:
+class Restored(Protocol):
+    """Values of a block, or of some of its rows."""
+
+    def window(self, window: ChunkPlace) -> NDArray[Any]:
+        """One channel at the place of a chunk, shape (row, column)."""
+
+
+def encode_chunks(prepared: Prepared, header: Header, restored: Sequence[Restored]) -> tuple[list[bytes], list[bool]]:
     """The section's chunks; and of each channel whether it is exact then.
 
     A precision is for the coordinates, or for the channel or attribute that it names: the others come back bit for
@@ -33,10 +42,10 @@ def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) ->
     ----------
     prepared : Prepared
     header : Header
-    restored : list of Values, one for each block
+    restored : sequence of Restored, one for each block
         What comes back without these chunks.
     """
-    coder = _ChunkCoder(prepared, header, restored)
+    coder = ChunkCoder(prepared, header, restored)
     windows = list(chunk_places(header))
     coded = spread(coder.code, windows)
     exact = [True] * header.channels
@@ -45,7 +54,9 @@ def encode_chunks(prepared: Prepared, header: Header, restored: list[Values]) ->
     return [chunk for chunk, _ in coded], exact
 
 
-def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coefficients: float) -> tuple[int, int]:
+def chunk_size(
+    prepared: Prepared, header: Header, restored: Sequence[Restored], coefficients: float
+) -> tuple[int, int]:
     """The smallest chunks that do not cost much, as exponents of two of their rows and columns.
 
     Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
@@ -60,14 +71,13 @@ def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coeff
     """
     if len(prepared.chunks) == 1:
         return prepared.chunks[0]
-    shape, largest = header.shape, prepared.chunks[-1]
-    starts = [length // 2 >> exponent << exponent for length, exponent in zip(shape, largest, strict=True)]
-    stops = [min(start + (1 << e), length) for start, length, e in zip(starts, shape, largest, strict=True)]
+    shape = header.shape
+    starts, stops = zip(*chunk_sample(prepared, shape), strict=True)
     share = math.prod(stop - start for start, stop in zip(starts, stops, strict=True)) / math.prod(shape)
     costs = []
     for chunk in prepared.chunks:
         tried = replace(header, chunk=chunk)
-        coder = _ChunkCoder(prepared, tried, restored)
+        coder = ChunkCoder(prepared, tried, restored)
         inside = [
             window
             for window in chunk_places(tried)
@@ -78,10 +88,20 @@ def chunk_size(prepared: Prepared, header: Header, restored: list[Values], coeff
     return next(chunk for chunk, cost in zip(prepared.chunks, costs, strict=True) if cost <= most)
 
 
-class _ChunkCoder:
-    """Makes chunks."""
+def chunk_sample(prepared: Prepared, shape: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Rows and columns, half-open, on which `chunk_size` tries the sizes of chunks: the largest one in the middle."""
+    starts = [length // 2 >> exponent << exponent for length, exponent in zip(shape, prepared.chunks[-1], strict=True)]
+    rows, columns = (
+        (start, min(start + (1 << exponent), length))
+        for start, length, exponent in zip(starts, shape, prepared.chunks[-1], strict=True)
+    )
+    return rows, columns
 
-    def __init__(self, prepared: Prepared, header: Header, restored: list[Values]) -> None:
+
+class ChunkCoder:
+    """Makes chunks, see `encode_chunks`."""
+
+    def __init__(self, prepared: Prepared, header: Header, restored: Sequence[Restored]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
         self._rough = prepared.rough
 

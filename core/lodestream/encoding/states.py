@@ -106,4 +106,4 @@ def _first_changed(layout: Layout, before: NDArray[np.int8], after: NDArray[np.i
     one, or the same as before.
     """
     changed = np.flatnonzero(before != after)
-    return layout.tiles[changed[0]].level if changed.size else layout.levels + 1
+    return layout.level_of(changed[0]) if changed.size else layout.levels + 1

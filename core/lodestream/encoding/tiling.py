@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-__all__ = ["CHUNK_BITS", "TILE_BITS", "WHOLE_CHUNK", "WHOLE_TILE", "chunk_exponents", "square", "tile_exponents"]
+__all__ = [
+    "CHUNK_BITS",
+    "TILE_BITS",
+    "VAST",
+    "WHOLE_CHUNK",
+    "WHOLE_TILE",
+    "chunk_exponents",
+    "square",
+    "tile_exponents",
+]
 
 #: Coefficients of a tile in a band, and points of a chunk of residual, as exponents of two.
 TILE_BITS, CHUNK_BITS = 12, 12
 #: The same for surfaces of at most so many points, where these take many bytes each.
 SMALL_TILE, SMALL_CHUNK, SMALL = 11, 10, 1 << 19
+#: Points from which on tiles have four times as many columns: there are very many, and each takes memory of a reader.
+VAST = 1 << 28
 #: Of x, y, z, where no window is wanted, or small chunks would take many more bytes.
 WHOLE_TILE, WHOLE_CHUNK = 14, 16
 
@@ -21,8 +32,11 @@ def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, 
     (6, 6)
     >>> tile_exponents((16, 1000))
     (3, 9)
+    >>> tile_exponents((20000, 20000))
+    (6, 8)
     """
-    return _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, bits)
+    rows, columns = _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, bits)
+    return rows, columns + 2 if shape[0] * shape[1] >= VAST else columns
 
 
 def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:

@@ -17,7 +17,7 @@ from .closed_loop import ClosedLoop
 from .lattice_coordinates import Lattices, lattice_coordinates
 from .prepared import Prepared
 
-__all__ = ["Transformed", "transform"]
+__all__ = ["Transformed", "band_weights", "transform"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ def transform(prepared: Prepared, lattices: Lattices) -> Transformed:
         else:
             coefficients.append(gather(tables[channel], arrays))
         del arrays, originals  # before the arrays of the next channel are made
-        weights.append(_weights(prepared, channel, lattice, tables[channel], own))
+        weights.append(band_weights(prepared, channel, lattice, tables[channel], own))
     return Transformed(prepared, lattices, tables, predictors, tuple(loops), tuple(coefficients), tuple(weights))
 
 
@@ -87,7 +87,7 @@ def _forward(
     return arrays, originals, predictors
 
 
-def _weights(
+def band_weights(
     prepared: Prepared, channel: int, lattice: Lattice, table: TileTable, predictors: NDArray[np.int8]
 ) -> NDArray[np.float64]:
     """What a coefficient of one is worth in each band: float64, shape (band,).
@@ -99,13 +99,8 @@ def _weights(
     norms = [synthesis_norms(layout, predictors, grid) for grid in range(len(layout.grids))]
     span = prepared.extent if channel < prepared.geometric else prepared.span(channel)
     spacing = lattice.spacing / span if span else 0.0
-    return np.array(
-        [
-            norms[band.grid][tile.level, *map(int, band.kind)] * spacing**2
-            for tile, bands in zip(layout.tiles, table.members, strict=True)
-            for band in bands
-        ]
-    )
+    classes, of_band = table.classes()
+    return np.array([norms[grid][level, *map(int, kind)] * spacing**2 for level, grid, kind in classes])[of_band]
 
 
 def _largest(values: NDArray[np.int32]) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..container.digest import DIGEST, values_digest
 from ..container.writer import CodedLayer, CodedSegment, write_container
@@ -15,7 +16,7 @@ from .corrected import Corrected
 from .measured import Measured, MeasuredLayer, all_passes
 from .residual_encoder import as_returned
 
-__all__ = ["write"]
+__all__ = ["window_section_of", "write"]
 
 #: The share of the bytes that errors of windows may take.
 _WINDOWS_SHARE = 0.005
@@ -41,7 +42,7 @@ def _coded(measured: Measured) -> list[CodedLayer]:
     geometric, large = quantized.prepared.geometric, measured.header.large
     tables = [table.of_small(own.true.size) for table, own in zip(quantized.tables, channels, strict=True)]
     coder = TileCoder(tables, channels, geometric, quantized.quantiser, large, measured.strings)
-    before = start = all_passes(quantized)
+    before = start = all_passes([channel.top for channel in channels])
     coded = []
     for layer in measured.layers:
         state, segments = layer.state, []
@@ -62,6 +63,15 @@ def _window_errors(
     codes = [layer.window_codes for layer in measured if layer.window_codes is not None]
     if len(codes) < len(coded):
         return {}
-    payload = serialize_window_errors(codes)
     total = sum(len(s.data) for layer in coded for s in layer.segments) + sum(map(len, chunks))
-    return {WINDOW_ERRORS: payload} if len(payload) < _WINDOWS_SHARE * total else {}
+    payload = window_section_of(codes, total)
+    return {} if payload is None else {WINDOW_ERRORS: payload}
+
+
+def window_section_of(codes: Sequence[NDArray[np.uint8]], total: int) -> bytes | None:
+    """The payload that tells errors of windows; None where it is much beside ``total`` bytes.
+
+    ``codes`` are uint8, shape (cell, 2), of each layer, see `layer_codes`.
+    """
+    payload = serialize_window_errors(codes)
+    return payload if len(payload) < _WINDOWS_SHARE * total else None

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from copy import copy
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grid.layout import REMEMBERED, Band, Layout
+from ..grid.layout import REMEMBERED, Layout
+from ..grid.tile_arrays import AT_ONCE, BandArrays, runs_of
 from ..kernels import PASSES_STATE
 from ..quantization.band_steps import Quantiser, band_step
-from .band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
+from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
 from .dequantize import spread_bands
 
-__all__ = ["Reading", "Run", "TileTable", "Tiles", "gather"]
+__all__ = ["BandClass", "Reading", "Run", "TileTable", "Tiles", "gather"]
 
 #: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
-_NO_PARENT = (1, 0, 31, 31)
+NO_PARENT = (1, 0, 31, 31)
 
 #: Where reading: no coefficients that would be written, and no costs.
 _NOTHING, _FREE = np.zeros(0, np.int32), np.zeros(0)
@@ -28,103 +29,171 @@ _NOTHING, _FREE = np.zeros(0, np.int32), np.zeros(0)
 #: Column of a table of runs: where a run's bytes begin, see `bitplanes.code_passes`.
 RUN_START = 5
 
-#: By grid and kind, a tile's bands, where they begin in the flat arrays, and their strides there.
-_Places = dict[tuple[int, int], tuple[Band, int, int]]
+#: Numbers before the first band in a flat array: what bands without a parent point at.
+_BEFORE = 3
 
 
-@dataclass(frozen=True)
+class BandClass(NamedTuple):
+    """What bands of many tiles have in common: level, grid, and whether they hold details along rows and columns."""
+
+    level: int
+    grid: int
+    kind: tuple[bool, bool]
+
+
 class TileTable:
-    """Places of all bands in the flat arrays.
+    """Places of all bands in the flat arrays, of a surface's tiles or of some of them.
+
+    Of each tile two numbers are kept; tables of the bands are made when they are asked for.
+
+    Parameters
+    ----------
+    layout : Layout
+    coordinate : bool
+        For coordinates, or for other channels: without interfaces.
+    chosen : int64, shape (tile,), optional
+        The table is of these tiles of the layout alone, in this order, and numbers them anew. Bands whose parents are
+        not among them have none. All if not given.
 
     Attributes
     ----------
-    bands : int64, shape (band, `band_fields.BAND_FIELDS`)
-        Of all tiles in order.
-    first : list of int
+    members : range, or int64 of shape (tile,)
+        The numbers that the table's tiles have in the layout.
+    first : int64, shape (tile + 1,)
         Number of each tile's first band, and the number of bands at the end.
+    starts : int64, shape (tile + 1,)
+        Where each tile begins in the flat arrays of coefficients, zeros around its bands included, and where the last
+        one ends.
     size, blocks : int
         Lengths of the flat arrays of coefficients and of block flags.
-    origins : int64, shape (band, 3)
-        Of each band: its tile, and its first row and column in the array of coefficients.
-    of_grid : list of int64 arrays
-        For each grid the numbers of its bands, coarsest level first.
     """
 
-    layout: Layout
-    members: list[tuple[Band, ...]]
-    bands: NDArray[np.int64]
-    first: list[int]
-    size: int
-    blocks: int
-    origins: NDArray[np.int64]
-    of_grid: list[NDArray[np.int64]]
+    def __init__(self, layout: Layout, coordinate: bool = True, chosen: NDArray[np.int64] | None = None) -> None:
+        self.layout, self.coordinate, self.chosen = layout, coordinate or not layout.shared, chosen
+        self.members: range | NDArray[np.int64] = range(layout.tile_arrays.count) if chosen is None else chosen
+        count = len(self.members)
+        self.first, self.starts, self.blocks = np.zeros(count + 1, np.int64), np.full(count + 1, _BEFORE), 0
+        for run in runs_of(count):
+            arrays = self._arrays_of(run)
+            ends = np.cumsum(np.bincount(arrays.tile, minlength=len(run)))
+            sizes, blocks = _sizes(arrays.shape)
+            sums = np.concatenate([[0], np.cumsum(sizes)])
+            self.first[run.start + 1 : run.stop + 1] = self.first[run.start] + ends
+            self.starts[run.start + 1 : run.stop + 1] = self.starts[run.start] + sums[ends]
+            self.blocks += int(blocks.sum())
+        self.size = int(self.starts[-1]) + PADDING
+        # Of few tiles what they were counted by is kept for what will be asked next.
+        self._kept = arrays if 0 < count <= AT_ONCE else None
 
     @staticmethod
-    @lru_cache(maxsize=REMEMBERED)
     def of(layout: Layout, coordinate: bool = True) -> TileTable:
-        """Lay out the tiles of a surface, for its coordinates or for other channels: without interfaces."""
-        rows: list[tuple[int, ...]] = []
-        origins: list[tuple[int, int, int]] = []
-        of_grid: list[list[int]] = [[] for _ in layout.grids]
-        first = [0]
-        size, blocks = 3, 0
-        members = [tile.bands if coordinate else tile.whole for tile in layout.tiles]
-        known: list[_Places] = []  # of every tile so far; parents come before their children
-        for number, (tile, bands) in enumerate(zip(layout.tiles, members, strict=True)):
-            above, own = known[tile.parent] if tile.parent >= 0 else {}, {}
-            for band in bands:
-                of_grid[band.grid].append(len(rows))
-                height, width = band.shape
-                stride, across = width + 2, (width + 7) // 8
-                place = size + 2 * stride + 2
-                flags, kind = blocks + across + 2, 2 * band.kind[0] + band.kind[1]
-                # Children are later tiles: they look the place of their parents up here.
-                own[band.grid, kind] = band, place, stride
-                parent = above.get((band.grid, kind))
-                joined = _NO_PARENT if parent is None else _joined(band, tile.level, layout, *parent)
-                rows.append((place, stride, height, width, flags, *joined, kind))
-                origins.append((number, band.rows[0], band.columns[0]))
-                # Two rows and two columns of zeros around each band: contexts read beyond its sides without asking.
-                size += (height + 4) * stride + 2
-                blocks += ((height + 7) // 8 + 2) * (across + 1) + 1
-            first.append(len(rows))
-            known.append(own)
-        places = np.array(origins, np.int64).reshape(-1, 3)
-        of = [np.array(numbers, np.int64) for numbers in of_grid]
-        described = np.array(rows, np.int64).reshape(-1, BAND_FIELDS)
-        return TileTable(layout, members, described, first, size + PADDING, blocks, places, of)
+        """The table of all tiles of a surface, the same object for the same layout."""
+        return _table(layout, coordinate or not layout.shared)
+
+    @cached_property
+    def bands(self) -> NDArray[np.int64]:
+        """What the kernels are told of all tiles' bands in order, shape (band, `band_fields.BAND_FIELDS`)."""
+        arrays = self._arrays()
+        height, width = arrays.shape.T
+        stride, across = width + 2, (width + 7) // 8
+        sizes, blocks = _sizes(arrays.shape)
+        place = _BEFORE + np.cumsum(sizes) - sizes + 2 * stride + 2
+        flags = np.cumsum(blocks) - blocks + across + 2
+        columns = [place, stride, height, width, flags, *self._joined(arrays, place, stride), arrays.kind]
+        return np.ascontiguousarray(np.array(columns).T)
+
+    @cached_property
+    def origins(self) -> NDArray[np.int64]:
+        """Of each band: its tile, and its first row and column in the array of coefficients; int64, shape (band, 3)."""
+        arrays = self._arrays()
+        return np.ascontiguousarray(np.array([arrays.tile, *arrays.start.T]).T)
+
+    @cached_property
+    def of_grid(self) -> list[NDArray[np.int64]]:
+        """For each grid the numbers of its bands, coarsest level first; int64 arrays of shape (band,)."""
+        if len(self.layout.grids) == 1:
+            return [np.arange(self.first[-1])]
+        grids = self._arrays().grid
+        ends = np.cumsum(np.bincount(grids, minlength=len(self.layout.grids)))
+        return np.split(np.argsort(grids, kind="stable"), ends[:-1])
+
+    def classes(self) -> tuple[list[BandClass], NDArray[np.int64]]:
+        """All that differs between bands but their places and sizes, and which of them each band is, shape (band,)."""
+        arrays, grids = self._arrays(), len(self.layout.grids)
+        codes = (arrays.level * grids + arrays.grid) * 4 + arrays.kind
+        found = np.flatnonzero(np.bincount(codes))
+        number = np.zeros(4 * grids * (self.layout.levels + 1), np.int64)
+        number[found] = np.arange(len(found))
+        classes = [BandClass(k // 4 // grids, k // 4 % grids, (k % 4 > 1, k % 2 == 1)) for k in found.tolist()]
+        return classes, number[codes]
 
     def steps(self, quantiser: Quantiser) -> NDArray[np.int64]:
         """The step of each band, in lattice steps; int64, shape (band,)."""
-        found: dict[tuple[int, int, tuple[bool, bool]], int] = {}  # many tiles have bands of the same kind
-        for tile, bands in zip(self.layout.tiles, self.members, strict=True):
-            for band in bands:
-                key = tile.level, band.grid, band.kind
-                if key not in found:
-                    found[key] = band_step(band, tile.level, self.layout, quantiser)
-        return np.array(
-            [
-                found[tile.level, band.grid, band.kind]
-                for tile, bands in zip(self.layout.tiles, self.members, strict=True)
-                for band in bands
-            ],
-            np.int64,
-        )
+        classes, of_band = self.classes()
+        return np.array([band_step(*own, self.layout, quantiser) for own in classes], np.int64)[of_band]
+
+    def tiles_from(self, level: int) -> int:
+        """The first of the table's tiles of a level or of finer ones; as many as there are where there is none."""
+        first = self.layout.tiles_from(level)
+        return first if self.chosen is None else int(np.searchsorted(self.chosen, first))
+
+    def level_of(self, tile: int) -> int:
+        """The level of one of the table's tiles."""
+        return self.layout.level_of(self.members[tile])
 
     def small_size(self, large: int) -> int:
         """How long the flat array of coefficients is up to the tile ``large``, the first that is not in it."""
-        if self.first[large] == len(self.bands):
-            return self.size
-        row = self.bands[self.first[large]]
-        return int(row[OFFSET] - 2 * row[STRIDE] - 2) + PADDING
+        return int(self.starts[large]) + PADDING
 
     def of_small(self, size: int) -> TileTable:
         """The same places in flat arrays that end after so many coefficients, see `small_size`."""
-        return replace(self, size=size)
+        table = copy(self)
+        table.size = size
+        return table
 
     def of_tile(self, tile: int) -> NDArray[np.int64]:
         """The rows of one tile's bands, shape (band, `band_fields.BAND_FIELDS`), a view."""
         return self.bands[self.first[tile] : self.first[tile + 1]]
+
+    def _arrays_of(self, run: range) -> BandArrays:
+        numbers = np.arange(run.start, run.stop) if self.chosen is None else self.chosen[run.start : run.stop]
+        return self.layout.tile_arrays.bands(numbers, self.coordinate)
+
+    def _arrays(self) -> BandArrays:
+        """Of all tiles."""
+        return self._arrays_of(range(len(self.members))) if self._kept is None else self._kept
+
+    def _joined(
+        self, arrays: BandArrays, place: NDArray[np.int64], stride: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], ...]:
+        """What bands say of their parents, see `bitplanes.code_passes`: four arrays of shape (band,)."""
+        numbers, grids = np.asarray(self.members), len(self.layout.grids)
+        above = self.layout.tile_arrays.parents(numbers)
+        if self.chosen is not None:
+            order = np.argsort(numbers, kind="stable")
+            found = order[np.minimum(np.searchsorted(numbers, above, sorter=order), len(order) - 1)]
+            above = np.where(numbers[found] == above, found, -1)
+        # The parent of a band has its grid and its kind, and bands stand by tile, grid and kind.
+        keys, own = (arrays.tile * grids + arrays.grid) * 4 + arrays.kind, above[arrays.tile]
+        wanted = keys + 4 * grids * (own - arrays.tile)
+        parent = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        known = (own >= 0) & (keys[parent] == wanted)
+        # Without its first row, which comes from an interface, a band has an odd origin: its parent's has one too.
+        row, column = (((arrays.origin + arrays.halved) >> arrays.halved) - arrays.origin[parent]).T
+        joined = place[parent] + row * stride[parent] + column, stride[parent], *arrays.halved.T
+        return tuple(np.where(known, a, b) for a, b in zip(joined, NO_PARENT, strict=True))
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _table(layout: Layout, coordinate: bool) -> TileTable:
+    return TileTable(layout, coordinate)
+
+
+def _sizes(shape: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """What bands of a shape (band, axis) take of the flat arrays of coefficients and of block flags, shape (band,)."""
+    height, width = shape.T
+    # Two rows and two columns of zeros around each band: contexts read beyond its sides without asking.
+    return (height + 4) * (width + 2) + 2, ((height + 7) // 8 + 2) * ((width + 7) // 8 + 1) + 1
 
 
 class Run(NamedTuple):
@@ -133,7 +202,7 @@ class Run(NamedTuple):
     tile: int
     first: int
     last: int
-    data: bytes
+    data: bytes | memoryview
 
 
 class Reading:
@@ -142,7 +211,7 @@ class Reading:
     Readings of different tiles may run at the same time, unless one has a tile whose parent the other one has.
     """
 
-    def __init__(self, tiles: Tiles, table: NDArray[np.int64], parts: list[bytes]) -> None:
+    def __init__(self, tiles: Tiles, table: NDArray[np.int64], parts: list[bytes | memoryview]) -> None:
         self._tiles, self._table, self._parts = tiles, table, parts
         self._state = np.zeros(PASSES_STATE, np.int64)
 
@@ -169,7 +238,7 @@ class Tiles:
         self.flags = np.zeros(table.blocks, np.uint8)
         self.early = np.zeros(table.size, np.uint8)
         self.trellis = quantiser is not None
-        self.large = len(table.members) if self.trellis else table.layout.tiles_from(large)
+        self.large = len(table.members) if self.trellis else table.tiles_from(large)
         self.models = new_models(len(table.members), self.trellis, self.large)
 
     def read(self, runs: Sequence[Run]) -> None:
@@ -178,13 +247,11 @@ class Tiles:
 
     def readings(self, runs: Sequence[Run], ends: Sequence[int]) -> list[Reading]:
         """What decodes the runs up to each of ``ends``, from the end before it."""
-        described, start, bands = [], 0, self.table.first
-        for tile, first, last, data in runs:
-            length = len(data)
-            count = bands[tile + 1] - bands[tile]
-            described.append((bands[tile], count, tile, first, last, start, length, tile >= self.large))
-            start += length
-        table = np.array(described, np.int64).reshape(-1, 8)
+        told = np.array([(tile, first, last, len(data)) for tile, first, last, data in runs], np.int64).reshape(-1, 4)
+        tile, first, last, length = told.T
+        bands = self.table.first[tile]
+        count, start = self.table.first[tile + 1] - bands, np.cumsum(length) - length
+        table = np.stack([bands, count, tile, first, last, start, length, tile >= self.large], axis=1)
         made, begin = [], 0
         for end in ends:
             own = table[begin:end]
@@ -300,27 +367,18 @@ def _runs(first: int, last: int, without: Collection[int]) -> Iterator[tuple[int
         first = number + 1
 
 
-def _joined(band: Band, level: int, layout: Layout, parent: Band, place: int, stride: int) -> tuple[int, int, int, int]:
-    """What a band of this level says of its parent, see `bitplanes.code_passes`."""
-    finer, coarser = layout.shape(band.grid, level - 1), layout.shape(band.grid, level - 2)
-    down, right = int(finer[0] != coarser[0]), int(finer[1] != coarser[1])
-    # Without its first row, which comes from an interface, a band has an odd origin: its parent's has one too.
-    row = ((band.origin[0] + down) >> down) - parent.origin[0]
-    column = ((band.origin[1] + right) >> right) - parent.origin[1]
-    return place + row * stride + column, stride, down, right
+def gather(
+    table: TileTable, coefficients: Sequence[NDArray[np.int32]], origins: NDArray[np.int64] | None = None
+) -> NDArray[np.int32]:
+    """The signed coefficients of all tiles, shape (`TileTable.size`,), from those of the grids, (row, column).
 
-
-def _window(coefficients: NDArray[np.int32], band: Band) -> NDArray[np.int32]:
-    return coefficients[slice(*band.rows), slice(*band.columns)]
-
-
-def gather(table: TileTable, coefficients: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
-    """The signed coefficients of all tiles, shape (`TileTable.size`,), from those of the grids, (row, column)."""
-    flat = np.zeros(table.size, np.int32)
-    for number, bands in enumerate(table.members):
-        for band, row in zip(bands, table.of_tile(number), strict=True):
-            place, stride, height = (int(x) for x in row[[OFFSET, STRIDE, ROWS]])
-            start = place - stride - 1
-            frame = flat[start : start + (height + 2) * stride].reshape(height + 2, stride)
-            frame[1:-1, 1:-1] = _window(coefficients[band.grid], band)
+    ``origins`` are those of the table, unless the arrays have other rows.
+    """
+    flat, bands = np.zeros(table.size, np.int32), table.bands
+    tops = (table.origins if origins is None else origins)[:, 1:]
+    for array, numbers in zip(coefficients, table.of_grid, strict=True):
+        places = bands[numbers][:, [OFFSET, STRIDE, ROWS, COLUMNS]].tolist()
+        for (place, stride, rows, columns), (top, left) in zip(places, tops[numbers].tolist(), strict=True):
+            frame = flat[place : place + rows * stride].reshape(rows, stride)
+            frame[:, :columns] = array[top : top + rows, left : left + columns]
     return flat

@@ -94,6 +94,8 @@ def _maps(value: Any) -> list[dict[str, Any]]:
 
 def survives(values: NDArray[Any], dtype: Any) -> bool:
     """Whether every value, of an array of any shape, is the same number in another type; NaN are."""
+    if values.dtype == dtype:
+        return True
     with np.errstate(over="ignore", invalid="ignore"):
         other = values.astype(dtype)
         back = other.astype(values.dtype)

@@ -128,7 +128,20 @@ def read(source: Source) -> Surface:
             raise FormatError(
                 f"expected {number(header.nbytes)} bytes of values ({header.words}), got {number(follows)}: {words}"
             )
+        if source.room.takes(header.nbytes) and not header.fortran:
+            mapped = np.memmap(source.path, header.dtype, "r", file.tell(), header.shape)
+            return Surface(native(mapped, source), metadata=source.metadata("npy"))
         return Surface(read_values(file, header), metadata=source.metadata("npy"))
+
+
+def native(values: NDArray[Any], source: Source) -> NDArray[Any]:
+    """Values, shape (row, ...), in the byte order of the machine: as they are, or copied to where there is room."""
+    if values.dtype.isnative:
+        return values
+    copy = source.empty(values.shape, values.dtype.newbyteorder("="))
+    for row, own in enumerate(values):
+        copy[row] = own
+    return copy
 
 
 def write(surface: Surface, file: BinaryIO) -> None:

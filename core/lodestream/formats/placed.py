@@ -13,6 +13,7 @@ from ..container.metadata import fitted
 from ..coordinates.coordinate_rules import VALUES, evaluate, fit_axis
 from ..coordinates.seams import merge, unwrap, wrapped
 from ..errors import FormatError
+from ..scratch import IN_MEMORY, Room
 from ..surface import Closed, Surface
 from .longitudes import TURN, close_around, encircles
 
@@ -49,6 +50,7 @@ def place(
     mask: NDArray[np.bool_] | None = None,
     attributes: Mapping[str, NDArray[Any]] | None = None,
     metadata: Mapping[str, Any] | None = None,
+    room: Room = IN_MEMORY,
 ) -> Surface:
     """Put heights over their coordinates.
 
@@ -65,6 +67,8 @@ def place(
         What was said of the surface; None leaves it to what the coordinates show.
     mask, attributes, metadata
         See `Surface`.
+    room : Room
+        Where x, y, z go.
     """
     extras: dict[str, Any] = {"mask": mask, "attributes": attributes or {}}
     values = dict(metadata or {})
@@ -80,7 +84,9 @@ def place(
             return surface
     planes = [_plane(coordinate, heights.shape) for coordinate in (x, y)]
     dtype = np.result_type(*planes, heights)
-    points = np.stack([plane.astype(dtype) for plane in (*planes, heights)], axis=-1)
+    points = room.empty((*heights.shape, 3), dtype)
+    for channel, plane in enumerate((*planes, heights)):
+        points[..., channel] = plane
     degrees = [channel for channel, coordinate in enumerate((x, y)) if coordinate.degrees]
     surface = merge(Surface(points, **extras, metadata=values), closed, angle=(degrees[0], TURN) if degrees else None)
     if len(degrees) != 1:

@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from ..container import metadata
+from ..container.sections import is_container
 from ..errors import FormatError, InputError, OptionError
+from ..scratch import IN_MEMORY, Room
 from ..surface import Closed, Surface
 from . import notes
-from .source import DEFAULT_MAX_VERTICES, Source, check_allowed, with_name
+from .source import DEFAULT_MAX_VERTICES, UNLIMITED_VERTICES, Source, check_allowed, with_name
 from .table import FORMATS, Format
 
 __all__ = ["read", "readable", "sniff"]
@@ -60,10 +62,11 @@ def read(
     path: str | os.PathLike[str],
     *more: str | os.PathLike[str],
     closed: str | Closed = "auto",
-    max_vertices: int = DEFAULT_MAX_VERTICES,
+    max_vertices: int | None = None,
     filename: str | None = None,
     allowed: Collection[str] | None = None,
     format_name: str | None = None,
+    room: Room | None = None,
     **options: Any,
 ) -> Surface:
     """Read a surface from a file; the file's content decides its format.
@@ -77,8 +80,9 @@ def read(
     closed : {"auto", "none", "rows", "cols", "both"} or (bool, bool)
         Which axes are closed. "auto": those that the format declares closed, and those whose last row or column repeats
         the first bit for bit. The repeated one is merged (``seam`` in the metadata) and written again by `write`.
-    max_vertices : int
-        Larger surfaces are refused before memory is allocated for them.
+    max_vertices : int, optional
+        Larger surfaces are refused before memory is allocated for them; by default those of more than 2**28 vertices,
+        where there is no `room`.
     filename : str, optional
         The file's original name, if `path` has another, as with uploads. It is used in messages and as ``name`` in the
         metadata; its suffix helps with text.
@@ -87,6 +91,9 @@ def read(
     format_name : str, optional
         The format that the file must have, or a suffix of it without the dot ("hgt"), for a file whose name does not
         say so.
+    room : Room, optional
+        Where large arrays go: NPY files are memory-mapped, rasters are read band by band into files. Other formats, and
+        what those hold beside numbers in the machine's byte order, are read into memory all the same.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -103,7 +110,7 @@ def read(
     Raises
     ------
     FormatError
-        If the file is invalid, cut short, or not a structured surface.
+        If the file is invalid, cut short, or not a structured surface; or a container, which `decode` takes.
     SwitchedOffError
         If its format may not be read.
     TooLargeError
@@ -129,6 +136,8 @@ def read(
         if isinstance(closed, str) and closed not in _CLOSED:
             raise OptionError(f"expected closed as one of {', '.join(_CLOSED)}, got {closed!r}")
         chosen = _CLOSED[closed] if isinstance(closed, str) else closed
+        if max_vertices is None:
+            max_vertices = DEFAULT_MAX_VERTICES if room is None else UNLIMITED_VERTICES
         if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
             raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
         format_ = _sniff(path, name.suffix.lower(), format_name)
@@ -144,7 +153,8 @@ def read(
         for other in others:
             _check_regular(other)
         size = path.stat().st_size
-        surface = format_.read(Source(path, name.stem, size, max_vertices, options, others, chosen, allowed))
+        source = Source(path, name.stem, size, max_vertices, options, others, chosen, allowed, room or IN_MEMORY)
+        surface = format_.read(source)
         surface.metadata, dropped = metadata.fitted(surface.metadata)
         if dropped:
             words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)
@@ -174,6 +184,11 @@ def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
             got = _describe(head) if head else "an empty file"
             raise FormatError(f"expected a file of format {format_.name}, got {got}")
         return format_
+    if is_container(head):
+        raise FormatError(
+            "expected a file of another format, got a container of Lodestream: lodestream.decode(bytes) gives its "
+            "surface, lodestream decode writes it to a file"
+        )
     if not any(suffix in it.suffixes for it in FORMATS):
         suffix = ""
     if not head:
@@ -201,7 +216,13 @@ def readable(name: str) -> Format:
 
 
 def _check_regular(path: Path) -> None:
-    if not stat.S_ISREG(path.stat().st_mode):
+    mode = path.stat().st_mode
+    if stat.S_ISDIR(mode) and any((path / name).exists() for name in ("zarr.json", ".zgroup", ".zarray")):
+        raise FormatError(
+            "expected a file, got a Zarr store: open it with xarray, and give one of its arrays to lodestream.encode, "
+            "which reads it by windows"
+        )
+    if not stat.S_ISREG(mode):
         raise FormatError("expected a regular file, got a folder, pipe or device")
 
 

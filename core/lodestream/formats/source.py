@@ -9,14 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FormatError, InputError, OptionError, SwitchedOffError, TooLargeError
+from ..scratch import IN_MEMORY, Room
 from ..surface import Closed
 
-__all__ = ["DEFAULT_MAX_VERTICES", "Source", "check_allowed", "number", "with_name"]
+__all__ = ["DEFAULT_MAX_VERTICES", "UNLIMITED_VERTICES", "Source", "check_allowed", "number", "with_name"]
 
 #: What `read` accepts unless told otherwise: 2 GiB of float64 heights.
 DEFAULT_MAX_VERTICES = 1 << 28
+#: And where large arrays go to files.
+UNLIMITED_VERTICES = 1 << 48
 
 #: Values per allowed vertex, so that a grid of few vertices and millions of channels is no way around the limit.
 _MAX_CHANNELS = 64
@@ -62,6 +66,8 @@ class Source:
         Which axes wrap, where that was said; None leaves it to the reader.
     allowed : collection of str or None
         Names of the formats that may be read; None for all.
+    room : Room
+        Where large arrays go.
     """
 
     path: Path
@@ -72,6 +78,11 @@ class Source:
     more: tuple[Path, ...] = ()
     closed: Closed | None = None
     allowed: Collection[str] | None = None
+    room: Room = IN_MEMORY
+
+    def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+        """A new array of this shape, (row, ...), whatever it holds: a large one lies in a file, if there is room."""
+        return self.room.empty(shape, dtype)
 
     def check_vertices(self, count: int, shape: str) -> None:
         """Refuse a surface of too many vertices; `shape` says in words where the count comes from.

@@ -11,6 +11,7 @@ from ..surface import Surface
 from . import bezier, glb, npy, npz, npz_writer, off, text_arrays
 from .netcdf import reader as netcdf
 from .netcdf import writer as netcdf_writer
+from .netcdf import zarr_store
 from .obj import reader as obj
 from .obj import writer as obj_writer
 from .pcd import reader as pcd
@@ -44,7 +45,7 @@ class Format:
     read : callable or None
         Takes a `Source`, returns a `Surface`; None if the format is only written.
     write : callable or None
-        Takes a `Surface` and a binary file that need not be seekable; None if the format is only read.
+        Takes a `Surface` and a binary file that need not be seekable; None if the format is only read, or is a folder.
     blocks : bool
         Whether several blocks can be written.
     options : mapping of str to str
@@ -63,8 +64,11 @@ class Format:
     write_suffixes : tuple of str
         The suffixes under which it is written, if not under all of them.
     write_beside : callable or None
-        Takes a `Surface` and the path of its file, for a format of several files: it puts them all in place, complete
-        or not at all. `write` makes a ZIP archive of them then.
+        Takes a `Surface` and the path of its file or folder, for a format of several files: it puts them all in place,
+        complete or not at all. `write` makes a ZIP archive of them then, if there is one.
+    memory : int
+        Bytes that writing takes for each point, beside the surface, about; 0 where it takes some rows at a time, of a
+        surface that is in files.
     """
 
     name: str
@@ -81,15 +85,16 @@ class Format:
     process: bool = False
     write_suffixes: tuple[str, ...] = ()
     write_beside: Callable[[Surface, Path], None] | None = None
+    memory: int = 0
 
     @property
     def suffixes_out(self) -> tuple[str, ...]:
         """Suffixes of the names under which it is written, the usual one first; none where it is only read."""
-        return (self.write_suffixes or self.suffixes) if self.write else ()
+        return (self.write_suffixes or self.suffixes) if self.write or self.write_beside else ()
 
     @property
     def stream_suffix(self) -> str:
-        """Suffix of a file into which `write` writes; empty where it is only read."""
+        """Suffix of a file into which `write` writes; empty where there is no `write`."""
         return self.suffixes_out[0] + (".zip" if self.write_beside else "") if self.write else ""
 
     @property
@@ -102,7 +107,13 @@ class Format:
 FORMATS = (
     Format(name="npy", suffixes=(".npy",), sniff=npy.sniff, read=npy.read, write=npy.write),
     Format(
-        name="npz", suffixes=(".npz",), sniff=npz.sniff, read=npz.read, write=npz_writer.write, options=npz.READ_OPTIONS
+        name="npz",
+        suffixes=(".npz",),
+        sniff=npz.sniff,
+        read=npz.read,
+        write=npz_writer.write,
+        options=npz.READ_OPTIONS,
+        memory=32,
     ),
     Format(
         name="geotiff",
@@ -131,6 +142,12 @@ FORMATS = (
         media_type="application/x-netcdf",
     ),
     Format(
+        name="zarr",
+        suffixes=zarr_store.SUFFIXES,
+        sniff=zarr_store.sniff,
+        write_beside=zarr_store.write_beside,
+    ),
+    Format(
         name="png",
         suffixes=(".png",),
         sniff=png.sniff,
@@ -138,6 +155,7 @@ FORMATS = (
         write=png.write,
         options=png.READ_OPTIONS,
         named=png.named,
+        memory=16,
         media_type="image/png",
     ),
     Format(
@@ -146,6 +164,7 @@ FORMATS = (
         sniff=ascii_grid.sniff,
         read=ascii_grid.read,
         write=ascii_writer.write,
+        memory=24,
         media_type="text/plain",
     ),
     Format(name="usgs-dem", suffixes=(".dem",), sniff=usgs_dem.sniff, read=usgs_dem.read),
@@ -157,7 +176,9 @@ FORMATS = (
         options=srtm_hgt.READ_OPTIONS,
         named=srtm_hgt.named,
     ),
-    Format(name="ply", suffixes=(".ply",), sniff=ply.sniff, read=ply.read, write=ply_writer.write, blocks=True),
+    Format(
+        name="ply", suffixes=(".ply",), sniff=ply.sniff, read=ply.read, write=ply_writer.write, blocks=True, memory=120
+    ),
     Format(name="off", suffixes=(".off",), sniff=off.sniff, read=off.read),
     Format(
         name="obj",
@@ -165,6 +186,7 @@ FORMATS = (
         sniff=obj.sniff,
         read=obj.read,
         write=obj_writer.write,
+        memory=144,
         blocks=True,
         media_type="model/obj",
     ),
@@ -183,6 +205,7 @@ FORMATS = (
         sniff=vtk_xml.sniff,
         read=vtk_xml.read,
         write=vts_writer.write,
+        memory=48,
         blocks=True,
         options=vtk_xml.OPTIONS,
         more=vtk_xml.MORE,
@@ -193,11 +216,20 @@ FORMATS = (
         suffixes=multiblock.SUFFIXES,
         sniff=multiblock.sniff,
         write=multiblock.write,
+        memory=48,
         write_beside=multiblock.write_beside,
         blocks=True,
         media_type=multiblock.MEDIA_TYPE,
     ),
-    Format(name="glb", suffixes=(".glb",), sniff=glb.sniff, write=glb.write, blocks=True, media_type=glb.MEDIA_TYPE),
+    Format(
+        name="glb",
+        suffixes=(".glb",),
+        sniff=glb.sniff,
+        write=glb.write,
+        blocks=True,
+        media_type=glb.MEDIA_TYPE,
+        memory=216,
+    ),
     Format(name="cgns", suffixes=(".cgns",), sniff=cgns.sniff, read=cgns.read, options=cgns.OPTIONS, process=True),
     Format(name="bpt", suffixes=(bezier.SUFFIX,), sniff=bezier.sniff, read=bezier.read, options=bezier.OPTIONS),
     Format(
@@ -213,6 +245,7 @@ FORMATS = (
         sniff=plot3d.sniff,
         read=plot3d.read,
         write=plot3d_writer.write,
+        memory=48,
         blocks=True,
         write_suffixes=plot3d_writer.SUFFIXES,
         options=plot3d.READ_OPTIONS,

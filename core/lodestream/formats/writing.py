@@ -48,7 +48,7 @@ def for_writing(path: str | os.PathLike[str]) -> Format:
 
 
 def written(name: str) -> Format:
-    """The format of this name, or whose files end so: ``geotiff``, ``tif`` and ``tiff`` are one.
+    """The format of this name, or whose files end so, that can be one file: ``geotiff``, ``tif`` and ``tiff`` are one.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def written(name: str) -> Format:
         If there is none that is written; the message names those that exist.
     """
     formats = {it.name: it for it in FORMATS if it.write}
-    by_suffix = {suffix[1:]: it for it in FORMATS for suffix in it.suffixes_out}
+    by_suffix = {suffix[1:]: it for it in formats.values() for suffix in it.suffixes_out}
     found = (by_suffix | formats).get(name)
     if found is None:
         raise OptionError(f"expected format to be one of {', '.join(formats)}, got {name[:80]!a}")
@@ -67,7 +67,7 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     """Write a surface to a file; the suffix decides the format.
 
     The file is written under a temporary name and renamed at the end, so it is complete or absent; so are both the
-    file and the folder of a .vtm. A `FormatWarning` tells what the format cannot hold.
+    file and the folder of a .vtm, and the folder of a .zarr. A `FormatWarning` tells what the format cannot hold.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     (97, 70)
     """
     path, format_ = Path(path), for_writing(path)
-    if path.exists() and not path.is_file():
+    if format_.write is not None and path.exists() and not path.is_file():
         with path.open("wb") as file:  # a pipe or a device cannot be replaced by a file; a folder is refused here
             write_stream(surface, format_.name, file)
         return
@@ -95,8 +95,12 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
             format_.write_beside(_prepared(surface, format_), target)
         except InputError as error:
             raise with_name(error, str(path)) from None
+        except OSError as error:
+            if error.errno is None:
+                raise
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from None  # not one of the temporary names
         return
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    temporary = target.with_name(f".{target.name[:50]}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
             write_stream(surface, format_.name, file)

@@ -9,10 +9,11 @@ a grid, or all bands of a level of several small grids; level 0 of all grids is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..surface import Closed
 from .axis import AxisStep, axis_lengths, axis_step
+from .tile_arrays import BandArrays, TileArrays, runs_of
 
 __all__ = ["REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
 
@@ -181,129 +183,42 @@ class Layout:
         return self._steps[grid][level]
 
     @cached_property
-    def tiles(self) -> tuple[Tile, ...]:
-        """All tiles, coarsest level first, then group by group (interfaces first), row by row."""
-        every = range(len(self.grids))
-        tiles = [Tile(0, (0, 0), *self._members(every, 0), -1)]
-        parents: dict[int, tuple[int, int, int]] = {}  # grid -> number of its first tile, tiles down, tiles across
-        groups = self._groups()
-        for level in range(1, self.levels + 1):
-            found = {}
-            for group in groups[level]:
-                first, bounds = len(tiles), self._bounds(group, level)
-                down, across = (len(b) - 1 for b in bounds)
-                before, parents_down, parents_across = parents.get(group[0], (0, 1, 1))
-                halves = self._halves(group[0], level) if len(group) == 1 else (0, 0)
-                for i in range(down):
-                    for j in range(across):
-                        parent = -1
-                        if level > 1:
-                            # The last tile takes what is left, so a level may have one tile fewer than twice those
-                            # below it, or one more: that one has the last parent too.
-                            up = min(i >> halves[0], parents_down - 1), min(j >> halves[1], parents_across - 1)
-                            parent = before + up[0] * parents_across + up[1]
-                        members = self._members(group, level, bounds, (i, j))
-                        tiles.append(Tile(level, (i, j), *members, parent))
-                found.update(dict.fromkeys(group, (first, down, across)))
-            parents = found
-        return tuple(tiles)
+    def tile_arrays(self) -> TileArrays:
+        """Levels, places, parents and bands of any tiles as arrays."""
+        return TileArrays(self.grids, np.array(self._shapes, np.int64).transpose(1, 0, 2), self.tile)
 
-    def _groups(self) -> list[list[list[int]]]:
-        """For each level the grids whose tiles are common: all interfaces, and neighbouring patches small there.
+    @property
+    def tiles(self) -> Sequence[Tile]:
+        """All tiles, coarsest level first, then group by group (interfaces first), row by row.
 
-        Grids that have a tile in common have one at the coarser levels too.
+        Each is made when it is asked for. What needs something of many tiles takes `tile_levels`, `parents` or
+        `tile_arrays`.
         """
-        groups = [[number] for number in range(len(self.grids))]
-        most = 4 << sum(self.tile)  # points of a tile's three bands, and of the nodes under them
-        levels = [groups]
-        for level in range(self.levels, 0, -1):
-            merged: list[list[int]] = []
-            size = 0
-            for group in groups:
-                shapes = [self.shape(number, level) for number in group]
-                points = sum(rows * columns for rows, columns in shapes)
-                joins = merged and self.grids[group[0]].interface == self.grids[merged[-1][0]].interface
-                if joins and (self.grids[group[0]].interface or size + points <= most):
-                    merged[-1] = merged[-1] + group
-                    size += points
-                else:
-                    merged.append(group)
-                    size = points
-            groups = merged
-            levels.append(groups)
-        levels.append([])  # of level 0, whose only tile is everybody's
-        return levels[:0:-1]
+        return _Tiles(self)
 
-    def _halves(self, grid: int, level: int) -> tuple[int, int]:
-        """For each axis 1 if it steps from the level below to the one below that."""
-        if level < 2:
-            return 0, 0
-        finer, coarser = self.shape(grid, level - 1), self.shape(grid, level - 2)
-        return int(finer[0] != coarser[0]), int(finer[1] != coarser[1])
-
-    def _bounds(self, group: list[int], level: int) -> tuple[list[int], list[int]]:
-        coarse = self.shape(group[0], level - 1)
-        if len(group) > 1 or self.grids[group[0]].interface:
-            return [0, coarse[0]], [0, coarse[1]]  # one tile, of which only the number of bounds matters
-        return tile_bounds(coarse[0], self.tile[0]), tile_bounds(coarse[1], self.tile[1])
-
-    def _members(
-        self,
-        group: Sequence[int],
-        level: int,
-        bounds: tuple[list[int], list[int]] | None = None,
-        place: tuple[int, int] = (0, 0),
-    ) -> tuple[tuple[Band, ...], tuple[Band, ...]]:
-        """The tile's bands of coordinates, and of channels that take nothing from interfaces and have none."""
-        bands: list[Band] = []
-        whole: list[Band] = []
-        for number in group:
-            grid = self.grids[number]
-            coarse = self.shape(number, level - 1) if level else self.shape(number, 0)
-            own = bounds if bounds and len(group) == 1 else ([0, coarse[0]], [0, coarse[1]])
-            bands += self._bands(number, level, own, place, grid.taken)
-            if self.shared and not grid.interface:
-                whole += self._bands(number, level, own, place, _NONE)
-        coordinate = tuple(bands)
-        return coordinate, tuple(whole) if self.shared else coordinate
-
-    def _bands(
-        self, number: int, level: int, bounds: tuple[list[int], list[int]], place: tuple[int, int], taken: Sides
-    ) -> list[Band]:
-        fine = self.shape(number, level)
-        coarse = self.shape(number, level - 1) if level else fine
-        kinds = ((False, True), (True, False), (True, True)) if level else ((False, False),)
-        spans = []  # of either axis: its nodes and its details, and where they begin within the whole band
-        for axis in range(2):
-            start, stop = bounds[axis][place[axis]], bounds[axis][place[axis] + 1]
-            last = place[axis] == len(bounds[axis]) - 2
-            # A side that comes from an interface is coded there: the first and the last band leave its nodes out.
-            first = start + (taken[2 * axis] and place[axis] == 0)
-            nodes = (first, stop - (taken[2 * axis + 1] and last)), first
-            details = fine[axis] - coarse[axis]
-            # There are up to two details fewer than nodes, and as many where an axis wraps; those of a stopped axis: 0.
-            start, stop = min(start, details), details if last else min(stop, details)
-            spans.append((nodes, ((coarse[axis] + start, coarse[axis] + stop), start)))
-        bands = []
-        for kind in kinds:
-            (rows, top), (columns, left) = spans[0][kind[0]], spans[1][kind[1]]
-            if rows[1] > rows[0] and columns[1] > columns[0]:
-                bands.append(Band(kind, rows, columns, (top, left), number))
-        return bands
+    def level_of(self, tile: int) -> int:
+        """The level of a tile."""
+        return bisect_right(self._starts, tile) - 1
 
     def tiles_of(self, level: int) -> range:
         """Numbers of the tiles of a level."""
-        return self._tile_ranges[level]
+        return range(self._starts[level], self._starts[level + 1])
 
     @cached_property
-    def parents(self) -> list[int]:
-        """The number of each tile's parent, -1 where it has none."""
-        return [tile.parent for tile in self.tiles]
+    def tile_levels(self) -> NDArray[np.uint8]:
+        """The level of each tile, uint8, shape (tile,)."""
+        return np.repeat(np.arange(self.levels + 1, dtype=np.uint8), np.diff(self.tile_arrays.starts))
+
+    @cached_property
+    def parents(self) -> NDArray[np.int64]:
+        """The number of each tile's parent, -1 where it has none; int64, shape (tile,)."""
+        arrays = self.tile_arrays
+        return np.concatenate([arrays.parents(np.arange(run.start, run.stop)) for run in runs_of(arrays.count)])
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
         """The first tile of each level, int64, shape (level,)."""
-        return np.array([own.start for own in self._tile_ranges])
+        return self.tile_arrays.starts[:-1]
 
     def points(self, level: int) -> int:
         """Of all grids at a level."""
@@ -311,11 +226,52 @@ class Layout:
 
     def tiles_from(self, level: int) -> int:
         """The first tile of a level; the number of tiles where there is none, as for level 0."""
-        return self.tiles_of(level).start if 0 < level <= self.levels else len(self.tiles)
+        return self._starts[level] if 0 < level <= self.levels else self._starts[-1]
 
     @cached_property
-    def _tile_ranges(self) -> list[range]:
-        numbers: list[list[int]] = [[] for _ in range(self.levels + 1)]
-        for number, tile in enumerate(self.tiles):
-            numbers[tile.level].append(number)
-        return [range(found[0], found[-1] + 1) for found in numbers]
+    def _starts(self) -> list[int]:
+        """The first tile of each level, and the number of tiles."""
+        starts: list[int] = self.tile_arrays.starts.tolist()
+        return starts
+
+
+class _Tiles(Sequence[Tile]):
+    """The tiles of a layout, each made when it is asked for."""
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+
+    def __len__(self) -> int:
+        return self._layout.tile_arrays.count
+
+    @overload
+    def __getitem__(self, number: int) -> Tile: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[Tile]: ...
+
+    def __getitem__(self, number: int | slice) -> Tile | Sequence[Tile]:
+        chosen = range(len(self))[number]
+        return tuple(self._made(chosen)) if isinstance(chosen, range) else next(self._made(range(chosen, chosen + 1)))
+
+    def __iter__(self) -> Iterator[Tile]:
+        for run in runs_of(len(self)):
+            yield from self._made(run)
+
+    def _made(self, numbers: range) -> Iterator[Tile]:
+        tiles, arrays = np.arange(numbers.start, numbers.stop, numbers.step), self._layout.tile_arrays
+        bands = _bands(arrays.bands(tiles, True), len(tiles))
+        whole = _bands(arrays.bands(tiles, False), len(tiles)) if self._layout.shared else bands
+        each = arrays.levels(tiles), arrays.places(tiles), arrays.parents(tiles)
+        told = zip(*(of.tolist() for of in each), strict=True)
+        for (level, (row, column), parent), own, others in zip(told, bands, whole, strict=True):
+            yield Tile(level, (row, column), own, others, parent)
+
+
+def _bands(arrays: BandArrays, count: int) -> list[tuple[Band, ...]]:
+    """The bands of each of so many tiles."""
+    found: list[list[Band]] = [[] for _ in range(count)]
+    for tile, _, grid, kind, start, shape, origin, _ in zip(*(of.tolist() for of in arrays), strict=True):
+        rows, columns = ((first, first + length) for first, length in zip(start, shape, strict=True))
+        found[tile].append(Band((kind > 1, kind % 2 == 1), rows, columns, tuple(origin), grid))
+    return [tuple(own) for own in found]

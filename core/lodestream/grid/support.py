@@ -14,6 +14,7 @@ from ..errors import OptionError
 from ..target import Region
 from .axis import AxisStep
 from .layout import Layout
+from .tile_arrays import runs_of
 
 __all__ = ["check_region", "coefficients_needed", "needed_tiles"]
 
@@ -43,23 +44,36 @@ def needed_tiles(layout: Layout, region: Region) -> Mask:
 
     Parents are there because the contexts of a tile's segments look at them.
     """
-    needed = np.zeros(len(layout.tiles), np.bool_)
-    needed[0] = True
-    shape = layout.grids[0].shape
+    arrays, shape = layout.tile_arrays, layout.grids[0].shape
     samples = [np.zeros(n, np.bool_) for n in shape]
     for axis, (start, stop) in enumerate(region):
         samples[axis][start:stop] = True
-    for level in range(layout.levels, 0, -1):
-        # Coefficients along each axis: nodes first, details after them.
-        lines = [coefficients_needed(s, step) for s, step in zip(samples, layout.steps(0, level), strict=True)]
-        for number in layout.tiles_of(level):
-            for band in layout.tiles[number].bands:
-                if lines[0][slice(*band.rows)].any() and lines[1][slice(*band.columns)].any():
-                    needed[number] = True
-        samples = [line[: step.coarse] for line, step in zip(lines, layout.steps(0, level), strict=True)]
-    for number in range(len(layout.tiles) - 1, -1, -1):
-        if needed[number] and layout.tiles[number].parent >= 0:
-            needed[layout.tiles[number].parent] = True
+    # Along each axis how many coefficients are needed before each one, nodes first, details after them: level after
+    # level from the finest one, and where a level begins.
+    before: tuple[list[NDArray[np.int64]], ...] = [], []
+    begins = np.zeros((2, layout.levels + 2), np.int64)
+    for level in range(layout.levels, -1, -1):
+        for axis in range(2):
+            line = samples[axis]
+            if level:
+                step = layout.steps(0, level)[axis]
+                line = coefficients_needed(line, step)
+                samples[axis] = line[: step.coarse]
+            before[axis].append(np.append(0, line.cumsum()))
+            begins[axis, level] = begins[axis, level + 1] + line.size + 1
+    needed = np.zeros(arrays.count, np.bool_)
+    rows, columns = (np.concatenate(counts) for counts in before)
+    for run in runs_of(arrays.count):
+        bands = arrays.bands(np.arange(run.start, run.stop), True)
+        own = np.ones(len(bands.tile), np.bool_)
+        for axis, counts in enumerate((rows, columns)):
+            first = begins[axis, 1:][bands.level] + bands.start[:, axis]
+            own &= counts[first + bands.shape[:, axis]] > counts[first]
+        needed[run.start + bands.tile[own]] = True
+    needed[0] = True
+    for level in range(layout.levels, 1, -1):
+        tiles = layout.tiles_of(level)
+        needed[arrays.parents(tiles.start + needed[tiles.start : tiles.stop].nonzero()[0])] = True
     return needed
 
 

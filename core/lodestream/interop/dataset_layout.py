@@ -21,13 +21,28 @@ from ..errors import FormatError
 from ..formats.notes import survives, warn
 from ..surface import Block, Closed, Surface
 
-__all__ = ["MARK", "Axes", "Grid", "Part", "axes_of", "mark_of", "parts_of", "values_of"]
+__all__ = [
+    "MARK",
+    "ORDERED",
+    "Axes",
+    "Grid",
+    "Part",
+    "axes_of",
+    "in_json",
+    "is_ordered",
+    "mark_of",
+    "parts_of",
+    "values_of",
+]
 
 #: The attribute of a Dataset that holds what has no other place.
 MARK = "lodestream"
 
 #: Metadata that coordinates say, or that stand in attributes of the CF conventions.
 _TOLD = ("geotransform", "grid", "axes", "nodes", "crs", "unit", "tags")
+
+#: Metadata that are true of rows and columns in their order only.
+ORDERED = ("faces", "poles", "turn")
 
 #: What tags say of the values of a file, which are decoded here, and what xarray has in the encoding of a variable.
 _OF_THE_FILE = frozenset(
@@ -36,6 +51,11 @@ _OF_THE_FILE = frozenset(
         *("valid_min", "valid_max", "valid_range", "coordinates", "grid_mapping"),
     )
 )
+
+
+def is_ordered(metadata: Mapping[str, Any]) -> bool:
+    """Whether a Dataset needs numbers of rows and columns, which tell whether they are as they were."""
+    return any(metadata.get(key) for key in ORDERED)
 
 
 @dataclass(frozen=True)
@@ -118,6 +138,7 @@ def parts_of(grid: Grid) -> list[Part]:
     """The variables of a block, the heights (or z) first where it has any."""
     dims = grid.dims
     taken = {"x", "y", "xc", "yc", "spatial_ref", *dims}
+    taken |= {"row", "column"} if is_ordered(grid.metadata) else set()
     dtype = _with_nan(grid.dtype) if grid.holes else grid.dtype
     parts: list[Part] = []
     name = grid.metadata.get("variable")
@@ -249,21 +270,27 @@ def mark_of(grid: Grid, parts: Sequence[Part]) -> str:
     """What the Dataset's attribute `MARK` holds, as JSON."""
     heights = next((part.name for part in parts if part.attribute is None and part.channel in (None, 2)), None)
     names = {part.name: part.attribute for part in parts if part.attribute is not None}
-    metadata, lost = {}, []
-    for key, value in grid.metadata.items():
-        if key in _TOLD or (key == "angles" and not grid.channels):
-            continue
+    told = {*_TOLD, *(() if grid.channels else ("angles",))}
+    metadata, lost = in_json({key: value for key, value in grid.metadata.items() if key not in told})
+    if lost:
+        warn(f"the Dataset is made without {', '.join(lost)}, which JSON cannot hold")
+    mark = {"shape": list(grid.shape), "closed": list(grid.closed), "dims": list(grid.dims)}
+    mark |= {"variable": heights, "attributes": names}
+    tags = _other_tags(grid, parts)
+    return json.dumps(mark | {"metadata": metadata | ({"tags": tags} if tags else {})})
+
+
+def in_json(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """The metadata that JSON can hold, and the keys of the others."""
+    kept, lost = {}, []
+    for key, value in metadata.items():
         try:
             json.dumps(value)
         except (TypeError, ValueError):
-            lost.append(key)
+            lost.append(str(key))
         else:
-            metadata[key] = value
-    if lost:
-        warn(f"the Dataset is made without {', '.join(map(str, lost))}, which JSON cannot hold")
-    mark = {"shape": list(grid.shape), "closed": list(grid.closed), "variable": heights, "attributes": names}
-    tags = _other_tags(grid, parts)
-    return json.dumps(mark | {"metadata": metadata | ({"tags": tags} if tags else {})})
+            kept[key] = value
+    return kept, lost
 
 
 def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:

@@ -15,10 +15,13 @@ from ..coordinates.height_fields import coordinates
 from ..errors import FormatError, InputError, OptionError
 from ..formats.netcdf import reader as netcdf
 from ..formats.netcdf.choice import Choice, choose
+from ..formats.notes import listing, warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed, Surface
-from .dataset_layout import MARK
+from .dataset_layout import MARK, ORDERED, Grid
 from .optional import require_library
+from .to_xarray import axis_attributes
 
 if TYPE_CHECKING:
     import xarray
@@ -26,11 +29,13 @@ if TYPE_CHECKING:
 __all__ = ["from_xarray"]
 
 #: Metadata that are true of a grid of the same shape only.
-_OF_THE_SHAPE = ("seam", "turn", "dtype", "angles", "faces", "poles")
+_OF_THE_SHAPE = ("seam", "dtype", "angles", *ORDERED)
 
 
 def from_xarray(
     data: xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    room: Room = IN_MEMORY,
+    /,
     *,
     attributes: Iterable[str] | None = None,
     closed: Closed | None = None,
@@ -38,7 +43,7 @@ def from_xarray(
 ) -> Surface:
     """A surface of a Dataset or DataArray, or of several blocks from a DataTree.
 
-    See `lodestream.Surface.from_xarray`.
+    See `lodestream.Surface.from_xarray`. What is large for the ``room`` is read by windows, into files.
 
     Raises
     ------
@@ -52,41 +57,58 @@ def from_xarray(
         nodes = [node.to_dataset() for node in data.subtree if node.data_vars or MARK in node.attrs]
         if not nodes:
             raise FormatError("expected a DataTree with a variable over two dimensions, got none")
-        found = [_of_dataset(xr, node, attributes, closed, options) for node in nodes]
+        found = [_of_dataset(xr, node, attributes, closed, room, options) for node in nodes]
         if len(found) == 1:
             return found[0]
         blocks = [block for surface in found for block in surface.blocks]
-        return Surface(blocks=blocks, metadata=found[0].metadata)
+        # What is true of the first block in its order is true of all only where each has kept its own.
+        lost = {key for key in ORDERED if any(key not in surface.metadata for surface in found)}
+        metadata = {key: value for key, value in found[0].metadata.items() if key not in lost}
+        return Surface(blocks=blocks, metadata=metadata)
     if isinstance(data, xr.DataArray):
         name = "z" if data.name is None or data.name in data.coords else str(data.name)
-        return _of_dataset(xr, data.to_dataset(name=name), attributes, closed, {"variable": name, **options})
+        return _of_dataset(xr, data.to_dataset(name=name), attributes, closed, room, {"variable": name, **options})
     if isinstance(data, xr.Dataset):
-        return _of_dataset(xr, data, attributes, closed, options)
+        return _of_dataset(xr, data, attributes, closed, room, options)
     raise InputError(f"expected a Dataset, a DataArray or a DataTree of xarray, got {type(data).__name__}")
 
 
 def _of_dataset(
-    xr: Any, data: Any, attributes: Iterable[str] | None, closed: Closed | None, options: Mapping[str, str]
+    xr: Any,
+    data: Any,
+    attributes: Iterable[str] | None,
+    closed: Closed | None,
+    room: Room,
+    options: Mapping[str, str],
 ) -> Surface:
     mark = _mark(data)
+    wanted = None if attributes is None else list(attributes)
     # A shallow copy with the attributes that a file would have: decoding has moved some of them to the encoding.
+    left_out = _left_out(data, mark, options, wanted)
     whole = xr.Dataset(
-        {name: _as_stored(variable) for name, variable in data.variables.items() if name not in data.coords},
-        {name: _as_stored(variable) for name, variable in data.coords.variables.items()},
+        {
+            name: _as_stored(data[name].variable, room, _places(data[name]), name not in left_out)
+            for name in data.data_vars
+        },
+        {name: _as_stored(variable, room) for name, variable in data.coords.variables.items()},
         {key: value for key, value in data.attrs.items() if key != MARK},
     )
-    wanted = None if attributes is None else list(attributes)
+    whole = _numbers(whole, [options["variable"]] if "variable" in options else [])
     given = {**_names(whole, mark, options, wanted), **options}
-    source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, given, (), None if mark is None else _closed(whole, mark))
-    choice = choose(source, whole)
+    wraps = None if mark is None else _closed(whole, mark)
+    source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, given, (), wraps, room=room)
+    # Attributes of a surface are no coordinates of it, whatever they are called.
+    own = [] if mark is None else [name for name in mark["attributes"] if name not in given.values()]
+    choice = choose(source, whole.drop_vars(own, errors="ignore"))
     choice = replace(choice, attributes=_attributes(whole, choice, wanted))
-    surface = _placed(netcdf.surface_of(source, whole, choice), whole, choice.heights)
+    whole = _numbers(whole, choice.attributes)
+    surface = _placed(netcdf.surface_of(source, whole, choice), whole, choice.heights, room)
     metadata = {key: value for key, value in surface.metadata.items() if key not in ("name", "format")}
     names = {} if mark is None else mark["attributes"]
     if mark is not None:
-        metadata = _restored(metadata, mark, surface)
+        metadata = _restored(metadata, mark, surface, choice, _in_order(whole, choice))
     beside = {str(names.get(name, name)): values for name, values in surface.attributes.items()}
-    wraps = closed or source.closed or surface.closed
+    wraps = closed or wraps or surface.closed
     return Surface(surface.points, wraps, mask=surface.mask, attributes=beside, metadata=metadata)
 
 
@@ -95,20 +117,47 @@ def _mark(data: Any) -> dict[str, Any] | None:
     try:
         mark = json.loads(data.attrs[MARK])
         shape, closed = mark["shape"], mark["closed"]
-        sound = len(shape) == len(closed) == 2 and isinstance(mark["metadata"], dict)
+        sound = len(shape) == len(closed) == len(set(mark["dims"])) == 2 and isinstance(mark["metadata"], dict)
         return mark if sound and isinstance(mark["attributes"], dict) else None
     except (KeyError, TypeError, ValueError):
         return None
 
 
-def _as_stored(variable: Any) -> Any:
-    """A variable with the attributes of its file, and integers where its floats are such with NaN in place of some."""
+def _places(array: Any) -> dict[str, str]:
+    """What a file would say of the coordinates of an array that are none of its dimensions."""
+    names = [str(name) for name, own in array.coords.items() if own.ndim and name not in array.dims]
+    return {"coordinates": " ".join(names)} if names else {}
+
+
+def _numbers(whole: Any, names: Iterable[str]) -> Any:
+    """The Dataset with flags of these names as 0 and 1; where it has nothing else, with all of them."""
+    flags = [name for name, values in whole.data_vars.items() if values.dtype.kind == "b"]
+    chosen = [name for name in flags if name in names or len(flags) == len(whole.data_vars)]
+    return whole.assign({name: whole[name].astype(np.uint8) for name in chosen}) if chosen else whole
+
+
+def _left_out(
+    data: Any, mark: Mapping[str, Any] | None, options: Mapping[str, str], attributes: list[str] | None
+) -> set[str]:
+    """Variables that are neither the surface nor an attribute of it; none where the conventions must say which is."""
+    named = {**_names(data, mark, options, attributes), **options}
+    if attributes is None or "variable" not in named:
+        return set()
+    return set(map(str, data.data_vars)) - {*named.values(), *attributes}
+
+
+def _as_stored(variable: Any, room: Room, places: Mapping[str, str] | None = None, read: bool = True) -> Any:
+    """A variable with the attributes of its file, and integers where its floats are such with NaN in place of some.
+
+    Floats stay if they are not to be read.
+    """
     encoding, values = variable.encoding, variable
-    attrs = {**variable.attrs, **{k: encoding[k] for k in ("grid_mapping", "coordinates") if k in encoding}}
+    told = {k: encoding[k] for k in ("grid_mapping", "coordinates") if k in encoding}
+    attrs = {**variable.attrs, **(places or {}), **told}
     fill, dtype = encoding.get("_FillValue"), np.dtype(encoding.get("dtype") or variable.dtype)
     packed = any(encoding.get(key) is not None for key in ("scale_factor", "add_offset"))
-    if fill is not None and dtype.kind in "iu" and variable.dtype.kind == "f" and not packed:
-        whole = _integers(variable.values, dtype, fill)
+    if read and fill is not None and dtype.kind in "iu" and variable.dtype.kind == "f" and not packed:
+        whole = _integers(variable, dtype, fill, room)
         if whole is not None:
             return variable.__class__(variable.dims, whole, {**attrs, "_FillValue": dtype.type(fill)})
     copy = values.copy(deep=False)
@@ -116,16 +165,23 @@ def _as_stored(variable: Any) -> Any:
     return copy
 
 
-def _integers(values: NDArray[Any], dtype: np.dtype[Any], fill: Any) -> NDArray[Any] | None:
+def _integers(variable: Any, dtype: np.dtype[Any], fill: Any, room: Room) -> NDArray[Any] | None:
     """Floats as the integers that they are, NaN as the value that stands for them; None where they are no integers."""
-    hidden, limits = np.isnan(values), np.iinfo(dtype)
-    known = values[~hidden]
-    if not len(known) or not (limits.min <= known.min() and known.max() <= limits.max):
-        return None
-    result = np.full(values.shape, fill, dtype)
-    result[~hidden] = known.astype(dtype)
-    same = (result[~hidden] == known).all() and not (result[~hidden] == dtype.type(fill)).any()
-    return result if same else None
+    limits, result, anything = np.iinfo(dtype), room.empty(variable.shape, dtype), False
+    for window, part in netcdf.pieces(variable, room):
+        values = part.values
+        valid = ~np.isnan(values)
+        known = values[valid]
+        if known.size and not (limits.min <= known.min() and known.max() <= limits.max):
+            return None
+        whole = known.astype(dtype)
+        if not (whole == known).all() or (whole == dtype.type(fill)).any():
+            return None
+        own = np.full(values.shape, fill, dtype)
+        own[valid] = whole
+        result[window] = own
+        anything |= bool(known.size)
+    return result if anything else None
 
 
 def _names(
@@ -148,34 +204,50 @@ def _names(
 
 def _closed(whole: Any, mark: Mapping[str, Any]) -> Closed:
     """The closed axes that are as long as they were."""
-    name = mark.get("variable")
-    shape = whole[name].shape if name in whole.variables else whole["x"].shape if "x" in whole.variables else (0, 0)
-    rows, columns = (
-        bool(wraps) and length == was
-        for wraps, length, was in zip(mark["closed"], (*shape, 0, 0)[:2], mark["shape"], strict=True)
-    )
+    variable = whole.variables.get(mark.get("variable"), whole.variables.get("x"))
+    if variable is None or variable.ndim < 2:
+        return False, False
+    known = dict(zip(mark["dims"], zip(mark["closed"], mark["shape"], strict=True), strict=True))
+    lengths = dict(zip(variable.dims, variable.shape, strict=True))
+    rows, columns = (bool(known.get(dim, (0, 0))[0]) and known[dim][1] == lengths[dim] for dim in variable.dims[:2])
     return rows, columns
+
+
+def _in_order(whole: Any, choice: Choice) -> bool:
+    """Whether rows and columns are those that `to_xarray` numbered, each at its place."""
+    numbers = [whole.variables.get(name) for name in ("row", "column")]
+    return all(
+        own is not None and own.dims == (dim,) and np.array_equal(own.values, np.arange(length))
+        for own, dim, length in zip(numbers, choice.dims, choice.shape, strict=True)
+    )
 
 
 def _attributes(whole: Any, choice: Choice, wanted: list[str] | None) -> tuple[str, ...]:
     """The other variables over the same dimensions, with or without one of components."""
-    found = []
+    found, no_numbers = [], []
     for name in map(str, whole.data_vars):
         if name == choice.heights or (wanted is not None and name not in wanted):
             continue
         variable = whole.variables[name]
         dims = tuple(map(str, (dim for dim in variable.dims if dim not in choice.index)))
-        if dims[:2] == choice.dims and len(dims) <= 3 and variable.dtype.kind in "iuf":
+        fits = dims[:2] == choice.dims and len(dims) <= 3
+        if fits and variable.dtype.kind in "iufb":
             found.append(name)
+        elif fits and wanted is None:
+            no_numbers.append(name)
+        elif fits:
+            raise OptionError(f"expected attributes of numbers or flags, got {name!r} of {variable.dtype}")
         elif wanted is not None:
             raise OptionError(f"expected attributes over {' and '.join(choice.dims)}, got {name!r} over {list(dims)}")
     missing = [name for name in wanted or () if name not in whole.data_vars]
     if missing:
         raise OptionError(f"expected attributes among {', '.join(map(str, whole.data_vars))}, got {missing[0]!r}")
+    if no_numbers:
+        warn(f"left out variables that are no numbers: {listing(no_numbers)}")
     return tuple(found)
 
 
-def _placed(surface: Surface, whole: Any, name: str | None) -> Surface:
+def _placed(surface: Surface, whole: Any, name: str | None, room: Room) -> Surface:
     """The surface with the CRS of ``spatial_ref`` and, where it says every coordinate, its geotransform."""
     reference = whole.variables.get("spatial_ref")
     if reference is None:
@@ -187,30 +259,63 @@ def _placed(surface: Surface, whole: Any, name: str | None) -> Surface:
         transform = [float(number) for number in str(reference.attrs["GeoTransform"]).split()]
     except (KeyError, ValueError):
         return surface
-    points, mask = surface.points, surface.mask
-    if len(transform) != 6 or name is None:
+    if len(transform) != 6 or name is None or not _lies_at(surface, transform):
         return surface
-    heights = points if points.ndim == 2 else points[..., 2].astype(whole.variables[name].dtype)
-    own = coordinates(surface) if points.ndim == 2 else (points[..., 0], points[..., 1])
-    told = coordinates(Surface(heights, mask=mask, metadata={"geotransform": transform}))
-    valid = np.ones(surface.shape, np.bool_) if mask is None or points.ndim == 2 else mask
-    if not all(np.array_equal(one[valid], other[valid]) for one, other in zip(own, told, strict=True)):
-        return surface
-    metadata = {**surface.metadata, "geotransform": transform}
+    heights, metadata = surface.points, {**surface.metadata, "geotransform": transform}
+    if heights.ndim == 3:
+        heights = room.empty(surface.shape, whole.variables[name].dtype)
+        heights[...] = surface.points[..., 2]
     metadata.pop("axes", None)
-    return Surface(heights, surface.closed, mask=mask, attributes=surface.attributes, metadata=metadata)
+    return Surface(heights, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
 
 
-def _restored(metadata: dict[str, Any], mark: Mapping[str, Any], surface: Surface) -> dict[str, Any]:
-    """The metadata with those that `to_xarray` left; what is true of one shape only, if it is this."""
+def _lies_at(surface: Surface, transform: list[float]) -> bool:
+    """Whether a geotransform says every coordinate; some rows at a time, of which there may be many."""
+    for rows in rows_at_once(surface.shape):
+        told = _of_rows(surface, {"geotransform": transform}, rows)
+        if surface.points.ndim == 2:
+            own, valid = _of_rows(surface, surface.metadata, rows), None
+        else:
+            own = surface.points[rows, :, 0], surface.points[rows, :, 1]
+            valid = None if surface.mask is None else surface.mask[rows]
+        if not all(((a == b) | (False if valid is None else ~valid)).all() for a, b in zip(own, told, strict=True)):
+            return False
+    return True
+
+
+def _of_rows(surface: Surface, metadata: Mapping[str, Any], rows: slice) -> tuple[NDArray[Any], NDArray[Any]]:
+    """x and y that metadata say of some rows of heights, shape (row, column)."""
+    lines = [*range(rows.start, rows.stop), rows.stop]  # a surface has two points or more
+    places = {**metadata, "nodes": [lines, list(range(surface.shape[1]))]}
+    nothing = np.broadcast_to(np.zeros((), surface.dtype), (len(lines), surface.shape[1]))
+    x, y = coordinates(Surface(nothing, metadata=places))
+    return x[:-1], y[:-1]
+
+
+def _restored(
+    metadata: dict[str, Any], mark: Mapping[str, Any], surface: Surface, choice: Choice, ordered: bool
+) -> dict[str, Any]:
+    """The metadata with those that `to_xarray` left; what is true of one shape or order only, if it is this."""
     kept = dict(mark["metadata"])
-    if list(surface.shape) != mark["shape"]:
-        kept = {key: value for key, value in kept.items() if key not in _OF_THE_SHAPE}
+    gone: set[str] = set()
+    if list(surface.shape) != mark["shape"] or list(choice.dims) != mark["dims"]:
+        gone |= set(_OF_THE_SHAPE)
+    if not ordered:
+        gone |= {*ORDERED, "seam"} if "turn" in kept else set(ORDERED)
+    kept = {key: value for key, value in kept.items() if key not in gone}
     tags = kept.pop("tags", {})
     result = {**metadata, **kept}
-    if isinstance(tags, dict) and tags:
-        texts = {**metadata.get("tags", {}).get("", {}), **tags.get("", {})}
-        result["tags"] = {**tags, **({"": texts} if texts else {})}
+    told = tags.get("", {}) if isinstance(tags, dict) else {}
+    texts = {**metadata.get("tags", {}).get("", {}), **(told if isinstance(told, dict) else {})}
+    usual = axis_attributes(Grid.of(surface.blocks[0], result | {"tags": {"": told}}))
+    for letter, attributes in usual.items():
+        for key, text in attributes.items():
+            if texts.get(f"{letter}#{key}") == text and f"{letter}#{key}" not in told:
+                del texts[f"{letter}#{key}"]  # `to_xarray` says so of every surface of this kind
+    others = {key: value for key, value in tags.items() if key} if isinstance(tags, dict) else {}
+    result.pop("tags", None)
+    if texts or others:
+        result["tags"] = {**others, **({"": texts} if texts else {})}
     if "variable" in metadata and "variable" not in kept:
         del result["variable"]  # the name that `to_xarray` gave
     return result

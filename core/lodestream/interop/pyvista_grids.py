@@ -10,20 +10,21 @@ from numpy.typing import NDArray
 
 from ..container import read_index
 from ..container.capacity import Capacity
-from ..coordinates.seams import merge, restore
+from ..coordinates.seams import merge
 from ..decoding.decoder import Decoder
 from ..errors import FormatError, InputError
 from ..formats.attributes import NORMAL, TEXTURE
 from ..formats.notes import keep_words, listing, warn
 from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
 from ..formats.vtk.grids import without_hidden
-from ..formats.vtk.writer import grid_of
 from ..mesh import Mesh
 from ..planning.planner import plan
 from ..surface import Block, Surface
 from ..target import Target
+from .dataset_layout import MARK
 from .meshes import surface_of_mesh
 from .optional import require_library
+from .pyvista_layout import GHOSTS, as_it_was, grid_of_block, marks_of
 
 if TYPE_CHECKING:
     import pyvista
@@ -32,7 +33,6 @@ __all__ = ["from_pyvista", "read", "to_pyvista"]
 
 #: How names of arrays begin that VTK makes for itself.
 _OWN = "vtk"
-_GHOSTS = "vtkGhostType"
 _WORDS = ("name", "unit", "crs")
 
 
@@ -70,8 +70,9 @@ def read(path: str | os.PathLike[str], *, level: int | None = None) -> pyvista.S
 def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:
     """See `lodestream.Surface.to_pyvista`."""
     pv = require_library("pyvista", "pyvista")
-    surface = restore(surface)
     grids: list[pyvista.StructuredGrid] = [_structured(pv, surface, n) for n in range(len(surface.blocks))]
+    for grid, mark in zip(grids, marks_of(surface), strict=True):
+        grid.field_data[MARK] = [mark]
     if len(grids) == 1:
         return grids[0]
     blocks: pyvista.MultiBlock = pv.MultiBlock()
@@ -81,7 +82,7 @@ def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:
 
 
 def _structured(pv: Any, surface: Surface, number: int) -> Any:
-    own = grid_of(surface, number, "pyvista")
+    own = grid_of_block(surface, number)
     rows, columns = own.points.shape[:2]
     grid = pv.StructuredGrid()
     points = own.points if own.points.dtype.kind == "f" else own.points.astype(np.float64)
@@ -90,9 +91,9 @@ def _structured(pv: Any, surface: Surface, number: int) -> Any:
     for name, values in own.attributes.items():
         grid.point_data[name] = np.ascontiguousarray(values.reshape(rows * columns, *values.shape[2:]))
     if own.hidden_points.any():
-        grid.point_data[_GHOSTS] = own.hidden_points.reshape(-1).astype(np.uint8) * HIDDEN_POINT
+        grid.point_data[GHOSTS] = own.hidden_points.reshape(-1).astype(np.uint8) * HIDDEN_POINT
     if own.hidden_cells.any():
-        grid.cell_data[_GHOSTS] = own.hidden_cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
+        grid.cell_data[GHOSTS] = own.hidden_cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
     data = grid.point_data
     for name, width, role in ((NORMAL, 3, "active_normals_name"), (TEXTURE, 2, "active_texture_coordinates_name")):
         if name in own.attributes and own.attributes[name].shape[2:] == (width,):
@@ -123,6 +124,7 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
     if not grids:
         raise FormatError("expected structured grids, got a MultiBlock without any")
     blocks: list[Block] = []
+    plain: list[Block] = []
     faces: list[dict[str, Any]] = []
     words: dict[str, str] = {}
     left_out: list[str] = []
@@ -132,7 +134,8 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
             if isinstance(grid, pv.DataObject):
                 raise FormatError(f"expected structured grids or a mesh of polygons, got {type(grid).__name__}")
             raise InputError(f"expected a grid of pyvista, got {type(grid).__name__}")
-        block, face = _block(grid)
+        own, block, face = _block(grid)
+        plain.append(own)
         blocks.append(block)
         faces.append(face)
         words |= _words(grid)
@@ -141,14 +144,16 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
     if left_out:
         warn(f"left out data that do not belong to points: {listing(dict.fromkeys(left_out))}")
     _warn_no_numbers(no_numbers)
+    if (same := as_it_was(grids, plain, words)) is not None:
+        return same
     metadata: dict[str, Any] = dict(words)
     if any(faces):
         metadata["faces"] = faces if len(faces) > 1 else faces[0]
     return merge(Surface(blocks=blocks, metadata=metadata))
 
 
-def _block(grid: Any) -> tuple[Block, dict[str, Any]]:
-    """A block of a grid, and what is to be said of its faces."""
+def _block(grid: Any) -> tuple[Block, Block, dict[str, Any]]:
+    """A grid as a block without holes and with them, and what is to be said of its faces."""
     i, j, k = (int(length) for length in grid.dimensions)
     if 1 not in (i, j, k):
         raise FormatError(
@@ -162,16 +167,17 @@ def _block(grid: Any) -> tuple[Block, dict[str, Any]]:
         if role in attributes and known not in attributes:
             attributes[known] = attributes.pop(role)
     mask = None
-    if _GHOSTS in grid.point_data:
-        mask = _rows(grid.point_data[_GHOSTS], shape) & HIDDEN_POINT == 0
+    if GHOSTS in grid.point_data:
+        mask = _rows(grid.point_data[GHOSTS], shape) & HIDDEN_POINT == 0
     face: dict[str, Any] = {}
-    if _GHOSTS in grid.cell_data and min(shape) > 1:
-        hidden = np.asarray(grid.cell_data[_GHOSTS]) & HIDDEN_CELL != 0
+    if GHOSTS in grid.cell_data and min(shape) > 1:
+        hidden = np.asarray(grid.cell_data[GHOSTS]) & HIDDEN_CELL != 0
         hidden = hidden.reshape(shape[0] - 1, shape[1] - 1)
         if mask is not None:  # cells of holes are hidden anyway, and say nothing of their other corners
             hidden &= mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
         mask, face = without_hidden(hidden, mask)
-    return Block(_rows(grid.points, shape), mask=mask, attributes=attributes), face
+    points = _rows(grid.points, shape)
+    return Block(points, attributes=attributes), Block(points, mask=mask, attributes=attributes), face
 
 
 def _rows(values: Any, shape: tuple[int, int]) -> NDArray[Any]:

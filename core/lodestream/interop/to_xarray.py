@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coordinates.height_fields import coordinates
+from ..formats.netcdf.names import AXIS_WORDS, is_east, is_geographic
 from ..surface import Block, Surface
-from .dataset_layout import MARK, Grid, Part, axes_of, mark_of, parts_of, values_of
+from .dataset_layout import MARK, Grid, Part, axes_of, is_ordered, mark_of, parts_of, values_of
 from .optional import require_library
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["dataset", "to_xarray", "tree"]
+__all__ = ["axis_attributes", "dataset", "to_xarray", "tree"]
 
 _EAST = {"standard_name": "longitude", "long_name": "longitude", "units": "degrees_east", "axis": "X"}
 _NORTH = {"standard_name": "latitude", "long_name": "latitude", "units": "degrees_north", "axis": "Y"}
@@ -69,10 +70,13 @@ def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> 
     places: dict[str, Any] = {}
     for part in parts:
         values, encoding = given(part)
-        attrs = part.attrs | (_letters(grid)[part.name] if part.coordinate else {})
+        attrs = part.attrs | (axis_attributes(grid)[part.name] if part.coordinate else {})
         own = encoding | ({} if part.coordinate else mapping)
         (places if part.coordinate else variables)[part.name] = xr.Variable(part.dims, values, attrs, own)
     places |= _coordinates(xr, grid)
+    if is_ordered(grid.metadata):
+        for dim, name, length in zip(grid.dims, ("row", "column"), grid.shape, strict=True):
+            places[name] = xr.Variable((dim,), np.arange(length))
     if mapping:
         places["spatial_ref"] = xr.Variable((), np.int64(0), _spatial_ref(grid.metadata))
     texts = grid.metadata.get("tags", {})
@@ -93,7 +97,7 @@ def _coordinates(xr: Any, grid: Grid) -> dict[str, Any]:
     """The coordinates of heights."""
     if grid.channels:
         return {}
-    letters = _letters(grid)
+    letters = axis_attributes(grid)
     axes = axes_of(grid)
     if axes is not None:
         return {
@@ -110,14 +114,19 @@ def _coordinates(xr: Any, grid: Grid) -> dict[str, Any]:
     }
 
 
-def _letters(grid: Grid) -> dict[str, dict[str, str]]:
-    """What the conventions say of x and y."""
-    crs = str(grid.metadata.get("crs", "")).upper()
+def axis_attributes(grid: Grid) -> dict[str, dict[str, str]]:
+    """The attributes of x and y: what the conventions say of them, and what a file said (tags ``x#units``, ...)."""
+    crs = grid.metadata.get("crs")
     degrees = {angle["channel"] for angle in grid.metadata.get("angles", ()) if isinstance(angle, Mapping)}
-    around = crs.startswith(("GEOGCS", "GEOGCRS"))
-    if around or degrees == {0}:
-        return {"x": _EAST, "y": _NORTH}
-    return {"x": _X, "y": _Y} if crs or degrees else {"x": {"axis": "X"}, "y": {"axis": "Y"}}
+    tags = grid.metadata.get("tags")
+    texts = tags.get("") if isinstance(tags, Mapping) else None
+    given = texts if isinstance(texts, Mapping) else {}
+    x, y = ({key: given[f"{it}#{key}"] for key in AXIS_WORDS if f"{it}#{key}" in given} for it in "xy")
+    if is_geographic(crs) or degrees == {0} or (not crs and is_east(x.get("units"))):
+        return {"x": _EAST | x, "y": _NORTH | y}
+    if crs or degrees:
+        return {"x": _X | x, "y": _Y | y}
+    return {"x": {"axis": "X"} | x, "y": {"axis": "Y"} | y}
 
 
 def _spatial_ref(metadata: Mapping[str, Any]) -> dict[str, str]:

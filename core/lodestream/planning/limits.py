@@ -70,7 +70,9 @@ class ErrorLimits:
         channels: list[NamedLimit] = []
         for name, which, most in target.channels:
             if name not in named:
-                raise OptionError(f"expected an error of one of {', '.join(named)}, got one of {name[:80]!r}")
+                raise OptionError(
+                    f"expected an error of one of {', '.join(named)}, got one of {_missing(name, header)}"
+                )
             channels += [NamedLimit(name, group, which, most) for group in named[name]]
         return cls(rms, worst, tuple(channels))
 
@@ -98,6 +100,13 @@ class ErrorLimits:
         for limit in self.channels:
             if limit.error(own) > limit.most:
                 yield limit.which, limit.name, limit.error(own)
+
+
+def _missing(name: str, header: Header) -> str:
+    """A name that is not wanted or not there, with the reason if it is there."""
+    kinds = {kind.name for kind in header.attributes}
+    there = name in kinds or name in header.channel_names
+    return f"{name[:80]!r}" + (", which is left out: it is not among the attributes asked for" if there else "")
 
 
 def _named(target: Target, header: Header) -> dict[str, list[tuple[int, ...]]]:

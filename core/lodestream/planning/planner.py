@@ -109,12 +109,12 @@ def _until(marks: list[Mark], target: Target, header: Header) -> tuple[list[Mark
 
 def _slices_of_layers(index: Index, level: int) -> Plan:
     """Quality order of the levels up to one: of each layer the segments that belong to them, which stand together."""
-    tiles = index.header.layout.tiles
+    levels = index.header.layout.tile_levels.data
     ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
     for layer, segments in groupby(index.segments, key=lambda segment: segment.layer):
         for segment in segments:
-            if tiles[segment.tile].level <= level:
+            if levels[segment.tile] <= level:
                 _append(ranges, segment.range)
                 size += segment.range.length
         record = index.layers[layer]
@@ -129,12 +129,12 @@ def _slices_of_layers(index: Index, level: int) -> Plan:
 
 def _by_level(index: Index, target: Target, level: int) -> Plan:
     """Level order: level by level, the segments of all layers; the complete surface also has its residual."""
-    tiles = index.header.layout.tiles
+    levels = index.header.layout.tile_levels.data
     ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
     of_level: list[list[ByteRange]] = [[] for _ in index.levels]
     for segment in index.segments:
-        of_level[tiles[segment.tile].level].append(segment.range)
+        of_level[levels[segment.tile]].append(segment.range)
     for state, places in zip(index.levels[: level + 1], of_level, strict=False):
         for place in places:
             _append(ranges, place)
@@ -152,13 +152,13 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
 def _selected(index: Index, target: Target, windows: WindowErrors | None, bounded: bool) -> Plan:
     """A window, or some attributes only: segments in file order or level by level, then chunks of residual."""
     chosen = select(index, selection_of(target))
-    tiles, within = index.header.layout.tiles, _figures(index, target.region, windows, bounded)
+    levels, within = index.header.layout.tile_levels.data, _figures(index, target.region, windows, bounded)
     finest = index.header.levels if target.level is None else target.level
     if finest > index.header.levels:
         raise OptionError(f"expected a level of 0 to {index.header.levels}, got {finest}")
-    segments = [s for s in chosen.segments if tiles[s.tile].level <= finest]
+    segments = [s for s in chosen.segments if levels[s.tile] <= finest]
     if target.order == "level":
-        segments.sort(key=lambda segment: tiles[segment.tile].level)
+        segments.sort(key=lambda segment: levels[segment.tile])
     ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
     level = 0
@@ -166,11 +166,11 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
     for number, segment in enumerate(segments):
         _append(ranges, segment.range)
         size += segment.range.length
-        own = tiles[segment.tile].level
+        own = levels[segment.tile]
         level = max(level, own)
         after = segments[number + 1] if number + 1 < len(segments) else None
         if target.order == "level":
-            if after is None or tiles[after.tile].level > own:
+            if after is None or levels[after.tile] > own:
                 state = index.levels[own]
                 marks.append(Mark(size, own, own, size, *within(state.errors)))
         elif after is None or after.layer > segment.layer:

@@ -183,9 +183,9 @@ def _cell_counts(shape: tuple[int, int], cell: tuple[int, int], mask: NDArray[np
     if mask is None:
         rows, columns = (np.diff(starts, append=length) for starts, length in zip(edges, shape, strict=True))
         return np.multiply.outer(rows, columns)
-    across = np.add.reduceat(mask, edges[1], axis=1, dtype=np.int64)
-    counts: NDArray[np.int64] = np.add.reduceat(across, edges[0], axis=0)
-    return counts
+    # One row of cells after the other: numpy would make a number of 8 bytes of each point.
+    sums = (np.add.reduce(mask[start : start + (1 << cell[0])], axis=0, dtype=np.int64) for start in edges[0])
+    return np.stack([np.add.reduceat(row, edges[1]) for row in sums])
 
 
 def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..grid.layout import Band, Layout
+from ..grid.layout import Layout
 
 __all__ = ["MOST_BASE", "Quantiser", "band_step", "lifting_steps_along"]
 
@@ -36,24 +36,24 @@ class Quantiser:
     base: int
 
 
-def band_step(band: Band, level: int, layout: Layout, quantiser: Quantiser) -> int:
-    """The quantization step of a band of a level, in lattice steps; at least 1 and below 2**26."""
+def band_step(level: int, grid: int, kind: tuple[bool, bool], layout: Layout, quantiser: Quantiser) -> int:
+    """The quantization step of bands of a level, a grid and a kind, in lattice steps; at least 1 and below 2**26."""
     product = quantiser.base
     for axis in range(2):
-        product *= _along(*lifting_steps_along(band, level, layout, axis))
+        product *= _along(*lifting_steps_along(level, grid, kind[axis], layout, axis))
     return max(1, product >> 32)
 
 
-def lifting_steps_along(band: Band, level: int, layout: Layout, axis: int) -> tuple[int, bool]:
-    """Lifting steps of an axis from a band of a level to the finest, and whether the band has details along it.
+def lifting_steps_along(level: int, grid: int, detail: bool, layout: Layout, axis: int) -> tuple[int, bool]:
+    """Lifting steps of an axis from bands of a level to the finest, and whether they have details along it.
 
     Across itself an interface counts as a node: its points change the patches beside it.
     """
     first = max(level, 1)
-    if layout.grids[band.grid].interface and axis == 1:
+    if layout.grids[grid].interface and axis == 1:
         return layout.levels + 1 - first, False
     every = range(first, layout.levels + 1)
-    return sum(1 for k in every if layout.steps(band.grid, k)[axis].midpoints), band.kind[axis]
+    return sum(1 for k in every if layout.steps(grid, k)[axis].midpoints), detail
 
 
 def _along(count: int, detail: bool) -> int:

@@ -17,7 +17,16 @@ from ..parallel import spread
 from .lattice import Lattice
 from .measure import distances
 
-__all__ = ["Original", "coordinate_distances", "originals_of", "other_originals", "store_values"]
+__all__ = [
+    "Original",
+    "coordinate_distances",
+    "distance_figures",
+    "errors_of_figures",
+    "has_figures",
+    "originals_of",
+    "other_originals",
+    "store_values",
+]
 
 Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
 
@@ -176,17 +185,16 @@ def coordinate_distances(
     dtype, count = originals[0].points.dtype, sum(original.count for original in originals)
     if not count:
         return [(0.0, 0.0)] * _kinds(len(lattices))
-    if dtype.kind == "f" or dtype.itemsize < 8:
-        rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
-        patches = [_distances(*pair, rules, channel) for pair in zip(originals, coordinates, strict=True)]
-        worst = [max(float(patch[..., kind, 1].max()) for patch in patches) for kind in range(_kinds(len(lattices)))]
-        if worst[0] == 0 and dtype.itemsize < 8:  # squares of narrower types never vanish
-            return [(0.0, 0.0)] * len(worst)
-        if 1e-250 < worst[0] < 1e250:
-            if cells is not None:
+    if has_figures(dtype):
+        patches = [
+            distance_figures(original, lattices, place, fractions, channel)
+            for original, place in zip(originals, coordinates, strict=True)
+        ]
+        found = errors_of_figures(patches, count, dtype)
+        if found is not None:
+            if cells is not None and found[0][1]:
                 cells += [patch[..., 0, :] for patch in patches]
-            totals = [math.fsum(math.fsum(patch[..., k, 0].flat) for patch in patches) for k in range(len(worst))]
-            return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]
+            return found
     return _distances_of_values(originals, lattices, coordinates, fractions, channel)
 
 
@@ -225,13 +233,32 @@ def _kinds(channels: int) -> int:
     return 1 + channels if channels > 1 else 1
 
 
-def _distances(
-    original: Original, coordinates: NDArray[np.int32], rules: NDArray[np.float64], channel: int
-) -> NDArray[np.float64]:
-    """Sums and largest of the squared distances of one patch, float64, shape (row, column, kind, 2).
+def has_figures(dtype: np.dtype[Any]) -> bool:
+    """Whether float64 tells values of this type apart, as `distance_figures` needs it."""
+    return dtype.kind == "f" or dtype.itemsize < 8
 
-    See `kernels.square_distances`.
+
+def distance_figures(
+    original: Original,
+    lattices: Sequence[Lattice],
+    coordinates: NDArray[np.int32],
+    fractions: Sequence[int],
+    channel: int = 0,
+) -> NDArray[np.float64]:
+    """Sums and largest of the squared distances of one patch, or of some of its rows, in cells.
+
+    Parameters
+    ----------
+    original, lattices, coordinates, fractions, channel
+        As of `coordinate_distances`, of the one patch.
+
+    Returns
+    -------
+    float64, shape (row of cells, column of cells, kind, 2)
+        Cells have `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points. The first kind are the distances; where there
+        are several channels, those of each by itself follow. See `kernels.square_distances`.
     """
+    rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
     rows, columns, channels = original.points.shape
     down, across = -(-rows // kernels.PART_ROWS), -(-columns // kernels.PART_COLUMNS)
     figures = np.empty((down, across, _kinds(len(rules)), 2))
@@ -243,3 +270,31 @@ def _distances(
         range(0, down * across, _CELLS),
     )
     return figures
+
+
+def errors_of_figures(
+    patches: Sequence[NDArray[np.float64]], count: int, dtype: np.dtype[Any]
+) -> list[tuple[float, float]] | None:
+    """RMS and maximum of each kind of distances.
+
+    Parameters
+    ----------
+    patches : float64, shape (row of cells, column of cells, kind, 2), see `distance_figures`
+    count : int
+        Points that were compared, at least one.
+    dtype : dtype
+        Of their values.
+
+    Returns
+    -------
+    list of (float, float), or None
+        None: float64 does not hold the squares; of values of 8 bytes not even those of the smallest differences.
+    """
+    kinds = range(patches[0].shape[2])
+    worst = [max(float(patch[..., kind, 1].max()) for patch in patches) for kind in kinds]
+    if worst[0] == 0 and dtype.itemsize < 8:  # squares of narrower types never vanish
+        return [(0.0, 0.0)] * len(worst)
+    if not 1e-250 < worst[0] < 1e250:
+        return None
+    totals = [math.fsum(math.fsum(patch[..., kind, 0].flat) for patch in patches) for kind in kinds]
+    return [(math.sqrt(total / count), math.sqrt(most)) for total, most in zip(totals, worst, strict=True)]

@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..parallel import spread
+
 __all__ = ["LATTICE_BITS", "Lattice", "find_lattice", "offset_lattice", "precision_lattice", "short_lattice"]
 
 #: Lattice coordinates of valid values are below two to this power in magnitude.
@@ -30,6 +32,8 @@ _SAMPLE = 4096
 #: Share of the differences that a step must divide to count, differences that propose one, and metres in a foot.
 _MOST = 0.7
 _SEEN = 64
+_REACHES = (2, 8, 32, 128, 512)  # times a step, up to which differences fit it, turn by turn
+_BLOCK = 1 << 12  # differences looked at before it is asked whether they are enough to tell
 _FOOT = 0.3048
 _SHORT_STEP = 3  # bytes: a step of 13 significant bits
 _STRIP = 1 << 15  # values worked on together, so that what is in between stays in the cache
@@ -224,29 +228,65 @@ def offset_lattice(values: NDArray[Any]) -> Lattice | None:
     moved = np.abs(differences[np.abs(differences) > 64 * tolerance])
     if 2 * moved.size < differences.size:
         return None
-    for step in _spacings(moved, 64 * tolerance):
+    for step in _spacings(moved, tolerance):
+        if (high - low) / step >= 2**LATTICE_BITS - 4 or not _may_divide(moved, step, tolerance):
+            continue
         share = _share(moved, step, tolerance)
-        if (high - low) / step < 2**LATTICE_BITS - 4 and share > _MOST:
+        if share > _MOST:
             short = float(f"{step:.5g}")
             step = short if _share(moved, short, tolerance) >= share else step
             return _centred("affine", float(np.rint(low / step)) * step, step, int((high - low) / step) + 1)
     return None
 
 
-def _spacings(moved: NDArray[np.float64], least: float) -> list[float]:
-    """Steps to be tried, the largest first: round numbers, and what small differences say."""
+def _spacings(moved: NDArray[np.float64], tolerance: float) -> list[float]:
+    """Steps to be tried, the largest first: round numbers, and what small differences say.
+
+    Left out are some of which it is certain that they do not divide most differences, all above 64 tolerances.
+    """
+    least, ordered = 64 * tolerance, np.sort(moved)
+    # A step divides nothing that is shorter than itself.
+    most = min(float(ordered[int((1.01 - _MOST) * moved.size)]) + 2 * tolerance, float(ordered[-1]))
     round_ones = [m * 10.0**k * unit for k in range(-9, 4) for m in (1.0, 2.0, 2.5, 5.0) for unit in (1.0, _FOOT)]
-    seen = []
-    for first in np.sort(moved)[:: max(1, moved.size // _SEEN)]:
-        step = float(first)
-        for reach in (2, 8, 32, 128, 512):
-            near = moved[moved < reach * step]
-            times = np.rint(near / step)
-            whole = np.abs(near - times * step) < max(least / 16, 0.2 * step / reach)
-            if (times * whole).any():
-                step = float((near * times)[whole].sum() / (times * times)[whole].sum())
-        seen.append(step)
-    return sorted((step for step in {*round_ones, *seen} if least <= step <= moved.max()), reverse=True)
+    firsts = dict.fromkeys(ordered[:: max(1, moved.size // _SEEN)].tolist())
+    seen = spread(lambda first: _seen_spacing(moved, first, tolerance, most), firsts)
+    steps = {*round_ones, *(step for step in seen if step is not None)}
+    return sorted((step for step in steps if least <= step <= most), reverse=True)
+
+
+def _seen_spacing(moved: NDArray[np.float64], first: float, tolerance: float, most: float) -> float | None:
+    """The step near a difference that fits more and more of the larger ones; None where it fits too few, or is large.
+
+    Each turn moves the step by less than its `within`, and the next turns by less than `ahead` in all.
+    """
+    least, step = 64 * tolerance, first
+    for turn, reach in enumerate(_REACHES):
+        ahead = sum(least / 16 + 0.25 * step / later for later in _REACHES[turn:])
+        if step - ahead > most or (ahead < step and not _may_divide(moved, step, tolerance, ahead / (step - ahead))):
+            return None
+        near = moved[moved < reach * step]
+        times = np.rint(near / step)
+        within = max(least / 16, 0.2 * step / reach)
+        whole = np.abs(near - times * step) < within
+        if (times * whole).any():
+            step = float((near * times)[whole].sum() / (times * times)[whole].sum())
+    return step
+
+
+def _may_divide(differences: NDArray[np.float64], step: float, tolerance: float, slack: float = 0.0) -> bool:
+    """Whether it is not certain that a step divides at most `_MOST` of the differences, as `_share` counts them.
+
+    ``slack``: nor that one of up to so many times its own length more or less does.
+    """
+    missed, most = 0, (1.001 - _MOST) * differences.size + 1
+    for start in range(0, differences.size, _BLOCK):
+        block = differences[start : start + _BLOCK]
+        off = np.abs(block - np.rint(block / step) * step)
+        limit = 2 * tolerance * (1 + slack) + slack * block if slack else tolerance
+        missed += int(np.count_nonzero(off > limit))
+        if missed > most:
+            return False
+    return True
 
 
 def _share(differences: NDArray[np.float64], step: float, tolerance: float) -> float:

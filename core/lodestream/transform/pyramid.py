@@ -7,19 +7,18 @@ needs are made by a forward step of the interface's points. Interfaces are there
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import kernels
 from ..grid.axis import AxisStep
 from ..grid.layout import Layout, Source
 from .all_levels import fits, inverse_levels
+from .fitting import fitted_predictor
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
-from .predictors import FIT_NODES, FOUR_POINT, INTERFACES, default_predictors, fitted_steps, predictor
+from .predictors import INTERFACES, default_predictors, fitted_steps, predictor
 
 __all__ = [
     "PADDING",
@@ -37,13 +36,8 @@ __all__ = [
     "third_step",
 ]
 
-#: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
-_CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
 #: Unused columns at the end of an array of coefficients, see `allocate`.
 PADDING = 24
-_SAMPLE_LINES = 96
-#: Values in one call of a kernel that fits.
-_AT_ONCE = 1 << 22
 _NORM_LEVELS = 6
 
 
@@ -70,7 +64,9 @@ def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
     return copy
 
 
-def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True) -> NDArray[np.int8]:
+def forward(
+    arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True, top: int | None = None
+) -> NDArray[np.int8]:
     """Turn a channel's lattice coordinates into its coefficients, in place.
 
     Parameters
@@ -80,6 +76,8 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
     layout : Layout
     fit : bool
         Choose the third step's (a, b) by size for each level and axis that is long enough; otherwise (0, 0) there.
+    top : int, optional
+        The arrays hold, and have the shape of, the grids of this level; by default of the finest one.
 
     Returns
     -------
@@ -88,7 +86,7 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
     """
     predictors = default_predictors(layout)
     fitted = set(fitted_steps(layout))
-    for level in range(layout.levels, 0, -1):
+    for level in range(layout.levels if top is None else top, 0, -1):
         for axis in range(2):
             # All patches have one predictor, and all interfaces another: a short side alone is no sample to fit it to.
             corners = [_corner(array, layout.shape(k, level)) for k, array in enumerate(arrays)]
@@ -99,7 +97,7 @@ def forward(arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = Tru
                         for k, corner in enumerate(corners)
                         if layout.grids[k].interface == (which == INTERFACES)
                     ]
-                    predictors[level - 1, which] = _fit(lines)
+                    predictors[level - 1, which] = fitted_predictor(lines)
             for k, grid in enumerate(layout.grids):
                 step = layout.steps(k, level)[axis]
                 if step.midpoints:
@@ -260,99 +258,6 @@ def take_details(
         line = points.reshape(1, -1).copy()
         forward_step(line, 1, step, predictor(predictors, grid, step, level, axis))
         target[step.coarse :] = line[0, step.coarse :]
-
-
-class _Sample(NamedTuple):
-    """Factors of a and b in v_k, and d_k, of some midpoints: int32, flat; and what no magnitude of the factors exceeds.
-
-    Details with what the third step needs around them: k from 2 to midpoints - 4.
-    """
-
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    details: NDArray[np.int32]
-    largest: int
-
-    def batches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
-        """Factors and details, so many as a kernel takes at once."""
-        for start in range(0, self.details.size, _AT_ONCE):
-            batch = slice(start, start + _AT_ONCE)
-            yield self.first[batch], self.second[batch], self.details[batch]
-
-    def bits(self, a: int, b: int) -> float:
-        """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
-        total = np.zeros(1)
-        for batch in self.batches():
-            kernels.predictor_bits(*batch, self.largest, a, b, total)
-        return float(total[0])
-
-    def moments(self, a: float, b: float, weighted: bool) -> list[float]:
-        """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
-        sums = np.zeros(5)
-        for batch in self.batches():
-            kernels.predictor_moments(*batch, a, b, weighted, sums)
-        found: list[float] = sums.tolist()
-        return found
-
-
-def _fit(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
-    """The (a, b) that makes the details along axis 0 of some of the columns smallest, in bits."""
-    sample = _sample(grids)
-    costs: dict[tuple[int, int], float] = {}
-
-    def bits(ab: tuple[int, int]) -> float:
-        if ab not in costs:
-            costs[ab] = sample.bits(*ab)
-        return costs[ab]
-
-    # Bits are not convex in (a, b), and bumpy from rounding: several starts, then a search in steps that get smaller.
-    best = min([*_CANDIDATES, *_least_squares(sample)], key=bits)
-    for reach in (4, 2, 1):
-        around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
-        best = min((ab for ab in around if max(map(abs, ab)) <= 127), key=bits)
-    return best
-
-
-def _sample(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> _Sample:
-    """Some of the columns, stepped without the third step."""
-    lines = sum(corner.shape[1] for corner, _ in grids)
-    samples = []
-    for corner, step in grids:
-        if step.midpoints and step.run >= FIT_NODES:
-            stride = max(1, min(lines // _SAMPLE_LINES, corner.shape[1]))
-            columns = np.array(corner[:, ::stride], order="C")
-            forward_step(columns, 0, step, (0, 0))
-            samples.append(_surroundings(columns, step.coarse, step.midpoints))
-    if len(samples) == 1:
-        return samples[0]
-    first, second, details = (np.concatenate([sample[i] for sample in samples]) for i in range(3))
-    return _Sample(first, second, details, max(sample.largest for sample in samples))
-
-
-def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sample:
-    count, width = midpoints - 5, lines.shape[1]
-    first, second, details = np.empty((3, count * width), np.int32)
-    largest, height = 0, max(1, _AT_ONCE // width)
-    for start in range(0, count, height):
-        stop = min(start + height, count)
-        batch = slice(start * width, stop * width)
-        planes = lines[start : stop + 5], lines[coarse + 2 + start : coarse + 2 + stop]
-        largest = max(largest, kernels.predictor_factors(*planes, first[batch], second[batch], details[batch]))
-    return _Sample(first, second, details, largest)
-
-
-def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
-    """Fits of 256 d = a u + b w, residuals reweighted towards small ones in turn."""
-    found = []
-    a = b = 0.0
-    for turn in range(5):
-        uu, uw, ww, ud, wd = sample.moments(a, b, turn > 0)
-        determinant = uu * ww - uw * uw
-        if determinant <= 1e-9 * uu * ww:
-            break  # one factor is all but a multiple of the other: nothing tells a from b
-        a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
-        found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
-    return found
 
 
 def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import signal
+import traceback
 from collections.abc import Callable
 from textwrap import indent
 from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_json
 
 from lodestream.errors import LodestreamError
 
@@ -17,6 +19,7 @@ __all__ = [
     "ProcessDiedError",
     "UnforeseenError",
     "WrongAnswerError",
+    "answer_of",
     "name_of",
     "reason_of",
     "result_of",
@@ -25,6 +28,7 @@ __all__ = [
 LONGEST_ANSWER = 256 << 10
 _LONGEST_KIND = 100
 _LONGEST_REASON = 2000
+_TRACEBACK = 20_000
 
 
 class ProcessDiedError(LodestreamError):
@@ -76,6 +80,23 @@ class UnforeseenError(LodestreamError):
 def name_of(function: Callable[..., Any]) -> str:
     """The module and the name by which another process finds a function."""
     return f"{function.__module__}:{function.__qualname__}"
+
+
+def answer_of(call: Callable[[], Any]) -> bytes:
+    """Make a call; what it returns or raises as JSON, for `result_of`."""
+    # Not every exception survives the way between processes: its name and its text do.
+    try:
+        return to_json({"returned": call()})
+    except MemoryError as error:
+        return json.dumps({"memory": str(error)[:1000]}).encode()
+    except Exception as error:
+        number = getattr(error, "errno", None)
+        raised = {
+            "kind": type(error).__name__,
+            "errno": number if isinstance(number, int) else None,
+            "traceback": traceback.format_exc()[-_TRACEBACK:],
+        }
+        return json.dumps({"raised": raised}).encode()
 
 
 def result_of(function: Callable[..., Any], answer: bytes) -> Any:

@@ -1,7 +1,7 @@
 """Uploaded containers: they are not built but checked, and kept unchanged.
 
 The upload of such a surface is its container. A stranger wrote it, so all of it is checked and decoded once, in a build
-process and under the limits of a build; see `lodestream.decoding.inspection`. If the container is lost, it is checked
+process and under the limits of a build; see `lodestream.bands.inspecting`. If the container is lost, it is checked
 and copied again from the upload, and never encoded again.
 """
 
@@ -103,14 +103,19 @@ def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, 
         If it is damaged, cut short, followed by more bytes, or of a version that this server does not read; or if its
         metadata are too long or cannot be expressed in JSON.
     TooLargeError
-        If it has more vertices than allowed.
+        If it has more vertices than allowed, or cannot be checked within the memory.
     """
+    from lodestream.bands.inspecting import inspect
     from lodestream.container import describe
-    from lodestream.decoding.inspection import inspect
 
     digest = hashlib.sha256()
     with job.files[0].open("rb") as source:
-        found = inspect(source, max_vertices=job.max_vertices, progress=progress)
+        found = inspect(
+            source,
+            max_vertices=job.max_vertices,
+            memory=job.room,
+            progress=progress,
+        )
         checked(found.index, describe(found.index, channels=True))
         source.seek(0)
         with NewFile(path) as target:

@@ -18,7 +18,7 @@ from typing import Any
 from .answers import LONGEST_ANSWER, ProcessDiedError, WrongAnswerError, name_of
 from .forkserver import Allowed
 
-__all__ = ["ForkServer", "Process", "Started"]
+__all__ = ["ONE_THREAD", "ForkServer", "Process", "Started"]
 
 _LOOK_SECONDS = 0.1
 _LAST_SECONDS = 5.0
@@ -28,8 +28,8 @@ _LONGEST_MESSAGE = 64 << 10
 _ENVIRONMENT = ("HOME", "LANG", "LD_LIBRARY_PATH", "LD_PRELOAD", "PATH", "TMPDIR", "TZ", "XDG_CACHE_HOME")
 _ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "PROJ_", "PYTHON")
 
-# Threads of libraries would not be there in a process that is forked, and a build has one processor.
-_ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
+#: Threads of libraries would not be there in a process that is forked, and a build has one processor.
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
 
 _PROGRAM = "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); from {module} import main; main()"
 
@@ -175,7 +175,7 @@ class ForkServer:
         command = [sys.executable, "-c", program, str(theirs.fileno()), self._preload, path]
         try:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, env=environment | _ONE_THREAD, pass_fds=(theirs.fileno(),)
+                command, stdin=subprocess.DEVNULL, env=environment | ONE_THREAD, pass_fds=(theirs.fileno(),)
             )
         except BaseException:
             ours.close()

@@ -36,10 +36,11 @@ from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
 from pydantic import TypeAdapter
-from pydantic_core import to_json
 
 from lodestream import parallel
 from lodestream.confinement import Rights, confine
+
+from .answers import answer_of
 
 __all__ = ["Allowed", "main", "receive_exactly", "resolve"]
 
@@ -247,23 +248,14 @@ def _answer(answer: int, text: bytes) -> NoReturn:
 
 
 def _call(text: bytes) -> bytes:
-    # Not every exception survives the way between processes: its name and its text do.
-    try:
+    def call() -> Any:
         request: _Request = _adapter(_Request).validate_json(text)
         function = resolve(request.function)
         args = _arguments(function, request.args)
         _limit(request.allowed)
-        return to_json({"returned": function(*args)})
-    except MemoryError as error:
-        return json.dumps({"memory": str(error)[:1000]}).encode()
-    except Exception as error:
-        number = getattr(error, "errno", None)
-        raised = {
-            "kind": type(error).__name__,
-            "errno": number if isinstance(number, int) else None,
-            "traceback": traceback.format_exc()[-_TRACEBACK:],
-        }
-        return json.dumps({"raised": raised}).encode()
+        return function(*args)
+
+    return answer_of(call)
 
 
 @cache

@@ -39,6 +39,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from lodestream.errors import InputError, TooLargeError
 
@@ -50,7 +51,9 @@ from ..storage.records import Record, State
 from ..storage.storage import Storage
 from ..storage.uploads import check_upload
 from . import results, worker
-from .answers import ProcessDiedError, UnforeseenError, reason_of
+from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason_of
+from .cluster_build import ClusterJob
+from .clusters import build_by_cluster
 from .fork_control import ForkServer
 from .forkserver import Allowed
 from .processes import Call, Pool
@@ -65,10 +68,12 @@ _ENDINGS = 3
 _CRASHES = 3
 
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
-_ROOM = (errno.ENOSPC, errno.EDQUOT)
-_PASSING = (*_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+_PASSING = (*worker.NO_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
+
+# Of the points of a surface, in the largest type.
+_BYTES = 24
 
 # So often a build is tried that lacks them, where somebody waits for its end.
 _ATTEMPTS = 3
@@ -83,6 +88,9 @@ class _Running:
     call: Call
 
 
+_T = TypeVar("_T")
+
+
 class _LaterError(Exception):
     """The system has no room, or nothing else that a build needs, now."""
 
@@ -93,7 +101,9 @@ class _LaterError(Exception):
     def of(cls, number: int | None) -> _LaterError:
         """What stands behind an error of the system."""
         return cls(
-            "space on the server's disk" if number in _ROOM else f"the server's system ({os.strerror(number or 0)})"
+            "space on the server's disk"
+            if number in worker.NO_ROOM
+            else f"the server's system ({os.strerror(number or 0)})"
         )
 
 
@@ -394,7 +404,9 @@ class Builder:
         call = Call(worker.build, (job,), self._settings.build_seconds, partial(make_folder, folder), allowed)
         self._running[record.id] = _Running(folder, call)
         try:
-            result: worker.Built | worker.Refused | None = await self._run(call)
+            result: worker.Built | worker.Parsed | worker.Refused | None = await self._run(self._pool.run(call))
+            if isinstance(result, worker.Parsed):
+                result = await self._run_by_cluster(record, job)
             if isinstance(result, worker.Built):
                 self.ready = True  # as a build shows, whatever was wrong before
                 result = await self._keep(record, job, result)
@@ -411,12 +423,11 @@ class Builder:
             # The process has ended, or has given its result: nobody writes here any more.
             await _removed(folder)
 
-    async def _run(self, call: Call) -> worker.Built | worker.Refused:
+    async def _run(self, work: Awaitable[_T]) -> _T | worker.Refused:
         try:
-            result: worker.Built | worker.Refused = await self._pool.run(call)
+            result = await work
         except TimeoutError as error:
-            longer = f"more {error} than" if error.args else "longer than"
-            return worker.Refused(f"the build took {longer} {self._settings.build_seconds:g} s", final=False)
+            return self._too_slow(error)
         except UnforeseenError as error:
             if error.errno in _PASSING:
                 raise _LaterError.of(error.errno) from None
@@ -428,6 +439,25 @@ class Builder:
         if isinstance(result, worker.Refused):
             return worker.Refused(reason_of(result.reason), result.final)
         return result
+
+    async def _run_by_cluster(self, record: Record, job: worker.Job) -> worker.Built | worker.Refused:
+        if not job.shared:
+            raise WrongAnswerError("expected a container, got a surface that is only parsed")
+        address, started = self._settings.dask, time.monotonic()
+        _log.info("the build of %s goes to the workers of the Dask scheduler %s", record.id, address)
+        how = "cut short"
+        try:
+            task = ClusterJob(job, address, self._memory // 2)
+            result = await self._run(build_by_cluster(task, self._settings.build_seconds, self._threads))
+            how = f"refused: {result.reason}" if isinstance(result, worker.Refused) else "built"
+            return result
+        finally:
+            seconds = time.monotonic() - started
+            _log.info("the build of %s came back from Dask after %.1f s: %s", record.id, seconds, how)
+
+    def _too_slow(self, error: TimeoutError) -> worker.Refused:
+        longer = f"more {error} than" if error.args else "longer than"
+        return worker.Refused(f"the build took {longer} {self._settings.build_seconds:g} s", final=False)
 
     async def _keep(self, record: Record, job: worker.Job, built: worker.Built) -> worker.Refused | None:
         try:
@@ -480,6 +510,7 @@ class Builder:
             max_vertices=self._settings.max_vertices,
             folder=folder,
             allowed=self._settings.formats,
+            shared=bool(self._settings.dask),
         )
 
 
@@ -509,8 +540,9 @@ def _allowed(job: worker.Job, size: int, memory: int, threads: int) -> Allowed:
         processes=process,
         threads=threads,
         memory=memory,
-        # No container is longer than what it was made of takes in memory, and one that was uploaded is copied.
-        file_bytes=max(memory, size) + (1 << 20),
+        # No container is longer than what it was made of takes in memory, and one that was uploaded is copied. Scratch
+        # holds an array of the largest surface.
+        file_bytes=max(memory, size, _BYTES * job.max_vertices) + (1 << 20),
     )
 
 

@@ -33,10 +33,10 @@ from typing import Any
 from fastapi import Request
 from starlette.requests import ClientDisconnect
 
-from lodestream.errors import LodestreamError, StreamError, TooLargeError
+from lodestream.errors import InputError, LodestreamError, OptionError, StreamError, TooLargeError
 
 from ..operation.settings import Settings
-from ..problems import BusyError, FullError, RestartingError, TooManyError
+from ..problems import BusyError, FullError, LargeLevelError, RestartingError, TooManyError, UnfitLevelError
 from ..storage import damage
 from ..storage.durable import discard, make_folder, remove
 from ..storage.folders import is_file
@@ -45,7 +45,7 @@ from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
 from .fork_control import ForkServer
 from .forkserver import Allowed
 from .level_files import Key, Lease, LevelFiles
-from .levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from .levels import FileTooLongError, LevelJob, MadeLevel, RefusedLevel, make_level
 from .processes import Call, Pool
 
 __all__ = ["LevelQueue", "Loan"]
@@ -351,10 +351,11 @@ class LevelQueue:
             call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings))
             made: MadeLevel | RefusedLevel = await self._pool.run(call)
         except TimeoutError:
-            raise TooLargeError(f"expected a level that is made within {seconds:g} s; {advice}") from None
+            raise LargeLevelError(
+                f"expected a level that is made within {seconds:g} s (level_seconds); {advice}"
+            ) from None
         except MemoryError:
-            most = self._settings.memory_of_levels >> 20
-            raise TooLargeError(f"expected a level that needs at most {most} MiB of memory; {advice}") from None
+            raise LargeLevelError(f"expected a level that needs at most {self._memory}; {advice}") from None
         except UnforeseenError as error:
             if error.errno in _NO_ROOM:
                 raise self._no_room(0) from None
@@ -372,14 +373,29 @@ class LevelQueue:
             raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
         if isinstance(made, MadeLevel):
             return await asyncio.to_thread(_checked_size, wanted, made)
-        if made.kind == TooLargeError.__name__:
+        refused = made.error()
+        if isinstance(refused, FileTooLongError):
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
-            raise TooLargeError(f"expected a level whose file has less than {wanted.most_bytes} bytes; {advice}")
-        refused = made.error()
+            raise LargeLevelError(
+                f"expected a level whose file has less than {wanted.most_bytes} bytes, a quarter of the disk space for "
+                f"levels (level_disk); {advice}"
+            )
+        if isinstance(refused, TooLargeError):  # what the decoder advises is for those who call it
+            told, _, _ = str(refused).partition("; max_vertices=")
+            raise LargeLevelError(f"expected a level that needs at most {self._memory}: {told}; {advice}")
+        if isinstance(refused, InputError) and not isinstance(refused, OptionError):
+            raise UnfitLevelError(str(refused))
         if isinstance(refused, StreamError):
             damage.tell(self._storage, key.container, refused)
         raise refused
+
+    @property
+    def _memory(self) -> str:
+        """The memory that a level may take, and the setting that says so."""
+        own = self._settings.level_memory is not None
+        setting = "level_memory" if own else "half of LODESTREAM_MEMORY, but at least 1024 MiB"
+        return f"{self._settings.memory_of_levels >> 20} MiB of memory ({setting})"
 
     def _no_room(self, most: int) -> LodestreamError:
         # What readers hold will be free again; what else is on the disk will not by itself.

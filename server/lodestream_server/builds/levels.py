@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import resource
 import signal
@@ -11,6 +12,8 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -31,13 +34,27 @@ from .answers import reason_of
 if TYPE_CHECKING:
     from lodestream import Surface
 
-__all__ = ["MEDIA_TYPES", "LevelJob", "MadeLevel", "RefusedLevel", "make_level"]
+__all__ = ["MEDIA_TYPES", "FileTooLongError", "LevelJob", "MadeLevel", "RefusedLevel", "make_level", "written_by"]
+
+#: Raise this with every change by which a level of the same container becomes a file of other bytes: of a writer, of
+#: tags, metadata and overviews, of what decoding gives. Caches, and readers that fetch a file by ranges, take files of
+#: one ETag for the same bytes. A test compares files of this revision.
+_REVISION = 1
+
+# What else decides about the bytes of some format.
+_LIBRARIES = ("h5netcdf", "h5py", "lodestream", "numpy", "rasterio", "scipy", "vtk")
 
 #: The formats of a level, and what they are called on the way.
 MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}
 
+
+class FileTooLongError(TooLargeError):
+    """The file of a level became longer than allowed."""
+
+
 # What an error is told as: the first class that fits.
 _KINDS: tuple[type[LodestreamError], ...] = (
+    FileTooLongError,
     TooLargeError,
     OptionError,
     FormatError,
@@ -89,8 +106,8 @@ class RefusedLevel:
     Attributes
     ----------
     kind : str
-        Name of an exception class: `TooLargeError` if the file became too large; otherwise the class that was raised,
-        or a base of it.
+        Name of an exception class: `FileTooLongError` if the file became too large; otherwise the class that was
+        raised, or a base of it.
     reason : str
         One line.
     """
@@ -102,6 +119,18 @@ class RefusedLevel:
         """The exception, limited to known classes: the process is not trusted."""
         kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
         return kind(reason_of(self.reason))
+
+
+@cache
+def written_by() -> str:
+    """What decides about the bytes of a level file beside the container, as some hexadecimal digits."""
+    versions = [str(_REVISION)]
+    for name in _LIBRARIES:
+        try:
+            versions.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            versions.append(name)
+    return hashlib.sha256("\n".join(versions).encode()).hexdigest()[:12]
 
 
 def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
@@ -164,7 +193,7 @@ def _short_files(job: LevelJob) -> Iterator[None]:
 
     Raises
     ------
-    TooLargeError
+    FileTooLongError
         When one was to become longer, whatever the library makes of that.
     """
     exceeded: list[int] = []
@@ -178,10 +207,10 @@ def _short_files(job: LevelJob) -> Iterator[None]:
     except Exception as error:
         if not exceeded:
             raise
-        raise TooLargeError(os.strerror(errno.EFBIG)) from error
+        raise FileTooLongError(os.strerror(errno.EFBIG)) from error
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (before, hard))
         tempfile.tempdir = folder
         signal.signal(signal.SIGXFSZ, handler)
     if exceeded:
-        raise TooLargeError(os.strerror(errno.EFBIG))
+        raise FileTooLongError(os.strerror(errno.EFBIG))

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lodestream.container.capacity import memory_limit
 from lodestream.container.metadata import with_notes
 from lodestream.errors import (
     FormatWarning,
@@ -33,20 +34,26 @@ from . import finished
 from .stored_quality import without_quality
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from lodestream import Surface
 
 __all__ = [
     "ALLOWED_BY",
     "CLOSED",
+    "NO_ROOM",
     "UNNAMED",
     "Built",
     "Job",
+    "Parsed",
     "Refused",
     "build",
+    "may_pass",
+    "moved",
     "preload",
+    "raise_where_full",
     "read_progress",
+    "reporter",
 ]
 
 _log = logging.getLogger(__name__)
@@ -59,6 +66,9 @@ UNNAMED = "upload"
 
 #: What is said to whoever brings a file of a format that is switched off.
 ALLOWED_BY = "on this server; its setting LODESTREAM_FORMATS lists those that are read"
+
+#: Errors of the system where a disk, or somebody's part of it, is full.
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 # Errors of the system that say nothing of what is in a file.
 _LOCAL = {
@@ -89,7 +99,10 @@ _SHORT_OF_MEMORY = re.compile(
 )
 
 _PROGRESS = "progress"
-_CONTAINER = "container"
+_CONTAINER, _SCRATCH, _READ, _MADE = "container", "scratch", "read", "made"
+_BLOCK = 1 << 20
+#: The part of the memory that an array of a file may take in memory.
+_PART = 16
 _REPORT_SECONDS = 0.1
 _LONGEST_PROGRESS = 20
 
@@ -114,6 +127,8 @@ class Job:
         Folder to write to; empty at the start.
     allowed : tuple of str or None
         Names of the formats that may be read; None: all.
+    shared : bool
+        Whether a surface that does not fit into memory is left to others once it is parsed.
     """
 
     files: tuple[Path, ...]
@@ -124,11 +139,27 @@ class Job:
     max_vertices: int
     folder: Path
     allowed: tuple[str, ...] | None = None
+    shared: bool = False
 
     @property
     def container(self) -> Path:
         """Path of the container to write."""
         return self.folder / _CONTAINER
+
+    @property
+    def scratch(self) -> Path:
+        """Folder for what does not fit into memory."""
+        return self.folder / _SCRATCH
+
+    @property
+    def parsed(self) -> Path:
+        """Folder of the arrays of a file, as far as they do not fit into memory."""
+        return self.scratch / _READ
+
+    @property
+    def room(self) -> int:
+        """Bytes to work in: half of what this process may have."""
+        return memory_limit() // 2
 
 
 @dataclass(frozen=True)
@@ -144,6 +175,18 @@ class Built:
 
     sha256: str
     errors: str | None = None
+
+
+@dataclass(frozen=True)
+class Parsed:
+    """The upload was parsed and left for others to build: its surface is on disk, see `Job.parsed`.
+
+    Attributes
+    ----------
+    vertices : int
+    """
+
+    vertices: int
 
 
 @dataclass(frozen=True)
@@ -174,8 +217,10 @@ def preload() -> None:
     """
     import numpy.ma  # noqa: F401  # numpy itself imports it when it first looks for the different values of an array
 
+    import lodestream.bands.front
+    import lodestream.bands.inspecting
+    import lodestream.bands.stored_surface
     import lodestream.decoding.decoder
-    import lodestream.decoding.inspection
     import lodestream.encoding.encoder
     import lodestream.formats
     import lodestream.mesh.recognise
@@ -187,29 +232,50 @@ def preload() -> None:
     library()
 
 
-def build(job: Job) -> Built | Refused:
-    """Read and encode an upload."""
+def build(job: Job) -> Built | Parsed | Refused:
+    """Read and encode an upload, or only read it if it is large and others build it."""
     # Errors come back as values: not every exception survives the way between processes.
     try:
         return _build(job)
     except SwitchedOffError as error:
         return Refused(f"{error} {ALLOWED_BY}", final=False)
     except LodestreamError as error:
-        return Refused(str(error), final=not _may_pass(error))
+        raise_where_full(error)
+        return Refused(str(error), final=not may_pass(error))
 
 
-def _may_pass(error: LodestreamError) -> bool:
+def raise_where_full(error: LodestreamError) -> None:
+    """Raise the error of the system that stands behind an error, if it is that the disk is full.
+
+    What was uploaded is not refused then: its build is begun again when there is room.
+
+    Raises
+    ------
+    OSError
+    """
+    for cause in _causes(error):
+        if isinstance(cause, OSError) and cause.errno in NO_ROOM:
+            raise OSError(cause.errno, os.strerror(cause.errno)) from error
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """An error, and what readers made it of."""
+    cause: BaseException | None = error
+    while cause is not None:
+        yield cause
+        cause = cause.__cause__ or cause.__context__
+
+
+def may_pass(error: LodestreamError) -> bool:
     """Whether an upload was refused for what this server lacks, or forbids, and not for its bytes."""
     if isinstance(error, TooLargeError | UnavailableError | UnsupportedVersionError):
         return True
-    cause: BaseException | None = error
-    while cause is not None:  # what a reader made its own error of
+    for cause in _causes(error):
         if isinstance(cause, MemoryError) or getattr(cause, "errno", None) in _LOCAL:
             return True
         # HDF5 and GDAL say it in words only; a filter fails for want of memory as for damage.
         if _SHORT_OF_MEMORY.search(str(cause)):
             return True
-        cause = cause.__cause__ or cause.__context__
     return False
 
 
@@ -228,31 +294,54 @@ def read_progress(folder: Path) -> float:
     return fraction if 0.0 <= fraction <= 1.0 else 0.0
 
 
-def _build(job: Job) -> Built:
+def _build(job: Job) -> Built | Parsed:
     from lodestream import encode
+    from lodestream.bands.front import goes_by_bands
+    from lodestream.bands.stored_surface import save_surface
     from lodestream.formats import check_allowed
+    from lodestream.scratch import Scratch
 
     path = job.container
     if finished.is_container(job.files[0]):
         check_allowed(("lode",), job.allowed)
         try:
-            return Built(*finished.keep(job, path, _reporter(job.folder)))
+            return Built(*finished.keep(job, path, reporter(job.folder)))
         except (StreamError, TooLargeError) as error:
             error.args = (f"{job.filename or UNNAMED}: {error}", *error.args[1:])
             raise
     quality, options = without_quality(job.options)
     surface = _read(job, options)
+    report = reporter(job.folder)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)  # it stands in the notes
-        container = encode(surface, quality=quality, progress=_reporter(job.folder))
+        if goes_by_bands(surface, quality, job.room):
+            if job.shared:
+                save_surface(surface, Scratch(job.parsed))
+                return Parsed(sum(block.shape[0] * block.shape[1] for block in surface.blocks))
+            made = job.folder / _MADE
+            encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.scratch / "build")
+            return Built(moved(made, path))
+        container = encode(surface, quality=quality, progress=report)
     with NewFile(path) as file:
         file.write(container)
     return Built(hashlib.sha256(container).hexdigest())
 
 
+def moved(made: Path, path: Path) -> str:
+    """Put a container in its place, and on disk; returns its SHA-256."""
+    digest = hashlib.sha256()
+    with made.open("rb") as source, NewFile(path) as target:
+        while block := source.read(_BLOCK):
+            digest.update(block)
+            target.write(block)
+    made.unlink()
+    return digest.hexdigest()
+
+
 def _read(job: Job, options: dict[str, str]) -> Surface:
     from lodestream.encoding.losses import at_holes
     from lodestream.formats import read
+    from lodestream.scratch import Room, Scratch
 
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always", FormatWarning)
@@ -262,6 +351,7 @@ def _read(job: Job, options: dict[str, str]) -> Surface:
             max_vertices=job.max_vertices,
             filename=job.filename or UNNAMED,
             allowed=job.allowed,
+            room=Room(lambda: Scratch(job.parsed), job.room // _PART),
             **options,
         )
     said = [str(warning.message) for warning in found if warning.category is FormatWarning]
@@ -275,7 +365,8 @@ def _read(job: Job, options: dict[str, str]) -> Surface:
     return surface
 
 
-def _reporter(folder: Path) -> Callable[[float], None]:
+def reporter(folder: Path) -> Callable[[float], None]:
+    """What is told the fraction that is done, 0 to 1, and leaves it for `read_progress`."""
     last = float("-inf")
 
     def report(fraction: float) -> None:

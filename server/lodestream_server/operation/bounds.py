@@ -29,7 +29,6 @@ class Bounds(BaseModel):
 
     upload_files: int = _count(64, "files in one upload")
     max_uploads: int = _count(64, "uploads in progress")
-    max_vertices: int = _count(1 << 28, "vertices of one surface")
     max_surfaces: int = _count(100_000, "surfaces on the server")
     owner_bytes: int | None = _follows(
         1,

@@ -49,10 +49,12 @@ class Settings(Bounds):
     origins: tuple[str, ...] = _field("origins")
     formats: tuple[str, ...] = _field("formats")
     upload_bytes: int = _field("upload_bytes")
+    max_vertices: int = _field("max_vertices")
     keep_free: int | None = _field("keep_free")
     workers: int = _field("workers")
     threads: int | None = _field("threads")
     memory: int | None = _field("memory")
+    dask: str = _field("dask")
     log_format: str = _field("log_format")
     log_level: str = _field("log_level")
 

@@ -8,11 +8,12 @@ for every command.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from lodestream.sizes import parse_size
 
 __all__ = ["FORMATS", "GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
 
@@ -47,8 +48,6 @@ FORMATS = (
 # attack.
 _LEFT_OUT = ("usgs-dem", "bpt", "vmec", "text")
 
-_UNITS = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
-_UNITS |= {f"{letter}i": 1024**power for power, letter in enumerate("kmgt", 1)}
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 
 
@@ -72,15 +71,6 @@ class Kind:
     metavar: str
     parse: Callable[[str], Any]
     show: Callable[[Any], str] = str
-
-
-def _size(text: str) -> int:
-    found = re.fullmatch(r"(\d{1,18})(\.\d{1,9})? ?([a-z]{0,3})", text.lower(), re.ASCII)
-    unit = None if found is None else _UNITS.get(found[3].removesuffix("b"))
-    if found is None or unit is None:
-        raise ValueError
-    size: int = int(found[1]) * unit + round(float(found[2] or 0) * unit)
-    return size
 
 
 def _show_size(size: int) -> str:
@@ -115,6 +105,13 @@ def _formats(text: str) -> tuple[str, ...]:
     return names
 
 
+def _scheduler(text: str) -> str:
+    # Here, as nothing of the library is needed for other commands.
+    from lodestream.bands.cluster import checked_address
+
+    return checked_address(text) if text else text
+
+
 def _choice(*words: str) -> Kind:
     def parse(text: str) -> str:
         if text not in words:
@@ -126,10 +123,11 @@ def _choice(*words: str) -> Kind:
 
 _TEXT = Kind("text", "TEXT", str)
 _INTEGER = Kind("an integer", "N", int)
-_SIZE = Kind("bytes, such as 1000000 or 4GiB", "SIZE", _size, _show_size)
+_SIZE = Kind("bytes, such as 1000000 or 4GiB", "SIZE", parse_size, _show_size)
 _SWITCH = Kind("yes or no", "", _switch, lambda value: "yes" if value else "no")
 _PATH = Kind("a path", "PATH", _path)
 _LIST = Kind("words separated by commas", "A,B", _list, ",".join)
+_SCHEDULER = Kind("the address of a Dask scheduler such as tcp://10.0.0.1:8786", "ADDRESS", _scheduler)
 _FORMATS = Kind(f"all, or some of {', '.join(FORMATS)}, separated by commas", "A,B", _formats, ",".join)
 
 
@@ -293,6 +291,7 @@ _SETTINGS = (
         usual=f"all but {', '.join(_LEFT_OUT)}",
     ),
     Setting("upload_bytes", _SIZE, 4 << 30, "largest upload", "limits", 1),
+    Setting("max_vertices", _INTEGER, 1 << 28, "vertices of one surface", "limits", 1),
     Setting(
         "keep_free",
         _SIZE,
@@ -330,6 +329,15 @@ _SETTINGS = (
         "limits",
         256 << 20,
         usual="half of the machine's memory",
+    ),
+    Setting(
+        "dask",
+        _SCHEDULER,
+        "",
+        "address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers build what is too large for the "
+        "memory of one build; they must see the data folder under the same path",
+        "limits",
+        usual="none",
     ),
     Setting("log_format", _choice("text", "json"), "text", "format of the log on standard error", "operation"),
     Setting(

@@ -16,7 +16,7 @@ from ..access.gate import caller_of
 from ..access.scopes import needs
 from ..builds.level_files import Key
 from ..builds.level_queue import Loan
-from ..builds.levels import MEDIA_TYPES
+from ..builds.levels import MEDIA_TYPES, written_by
 from ..problems import responses
 from ..storage.records import Record
 from . import examples
@@ -58,7 +58,7 @@ async def level(
     record = ready(parts, surface)
     _check(record, level)
     format_ = written(wanted)
-    etag = f'"{record.container}-{level}-{format_.name}"'
+    etag = f'"{record.container}-{level}-{format_.name}-{written_by()}"'
     headers = {"etag": etag, "cache-control": "no-cache"}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:

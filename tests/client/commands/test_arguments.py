@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lodestream.errors import OptionError
@@ -9,6 +11,8 @@ from lodestream_client.commands import values
 from lodestream_client.requests import addresses
 from lodestream_client.stream import pacing
 from lodestream_client.terminal import output
+
+from ..conftest import Run
 
 
 @pytest.mark.parametrize(
@@ -125,3 +129,21 @@ def test_a_surface_can_be_pulled_too() -> None:
 def test_what_cannot_be_pulled(url: str) -> None:
     with pytest.raises(OptionError, match="expected"):
         addresses.source_url(url)
+
+
+@pytest.mark.parametrize("command", ["encode", "convert", "push"])
+def test_options_of_formats_are_named_as_the_command_line_has_them(
+    command: str, run: Run, server: str, tmp_path: Path
+) -> None:
+    images = pytest.importorskip("PIL.Image")
+    path = tmp_path / "a map, encoding=any.png"
+    images.fromarray(np.zeros((20, 30, 3), np.uint8)).save(path)
+    out = {"encode": tmp_path / "a.lode", "convert": tmp_path / "a.npy", "push": server}[command]
+    hint = "give their meaning with -o encoding=terrain-rgb or -o encoding=terrarium"
+    code, _, stderr = run(command, path, out)
+    assert (code, stderr.count("-o ")) == (1, 2)
+    assert hint in stderr
+    assert "a map, encoding=any.png: " in stderr
+    code, _, stderr = run(command, path, out, "-o", "encoding=shades")
+    assert code == 1
+    assert "expected -o encoding= one of grey, terrain-rgb, terrarium, got 'shades'" in stderr

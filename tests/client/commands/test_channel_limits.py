@@ -88,6 +88,44 @@ def test_a_name_that_is_not_there_is_refused_with_those_that_are(
     assert not (tmp_path / "o.npz").exists()
 
 
+@pytest.mark.parametrize("way", ["decode", "ws", "http"])
+@pytest.mark.parametrize(("attributes", "limit"), [("none", "speed"), ("speed", "wind"), ("speed", "wind_1")])
+def test_an_error_of_what_is_left_out_is_refused_with_the_reason(
+    run: Run, file: Path, served: str, tmp_path: Path, way: str, attributes: str, limit: str
+) -> None:
+    source = ("decode", file) if way == "decode" else ("pull", "--transport", way, served)
+    out = tmp_path / "o.npz"
+    code, _, stderr = run(*source, out, "--attributes", attributes, "--until-rms", f"{limit}=0.1")
+    assert code == 1
+    assert f"got one of '{limit}', which is left out: it is not among the attributes asked for" in stderr
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("way", ["decode", "ws", "http"])
+@pytest.mark.parametrize(
+    ("attributes", "names"), [("none", ["z"]), ("speed", ["z", "speed"]), ("wind", ["z", "wind_0", "wind_1"])]
+)
+@pytest.mark.parametrize(("limit", "ended"), [(("--max-bytes", "4000"), "bytes"), (("--level", "3"), "level")])
+def test_errors_are_told_of_what_is_written_whatever_ended_it(
+    run: Run,
+    file: Path,
+    served: str,
+    tmp_path: Path,
+    way: str,
+    attributes: str,
+    names: list[str],
+    limit: tuple[str, str],
+    ended: str,
+) -> None:
+    source = ("decode", file) if way == "decode" else ("pull", "--transport", way, served)
+    code, stdout, stderr = run(*source, tmp_path / "o.npz", "--json", "--attributes", attributes, *limit)
+    told = json.loads(stdout)
+    assert (code, told["ended"], list(told["channels"])) == (0, ended, names), stderr
+    states = described(run, file)["levels" if ended == "level" else "layers"]
+    known = [dict(zip(("z", "speed", "wind_0", "wind_1"), it["channels"], strict=True)) for it in states]
+    assert told["channels"] in [{name: errors[name] for name in names} for errors in known]
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

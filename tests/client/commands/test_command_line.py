@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rich.console import Console
 
 import lodestream as ls
-from lodestream_client.commands import surfaces
 from lodestream_server import running_server
+from tests.core.surfaces import torus
 
 from ..conftest import Run
 
@@ -317,7 +316,8 @@ def test_push_of_many_files(run: Run, server: str, tmp_path: Path) -> None:
         np.save(names[-1], np.add.outer(np.arange(20 + number), np.arange(30)))
     code, stdout, stderr = run("push", "--each", *names, server)
     assert (code, stderr) == (0, "")
-    urls = stdout.splitlines()
+    urls, files = zip(*(line.split(" ", 1) for line in stdout.splitlines()), strict=True)
+    assert files == tuple(map(str, names))
     shapes = [json.loads(run("info", url, "--json")[1])["shape"] for url in urls]
     assert shapes == [[20, 30], [21, 30], [22, 30]]
     (tmp_path / "no.off").write_text("OFF\n1 1 0\n0 0 0\n3 0 0 0\n")
@@ -332,10 +332,21 @@ def test_push_of_many_files(run: Run, server: str, tmp_path: Path) -> None:
     assert "no.off: " in stderr.splitlines()[0]
     code, stdout, _ = run("push", "--each", *given, server, "--json")
     told = json.loads(stdout)
-    assert (code, len(told["surfaces"]), [it["file"] for it in told["failed"]]) == (1, 2, [*map(str, given[1:3])])
+    assert (code, [it["file"] for it in told["surfaces"]]) == (1, [str(given[0]), str(given[3])])
+    assert [it["file"] for it in told["failed"]] == [*map(str, given[1:3])]
     assert run("push", "--each", *names, server, "--name", "all")[0] == 2
     code, stdout, stderr = run("push", "--each", *names, "http://127.0.0.1:9")
     assert (code, stdout, stderr.count("\n")) == (1, "", 1)
+
+
+def test_push_of_many_files_says_whose_notes_they_are(run: Run, server: str, tmp_path: Path) -> None:
+    heights = np.add.outer(np.arange(20.0), np.arange(30.0))
+    np.save(tmp_path / "whole.npy", heights)
+    heights[3, 4] = np.nan
+    np.save(tmp_path / "holes.npy", heights)
+    code, stdout, stderr = run("push", "--each", tmp_path / "whole.npy", tmp_path / "holes.npy", server)
+    assert (code, len(stdout.splitlines())) == (0, 2)
+    assert stderr == f"lodestream: {tmp_path / 'holes.npy'}: 1 of 600 points are holes\n"
 
 
 def test_list_finds_and_sorts(run: Run, tmp_path: Path) -> None:
@@ -383,11 +394,35 @@ def test_convert_goes_from_one_format_to_another(run: Run, tmp_path: Path, monke
     np.testing.assert_array_equal(np.load(tmp_path / "d.npy"), [[1, 2], [3, 4]])
 
 
+def test_convert_tells_the_size_of_what_it_writes(run: Run, tmp_path: Path) -> None:
+    around = torus(8, 9)
+    ls.write(ls.Surface(np.concatenate([around, around[:, :1]], axis=1)), tmp_path / "a.vts")
+    assert ls.read(tmp_path / "a.vts").shape == (8, 9)  # the last column repeats the first
+    assert run("convert", tmp_path / "a.vts", tmp_path / "b.npy")[2].startswith("lodestream: 8 x 10 points written in ")
+    assert json.loads(run("convert", tmp_path / "a.vts", tmp_path / "b.npy", "--json")[1])["shape"] == [8, 10]
+    assert np.load(tmp_path / "b.npy").shape == (8, 10, 3)
+
+
+def test_convert_takes_a_container(run: Run, container_file: Path, terrain: Terrain, tmp_path: Path) -> None:
+    assert run("convert", container_file, tmp_path / "b.nc", "--name", "hill")[0] == 0
+    found = ls.read(tmp_path / "b.nc")
+    np.testing.assert_array_equal(found.points, terrain)
+    assert found.metadata["tags"][""]["NC_GLOBAL#title"] == "hill"
+    (tmp_path / "cut.lode").write_bytes(container_file.read_bytes()[:1000])
+    code, _, stderr = run("convert", tmp_path / "cut.lode", tmp_path / "c.npz")
+    assert code == 1
+    assert "cut.lode: expected" in stderr
+    assert run("convert", tmp_path / "none.lode", tmp_path / "c.npz")[0] == 1
+    assert not (tmp_path / "c.npz").exists()
+
+
 def test_convert_says_what_it_does_not_do(run: Run, container_file: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.eye(3))
     for files, words in (
         ((tmp_path / "a.npy", tmp_path / "b.lode"), "lodestream encode makes containers"),
-        ((container_file, tmp_path / "b.npy"), "lodestream decode reads containers"),
+        ((container_file, tmp_path / "a.npy", tmp_path / "b.vts"), "expected one container"),
+        ((container_file, tmp_path / "b.npy", "--closed", "rows"), "for the container"),
+        ((container_file, tmp_path / "b.npy", "-o", "array=a"), "for the container"),
         ((tmp_path / "a.npy", tmp_path / "b.npy", "--precision", "1"), "--precision"),
     ):
         code, stdout, stderr = run("convert", *files)
@@ -524,7 +559,7 @@ def test_a_list_has_a_line_for_each_however_narrow_the_terminal(
     code, stdout, _ = run("push", terrain_file, server, "--name", "long " * 40)
     assert code == 0
     url = stdout.splitlines()[-1]
-    monkeypatch.setattr(surfaces, "console", lambda: Console(file=sys.stdout, width=40))
+    monkeypatch.setenv("COLUMNS", "40")
     (line,) = [line for line in run("list", server)[1].splitlines() if "long" in line]
     assert line.startswith(f"{url}  ready  ")
     assert line.count("long") == 40

@@ -27,7 +27,7 @@ def test_the_page_has_a_row_for_each_format() -> None:
         [
             row.name,
             " ".join(row.suffixes),
-            ", ".join(way for way, there in (("in", row.read), ("out", row.write)) if there),
+            ", ".join(way for way, there in (("in", row.read), ("out", row.suffixes_out)) if there),
         ]
         for row in formats.formats()
     ]
@@ -38,7 +38,7 @@ def test_the_command_has_a_row_for_each_format(capsys: pytest.CaptureFixture[str
     assert main(["formats", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["formats"]
     assert [row["name"] for row in rows] == [row.name for row in formats.formats()]
-    assert [row["write"] for row in rows] == [row.write is not None for row in formats.formats()]
+    assert [row["write"] for row in rows] == [bool(row.suffixes_out) for row in formats.formats()]
     assert main(["formats"]) == 0
     shown = capsys.readouterr().out
     for row in formats.formats():

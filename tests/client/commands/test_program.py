@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -124,6 +125,18 @@ def test_shells_complete_commands_and_options(tmp_path: Path) -> None:
         printed = call("completion", shell)
         assert printed.returncode == 0
         assert b"lodestream" in printed.stdout
+        assert b"\\n#" not in printed.stdout
+        assert printed.stdout.startswith(b"#compdef lodestream\n") == (shell == "zsh")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_knows_the_command_by_what_is_printed_for_it() -> None:
+    pytest.importorskip("argcomplete")
+    script = call("completion", "bash").stdout
+    asked = b'eval "$(cat)"; complete -p lodestream; type _python_argcomplete'
+    done = subprocess.run(["bash", "-c", asked], input=script, capture_output=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    assert b"-F _python_argcomplete lodestream" in done.stdout
 
 
 def test_completion_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

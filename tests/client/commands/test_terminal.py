@@ -6,6 +6,8 @@ import ast
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +139,33 @@ def test_a_progress_bar_takes_no_markup() -> None:
     columns = output._drawn().columns
     assert columns
     assert all(not getattr(column, "markup", False) for column in columns)
+
+
+@pytest.mark.parametrize("command", ["encode", "decode"])
+def test_work_whose_steps_are_minutes_apart_has_its_time_left(
+    command: str, container_file: Path, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    periods, now = list[float](), [0.0]
+
+    @contextmanager
+    def unseen(period: float = 30.0) -> Iterator[output.Progress]:
+        periods.append(period)
+        yield output._Unseen()
+
+    monkeypatch.setattr(f"lodestream_client.commands.{command}.progress_bar", unseen)
+    given = (container_file, tmp_path / "a.npy") if command == "decode" else (tmp_path / "b.npy", tmp_path / "b.lode")
+    np.save(tmp_path / "b.npy", np.add.outer(np.arange(20.0), np.arange(30.0)))
+    assert run(command, *given)[0] == 0
+    (period,) = periods
+    bar = output._drawn(period)
+    bar.get_time = lambda: now[0]
+    task = bar.add_task("encoding", total=1.0, figures="")
+    for step in (0.01, 0.02, 0.03):
+        now[0] += 200
+        bar.update(task, completed=step)
+    left = bar.columns[-1]
+    assert not isinstance(left, str)
+    assert str(left.render(bar.tasks[0])) == "5:23 h left"
 
 
 @pytest.mark.parametrize("terminal", [False, True])

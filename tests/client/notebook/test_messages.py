@@ -94,3 +94,22 @@ def test_why_there_are_no_bytes_is_said(error: Exception, code: str) -> None:
     assert answer is not None
     assert (answer[0]["kind"], answer[0]["code"]) == ("refused", code)
     assert "gone" in answer[0]["detail"]
+
+
+def test_any_other_failure_is_told_to_the_page_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(MemorySource):
+        def read(self, offset: int, length: int) -> bytes:
+            raise ZeroDivisionError("by nought")
+
+    answer = Answers(Broken(DATA, "bytes"), Path(__file__)).to({"kind": "read", "id": "a", "offset": 0, "length": 5})
+    assert answer == (
+        {
+            "kind": "refused",
+            "id": "a",
+            "detail": "the kernel failed, see its log: ZeroDivisionError: by nought",
+            "code": "",
+        },
+        [],
+    )
+    assert "a question of the page of a widget failed" in caplog.text
+    assert "ZeroDivisionError" in caplog.text

@@ -231,6 +231,8 @@ def test_without_the_page_it_says_how_to_build_it(
     monkeypatch.setattr(page, "widget_modules", lambda: None)
     with pytest.raises(UnavailableError, match="make page builds it"):
         widget(container)
+    with pytest.raises(FileNotFoundError):
+        widget(tmp_path / "none.lode")
 
 
 def test_what_is_refused_is_closed_again(

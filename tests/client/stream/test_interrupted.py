@@ -67,7 +67,7 @@ encode = lodestream.encode
 def again(*given, **more):
     pathlib.Path({began!r}).touch()
     while True:
-        encode(*given, **more)
+        encode(*given, **{{**more, "out": None}})  # else it ends with each file
 lodestream.encode = again
 """
 

@@ -74,9 +74,8 @@ def sections_of(data: bytes) -> list[tuple[int, int]]:
         serialized = headers.serialize_header(replace(index.header, masked=False, holes=(), mask_data=()))
         places = [(8, len(serialized)), (len(serialized), index.layers[0].offset)]
     places += [(layer.offset, layer.end) for layer in index.layers]
-    for place in (index.residual, index.metadata):
-        if place is not None:
-            places.append((place.offset, place.end))
+    others = (index.residual, *(section.range for section in index.optional), index.metadata)
+    places += sorted((place.offset, place.end) for place in others if place is not None)
     _, root = sections.parse_footer(data[tail:], tail)
     return [*places, (index.index.offset, root.offset), (root.offset, root.end)]
 

@@ -513,7 +513,8 @@ def test_optional_sections_may_stand_anywhere_and_have_their_place_in_the_index(
 def test_a_bomb_in_place_of_residual_is_corrupt() -> None:
     container, index = contained("small")
     assert index.residual is not None
-    payload = sections.serialize_chunks(Errors(0.0, 0.0), [zlib.compress(bytes(30_000_000), 9)])
+    bomb = zlib.compress(bytes(30_000_000), 9)
+    payload = sections.serialize_chunk_table(Errors(0.0, 0.0), [bomb]) + bomb
     bomb = sections.section(sections.RESIDUAL, payload)
     decoder = Decoder()
     views = decoder.feed(container[: index.residual.offset] + bomb)

@@ -13,6 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream import Decoder, encode
 from lodestream.coordinates.coordinate_rules import fit_axis
 from lodestream.coordinates.georeference import has_gap, level_coordinates
 from lodestream.coordinates.height_fields import coordinates, level_metadata, to_heights, to_xyz, window_axes
@@ -290,3 +291,17 @@ def test_metadata_of_levels_keep_the_rest_and_drop_the_seam() -> None:
     assert gapped["nodes"] == [pytest.approx([0.0, 1.2, 2.4, 3.0]), None]
     x, y = coordinates(Surface(np.zeros((4, 3)), metadata=gapped))
     assert (x[0].tolist(), y[:, 0].tolist()) == ([0, 2, 4], pytest.approx([0, 2, 4, 5]))
+
+
+def test_a_level_of_points_in_space_has_no_geotransform_of_its_indices() -> None:
+    y, x = np.mgrid[0:97, 0:70].astype(np.float64)
+    points = np.stack([500 + 2 * x, 1000 - 3 * y, np.hypot(x, y)], axis=-1)
+    for metadata in ({"unit": "m"}, {"unit": "m", "geotransform": [499.0, 2.0, 0.0, 1001.5, 0.0, -3.0]}):
+        decoder = Decoder()
+        decoder.feed(encode(Surface(points, metadata=metadata)))
+        for level in range(decoder.view().level):
+            found = decoder.surface(level).metadata
+            assert set(found) == set(metadata), level
+    decoder = Decoder()
+    decoder.feed(encode(Surface(points[..., 2])))
+    assert decoder.surface(2).metadata["geotransform"][1] == pytest.approx(69 / 3)

@@ -326,3 +326,18 @@ def test_an_interrupted_view_is_decoded_on_from_where_it_was(
             interrupts += 1
     assert interrupts == 4
     assert np.array_equal(points, surface.points)
+
+
+def test_long_segments_are_windows_of_what_arrived_and_those_of_a_caller_s_buffer_copies() -> None:
+    heights = np.random.default_rng(5).integers(0, 4000, (200, 300)).astype(np.int16)
+    container = ls.encode(heights)
+    for given in (container, bytearray(container), memoryview(bytearray(container))):
+        decoder = Decoder()
+        decoder.feed(given)
+        lent = [s.data.obj for s in decoder._reconstruction._queue.values() if isinstance(s.data, memoryview)]
+        assert lent
+        assert all(isinstance(data, bytes) for data in lent)
+        assert all(data is container for data in lent) == (given is container)
+        if not isinstance(given, bytes):
+            given[:] = bytes(len(container))  # what the caller does next
+        np.testing.assert_array_equal(decoder.view().points, heights)

@@ -151,7 +151,7 @@ def test_some_attributes_alone_are_the_same() -> None:
 def test_the_reference_and_the_kernels_agree(
     surface: ls.Surface, options: dict[str, str], layer: int, level: int
 ) -> None:
-    agree_on(ls.encode(surface, **options), layer, level)  # type: ignore[arg-type]
+    agree_on(ls.encode(surface, **options), layer, level)  # type: ignore[call-overload]
 
 
 @settings(max_examples=12)
@@ -214,7 +214,7 @@ def test_it_is_said_once_and_by_what_decodes(caplog: pytest.LogCaptureFixture) -
 def test_encoding_and_inspecting_are_refused_before_anything_is_done() -> None:
     with without_kernels():
         with pytest.raises(ls.UnavailableError, match=f"^encoding .*{WHY}"):
-            ls.encode(object())  # type: ignore[arg-type]  # it would be refused otherwise
+            ls.encode(object())  # type: ignore[call-overload]  # it would be refused otherwise
         with pytest.raises(ls.UnavailableError, match=WHY):
             inspect(io.BytesIO(b""), max_vertices=1)
 

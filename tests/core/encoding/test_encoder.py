@@ -186,7 +186,7 @@ def test_a_layer_that_would_raise_the_error_is_left_out(monkeypatch: pytest.Monk
     points = terrain((40, 33), 1)
     told = [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
     assert len(told) > 5
-    kept_layers = measured._kept_layers
+    kept_layers = measured.kept_layers
 
     def layers_when(raised: int, wrong: float) -> list[float]:
         """What is told if the layer of this number had an error of ``wrong``."""
@@ -196,7 +196,7 @@ def test_a_layer_that_would_raise_the_error_is_left_out(monkeypatch: pytest.Monk
             changed = [*found[:raised], (errors._replace(rms=wrong), cells), *found[raised + 1 :]]
             return kept_layers(header, states, changed)
 
-        monkeypatch.setattr(measured, "_kept_layers", kept)
+        monkeypatch.setattr(measured, "kept_layers", kept)
         return [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
 
     assert layers_when(3, told[2] * 1.5) == told[:3] + told[4:]

@@ -141,7 +141,7 @@ def test_bytes_cut_off_at_the_end_are_zeros_and_other_bytes_do_no_harm(large: in
     runs = [(tile, 0, count - 1, count) for tile, count in enumerate(passes_of(layout, values)) if count]
     coded = encode_runs(layout, [values], runs, large)
     end = [[0]] * len(layout.tiles)
-    padded = [Coded(s.tile, s.channel, s.first, s.passes, s.data + bytes(9), 0) for s in coded]
+    padded = [Coded(s.tile, s.channel, s.first, s.passes, bytes(s.data) + bytes(9), 0) for s in coded]
     np.testing.assert_array_equal(decode_runs(layout, 1, padded, end, large)[0], values)
     for seed, data in enumerate([b"", b"\xff", b"\xff" * 3000, b"\x00" * 3000, bytes(range(256)) * 9]):
         other = [Coded(s.tile, s.channel, s.first, s.passes, data, seed) for s in coded]

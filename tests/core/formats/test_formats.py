@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lodestream import formats
+from lodestream import encode, formats
 from lodestream.errors import (
     FormatError,
     FormatWarning,
@@ -318,6 +318,12 @@ def test_a_tile_without_a_name_is_read_by_its_format(tmp_path: Path, size: int) 
     assert surface.metadata["geotransform"][0] == pytest.approx(-122, abs=1e-3)
 
 
+def test_a_container_is_refused_with_the_function_that_takes_it(tmp_path: Path) -> None:
+    (tmp_path / "x.lode").write_bytes(encode(np.arange(12.0).reshape(3, 4)))
+    with pytest.raises(FormatError, match=r"x\.lode: expected .* a container of Lodestream: lodestream\.decode"):
+        formats.read(tmp_path / "x.lode")
+
+
 def test_options_that_do_not_exist_are_named(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.eye(3))
     np.savez(tmp_path / "a.npz", np.eye(3))
@@ -388,13 +394,13 @@ def test_every_row_of_the_table_is_complete() -> None:
     table = formats.formats()
     assert len({row.name for row in table}) == len(table)
     for row in table:
-        assert row.read or row.write
+        assert row.read or row.suffixes_out
         assert all(suffix.startswith(".") and suffix == suffix.lower() for suffix in row.suffixes)
         assert all(text for text in row.options.values())
 
 
 def test_importing_formats_loads_no_library_of_a_format() -> None:
-    libraries = ("rasterio", "trimesh", "xarray", "PIL", "h5py", "scipy", "vtkmodules")
+    libraries = ("rasterio", "trimesh", "xarray", "zarr", "PIL", "h5py", "scipy", "vtkmodules")
     code = f"import sys, lodestream.formats; print([m for m in {libraries} if m in sys.modules])"
     path = os.pathsep.join(entry for entry in sys.path if entry)
     done = subprocess.run(

@@ -233,7 +233,8 @@ def test_a_file_by_hand_is_read(tmp_path: Path) -> None:
         (
             b"<VTKFile type='vtkMultiBlockDataSet'><vtkMultiBlockDataSet><DataSet index='0' file='a.vts'/>"
             b"</vtkMultiBlockDataSet></VTKFile>",
-            r"a \.vtm file, which only names other files, and these are never opened: give its \.vts files together",
+            r"a \.vtm file, which only names other files, and these are never opened: give its \.vts files together, "
+            r"one for each block, as in lodestream.read",
         ),
     ],
 )

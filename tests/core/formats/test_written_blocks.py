@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import struct
 from pathlib import Path
 from typing import Any
@@ -174,6 +176,20 @@ class _Pipe:
 
     def __init__(self, file: io.BytesIO) -> None:
         self.write = file.write
+
+
+@pytest.mark.parametrize("name", ["none/wing.vtm", "full/wing.vtm"])
+def test_an_error_of_the_disk_names_the_vtm(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "full").mkdir()
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), ".wing.12ab.tmp")
+
+    monkeypatch.setattr(writer, "write_block", full)
+    with pytest.raises(OSError, match=r"wing\.vtm'$") as found:
+        formats.write(wing(), tmp_path / name)
+    assert (found.value.filename, found.value.filename2) == (str(tmp_path / name), None)
+    assert list((tmp_path / "full").iterdir()) == []
 
 
 def test_what_lies_in_the_folder_of_a_vtm_is_never_deleted(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import re
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 
 from lodestream import formats
 from lodestream.errors import FormatError, FormatWarning, InputError, TooLargeError
+from lodestream.formats.raster import cog, geotiff
 from lodestream.surface import Block, Surface
 
 rasterio = pytest.importorskip("rasterio")
@@ -260,6 +263,29 @@ def test_metadata_that_are_no_rules_are_refused(kind: str, metadata: dict[str, A
         formats.write_stream(Surface(hills(), metadata=metadata), kind, io.BytesIO())
 
 
+@pytest.mark.parametrize(
+    ("dtype", "nodata", "written"),
+    [
+        ("int16", -32768, "-32768"),
+        ("int16", -32768.0, "-32768"),
+        ("int16", -0.5, None),  # it would make floats of all
+        ("float32", -9999.5, "-9999.5"),
+        ("int16", 8, None),  # a height
+        ("int16", True, None),
+    ],
+)
+def test_an_ascii_grid_without_holes_has_its_nodata(
+    tmp_path: Path, dtype: str, nodata: Any, written: str | None
+) -> None:
+    surface = Surface(hills(dtype), metadata={"geotransform": PLACE, "nodata": nodata})
+    formats.write(surface, tmp_path / "a.asc")
+    found = re.findall(r"NODATA_value (\S+)", (tmp_path / "a.asc").read_text())
+    assert found == ([] if written is None else [written])
+    back = formats.read(tmp_path / "a.asc")
+    assert back.metadata.get("nodata") == (None if written is None else nodata)
+    np.testing.assert_array_equal(back.points, surface.points)
+
+
 @pytest.mark.parametrize("nodata", ["none", b"-9999", [1], True, float("inf")])
 @pytest.mark.parametrize("kind", ["cog", "netcdf", "esri-ascii"])
 def test_nodata_that_is_no_number_is_passed_over(tmp_path: Path, kind: str, nodata: Any) -> None:
@@ -274,6 +300,20 @@ def test_single_numbers_that_are_left_out_are_not_taken_for_an_attribute(tmp_pat
     with pytest.warns(FormatWarning, match="without single numbers .scalars: mach, alpha., which"):
         formats.write(surface, tmp_path / "a.npz")
     assert set(formats.read(tmp_path / "a.npz").attributes) == {"scalars"}
+
+
+@pytest.mark.parametrize("suffix", ["cog.tif", "tif"])
+def test_a_south_up_raster_stays_one_with_each_value_at_its_place(tmp_path: Path, suffix: str) -> None:
+    surface = Surface(hills(shape=(600, 700)), metadata={"geotransform": [*PLACE[:5], 30.0], "crs": utm()})
+    formats.write(surface, tmp_path / f"a.{suffix}")
+    with rasterio.open(tmp_path / f"a.{suffix}") as dataset:
+        assert list(dataset.transform.to_gdal()) == [*PLACE[:5], 30.0]
+        np.testing.assert_array_equal(dataset.read(1), surface.points)
+        x, y = PLACE[0] + 30 * 3.5, PLACE[3] + 30 * 500.5
+        assert next(dataset.sample([(x, y)])).tolist() == [surface.points[500, 3]]
+    back = formats.read(tmp_path / f"a.{suffix}")
+    assert back.metadata["geotransform"] == [*PLACE[:5], 30.0]
+    np.testing.assert_array_equal(back.points, surface.points)
 
 
 @pytest.mark.parametrize("names", [("x", "y"), ("lon", "Latitude"), ("heights", "points")])
@@ -292,3 +332,82 @@ def test_attributes_with_the_names_of_coordinates_stay_attributes_in_npz(
     assert list(again.attributes) == [f"{name}_" for name in names]
     for name, values in attributes.items():
         assert np.array_equal(again.attributes[f"{name}_"], values)
+
+
+@pytest.mark.parametrize("shown", ["values", "mask", "nothing"])
+def test_what_gdal_has_not_written_is_told_and_what_was_there_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shown: str
+) -> None:
+    """GDAL's threads tell nobody that a disk is full, so the file is read again."""
+
+    def spoilt(path: Path, predictor: int) -> Path:
+        if shown == "nothing":
+            path.write_bytes(path.read_bytes()[:100])
+            return path
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), rasterio.open(path, "r+") as dataset:
+            if shown == "values":
+                dataset.write(dataset.read(1, window=((0, 1), (0, 9))) + np.uint8(1), 1, window=((0, 1), (0, 9)))
+            else:
+                dataset.write_mask(np.ones((30, 9), np.bool_))
+        return path
+
+    # Every number of its type, so that a mask says where holes are.
+    points = np.arange(270).reshape(30, 9).astype(np.uint8)
+    surface = Surface(points, mask=points != 7)
+    monkeypatch.setattr(cog, "_optimised", spoilt)
+    path = tmp_path / "a.cog.tif"
+    path.write_bytes(b"of yesterday")
+    with pytest.raises(OSError, match="GDAL has not written the whole file: "):
+        formats.write(surface, path)
+    assert path.read_bytes() == b"of yesterday"
+    assert [found.name for found in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".cog.tif", ".nc"])
+def test_what_is_made_first_lies_on_the_disk_of_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
+) -> None:
+    made: list[str] = []
+    folder = tempfile.TemporaryDirectory
+
+    def noted(**options: Any) -> Any:
+        made.append(str(options.get("dir")))
+        return folder(**options)
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", noted)
+    formats.write(Surface(hills()), tmp_path / f"a{suffix}")
+    assert made == [str(tmp_path)]
+    made.clear()
+    formats.write_stream(Surface(hills()), suffix[1:], io.BytesIO())
+    assert made == ["None"]
+    assert [found.name for found in tmp_path.iterdir()] == [f"a{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".cog.tif"])
+@pytest.mark.parametrize(
+    ("dtype", "nodata"), [("int64", 2**63 - 1), ("int64", -(2**63)), ("uint64", 2**64 - 1), ("int64", 2**53 + 1)]
+)
+def test_nodata_that_gdal_is_not_told_exactly_is_a_mask(tmp_path: Path, dtype: str, nodata: int, suffix: str) -> None:
+    surface = with_hole(dtype, nodata=nodata)
+    formats.write(surface, tmp_path / f"a{suffix}")
+    found = formats.read(tmp_path / f"a{suffix}")
+    assert surface.mask is not None
+    assert found.mask is not None
+    assert np.array_equal(found.mask, surface.mask)
+    assert np.array_equal(found.points[surface.mask], surface.points[surface.mask])
+
+
+def test_bands_of_several_types_are_joined_strip_by_strip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(geotiff, "_AT_ONCE", 256 * 40)
+    heights, far = hills(np.int16, (700, 40)), np.full((700, 40), 2**53, np.int64)
+    surface = Surface(heights, mask=heights != 5, attributes={"far": far, "part": hills(np.float32, (700, 40)) / 3})
+    formats.write(surface, tmp_path / "a.tif")
+    found = formats.read(tmp_path / "a.tif")
+    assert found.mask is not None
+    assert np.array_equal(found.mask, heights != 5)
+    assert np.array_equal(found.points[found.mask], heights[found.mask])
+    assert np.array_equal(found.attributes["far"], far)
+    assert np.array_equal(found.attributes["part"], surface.attributes["part"])
+    far[699, 3] += 1
+    with pytest.warns(FormatWarning, match="one type for all bands: far are rounded to float64"):
+        formats.write(surface, tmp_path / "a.tif")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.formats.placed import Coordinate, place
 from lodestream.interop import pyvista_grids
 from tests.core.surfaces import terrain, torus
 
@@ -33,6 +34,7 @@ def test_heights_stand_over_their_coordinates_and_holes_are_hidden() -> None:
     whole = mask[:-1, :-1] & mask[:-1, 1:] & mask[1:, :-1] & mask[1:, 1:]
     drawn = grid.extract_surface(algorithm="dataset_surface")
     assert (drawn.cell_data["vtkGhostType"] == 0).sum() == whole.sum()
+    grid.field_data.remove("lodestream")  # as of a grid that somebody else has made
     back = ls.Surface.from_pyvista(grid)
     assert back.mask is not None
     assert np.array_equal(back.mask, mask)
@@ -50,6 +52,104 @@ def test_closed_axes_repeat_their_first_points_and_are_closed_again() -> None:
     back = ls.Surface.from_pyvista(grid)
     assert back.closed == (True, True)
     assert np.array_equal(back.points, surface.points)
+
+
+def around() -> ls.Surface:
+    """Heights around the Earth, whose longitudes go on over 180 degrees, with a column that repeats the first."""
+    values = terrain((9, 36)).astype("f4")
+    metadata = {
+        "geotransform": [95.0, 10.0, 0.0, 45.0, 0.0, -10.0],
+        "angles": [{"channel": 0, "period": 360.0, "low": -180.0}],
+        "seam": "cols",
+    }
+    return ls.Surface(values, (False, True), metadata=metadata)
+
+
+def curved() -> ls.Surface:
+    """Points on a curved grid around the Earth, with longitudes in float32 that jump."""
+    lat, lon = np.meshgrid(np.linspace(-60, 60, 13), np.arange(0.0, 360.0, 10.0), indexing="ij")
+    east = (lon + 100.1 + lat / 10 + 180) % 360 - 180
+    found = place(
+        terrain((13, 36)).astype("f4"),
+        Coordinate(east.astype("f4"), None, True),
+        Coordinate(lat.astype("f4"), None),
+        closed=None,
+    )
+    assert found.closed == (False, True)
+    assert {"angles", "dtype"} <= set(found.metadata)
+    return found
+
+
+def surfaces() -> dict[str, ls.Surface]:
+    mask = np.ones((20, 30), np.bool_)
+    mask[4:8, 10:12] = False
+    place = {"geotransform": [0.0, 2.0, 0.0, 0.0, 0.0, -1.0], "unit": "m", "nodata": -9999, "tags": {"": {"a": "b"}}}
+    heights = terrain((20, 30))
+    return {
+        "integers with holes": ls.Surface(
+            heights.astype("i2"), mask=mask, attributes={"n": mask.astype("u1")}, metadata=place
+        ),
+        "planar": ls.Surface(torus(8, 9)[..., :2], (True, False)),
+        "integers in space": ls.Surface((torus(8, 9) * 1000).astype("i4"), (True, True), metadata={"name": "t"}),
+        "closed heights": ls.Surface(heights, (False, True), metadata={"geotransform": place["geotransform"]}),
+        "around the Earth": around(),
+        "curved": curved(),
+        "blocks": ls.Surface(
+            blocks=[ls.Block(torus(8, 9), (True, False)), ls.Block(torus(5, 6) + 9)],
+            metadata={"faces": [{"left_out": [3, 1]}, {}], "unit": "mm"},
+        ),
+    }
+
+
+@pytest.mark.parametrize("name", surfaces())
+def test_type_place_holes_and_closed_axes_come_back(name: str, tmp_path: Path) -> None:
+    surface = surfaces()[name]
+    grid = surface.to_pyvista()
+    grid.save(tmp_path / ("a.vtm" if len(surface.blocks) > 1 else "a.vts"))
+    for found in (grid, pv.read(tmp_path / ("a.vtm" if len(surface.blocks) > 1 else "a.vts"))):
+        back = ls.Surface.from_pyvista(found)
+        assert back.metadata == surface.metadata
+        for one, other in zip(back.blocks, surface.blocks, strict=True):
+            assert (one.closed, one.points.dtype) == (other.closed, other.points.dtype)
+            valid = np.ones(one.shape, np.bool_) if other.mask is None else other.mask
+            assert (one.mask is None) == (other.mask is None)
+            assert one.mask is None or np.array_equal(one.mask, valid)
+            assert np.array_equal(one.points[valid], other.points[valid])
+
+
+@pytest.mark.parametrize("change", ["moved", "raised", "cut", "hidden", "text"])
+def test_what_has_changed_in_pyvista_is_kept(change: str) -> None:
+    surface = surfaces()["integers with holes"]
+    grid: Any = surface.to_pyvista()
+    if change == "moved":
+        grid.points[:, 0] += 1
+    elif change == "raised":
+        grid.points[:, 2] += 0.5
+    elif change == "cut":
+        grid = grid.extract_subset((0, 9, 0, 8, 0, 0))
+    elif change == "hidden":
+        grid.hide_points([0])
+    else:
+        grid.field_data["lodestream"] = ['{"block": 0, "blocks": 1, "shape": 3}']
+    back = ls.Surface.from_pyvista(grid)
+    if change == "raised":  # the place is still true, the type is not
+        assert back.metadata == surface.metadata
+        assert np.array_equal(back.points[back.mask], surface.points[surface.mask] + 0.5)
+    else:
+        assert "geotransform" not in back.metadata
+        assert back.points.shape == (*((9, 10) if change == "cut" else (20, 30)), 3)
+
+
+@pytest.mark.parametrize("name", ["around the Earth", "curved", "closed heights"])
+def test_longitudes_do_not_jump_in_a_mesh(name: str) -> None:
+    surface = surfaces()[name]
+    grid: Any = surface.to_pyvista()
+    columns, rows, _ = grid.dimensions
+    assert columns == surface.shape[1] + 1
+    x = grid.points[:, 0].reshape(rows, columns)
+    steps = np.diff(x, axis=1)
+    assert (steps > 0).all()
+    assert steps.max() < 1.5 * steps.min()
 
 
 def test_a_valid_point_among_holes_and_a_closed_axis_with_holes_come_back() -> None:

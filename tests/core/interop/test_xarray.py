@@ -231,6 +231,93 @@ def test_arrays_and_datasets_of_others_are_read_as_netcdf_is() -> None:
     assert ls.Surface.from_xarray(several, variable="pressure", attributes=()).attributes == {}
 
 
+def test_flags_become_0_and_1_and_what_is_no_number_is_named() -> None:
+    values = terrain((6, 7))
+    dates = np.full((6, 7), "2001-01-01", "datetime64[ns]")
+    data = xr.Dataset({"depth": (("y", "x"), values), "land": (("y", "x"), values > 0)})
+    found = ls.Surface.from_xarray(data)  # a flag is no second surface to choose from
+    assert found.attributes["land"].dtype == np.uint8
+    assert np.array_equal(found.attributes["land"] == 1, values > 0)
+    assert list(ls.Surface.from_xarray(data, attributes=["land"]).attributes) == ["land"]
+    assert np.array_equal(ls.Surface.from_xarray(data.land).points == 1, values > 0)
+    assert ls.Surface.from_xarray(data[["land"]]).dtype == np.uint8
+    with pytest.warns(ls.FormatWarning, match="left out variables that are no numbers: day"):
+        ls.Surface.from_xarray(data.assign(day=(("y", "x"), dates)))
+    with pytest.raises(ls.OptionError, match=r"numbers or flags, got 'day' of datetime64"):
+        ls.Surface.from_xarray(data.assign(day=(("y", "x"), dates)), attributes=["day"])
+
+
+@pytest.mark.parametrize("key", [{"row": slice(None, None, -1)}, {"column": slice(None, None, -1)}, "transposed"])
+def test_rows_in_another_order_keep_nothing_that_is_true_of_their_order(key: Any) -> None:
+    metadata = {
+        "faces": {"diagonal": "main"},
+        "poles": [{"block": 0, "side": "top", "kind": "fan"}],
+        "turn": [0, 360.0, 1],
+        "seam": "cols",
+        "unit": "m",
+    }
+    surface = ls.Surface(torus(24, 24), (False, True), metadata=metadata)
+    found = dataset(surface)
+    assert_same(ls.Surface.from_xarray(found), surface)
+    changed = found.transpose("column", "row") if key == "transposed" else found.isel(key)
+    back = ls.Surface.from_xarray(changed)
+    assert back.metadata == {"unit": "m"}
+    assert back.closed == ((True, False) if key == "transposed" else (False, True))
+
+
+def test_blocks_keep_what_is_true_of_their_order_where_none_has_another() -> None:
+    blocks = [ls.Block(torus(8, 9)), ls.Block(torus(8, 9) + 9)]
+    surface = ls.Surface(blocks=blocks, metadata={"faces": [{}, {"a": 1}]})
+    tree: Any = surface.to_xarray()
+    assert_same(ls.Surface.from_xarray(tree), surface)
+    tree["block_1"] = tree["block_1"].isel(row=slice(None, None, -1))
+    assert ls.Surface.from_xarray(tree).metadata == {}
+
+
+@pytest.mark.parametrize("place", [{}, {"geotransform": [0.0, 1.0, 0.0, 0.0, 0.0, -1.0]}])
+@pytest.mark.parametrize("width", [0, 3])
+def test_attributes_called_lon_and_lat_are_no_coordinates(place: dict[str, Any], width: int, tmp_path: Path) -> None:
+    beside = {"lon": terrain((8, 9), 1), "lat": terrain((8, 9), 2)}
+    points = torus(8, 9) if width else terrain((8, 9))
+    surface = ls.Surface(points, attributes=beside, metadata={} if width else place)
+    found = dataset(surface)
+    assert_same(ls.Surface.from_xarray(found), surface)
+    if width:  # also of a Dataset that is not ours: coordinates of an array come before variables beside it
+        del found.attrs["lodestream"]
+        assert np.array_equal(ls.Surface.from_xarray(found).points, points)
+    ls.write(surface, tmp_path / "a.nc")
+    again = ls.read(tmp_path / "a.nc", attributes="lon,lat")
+    assert np.array_equal(again.points, points)
+    assert list(again.attributes) == ["lon", "lat"]
+
+
+def test_what_a_file_says_of_its_coordinates_comes_back(tmp_path: Path) -> None:
+    said = {"x": {"long_name": "east of the mast", "units": "km"}, "y": {"long_name": "north of it", "units": "km"}}
+    coords = {name: (name, np.arange(float(n)), said[name]) for name, n in (("y", 6), ("x", 7))}
+    data = xr.Dataset({"z": (("y", "x"), terrain((6, 7)), {"units": "m"})}, coords)
+    surface = ls.Surface.from_xarray(data)
+    ls.write(surface, tmp_path / "a.nc")
+    for found in (dataset(surface), dataset(ls.read(tmp_path / "a.nc"))):
+        for name, words in said.items():
+            assert found[name].attrs == words | {"axis": name.upper()}
+    assert_same(ls.Surface.from_xarray(dataset(surface)), surface)
+
+
+def test_longitudes_without_a_crs_stay_longitudes(tmp_path: Path) -> None:
+    units = {"lat": "degrees_north", "lon": "degrees_east"}
+    places = {"lat": np.linspace(-80, 80, 17), "lon": np.arange(0.0, 360.0, 10.0)}
+    data = xr.DataArray(terrain((17, 36)), {k: (k, v, {"units": units[k]}) for k, v in places.items()}, ("lat", "lon"))
+    surface = ls.Surface.from_xarray(data)
+    found = dataset(surface)
+    assert found.x.attrs["standard_name"] == "longitude"
+    assert found.x.attrs["units"] == "degrees_east"
+    assert found.y.attrs["units"] == "degrees_north"
+    assert_same(ls.Surface.from_xarray(found), surface)
+    with pytest.warns(ls.FormatWarning, match="without closure"):  # which its units tell all the same
+        ls.write(surface, tmp_path / "a.nc")
+    assert ls.read(tmp_path / "a.nc").closed == (False, True)
+
+
 def test_a_plane_is_chosen_by_time_or_place_and_dask_is_computed() -> None:
     values = np.arange(2 * 3 * 8 * 9, dtype="f8").reshape(2, 3, 8, 9)
     dates = np.array(["2001-01-01", "2001-02-01"], "datetime64[ns]")

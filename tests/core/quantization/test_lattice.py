@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -210,3 +210,55 @@ def test_lattices_with_offsets_are_found_at_any_scale() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (5, 1), (3, 3)])
 def test_small_and_flat_surfaces_have_no_lattice_with_offsets(shape: tuple[int, int]) -> None:
     assert offset_lattice(np.zeros(shape, np.float32)) is None
+
+
+@settings(max_examples=150)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    step=st.sampled_from([1.0, 0.025, 0.3048, 7.3, 1 / 3]),
+    spread=st.sampled_from([1.0, 5.0, 80.0]),
+    away=st.sampled_from([0.0, 1e-6, 0.01, 0.3]),
+    smooth=st.booleans(),
+)
+def test_no_step_is_left_out_that_divides_most_differences(
+    seed: int, step: float, spread: float, away: float, smooth: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0, spread, (30, 40))
+    steps = np.rint(steps.cumsum(axis=1) if smooth else steps) + rng.uniform(0, 1, (30, 1))
+    # Some lie off the lattice, so that from most to few of the differences are its steps.
+    steps += away * rng.normal(size=steps.shape) * (rng.random(steps.shape) < rng.uniform(0, 1))
+    values = (steps * step).astype(np.float32)
+    assert offset_lattice(values) == with_every_step(values)
+
+
+def with_every_step(values: NDArray[np.float32]) -> Lattice | None:
+    """`offset_lattice` of a small array, without leaving anything out."""
+    low, high = float(values.min()), float(values.max())
+    rows = values[:: min(max(1, values.size // 65536), max(1, values.shape[0] // 8))].astype(np.float64)
+    differences = np.diff(rows, axis=1).ravel()
+    tolerance = 2 * float(np.spacing(np.float32(max(abs(low), abs(high)))))
+    moved = np.abs(differences[np.abs(differences) > 64 * tolerance])
+    if 2 * moved.size < differences.size:
+        return None
+
+    def share(step: float) -> float:
+        return float((np.abs(moved - np.rint(moved / step) * step) <= tolerance).mean())
+
+    steps = {m * 10.0**k * unit for k in range(-9, 4) for m in (1.0, 2.0, 2.5, 5.0) for unit in (1.0, 0.3048)}
+    for first in np.sort(moved)[:: max(1, moved.size // 64)]:
+        step = float(first)
+        for reach in (2, 8, 32, 128, 512):
+            near = moved[moved < reach * step]
+            times = np.rint(near / step)
+            whole = np.abs(near - times * step) < max(4 * tolerance, 0.2 * step / reach)
+            if (times * whole).any():
+                step = float((near * times)[whole].sum() / (times * times)[whole].sum())
+        steps.add(step)
+    for step in sorted((step for step in steps if 64 * tolerance <= step <= moved.max()), reverse=True):
+        if (high - low) / step < 2**LATTICE_BITS - 4 and share(step) > 0.7:
+            short = float(f"{step:.5g}")
+            step = short if share(short) >= share(step) else step
+            half = float((int((high - low) / step) + 2) // 2)
+            return Lattice("affine", float(np.rint(low / step)) * step + half * step, step)
+    return None

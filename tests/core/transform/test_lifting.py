@@ -93,6 +93,22 @@ def test_chunks_of_nodes_leave_no_trace(ends: Ends, axis: int, nodes: range) -> 
         np.testing.assert_array_equal(stepped(coefficients, axis, step, predictor, True), samples)
 
 
+@pytest.mark.parametrize("ends", ENDS)
+@pytest.mark.parametrize(("axis", "width"), [(0, 16), (0, 64), (0, 83), (1, 3)])
+def test_details_that_just_fit_16_bits_are_stepped_as_others_are(ends: Ends, axis: int, width: int) -> None:
+    """Where processors can, short details are multiplied two by two."""
+    rng = np.random.default_rng(width)
+    for length, largest in itertools.product((9, 64, 150), (1, 2**12, 2**15 - 1, 2**15, 2**15 + 1)):
+        step = step_of(length, ends)
+        lines = rng.choice(np.array([-largest, 1 - largest, -1, 0, largest - 1, largest], np.int32), (length, width))
+        # All with the signs of the taps round one node, which makes its update as large as can be.
+        lines[step.coarse :, 0] = largest * (1 - 2 * (abs(np.arange(step.midpoints) - step.midpoints // 2) % 2))
+        samples = reference.inverse(lines.astype(np.int64), ends, 0, 0)
+        np.testing.assert_array_equal(stepped(lines, axis, step, (0, 0), True), samples)
+        coefficients = reference.forward(lines.astype(np.int64), ends, 16, -2)
+        np.testing.assert_array_equal(stepped(lines, axis, step, (16, -2), False), coefficients)
+
+
 @pytest.mark.parametrize("ends", [FREE, CLOSED])
 @pytest.mark.parametrize(("axis", "shape", "several"), [(1, (1, 4_260_004), (2, 1)), (0, (66_604, 64), (1, 2))])
 def test_long_lines_take_several_calls_and_come_out_as_in_one(

@@ -17,7 +17,7 @@ from lodestream.parallel import spread, threads
 from lodestream_server.builds import jobs, level_queue, worker
 from lodestream_server.builds.forkserver import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
-from lodestream_server.builds.worker import Built, Job, Refused, build
+from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 from lodestream_server.storage import durable
 from tests.server.storage.disks import FullDisk
 
@@ -35,6 +35,7 @@ __all__ = [
     "kill",
     "kill_level_once",
     "kill_once",
+    "lack_memory_for_level",
     "leave",
     "listed",
     "make_coarsest",
@@ -43,10 +44,12 @@ __all__ = [
     "nothing",
     "number",
     "out_of_processor_time",
+    "parse_only",
     "processor_seconds_left",
     "raise_error",
     "raise_full",
     "refuse",
+    "refuse_large_level",
     "share",
     "sleep",
     "take",
@@ -131,13 +134,13 @@ def use_processors(seconds: float) -> float:
     return time.process_time()
 
 
-def out_of_processor_time(job: Job) -> Built | Refused:
+def out_of_processor_time(job: Job) -> Built | Parsed | Refused:
     """End as the kernel ends a process that has used up its processor time."""
     os.kill(os.getpid(), signal.SIGXCPU)
     return Refused("survived")
 
 
-def wait(job: Job) -> Built | Refused:
+def wait(job: Job) -> Built | Parsed | Refused:
     """Report half, then go on when a file called ``go`` appears beside the surfaces' folders."""
     (job.folder / "progress").write_text("0.5")
     go = job.folder.parent.parent / "go"
@@ -149,20 +152,20 @@ def wait(job: Job) -> Built | Refused:
     return build(job)
 
 
-def listed(job: Job) -> Built | Refused:
+def listed(job: Job) -> Built | Parsed | Refused:
     """Write down in which order surfaces are built."""
     with (job.folder.parent.parent / "order").open("a") as file:
         file.write(job.folder.name.partition(".")[0] + "\n")
     return wait(job)
 
 
-def kill(job: Job) -> Built | Refused:
+def kill(job: Job) -> Built | Parsed | Refused:
     """End as the kernel ends a process that takes too much memory."""
     os.kill(os.getpid(), signal.SIGKILL)
     return Refused("survived")
 
 
-def end_once(job: Job) -> Built | Refused:
+def end_once(job: Job) -> Built | Parsed | Refused:
     """Be told to end the first time, as all processes of a service are that is stopped."""
     marker = job.folder.parent.parent / "told"
     if not marker.exists():
@@ -172,23 +175,23 @@ def end_once(job: Job) -> Built | Refused:
     return build(job)
 
 
-def explode(job: Job) -> Built | Refused:
+def explode(job: Job) -> Built | Parsed | Refused:
     """Raise what nobody foresaw."""
     raise ZeroDivisionError(f"with a secret: {job.folder}")
 
 
-def explode_later(job: Job) -> Built | Refused:
+def explode_later(job: Job) -> Built | Parsed | Refused:
     """The same, once ``go`` is there."""
     wait(job)
     return explode(job)
 
 
-def refuse(job: Job) -> Built | Refused:
+def refuse(job: Job) -> Built | Parsed | Refused:
     """Refuse the bytes, as a reader does that has become stricter."""
     return Refused("expected a better file")
 
 
-def kill_once(job: Job) -> Built | Refused:
+def kill_once(job: Job) -> Built | Parsed | Refused:
     """Be killed the first time."""
     marker = job.folder.parent.parent / "killed"
     if not marker.exists():
@@ -197,7 +200,7 @@ def kill_once(job: Job) -> Built | Refused:
     return build(job)
 
 
-def hoard(job: Job) -> Built | Refused:
+def hoard(job: Job) -> Built | Parsed | Refused:
     """Take more memory than a process of the tests may have."""
     return Refused(f"got {len(bytearray(2 << 30))} bytes")
 
@@ -207,7 +210,7 @@ def take(count: int) -> int:
     return len(bytearray(count))
 
 
-def full_at_each_step(job: Job) -> Built | Refused:
+def full_at_each_step(job: Job) -> Built | Parsed | Refused:
     """Find the disk full at the first step of writing the container, the next time at the second, and so on."""
     marker = job.folder.parent.parent / "fuller"
     done = int(marker.read_text()) if marker.exists() else 0
@@ -272,7 +275,7 @@ def kill_level_once(job: LevelJob) -> MadeLevel | RefusedLevel:
     return make_level(job)
 
 
-def find_full(job: Job) -> Built | Refused:
+def find_full(job: Job) -> Built | Parsed | Refused:
     """Find the disk full."""
     raise OSError(errno.ENOSPC, "no space left", str(job.folder))
 
@@ -280,3 +283,21 @@ def find_full(job: Job) -> Built | Refused:
 def raise_full(job: LevelJob) -> MadeLevel | RefusedLevel:
     """Find the disk full."""
     raise OSError(errno.ENOSPC, "no space left", str(job.folder))
+
+
+def refuse_large_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """What the decoder says of a level that does not fit into memory."""
+    words = (
+        "expected a surface that takes at most 9 MiB to decode (50% of the available memory), got one that takes more"
+    )
+    return RefusedLevel("TooLargeError", f"{words}; max_vertices=7 allows it")
+
+
+def lack_memory_for_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """No memory is left."""
+    raise MemoryError
+
+
+def parse_only(job: Job) -> Built | Parsed | Refused:
+    """Leave to others what nobody else is to build."""
+    return Parsed(4)

@@ -27,7 +27,7 @@ from tests.server.builds.test_builds import running
 from tests.server.connections import hostile
 from tests.server.helpers import eventually, hills, kept, npy, push, settled
 
-Build = Callable[[worker.Job], worker.Built | worker.Refused]
+Build = Callable[[worker.Job], worker.Built | worker.Parsed | worker.Refused]
 
 WHOLE = sys.platform == "linux" and bool(landlock.version(ctypes.CDLL(None)))
 needs_landlock = pytest.mark.skipif(not WHOLE, reason="this kernel has no Landlock")

@@ -203,9 +203,9 @@ def test_limits_of_builds_hold(tmp_path: Path, exact: bytes) -> None:
 
 
 def promising(rows: int, columns: int) -> bytes:
-    """A container of a few hundred bytes whose header promises so many points, all of them alike."""
+    """A container of a few hundred bytes whose header promises so many points, all of them alike, on a torus."""
     known = index_of(ls.encode(np.zeros((9, 9)))).header
-    header = replace(known, blocks=(((rows, columns), (False, False)),), exact=False, corrected=False)
+    header = replace(known, blocks=(((rows, columns), (True, True)),), exact=False, corrected=False)
     header = replace(header, predictors=default_predictors(header.layout)[np.newaxis])
     header = replace(header, empty=((2 << header.levels) - 1,))
     nothing = Errors(0.0, 0.0)
@@ -221,7 +221,7 @@ def test_a_small_container_that_takes_much_memory_is_held_to_that_of_a_build(tmp
     ):
         made = push(http, container)
         assert made["state"] == "waiting"
-        assert "more memory than its share, 600 MiB" in made["reason"]
+        assert "expected a surface that takes at most 300 MiB to check" in made["reason"]
         assert push(http, promising(64, 64))["state"] == "ready"
 
 

@@ -318,7 +318,8 @@ def test_a_file_that_would_be_too_long_is_not_made(tmp_path: Path) -> None:
         for name in ("npy", "obj", "ply"):
             answer = http.get(finest(surface), params={"format": name})
             assert problem(answer) == (413, "too-large")
-            assert str(1 << 19) in answer.json()["detail"]
+            assert f"less than {1 << 19} bytes, a quarter of" in answer.json()["detail"]
+            assert "(level_disk)" in answer.json()["detail"]
             assert http.get(f"{surface['url']}/levels/2", params={"format": name}).status_code == 200
             assert on_disk(tmp_path) < 1 << 19
 
@@ -343,6 +344,30 @@ def test_a_level_that_takes_too_much_is_refused_and_the_next_one_is_made(
         monkeypatch.setattr(level_queue, "make_level", slow.kill_level_once)
         monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
         assert http.get(finest(surface)).content == npy(hills())
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_a_level_that_memory_is_too_little_for_names_the_limit_and_its_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: bool
+) -> None:
+    settings: dict[str, Any] = {"level_memory": 256 << 20} if own else {}
+    with running_server(tmp_path, workers=1, memory=512 << 20, **settings) as url, client(url) as http:
+        surface = push(http, npy(hills()))
+        for function in (slow.refuse_large_level, slow.lack_memory_for_level):
+            monkeypatch.setattr(level_queue, "make_level", function)
+            answer = http.get(finest(surface))
+            assert problem(answer) == (413, "too-large")
+            assert answer.json()["title"] == "The level is too large to be made as a file"
+            words = (
+                "256 MiB of memory (level_memory)"
+                if own
+                else "1024 MiB of memory (half of LODESTREAM_MEMORY, but at least 1024 MiB)"
+            )
+            detail = answer.json()["detail"]
+            assert detail.startswith(f"expected a level that needs at most {words}")
+            assert "ask for a coarser level" in detail
+            assert "max_vertices" not in detail
+            assert "bytes" not in detail
 
 
 @needs_landlock
@@ -499,7 +524,7 @@ def test_the_process_makes_no_file_that_is_longer(tmp_path: Path) -> None:
         container = tmp_path / "data" / "containers" / f"{surface['container']}.lode"
         refused = make_level(LevelJob(container, len(surface["levels"]) - 1, "npy", _new(tmp_path / "a"), 1000))
         assert isinstance(refused, RefusedLevel)
-        assert refused.kind == "TooLargeError"
+        assert refused.kind == "FileTooLongError"
         made = make_level(LevelJob(container, len(surface["levels"]) - 1, "npy", _new(tmp_path / "b"), 10_000))
         assert not isinstance(made, RefusedLevel)
         assert (tmp_path / "b" / "level").read_bytes() == npy(hills())

@@ -26,7 +26,7 @@ from lodestream.library import library
 from lodestream.parallel import VARIABLE
 from lodestream_server.builds import worker
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel
-from lodestream_server.builds.worker import Built, Job, Refused, build
+from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 
 __all__ = [
     "burn",
@@ -57,7 +57,7 @@ __all__ = [
 ]
 
 
-def escape(job: Job) -> Built | Refused:
+def escape(job: Job) -> Built | Parsed | Refused:
     """Try every way out that a build should not have, and a few that it has; what came of each stands in the reason."""
     data, work = job.folder.parent.parent, job.folder.parent
     victim = data / "victim"
@@ -152,13 +152,13 @@ def _handles() -> list[str]:
     return [target for target in found if not target.startswith(("pipe:", "/proc/", str(Path(os.devnull))))]
 
 
-def burn(job: Job) -> Built | Refused:
+def burn(job: Job) -> Built | Parsed | Refused:
     """Compute for ever."""
     while True:
         pass
 
 
-def write_much(job: Job) -> Built | Refused:
+def write_much(job: Job) -> Built | Parsed | Refused:
     """Write a file far larger than any container may be."""
     with (job.folder / "container").open("wb") as file:
         file.seek(1 << 40)
@@ -166,7 +166,7 @@ def write_much(job: Job) -> Built | Refused:
     return Refused("written")
 
 
-def dig(job: Job) -> Built | Refused:
+def dig(job: Job) -> Built | Parsed | Refused:
     """Make folders that are too deep for most programs that would remove them, and then one that may not be entered."""
     os.chdir(job.folder)
     for _ in range(3000):
@@ -176,7 +176,7 @@ def dig(job: Job) -> Built | Refused:
     return Refused("dug")
 
 
-def trick_progress(job: Job) -> Built | Refused:
+def trick_progress(job: Job) -> Built | Parsed | Refused:
     """Make the file that the server looks at a link, and then something huge."""
     progress = job.folder / "progress"
     progress.symlink_to("/dev/zero")
@@ -205,50 +205,50 @@ def _is_pipe(handle: int) -> bool:
         return False
 
 
-def say_nothing(job: Job) -> Built | Refused:
+def say_nothing(job: Job) -> Built | Parsed | Refused:
     _say(b"")
 
 
-def say_garbage(job: Job) -> Built | Refused:
+def say_garbage(job: Job) -> Built | Parsed | Refused:
     _say(bytes(range(256)))
 
 
-def say_pickle(job: Job) -> Built | Refused:
+def say_pickle(job: Job) -> Built | Parsed | Refused:
     _say(pickle.dumps({"returned": {"reason": "unpickled", "final": True}}))
 
 
-def say_much(job: Job) -> Built | Refused:
+def say_much(job: Job) -> Built | Parsed | Refused:
     _say(b'{"returned": {"final": true, "reason": "' + b"x" * (64 << 20) + b'"}}')
 
 
-def say_deep(job: Job) -> Built | Refused:
+def say_deep(job: Job) -> Built | Parsed | Refused:
     _say(b"[" * 200_000)
 
 
-def say_something_else(job: Job) -> Built | Refused:
+def say_something_else(job: Job) -> Built | Parsed | Refused:
     _say(json.dumps({"returned": {"path": "/etc/passwd", "sha256": 5}}).encode())
 
 
-def say_a_class(job: Job) -> Built | Refused:
+def say_a_class(job: Job) -> Built | Parsed | Refused:
     _say(json.dumps({"raised": {"kind": "x\n2026 INFO forged", "errno": None, "traceback": ""}}).encode())
 
 
-def forge_log(job: Job) -> Built | Refused:
+def forge_log(job: Job) -> Built | Parsed | Refused:
     text = "x\n2026 INFO forged \x1b[2J\r2026 INFO forged"
     _say(json.dumps({"raised": {"kind": "ValueError", "errno": None, "traceback": text}}).encode())
 
 
-def forge_nothing(job: Job) -> Built | Refused:
+def forge_nothing(job: Job) -> Built | Parsed | Refused:
     """Say that something was built, where nothing was."""
     return Built("0" * 64)
 
 
-def forge_hash(job: Job) -> Built | Refused:
+def forge_hash(job: Job) -> Built | Parsed | Refused:
     build(job)
     return Built("0" * 64)
 
 
-def forge_path(job: Job) -> Built | Refused:
+def forge_path(job: Job) -> Built | Parsed | Refused:
     """Put a link to another's file where the container should be, with the hash of that."""
     built = build(job)
     assert isinstance(built, Built)
@@ -257,32 +257,32 @@ def forge_path(job: Job) -> Built | Refused:
     return built
 
 
-def forge_second_name(job: Job) -> Built | Refused:
+def forge_second_name(job: Job) -> Built | Parsed | Refused:
     built = build(job)
     os.link(job.container, job.folder / "second")
     return built
 
 
-def forge_folder(job: Job) -> Built | Refused:
+def forge_folder(job: Job) -> Built | Parsed | Refused:
     job.container.mkdir()
     return Built("0" * 64)
 
 
-def forge_container(job: Job) -> Built | Refused:
+def forge_container(job: Job) -> Built | Parsed | Refused:
     """Make something with the right hash that is no container."""
     data = np.arange(1000).tobytes()
     job.container.write_bytes(data)
     return Built(hashlib.sha256(data).hexdigest())
 
 
-def forge_errors(job: Job) -> Built | Refused:
+def forge_errors(job: Job) -> Built | Parsed | Refused:
     """Say of a surface that was built here that the errors of its maker were checked."""
     built = build(job)
     assert isinstance(built, Built)
     return Built(built.sha256, "checked")
 
 
-def forge_reason(job: Job) -> Built | Refused:
+def forge_reason(job: Job) -> Built | Parsed | Refused:
     return Refused("two\nlines \x1b[31m" + "and more " * 1000)
 
 
@@ -301,7 +301,7 @@ def say_garbage_of_level(job: LevelJob) -> MadeLevel | RefusedLevel:
     _say(bytes(range(256)))
 
 
-def linger(job: Job) -> Built | Refused:
+def linger(job: Job) -> Built | Parsed | Refused:
     """Leave processes behind, which only the readers of some formats could; their numbers stand in the reason."""
     left = []
     for _ in range(3):

@@ -36,6 +36,7 @@ def example(setting: Setting) -> str:
         "an integer": "7",
         "seconds": "0.5",
         "text": "/x",
+        "the address of a Dask scheduler such as tcp://10.0.0.1:8786": "tcp://10.0.0.2:8786",
         "a path": "/x",
         "words separated by commas": "a,b",
     }.get(setting.kind.expected, "3GiB")

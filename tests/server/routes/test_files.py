@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
+import warnings
+from collections.abc import Callable
 from contextlib import closing
 from http.client import HTTPConnection
 from pathlib import Path
@@ -16,6 +19,8 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.formats import write_stream
+from lodestream_server.builds import levels
 from tests.server.helpers import eventually, hills, npy, push
 
 
@@ -138,6 +143,50 @@ def test_levels_have_a_length_and_ranges(http: httpx.Client, surface: dict[str, 
     assert (outside.status_code, outside.headers["content-type"]) == (416, "application/problem+json")
 
 
+def test_levels_of_another_version_are_other_files(
+    http: httpx.Client, surface: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = f"{surface['url']}/levels/1"
+    before = http.get(path).headers["etag"]
+    assert http.get(path, headers={"if-none-match": before}).status_code == 304
+    changes: tuple[tuple[str, int | Callable[[str], str]], ...] = (
+        ("_REVISION", levels._REVISION + 1),
+        ("version", lambda library: "99.9"),
+    )
+    for name, value in changes:
+        with monkeypatch.context() as patch:
+            patch.setattr(levels, name, value)
+            levels.written_by.cache_clear()
+            answer = http.get(path, headers={"if-none-match": before, "if-range": before, "range": "bytes=0-9"})
+            assert answer.status_code == 200, "not a part of another file"
+            assert answer.headers["etag"] != before
+        levels.written_by.cache_clear()
+    assert http.get(path).headers["etag"] == before
+
+
+def test_the_files_are_those_of_this_revision() -> None:
+    # The formats that no other library has a part in. If this fails because what is written has changed on purpose,
+    # raise the revision of level files, and put the new digest here.
+    rows, columns = np.mgrid[:9, :7]
+    surface = ls.Surface(
+        (rows * 3 - columns).astype(np.float32),
+        mask=rows + columns > 2,
+        attributes={"a": (rows * columns).astype(np.int16)},
+        metadata={"name": "hill", "geotransform": [100.0, 2.0, 0.0, 50.0, 0.0, -2.0], "unit": "m"},
+    )
+    decoder = ls.Decoder()
+    digest = hashlib.sha256()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ls.FormatWarning)
+        decoder.feed(ls.encode(surface))
+        for name in ("npy", "esri-ascii", "obj", "ply", "glb", "plot3d"):
+            for level in (None, 0, 2):
+                file = io.BytesIO()
+                write_stream(decoder.surface(level), name, file)
+                digest.update(file.getvalue())
+    assert (levels._REVISION, digest.hexdigest()[:16]) == (1, "72ec35de6da6ddc6")
+
+
 def test_levels_come_as_meshes_too(http: httpx.Client, surface: dict[str, Any], tmp_path: Path) -> None:
     rows, columns = surface["levels"][3]["shape"]
     obj = http.get(surface["url"] + "/levels/3", params={"format": "obj"})
@@ -158,6 +207,13 @@ def test_a_level_of_several_files_is_an_archive(http: httpx.Client, surface: dic
     assert '-3.vtm.zip"' in answer.headers["content-disposition"]
     with ZipFile(io.BytesIO(answer.content)) as archive:
         assert archive.namelist() == ["surface.vtm", "surface/surface_0.vts"]
+
+
+def test_a_level_is_no_folder(http: httpx.Client, surface: dict[str, Any]) -> None:
+    answer = http.get(surface["url"] + "/levels/3", params={"format": "zarr"})
+    assert answer.status_code == 422
+    assert "expected format to be one of npy, " in answer.json()["detail"]
+    assert "got 'zarr'" in answer.json()["detail"]
 
 
 @pytest.mark.parametrize("name", ["npz", "asc", "nc", "p3d"])

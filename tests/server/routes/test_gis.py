@@ -94,6 +94,45 @@ def test_a_cog_is_read_by_ranges_and_has_overviews(authorised: str, place: tuple
         assert same.status_code == 304
 
 
+@pytest.mark.skipif("netCDF" not in rasterio.drivers.raster_driver_extensions().values(), reason="GDAL has no netCDF")
+def test_a_netcdf_has_its_place_where_its_address_ends_like_one(authorised: str) -> None:
+    assert "?format=nc&name=level.nc" in PAGE
+    profile, heights, valid = read(f"{authorised}?format=nc&name=level.nc")
+    surface = terrain()
+    assert surface.mask is not None
+    assert profile["crs"] == rasterio.crs.CRS.from_epsg(32611)
+    assert list(profile["transform"].to_gdal()) == PLACE
+    np.testing.assert_array_equal(heights[valid], surface.points[surface.mask])
+
+
+def test_the_finest_level_has_the_columns_of_the_source_and_what_has_no_cog_says_why(keys: Keys) -> None:
+    lon = np.linspace(0, 360, 37)
+    lat = np.linspace(80, -80, 17)
+    heights = np.cos(np.radians(lon)) * lat[:, None]
+    heights[:, -1] = heights[:, 0]
+    earth = ls.Surface(
+        heights[:, :-1], (False, True), metadata={"seam": "cols", "geotransform": [-5, 10, 0, 85, 0, -10]}
+    )
+    y, x = np.mgrid[:9, :9].astype(np.float64)
+    curved = ls.Surface(np.stack([x + y**2, y + x**2, x * y], axis=2))
+    two = ls.Surface(blocks=[curved.blocks[0], ls.Block(curved.points + 99)])
+    with (
+        server(keys.folder / "seam") as running,
+        httpx.Client(base_url=running.url, trust_env=False, timeout=60) as http,
+    ):
+        surface = push(http, ls.encode(earth))
+        for level, columns in ((-1, 37), (-2, 18)):
+            number = surface["levels"][level]["level"]
+            with rasterio.open(f"/vsicurl/{running.url}{surface['url']}/levels/{number}?format=cog") as dataset:
+                assert dataset.width == columns
+        for other, words in ((curved, "that are not"), (two, "one block")):
+            answer = http.get(f"{push(http, ls.encode(other))['url']}/levels/0?format=cog")
+            assert answer.status_code == 422
+            assert answer.json()["title"] == "The level cannot be written in this format"
+            assert words in answer.json()["detail"]
+            assert answer.json()["title"] in PAGE
+
+
 def test_a_coarser_level_covers_the_same_ground(authorised: str) -> None:
     finest = int(authorised.rsplit("/", 1)[1])
     bounds = []

@@ -38,6 +38,8 @@ export class Comm {
     private readonly told: (command: string) => void,
   ) {
     model.on("msg:custom", this.take);
+    // Jupyter's word for a kernel that died or was restarted. One that is busy answers later, however long it takes.
+    model.on("comm_live_update", this.lose);
   }
 
   /** Bytes of the container, see `PartReader`. @throws Refused */
@@ -54,7 +56,14 @@ export class Comm {
   /** Ends: what is waited for does not come. */
   close(): void {
     this.model.off("msg:custom", this.take);
-    for (const { reject } of this.waiting.values()) reject(new Refused("the widget was closed", ""));
+    this.model.off("comm_live_update", this.lose);
+    this.refuseAll("the widget was closed");
+  }
+
+  private readonly lose = (): void => this.refuseAll("the kernel is gone: run the cell again");
+
+  private refuseAll(why: string): void {
+    for (const { reject } of this.waiting.values()) reject(new Refused(why, ""));
     this.waiting.clear();
   }
 

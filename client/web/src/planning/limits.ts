@@ -34,7 +34,8 @@ export class ErrorLimits {
     this.channels = (target.channels ?? []).flatMap(([name, which, most]) => {
       const groups = names.get(name);
       if (groups === undefined) {
-        throw new OptionError(`expected an error of one of ${[...names.keys()].join(", ")}, got one of ${name}`);
+        const wanted = [...names.keys()].join(", ");
+        throw new OptionError(`expected an error of one of ${wanted}, got one of ${missing(name, header)}`);
       }
       return groups.map((channels) => ({ channels, which: which === "max" ? (1 as const) : (0 as const), most }));
     });
@@ -49,6 +50,12 @@ export class ErrorLimits {
     const all = this.channels.length > 0 && this.channels.every((limit) => together(limit, own) <= limit.most);
     return all ? "channels" : undefined;
   }
+}
+
+/** A name that is not wanted or not there, with the reason if it is there. */
+function missing(name: string, header: Header): string {
+  const there = header.channelNames.includes(name) || header.attributes.some((attribute) => attribute.name === name);
+  return name + (there ? ", which is left out: it is not among the attributes asked for" : "");
 }
 
 /** The channels that each name stands for; a name that several have stands for each of them. */

@@ -33,6 +33,7 @@ export function makeTarget(options: TargetOptions = {}): Target {
   const untilRms = ofWhole(options.untilRms);
   const untilMax = ofWhole(options.untilMax);
   const limits = [...ofChannels(options.untilRms, "rms"), ...ofChannels(options.untilMax, "max")];
+  limits.sort(([one], [other]) => Number(one > other) - Number(one < other));
   const channels = limits.length > 0 ? limits : undefined;
   const limited = [untilRms, untilMax, channels, maxBytes, seconds].some((limit) => limit !== undefined);
   if (level !== undefined && limited) throw new OptionError("expected either a level or other limits, got both");

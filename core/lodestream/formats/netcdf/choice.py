@@ -244,7 +244,8 @@ def _conventional(
     variables = dataset.variables
     named = [name for name in str(variables[main].attrs.get("coordinates", "")).split() if name in variables]
     letters = letters_of(dataset)
-    others = [name for name in letters if name != main]
+    beside = str(variables[main].attrs.get(_ANCILLARY, "")).split()  # say something of the values, not where they lie
+    others = [name for name in letters if name != main and name not in beside]
     ways: list[dict[str, Found]] = [{}, {}]
     for name in (*dims, *named, *others):
         if name not in variables or not _numeric(variables[name]):

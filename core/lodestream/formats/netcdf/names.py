@@ -6,10 +6,26 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["is_longitude", "is_time", "letter_of", "letters_of", "time_of"]
+__all__ = [
+    "AXIS_WORDS",
+    "axis_words",
+    "is_east",
+    "is_geographic",
+    "is_longitude",
+    "is_time",
+    "letter_of",
+    "letters_of",
+    "time_of",
+]
 
 _EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e", "degreese", "degreee")
 _NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n", "degreesn", "degreen")
+
+#: What a surface keeps of what a file says of x and y, as tags ``x#units`` and the like.
+AXIS_WORDS = ("standard_name", "long_name", "units")
+
+#: Units of CF for the coordinates of a geographic CRS, and their standard names.
+_DEGREES = {"x": ("longitude", "degrees_east"), "y": ("latitude", "degrees_north")}
 
 #: What x is called in the files of models (NEMO, ROMS, POP, WRF), with the word for y in its place: before it stand
 #: the letters of a staggered grid or a word, behind it such letters or a word.
@@ -26,6 +42,19 @@ _X_NAME = re.compile(
 
 #: Units of variables that may be a coordinate although nothing says so.
 _UNITS = frozenset(("", "1", "m", "km", "metre", "metres", "meter", "meters", "deg", "degree", "degrees"))
+
+
+def is_geographic(crs: Any) -> bool:
+    """Whether a WKT is one of longitudes and latitudes."""
+    return isinstance(crs, str) and crs.lstrip().upper().startswith(("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS"))
+
+
+def axis_words(letter: str, crs: Any) -> dict[str, str]:
+    """What the conventions say of x or y under a CRS (WKT, or nothing)."""
+    if is_geographic(crs):
+        standard, units = _DEGREES[letter]
+        return {"standard_name": standard, "units": units}
+    return {"standard_name": f"projection_{letter}_coordinate"} if crs else {}
 
 
 def letter_of(name: str, attributes: Mapping[str, Any]) -> str | None:
@@ -70,6 +99,11 @@ def _says_nothing(*variables: Any) -> bool:
         and str(variable.attrs.get("units", "")).strip().lower() in _UNITS
         for variable in variables
     )
+
+
+def is_east(units: Any) -> bool:
+    """Whether units are degrees to the east."""
+    return str(units).lower() in _EAST
 
 
 def is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:

@@ -14,14 +14,17 @@ from numpy.typing import NDArray
 
 from ...coordinates.seams import merge
 from ...errors import FormatError, InputError, OptionError, TooLargeError, UnavailableError
+from ...scratch import Room
+from ...sources import windows
 from ...surface import Closed, Surface
 from ..notes import listing, warn
 from ..placed import Coordinate, place
 from ..source import Source, check_allowed
 from . import hdf5_guard, vmec
 from .choice import Choice, choose, others
+from .names import AXIS_WORDS, axis_words
 
-__all__ = ["KINDS", "READ_OPTIONS", "read", "sniff", "surface_of"]
+__all__ = ["KINDS", "READ_OPTIONS", "pieces", "read", "sniff", "surface_of"]
 
 #: What is read by other rules than a NetCDF of heights.
 KINDS = ("vmec",)
@@ -130,55 +133,135 @@ def surface_of(source: Source, dataset: Any, choice: Choice) -> Surface:
     InputError
         If the arrays are no surface.
     """
-    metadata = source.metadata("netcdf") | _tags(dataset, choice)
-    mask = np.ones(choice.shape, np.bool_)
+    said = {} if choice.heights is None else _metadata(dataset, dataset.variables[choice.heights])
+    metadata = source.metadata("netcdf") | _tags(dataset, choice, said.get("crs"))
+    mask: NDArray[np.bool_] | None = None
     axes: list[Coordinate | None] = []
     for found in (choice.x, choice.y):
         if found is None:
             axes.append(None)
             continue
-        values, valid = _values(dataset.variables[found.name], choice.index)
+        values, valid = _values(source, dataset.variables[found.name], choice.index)
         if found.axis is None:
-            mask &= valid
+            mask = _both(mask, valid)
         axes.append(Coordinate(values, found.axis, found.degrees))
     x, y = (axis or Coordinate(np.arange(choice.shape[1 - number]), 1 - number) for number, axis in enumerate(axes))
-    attributes = {name: _raw(dataset.variables[name], choice.index) for name in choice.attributes}
+    attributes = {name: _raw(source, dataset.variables[name], choice.index) for name in choice.attributes}
     if choice.heights is None:
         points = np.stack(np.broadcast_arrays(x.values, y.values), axis=-1)
         surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
         return _closed_fields(source, dataset, choice, merge(surface, source.closed))
     variable = dataset.variables[choice.heights]
-    heights, valid = _values(variable, choice.index)
-    metadata |= {"variable": choice.heights} | _metadata(dataset, variable)
+    heights, valid = _values(source, variable, choice.index)
+    mask = _both(mask, valid)
+    metadata |= {"variable": choice.heights} | said
     if choice.x is None and choice.y is None:
-        return Surface(heights, mask=mask & valid, attributes=attributes, metadata=metadata)
-    surface = place(heights, x, y, closed=source.closed, mask=mask & valid, attributes=attributes, metadata=metadata)
+        return Surface(heights, mask=mask, attributes=attributes, metadata=metadata)
+    extras: dict[str, Any] = {"mask": mask, "attributes": attributes, "metadata": metadata}
+    surface = place(heights, x, y, closed=source.closed, room=source.room, **extras)
     return _closed_fields(source, dataset, choice, surface)
 
 
-def _raw(variable: Any, index: Mapping[str, int]) -> NDArray[Any]:
-    values = np.asarray(variable.isel({dim: at for dim, at in index.items() if dim in variable.dims}).values)
-    if str(variable.attrs.get("_Unsigned", "")).lower() == "true" and values.dtype.kind == "i":
-        values = values.view(values.dtype.str.replace("i", "u"))
-    return values
+def _both(one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+    """Where both are True; None: everywhere."""
+    if one is None or other is None:
+        return other if one is None else one
+    return one & other
 
 
-def _values(variable: Any, index: Mapping[str, int]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Values by the conventions' rules for packed ones, and where they are none of those that stand for missing."""
-    raw = _raw(variable, index)
+def _chosen(variable: Any, index: Mapping[str, int]) -> Any:
+    """A variable without the dimensions of which an index was chosen; nothing is read yet."""
+    return variable.isel({dim: at for dim, at in index.items() if dim in variable.dims})
+
+
+def pieces(variable: Any, room: Room) -> Iterator[tuple[Any, Any]]:
+    """What of a variable of xarray is read at a time: an index and that part of it, of which nothing is read yet.
+
+    All of it, unless it is large for the room and has two axes or more; then windows of whole chunks.
+    """
+    if variable.ndim < 2 or not room.takes(variable.nbytes):
+        yield ..., variable
+        return
+    for window in windows(variable.shape, _chunk(variable)):
+        yield window, variable[window]
+
+
+def _chunk(variable: Any) -> tuple[int, int]:
+    """Rows and columns of the chunks that Dask or a file has, 1 where there are none."""
+    preferred = variable.encoding.get("preferred_chunks") or {}
+    lengths = variable.chunks or [preferred.get(dim, 1) for dim in variable.dims]
+    rows, columns = (max(length) if isinstance(length, tuple) else int(length) for length in lengths[:2])
+    return max(rows, 1), max(columns, 1)
+
+
+def _stored(variable: Any) -> NDArray[Any]:
+    """Values as they are stored."""
+    return _signed(np.asarray(variable.values), variable.attrs)
+
+
+def _signed(values: NDArray[Any], said: Mapping[str, Any]) -> NDArray[Any]:
+    """Integers of any shape with or without a sign, as ``_Unsigned`` says of what NetCDF classic has no type for."""
+    kind = {"true": "u", "false": "i"}.get(str(said.get("_Unsigned", "")).lower())
+    if kind is None or values.dtype.kind not in "iu" or kind == values.dtype.kind:
+        return values
+    return values.view(values.dtype.str.replace(values.dtype.kind, kind))
+
+
+def _raw(source: Source, variable: Any, index: Mapping[str, int]) -> NDArray[Any]:
+    """Values as they are stored, shape (row, column); large ones where there is room."""
+    variable = _chosen(variable, index)
+    out: NDArray[Any] | None = None
+    for window, part in pieces(variable, source.room):
+        values = _stored(part)
+        if window is ...:
+            return values
+        out = source.empty(variable.shape, values.dtype.newbyteorder("=")) if out is None else out
+        out[window] = values
+    assert out is not None  # a variable has rows
+    return out
+
+
+def _values(source: Source, variable: Any, index: Mapping[str, int]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Values, shape (row, column), and where they are none of those that stand for missing; None: everywhere."""
+    variable = _chosen(variable, index)
+    out: NDArray[Any] | None = None
+    mask: NDArray[np.bool_] | None = None
+    for window, part in pieces(variable, source.room):
+        values, valid = _decoded(_stored(part), variable.attrs)
+        if window is ...:
+            return values, valid
+        out = source.empty(variable.shape, values.dtype.newbyteorder("=")) if out is None else out
+        out[window] = values
+        if valid is not None and mask is None:
+            mask = source.empty(variable.shape, np.dtype(np.bool_))
+            mask[...] = True
+        if valid is not None and mask is not None:
+            mask[window] = valid
+    assert out is not None  # a variable has rows
+    return out, mask
+
+
+def _decoded(raw: NDArray[Any], said: Mapping[str, Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    """Values by the conventions' rules for packed ones, and where they are valid; None: everywhere."""
     valid = np.ones(raw.shape, np.bool_)
     for key in ("_FillValue", "missing_value"):
-        for missing in np.atleast_1d(variable.attrs.get(key, [])):
+        for missing in np.atleast_1d(said.get(key, [])):
             if isinstance(missing, np.number | int | float):
+                if isinstance(missing, np.integer) and (missing.itemsize, "i") == (
+                    raw.itemsize,
+                    raw.dtype.kind.replace("u", "i"),
+                ):
+                    missing = _signed(np.array([missing]), said)[0]  # as stored, as the values are
                 valid &= raw != missing
                 if np.isinf(missing) and raw.dtype.kind == "f":
                     raw = np.where(valid, raw, raw.dtype.type(np.nan))
-    scale, offset = (variable.attrs.get(key) for key in ("scale_factor", "add_offset"))
+    mask = None if valid.all() else valid
+    scale, offset = (said.get(key) for key in ("scale_factor", "add_offset"))
     if scale is None and offset is None:
-        return raw, valid
+        return raw, mask
     factor, added = (float(np.ravel(number)[0]) for number in (1.0 if scale is None else scale, offset or 0.0))
     single = all(getattr(number, "dtype", None) == np.float32 for number in (scale, offset) if number is not None)
-    return (raw * factor + added).astype(np.float32 if single else np.float64), valid
+    return (raw * factor + added).astype(np.float32 if single else np.float64), mask
 
 
 def _metadata(dataset: Any, variable: Any) -> dict[str, Any]:
@@ -193,8 +276,11 @@ def _metadata(dataset: Any, variable: Any) -> dict[str, Any]:
     return metadata
 
 
-def _tags(dataset: Any, choice: Choice) -> dict[str, Any]:
-    """What the file says of itself and of the variables that are read, under the names that GDAL has for it."""
+def _tags(dataset: Any, choice: Choice, crs: str | None) -> dict[str, Any]:
+    """What the file says of itself and of the variables that are read, under the names that GDAL has for it.
+
+    Coordinates are x and y, whatever the file calls them; what the CRS says of them already is left out.
+    """
     tags: dict[str, str] = {}
     names = [*([choice.heights] if choice.heights else []), *choice.attributes]
     said = {"NC_GLOBAL": dataset.attrs, **{name: dataset.variables[name].attrs for name in names}}
@@ -207,6 +293,11 @@ def _tags(dataset: Any, choice: Choice) -> dict[str, Any]:
             else:
                 text = str(value)
             tags[f"{name}#{key}"] = text
+    for letter, found in (("x", choice.x), ("y", choice.y)):
+        attributes = {} if found is None else dataset.variables[found.name].attrs
+        for key, text in attributes.items():
+            if key in AXIS_WORDS and isinstance(text, str) and text != axis_words(letter, crs).get(key):
+                tags[f"{letter}#{key}"] = text
     return {"tags": {"": tags}} if tags else {}
 
 

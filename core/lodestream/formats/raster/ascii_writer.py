@@ -25,7 +25,7 @@ _NOWHERE = (-0.5, 1.0, 0.0, -0.5, 0.0, 1.0)
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write heights, row by row from the north, with every digit that they need.
+    """Write heights, row by row from the north, with every digit that they need, and the number that marks holes.
 
     Cells that are not square are written as ``dx`` and ``dy``, which GDAL reads.
 
@@ -77,13 +77,17 @@ def _write_rows(file: BinaryIO, heights: NDArray[Any], mask: NDArray[np.bool_] |
 
 
 def _nodata(surface: Surface, heights: NDArray[Any], mask: NDArray[np.bool_] | None) -> int | float | None:
-    """The number that stands for holes; None where there is none."""
-    if mask is None:
-        return None
-    valid = heights[mask]
+    """The number that stands for holes: the surface's own also where there are none; None where there is none."""
+    valid = heights if mask is None else heights[mask]
     given = surface.metadata.get("nodata")
-    candidates: list[int | float] = list(_NODATA)
-    if isinstance(given, int | float) and np.isfinite(given):
-        candidates.insert(0, given)
+    candidates: list[int | float] = []
+    if isinstance(given, int | float) and not isinstance(given, bool) and np.isfinite(given):
+        whole = float(given).is_integer()
+        # Among integers a number with a fraction would make a program read all of them as floats.
+        candidates += [int(given)] if whole and heights.dtype.kind in "iu" else [given] * (heights.dtype.kind == "f")
+    if mask is not None:
+        candidates += _NODATA
     free = [value for value in candidates if not (valid == value).any()]
-    return free[0] if free else int(np.floor(valid.min())) - 1
+    if free or mask is None:
+        return free[0] if free else None
+    return int(np.floor(valid.min())) - 1

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import BinaryIO
 
+from ...parallel import threads
 from ...surface import Surface
 from . import gdal
 from .geotiff import write_tiff
@@ -44,6 +45,7 @@ def _optimised(path: Path, predictor: int) -> Path:
             compress="DEFLATE",
             predictor=_PREDICTORS[predictor],
             bigtiff="IF_SAFER",
+            num_threads=str(threads()),
             overviews="IGNORE_EXISTING",
             resampling="AVERAGE",
         )

@@ -38,6 +38,9 @@ ALONE = {
 #: A tile is decoded whole, so it may be larger than the surface, but not by any amount.
 _HARMLESS_TILE = 1 << 24
 
+#: Rows that are read at a time are a multiple of the first, of about so many values.
+_TILE_ROWS, _AT_ONCE = 512, 1 << 24
+
 #: Each becomes an attribute, and rasterio and GDAL look through all bands for some of what they say of one.
 _MOST_BANDS = 1 << 12
 
@@ -77,16 +80,17 @@ def read(source: Source, driver: str, format_name: str, title: str, file_name: s
     """
     with _opened(source, driver, title, file_name, options) as dataset:
         band = _check(source, dataset, title)
-        points = dataset.read(band)
-        mask = _mask(dataset, band)
+        points = _values(dataset, band, source)
+        mask = _mask(dataset, band, source)
         others = _attributes(dataset, band)
         metadata = source.metadata(format_name) | _metadata(dataset, band) | read_tags(dataset, band, others)
-        # All at once: rasterio looks at every band of the file whenever it reads.
-        attributes = dict(zip(others, dataset.read([*others.values()]), strict=True)) if others else {}
+        attributes = _others(dataset, others, source)
         _warn_left_out(dataset)
         geographic = bool(dataset.crs and dataset.crs.is_geographic)
     if mask is not None and points.dtype.kind == "f":
-        points[np.isinf(points) & ~mask] = np.nan  # nodata that is infinite: no value, as the file says
+        for rows in _strips(points.shape):
+            own = points[rows]
+            own[np.isinf(own) & ~mask[rows]] = np.nan  # nodata that is infinite: no value, as the file says
     surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
     transform = metadata.get("geotransform")
     if geographic and transform and transform[2] == transform[4] == 0:
@@ -135,11 +139,40 @@ def _check(source: Source, dataset: Any, title: str) -> int:
     return band
 
 
-def _mask(dataset: Any, band: int) -> NDArray[np.bool_] | None:
+def _strips(shape: tuple[int, ...]) -> Iterator[slice]:
+    """All rows, so many at a time that they are whole rows of tiles, and not many bytes."""
+    each = max(_TILE_ROWS, _AT_ONCE // max(shape[1], 1) // _TILE_ROWS * _TILE_ROWS)
+    return (slice(start, min(start + each, shape[0])) for start in range(0, shape[0], each))
+
+
+def _values(dataset: Any, band: int, source: Source) -> NDArray[Any]:
+    """The values of a band, shape (row, column)."""
+    dtype = np.dtype(dataset.dtypes[band - 1])
+    if not source.room.takes(dataset.height * dataset.width * dtype.itemsize):
+        return np.asarray(dataset.read(band))
+    values = source.empty((dataset.height, dataset.width), dtype)
+    for rows in _strips(values.shape):
+        values[rows] = dataset.read(band, window=((rows.start, rows.stop), (0, dataset.width)))
+    return values
+
+
+def _others(dataset: Any, names: dict[str, int], source: Source) -> dict[str, NDArray[Any]]:
+    """The values of other bands, by name; shape (row, column)."""
+    size = dataset.height * dataset.width * max(np.dtype(kind).itemsize for kind in dataset.dtypes)
+    if not names or source.room.takes(size):
+        return {name: _values(dataset, band, source) for name, band in names.items()}
+    # All at once: rasterio looks at every band of the file whenever it reads.
+    return dict(zip(names, dataset.read([*names.values()]), strict=True))
+
+
+def _mask(dataset: Any, band: int, source: Source) -> NDArray[np.bool_] | None:
     """Where there is a value, by nodata, by a mask inside the file or by transparency, as GDAL finds it."""
     if all(flag.name == "all_valid" for flag in dataset.mask_flag_enums[band - 1]):
         return None
-    return np.asarray(dataset.read_masks(band) != 0)
+    mask = source.empty((dataset.height, dataset.width), np.dtype(np.bool_))
+    for rows in _strips(mask.shape):
+        mask[rows] = dataset.read_masks(band, window=((rows.start, rows.stop), (0, dataset.width))) != 0
+    return mask
 
 
 def _attributes(dataset: Any, heights: int) -> dict[str, int]:

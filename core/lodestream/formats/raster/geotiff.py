@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
-import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...parallel import threads
 from ...surface import Surface
+from ..beside import folder_beside
+from ..holes import occurs
 from ..notes import listing, metadata_left_out, survives, warn, warn_left_out
 from ..source import Source
 from . import gdal, tiff_guard
@@ -34,6 +39,12 @@ _HELD = (
 
 #: Sides of the tiles of an image that is at least so large.
 _TILE = 256
+#: Values that are written at a time, about.
+_AT_ONCE = 1 << 22
+#: float64 has all integers up to here.
+_EXACT = 1 << 53
+#: A disk with fewer bytes is full.
+_FULL = 1 << 20
 
 
 def sniff(head: bytes, suffix: str) -> bool:
@@ -67,55 +78,127 @@ def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], P
     finish : callable
         Takes the path of the GeoTIFF, alone in its folder, and TIFF's predictor for its values; returns the path of
         the file to hand over.
+
+    Raises
+    ------
+    UnavailableError
+        If rasterio is not installed.
+    FormatError
+        If a GeoTIFF cannot hold the surface.
+    OSError
+        If the file cannot be written, as on a full disk.
     """
     rasterio = gdal.require_rasterio(_TITLE)
     surface = even_heights(surface, _TITLE)
     if any(surface.closed):
         warn("GeoTIFF cannot express closed axes")
     warn_left_out(_TITLE, metadata_left_out(surface, _HELD))
-    names, bands = _bands(surface)
-    nodata = _nodata(surface, bands[0])
-    if surface.mask is not None:
-        kept = surface.blocks[0].kept
-        said = surface.mask if kept is None else surface.mask | kept
-        bands[0] = np.where(said, bands[0], bands[0].dtype.type(0 if nodata is None else nodata))
-    profile = _profile(surface, bands, nodata)
-    with tempfile.TemporaryDirectory(prefix="lodestream-") as folder, warnings.catch_warnings():
+    names, bands, dtype = _bands(surface)
+    nodata = _nodata(surface, dtype)
+    profile = _profile(surface, len(bands), dtype, nodata)
+    with folder_beside(file) as folder, _told(folder), warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        path = Path(folder) / "data.tif"
+        path = folder / "data.tif"
         with (
             rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_PAM_ENABLED="NO"),
             rasterio.open(path, "w", **profile) as dataset,
         ):
             crs = _locate(dataset, surface)
-            valid = bands[0] if surface.mask is None else bands[0][surface.mask]
-            describe(dataset, surface.metadata, names, [valid, *bands[1:]])
+            describe(dataset, surface.metadata, names, bands, surface.mask)
             for number, band in enumerate(bands, 1):
-                dataset.write(band, number)
+                for rows in _strips(band.shape):
+                    window = (rows.start, rows.stop), (0, band.shape[1])
+                    values = band[rows].astype(dtype, copy=False)
+                    values = _shown(surface, values, rows, nodata) if number == 1 else values
+                    dataset.write(values, number, window=window)
             if surface.mask is not None and nodata is None:
-                dataset.write_mask(surface.mask)
+                for rows in _strips(surface.shape):
+                    dataset.write_mask(surface.mask[rows], window=((rows.start, rows.stop), (0, surface.shape[1])))
         path = finish(path, profile["predictor"])
         with rasterio.Env(**gdal.ALONE), rasterio.open(path, driver="GTiff") as dataset:
             lost = missing(dataset, surface.metadata, names)
             lost += ["all of the CRS"] * (crs is not None and dataset.crs != crs)
+            _check(dataset, surface, bands, dtype, nodata)
         with path.open("rb") as written:
             shutil.copyfileobj(written, file)
     warn_left_out(_TITLE, lost, "which GDAL does not write")
 
 
-def _profile(surface: Surface, bands: Sequence[NDArray[Any]], nodata: float | None) -> dict[str, Any]:
+@contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    """Have errors of GDAL say what is wrong with the disk.
+
+    Raises
+    ------
+    OSError
+        In place of any of them.
+    """
+    from rasterio._err import CPLE_BaseError
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
+    except (CPLE_BaseError, RasterioError) as error:
+        if shutil.disk_usage(folder).free < _FULL:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from None
+        reason = " ".join(str(error).replace(f"{folder}{os.sep}", "").split())
+        raise OSError(errno.EIO, f"GDAL has not written the whole file: {reason[:120]}") from None
+
+
+def _check(
+    dataset: Any, surface: Surface, bands: Sequence[NDArray[Any]], dtype: np.dtype[Any], nodata: float | None
+) -> None:
+    """Read again what was written: GDAL writes by threads, whose errors nobody is told, as that a disk is full.
+
+    Raises
+    ------
+    OSError, RasterioError
+        If it is not there.
+    """
+    from rasterio.errors import RasterioIOError
+
+    mask = surface.mask if nodata is None else None
+    for rows in _strips(surface.shape):
+        window = (rows.start, rows.stop), (0, surface.shape[1])
+        for number, band in enumerate(bands, 1):
+            written = band[rows].astype(dtype, copy=False)
+            written = _shown(surface, written, rows, nodata) if number == 1 else written
+            found = dataset.read(number, window=window)
+            if not np.array_equal(found, written, equal_nan=found.dtype.kind == "f"):
+                raise RasterioIOError(f"other values in rows {rows.start} to {rows.stop - 1}")
+        if mask is not None and not np.array_equal(dataset.read_masks(1, window=window) > 0, mask[rows]):
+            raise RasterioIOError(f"another mask in rows {rows.start} to {rows.stop - 1}")
+
+
+def _strips(shape: tuple[int, ...]) -> Iterator[slice]:
+    """All rows, some rows of tiles at a time: a surface may be larger than memory."""
+    each = max(_TILE, _AT_ONCE // shape[1] // _TILE * _TILE)
+    return (slice(start, min(start + each, shape[0])) for start in range(0, shape[0], each))
+
+
+def _shown(surface: Surface, heights: NDArray[Any], rows: slice, nodata: float | None) -> NDArray[Any]:
+    """Some rows of the heights, in the type of all bands, with what stands for holes."""
+    if surface.mask is None:
+        return heights
+    kept = surface.blocks[0].kept
+    said = surface.mask[rows] if kept is None else surface.mask[rows] | kept[rows]
+    return np.where(said, heights, heights.dtype.type(0 if nodata is None else nodata))
+
+
+def _profile(surface: Surface, count: int, dtype: np.dtype[Any], nodata: float | None) -> dict[str, Any]:
     """How rasterio makes the file."""
     rows, columns = surface.shape
     profile: dict[str, Any] = {
         "driver": "GTiff",
         "height": rows,
         "width": columns,
-        "count": len(bands),
-        "dtype": bands[0].dtype,
+        "count": count,
+        "dtype": dtype,
         "nodata": nodata,
         "compress": "deflate",
-        "predictor": 3 if bands[0].dtype.kind == "f" else 2 if bands[0].dtype.itemsize < 8 else 1,  # libtiff before 4.4
+        "predictor": 3 if dtype.kind == "f" else 2 if dtype.itemsize < 8 else 1,  # libtiff before 4.4
         "bigtiff": "if_safer",
+        "num_threads": str(threads()),
         "photometric": "minisblack",  # or GDAL takes bands of bytes for colours, and the fourth for what is transparent
     }
     if min(rows, columns) >= _TILE:
@@ -123,8 +206,8 @@ def _profile(surface: Surface, bands: Sequence[NDArray[Any]], nodata: float | No
     return profile
 
 
-def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]]]:
-    """Names and values of all bands, which have one type in a TIFF."""
+def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]], np.dtype[Any]]:
+    """Names and values of all bands as the surface has them, and the one type that they have in a TIFF."""
     names, bands = [""], [surface.points]
     for name, values in surface.attributes.items():
         parts = values.reshape(*surface.shape, -1)
@@ -133,24 +216,30 @@ def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]]]:
         bands += [parts[..., part] for part in range(count)]
     common = np.result_type(*bands)
     for name, band in zip(names, bands, strict=True):
-        if not survives(band, common):
+        if not all(survives(band[rows], common) for rows in _strips(band.shape)):
             warn(f"GeoTIFF has one type for all bands: {name or 'heights'} are rounded to {common}")
-    return names, [band.astype(common, copy=False) for band in bands]
+    return names, bands, common
 
 
-def _nodata(surface: Surface, heights: NDArray[Any]) -> float | None:
-    """The value that stands for holes; None where there is none."""
-    given = surface.metadata.get("nodata")
-    valid = heights if surface.mask is None else heights[surface.mask]
-    value = _number(given)
-    if value is not None:
-        if heights.dtype.kind == "f" and np.isnan(value):
-            return value
-        limits: Any = np.finfo(heights.dtype) if heights.dtype.kind == "f" else np.iinfo(heights.dtype)
-        held = float(limits.min) <= value <= float(limits.max) and (heights.dtype.kind == "f" or value == int(value))
-        if held and not (valid == heights.dtype.type(value)).any():
-            return value
-    return float("nan") if surface.mask is not None and heights.dtype.kind == "f" else None
+def _nodata(surface: Surface, dtype: np.dtype[Any]) -> float | None:
+    """The value that stands for holes in the type of all bands; None where there is none."""
+    value = _number(surface.metadata.get("nodata"))
+    if value is not None and _holds(dtype, value) and not _occurs(surface, dtype.type(value)):
+        return value
+    return float("nan") if surface.mask is not None and dtype.kind == "f" else None
+
+
+def _occurs(surface: Surface, value: Any) -> bool:
+    """Whether a valid height is this value."""
+    return occurs(value, surface.points.__getitem__, surface.shape, surface.mask)
+
+
+def _holds(dtype: np.dtype[Any], value: float) -> bool:
+    """Whether a type has a value, which GDAL is told as a float64: of larger integers it would be another one."""
+    if dtype.kind == "f":
+        return bool(np.isnan(value) or abs(value) <= float(np.finfo(dtype).max))
+    limits = np.iinfo(dtype)
+    return value == np.rint(value) and max(limits.min, -_EXACT) <= value <= min(limits.max, _EXACT)
 
 
 def _number(text: Any) -> float | None:

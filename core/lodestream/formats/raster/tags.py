@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...scratch import rows_at_once
 from ..notes import listing, warn
 
 __all__ = ["describe", "missing", "read_tags"]
@@ -123,7 +124,13 @@ def _tags(dataset: Any, band: int) -> Tags:
     return result
 
 
-def describe(dataset: Any, metadata: Mapping[str, Any], names: Sequence[str], bands: Sequence[NDArray[Any]]) -> None:
+def describe(
+    dataset: Any,
+    metadata: Mapping[str, Any],
+    names: Sequence[str],
+    bands: Sequence[NDArray[Any]],
+    mask: NDArray[np.bool_] | None,
+) -> None:
     """Give an open dataset the words of a surface's metadata.
 
     Parameters
@@ -134,7 +141,9 @@ def describe(dataset: Any, metadata: Mapping[str, Any], names: Sequence[str], ba
     names : sequence of str
         Of the bands: "" for that of the heights, which is the first.
     bands : sequence of arrays
-        Their values, of shape (value,), without those of holes.
+        Their values, shape (row, column).
+    mask : bool, shape (row, column), or None
+        True where heights are valid.
     """
     from rasterio.enums import ColorInterp
 
@@ -145,7 +154,7 @@ def describe(dataset: Any, metadata: Mapping[str, Any], names: Sequence[str], ba
     for number, found in enumerate(described, 1):
         if found["description"]:
             dataset.set_band_description(number, found["description"])
-        tags, stale = _fresh(_written(found.get("tags")), bands[number - 1])
+        tags, stale = _fresh(_written(found.get("tags")), bands[number - 1], mask if number == 1 else None)
         if stale:
             warn(f"GeoTIFF is written without {listing(stale)} of band {number}, which describe other values")
         _set_tags(dataset, number, tags)
@@ -187,18 +196,31 @@ def _written(tags: Any) -> Tags:
     return result
 
 
-def _fresh(tags: Tags, values: NDArray[Any]) -> tuple[Tags, list[str]]:
+def _fresh(tags: Tags, values: NDArray[Any], mask: NDArray[np.bool_] | None) -> tuple[Tags, list[str]]:
     """Tags of a band without statistics of other values than these, such as those of a finer level."""
     own = tags.get("", {})
     stale = [key for key in own if key.startswith(_STATISTICS)]
+    if not stale:
+        return tags, []
     try:
         told = [float(own[key]) for key in (_LEAST, _GREATEST)]
     except (KeyError, ValueError):
         told = [math.nan, math.nan]
-    finite = values[np.isfinite(values)]
-    if not stale or (finite.size and np.allclose(told, [finite.min(), finite.max()], _NEAR, 0)):
+    found = _range(values, mask)
+    if found is not None and np.allclose(told, found, _NEAR, 0):
         return tags, []
     return {**tags, "": {key: value for key, value in own.items() if key not in stale}}, stale
+
+
+def _range(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> tuple[float, float] | None:
+    """The least and the largest of the valid, finite values; None where there are none."""
+    ends: list[float] = []
+    for rows in rows_at_once(values.shape):
+        finite = np.isfinite(values[rows])
+        own = values[rows][finite if mask is None else finite & mask[rows]]
+        if own.size:
+            ends += [float(own.min()), float(own.max())]
+    return (min(ends), max(ends)) if ends else None
 
 
 def _set_tags(dataset: Any, band: int, tags: Tags) -> None:

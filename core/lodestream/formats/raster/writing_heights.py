@@ -8,6 +8,7 @@ import numpy as np
 
 from ...coordinates.height_fields import coordinates, to_heights
 from ...errors import FormatError
+from ...scratch import rows_at_once
 from ...surface import Surface
 from ..notes import warn
 
@@ -42,15 +43,15 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
     """The affine rule nearest to where heights lie, six numbers in GDAL's order; None for mere indices."""
     metadata, (rows, columns) = surface.metadata, surface.shape
     if metadata.get("geotransform") is not None:
-        coordinates(surface)  # refuses what is none
+        coordinates(surface, slice(0, 1))  # refuses what is none
         return [float(value) for value in metadata["geotransform"]]
     if "grid" not in metadata and "axes" not in metadata:
         return None
     transform = []
-    for plane in coordinates(surface):
-        origin = float(plane[0, 0])
-        across = (float(plane[0, -1]) - origin) / max(columns - 1, 1)
-        down = (float(plane[-1, 0]) - origin) / max(rows - 1, 1)
+    for first, last in zip(*(coordinates(surface, own) for own in (slice(0, 1), slice(rows - 1, rows))), strict=True):
+        origin = float(first[0, 0])
+        across = (float(first[0, -1]) - origin) / max(columns - 1, 1)
+        down = (float(last[0, 0]) - origin) / max(rows - 1, 1)
         transform += [origin - (across + down) / 2, across, down]
     return transform
 
@@ -60,9 +61,12 @@ def warn_off(surface: Surface, transform: Sequence[float], title: str) -> None:
     metadata = {key: value for key, value in surface.metadata.items() if key not in ("angles", "nodes")}
     if "nodes" in surface.metadata or not {"grid", "axes"} & metadata.keys():
         return
-    exact = coordinates(Surface(surface.points, mask=surface.mask, metadata=metadata))
-    affine = coordinates(Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform}))
-    for name, is_, was, steps in zip("xy", affine, exact, (transform[1:3], transform[4:6]), strict=True):
-        off = float(np.abs(is_ - was).max())
+    exact = Surface(surface.points, mask=surface.mask, metadata=metadata)
+    affine = Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform})
+    away = [0.0, 0.0]
+    for rows in rows_at_once(surface.shape):
+        pairs = zip(coordinates(affine, rows), coordinates(exact, rows), strict=True)
+        away = [max(most, float(np.abs(is_ - was).max())) for most, (is_, was) in zip(away, pairs, strict=True)]
+    for name, off, steps in zip("xy", away, (transform[1:3], transform[4:6]), strict=True):
         if off > _OFF * max(map(abs, steps)):
             warn(f"{title} assumes evenly spaced rows and columns: {name} changes by up to {off:.3g}")

@@ -42,8 +42,8 @@ _READERS: dict[str, Any] = {
 #: Strings of field data that say something of the surface.
 _WORDS = ("name", "unit", "crs")
 
-#: Field data that VTK adds to what it reads from CGNS.
-_OWN = "Base/Zone"
+#: Field data that are of no use here: VTK adds the first to what it reads from CGNS, `Surface.to_pyvista` the second.
+_PASSED_OVER = ("Base/Zone", "lodestream")
 
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _MAX_SECONDS = 600
@@ -142,7 +142,7 @@ def _grid(data: Any) -> tuple[dict[str, Any], list[Any]]:
     fields = data.GetFieldData()
     for index in range(fields.GetNumberOfArrays()):
         array, name = fields.GetAbstractArray(index), fields.GetArrayName(index) or f"field_{index}"
-        if name == _OWN:
+        if name in _PASSED_OVER:
             continue
         if name in _WORDS and array.IsA("vtkStringArray") and array.GetNumberOfValues() == 1:
             words[name] = array.GetValue(0)

@@ -115,7 +115,7 @@ def _checked(path: Path) -> tuple[Dims, int]:
     if kind == "vtkMultiBlockDataSet":
         raise FormatError(
             "expected the grids themselves, got a .vtm file, which only names other files, and these are never opened: "
-            "give its .vts files together, one for each block"
+            "give its .vts files together, one for each block, as in lodestream.read('a/a_0.vts', 'a/a_1.vts')"
         )
     if kind != "StructuredGrid":
         raise FormatError(f"expected a VTK file of type StructuredGrid, got {kind[:60]}")

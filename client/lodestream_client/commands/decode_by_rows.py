@@ -1,0 +1,174 @@
+"""``lodestream decode`` of surfaces that do not fit into memory: by bands of rows, by way of a file."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lodestream.errors import CorruptStreamError, StreamError, TooLargeError, TruncatedStreamError
+from lodestream.target import Target
+
+from .inputs import named
+from .outcome import Outcome, check_grid
+
+if TYPE_CHECKING:
+    from lodestream.container import Header
+    from lodestream.decoding.by_rows import RowsDecoder
+
+    from .decode import DecodeOptions
+
+__all__ = ["by_rows"]
+
+#: Bytes for each value that decoding in one piece takes.
+_WHOLE = 12
+#: The part of the memory that an array in memory may take.
+_PART = 16
+
+
+def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callable[[float], None]) -> bool:
+    """Decode by bands, if the whole surface is wanted, takes more than the memory there is, and can be.
+
+    The surface is decoded into files beside the one that is written, from which that is written then.
+
+    Returns
+    -------
+    bool
+        Whether it was done; otherwise nothing was.
+
+    Raises
+    ------
+    TooLargeError
+        If there are more vertices than allowed, or if decoding or writing takes more memory than was given, or than
+        the machine has if none was.
+    LodestreamError, OSError
+        From decoding and writing.
+    """
+    if options.target.region is not None or options.target.level is not None:
+        return False
+    from lodestream.bands.front import default_memory
+    from lodestream.container.capacity import Capacity
+    from lodestream.container.reader import read_index
+    from lodestream.decoding.by_rows import RowsDecoder
+
+    memory = default_memory() if options.memory is None else options.memory
+    size = path.stat().st_size
+    with path.open("rb") as file:
+
+        def read(offset: int, length: int) -> bytes:
+            file.seek(offset)
+            return file.read(length)
+
+        capacity = Capacity(options.max_vertices)
+        try:
+            decoder = RowsDecoder(read, read_index(read, size, capacity))
+        except (CorruptStreamError, TruncatedStreamError, TooLargeError):
+            return False  # decoding in one piece tells what is wrong with it, and what is left
+        header = decoder.header
+        check_grid(options.out, header)
+        needs = _Needs(header, options)
+        try:
+            needs.check(memory)
+            if needs.decoding <= memory or needs.reason is not None:
+                return False
+            capacity.promise(needs.points, (), masked=0, tables=header.tables)
+        except TooLargeError as error:
+            raise named(error, options.container) from None
+        # Or GDAL would take a twentieth of the machine's memory for what it writes; in megabytes.
+        os.environ.setdefault("GDAL_CACHEMAX", str(max(memory >> 22, 32)))
+        try:
+            _decode(decoder, Path(options.out), memory, options, started, progress)
+        except StreamError as error:
+            raise named(error, options.container) from None
+    return True
+
+
+class _Needs:
+    """The memory that decoding all points takes.
+
+    Attributes
+    ----------
+    points : int
+    decoding : int
+        Bytes that it takes in one piece.
+    reason : str or None
+        Why it is not done by bands; None: it can be.
+    """
+
+    def __init__(self, header: Header, options: DecodeOptions) -> None:
+        from lodestream.decoding.by_rows import why_not_by_rows
+        from lodestream.formats import for_writing, written
+        from lodestream.planning.selection import selection_of
+
+        self._format = written("npy") if options.out == "-" else for_writing(options.out)
+        self._given = options.memory is not None
+        self.points = sum(rows * columns for (rows, columns), _ in header.blocks)
+        channels = selection_of(options.target).channels(header)
+        self.decoding = self.points * int(channels.sum()) * _WHOLE
+        self._values = self.points * sum(
+            kind.itemsize for kind, wanted in zip(header.dtypes, channels, strict=True) if wanted
+        )
+        if options.out == "-":
+            self.reason: str | None = "standard output is written in one piece"
+        elif options.partial or options.target != Target():
+            self.reason = "only the whole surface is, without --partial, limits and --attributes"
+        else:
+            self.reason = why_not_by_rows(header)
+
+    def check(self, memory: int) -> None:
+        """Refuse what takes more than was given or, if nothing was, than there is.
+
+        Raises
+        ------
+        TooLargeError
+        """
+        from lodestream.container.capacity import memory_limit
+        from lodestream.formats import formats
+
+        limit = memory if self._given else memory_limit()
+        whole = self.decoding <= memory or self.reason is not None
+        writing = self._format.memory * self.points + (self._values if whole else 0)
+        if self._format.memory and writing > limit:
+            by_bands = [it.name for it in formats() if (it.write or it.write_beside) and not it.memory]
+            raise TooLargeError(
+                f"expected a surface that takes at most {limit >> 20:,} MiB to write as {self._format.name}, got one "
+                f"that takes about {writing >> 20:,} MiB; {', '.join(by_bands)} are written by bands of rows"
+            )
+        if self.reason is not None and self.decoding > limit:
+            raise TooLargeError(
+                f"expected a surface that takes at most {limit >> 20:,} MiB to decode, got one that takes about "
+                f"{self.decoding >> 20:,} MiB and is not decoded by bands: {self.reason}"
+            )
+
+
+def _decode(
+    decoder: RowsDecoder,
+    out: Path,
+    memory: int,
+    options: DecodeOptions,
+    started: float,
+    progress: Callable[[float], None],
+) -> None:
+    from lodestream.scratch import Room, Scratch
+
+    with tempfile.TemporaryDirectory(prefix=f".{out.name[:50]}.", dir=out.resolve().parent) as folder:
+        surface = decoder.surface(Room(lambda: Scratch(folder), memory // _PART), memory, progress)
+        index, last = decoder.index, decoder.index.levels[-1]
+        outcome = Outcome(
+            surface,
+            index.surface_end,
+            index.size,
+            index.size,
+            decoder.header.levels,
+            last.rms,
+            last.max_error,
+            False,
+            time.monotonic() - started,
+            "complete",
+            dict(zip(decoder.header.channel_names, last.channels, strict=False)),
+        )
+        outcome.write(options.out)
+        outcome.report(options.json)

@@ -1,0 +1,133 @@
+"""What every task of a build knows: the prepared surface, its lattices, its bands. Each worker opens it from files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+
+from ..container.model import Header
+from ..encoding.lattice_coordinates import Lattices
+from ..encoding.prepared import Prepared
+from ..entropy.tiles import TileTable
+from ..scratch import Scratch
+from .geometry import CORE_POINTS, Bands
+from .references import dump, load
+
+__all__ = ["Build"]
+
+#: Builds that a process has open at most.
+_MOST = 2
+
+_FILE, _HEADER = "build.pickle", "header.pickle"
+
+
+@dataclass(frozen=True)
+class _Facts:
+    prepared: Prepared
+    lattices: Lattices
+    points: int
+    core_points: int
+
+
+class Build:
+    """One stream of a surface of one grid, built by bands in a folder.
+
+    Parameters
+    ----------
+    scratch : Scratch
+        Of this stream alone.
+    prepared : Prepared
+        Of a surface of one grid, with no `rms`; what is large in it is memory-mapped.
+    lattices : Lattices
+        With no `fineness`.
+    points : int
+        Of a band, about. It decides about memory, not about bytes.
+    core_points : int
+        See `Bands`.
+    """
+
+    def __init__(
+        self, scratch: Scratch, prepared: Prepared, lattices: Lattices, points: int, core_points: int = CORE_POINTS
+    ) -> None:
+        self.scratch, self.prepared, self.lattices = scratch, prepared, lattices
+        self.points, self._core_points = points, core_points
+
+    @cached_property
+    def bands(self) -> Bands:
+        """Which tiles and rows each band has."""
+        return Bands(self.prepared.layout, self.points, self._core_points)
+
+    @property
+    def table(self) -> TileTable:
+        """Of all tiles; the same for all channels, since no side is shared."""
+        return TileTable.of(self.prepared.layout)
+
+    @property
+    def channels(self) -> int:
+        """Of the surface, attributes included."""
+        return len(self.lattices.channels)
+
+    def save(self) -> None:
+        """Write what other processes need to open this."""
+        facts = _Facts(self.prepared, self.lattices, self.points, self._core_points)
+        dump(facts, self.scratch.folder / _FILE)
+
+    def save_header(self, header: Header) -> None:
+        """Write the header, with the size of chunks, for the tasks that code the residual."""
+        dump(header, self.scratch.folder / _HEADER)
+
+    def stored_header(self) -> Header:
+        """What `save_header` wrote.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it has written nothing yet.
+        """
+        header: Header = load(self.scratch.folder / _HEADER)
+        return header
+
+    @staticmethod
+    def open(folder: str) -> Build:
+        """The build that was saved in a folder, the same object for the same folder and file.
+
+        Those whose folders are gone are forgotten.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none, or a file is gone that the surface is in.
+        UnavailableError
+            If another version of this program has saved it.
+        """
+        # File systems of networks look anew when a file is opened; what they say of one otherwise may be old.
+        with (Path(folder) / _FILE).open("rb") as file:
+            state = os.fstat(file.fileno())
+        return _opened(folder, (state.st_ino, state.st_size, state.st_mtime_ns))
+
+    def close(self) -> None:
+        """Let this process forget the build: maps of files that were removed take their room on the disk."""
+        with _LOCK:
+            _OPENED.pop(str(self.scratch.folder), None)
+
+
+#: The builds that this process works on, by folder, with the state of their files.
+_OPENED: dict[str, tuple[tuple[int, ...], Build]] = {}
+_LOCK = Lock()
+
+
+def _opened(folder: str, state: tuple[int, ...]) -> Build:
+    with _LOCK:
+        known = _OPENED.get(folder)
+        if known is None or known[0] != state:
+            for other in [other for other in _OPENED if other == folder or not Path(other).exists()]:
+                del _OPENED[other]
+            while len(_OPENED) >= _MOST:
+                del _OPENED[next(iter(_OPENED))]
+            facts: _Facts = load(Path(folder) / _FILE)
+            build = Build(Scratch(folder, make=False), facts.prepared, facts.lattices, facts.points, facts.core_points)
+            known = _OPENED[folder] = state, build
+        return known[1]

@@ -1,0 +1,101 @@
+"""Tasks carried out by threads of this process, or by any executor: what is done already is not done again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Executor, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from typing import Any
+
+from ..scratch import Scratch
+
+__all__ = ["Execution", "Task"]
+
+#: Seconds between two looks at tasks, so that an interruption of this thread is heard.
+_LOOK = 0.5
+
+
+@dataclass(frozen=True)
+class Task:
+    """A call of a function that any process may make, and that may be made twice.
+
+    Attributes
+    ----------
+    done : str
+        The name of the file in the scratch folder that the function writes last.
+    function : callable
+        At the top level of a module. It is given the folder, a str, then the arguments, and returns nothing: what it
+        finds is in files, which appear when they are whole.
+    arguments : tuple of int
+    """
+
+    done: str
+    function: Callable[..., None]
+    arguments: tuple[int, ...] = ()
+
+
+class Execution:
+    """Carries out phases of tasks, one phase after another, the tasks of each in any order and at once.
+
+    Parameters
+    ----------
+    scratch : Scratch
+        Where the tasks' files are.
+    executor : concurrent.futures.Executor or None
+        None: threads of this process.
+    threads : int
+        How many of these, 1 or more.
+    """
+
+    def __init__(self, scratch: Scratch, executor: Executor | None = None, threads: int = 1) -> None:
+        self._scratch, self._executor, self._threads = scratch, executor, threads
+
+    def carry_out(self, tasks: Sequence[Task], progress: Callable[[float], None] = lambda fraction: None) -> None:
+        """Carry out the tasks of one phase that are not done yet.
+
+        Parameters
+        ----------
+        tasks : sequence of Task
+        progress : callable
+            Is told the fraction of them that are done, 0 to 1.
+
+        Raises
+        ------
+        Exception
+            What the first task that failed raised; no other is begun after that, and none is at work any more in
+            threads and processes of this machine. A task that a Dask worker has begun may end later, as may one of a
+            worker that was given up: no task may write other values into a file that another task has written.
+        """
+        found = self._scratch.those_of(task.done for task in tasks)
+        left = [task for task in tasks if task.done not in found]
+        done = len(tasks) - len(left)
+        folder = str(self._scratch.folder)
+        if self._executor is None and self._threads == 1:
+            for number, task in enumerate(left, done + 1):
+                task.function(folder, *task.arguments)
+                progress(number / len(tasks))
+        elif self._executor is None:
+            with ThreadPoolExecutor(self._threads, "lodestream-bands") as own:
+                self._wait(own, folder, left, done, progress)
+        else:
+            self._wait(self._executor, folder, left, done, progress)
+
+    def _wait(
+        self, executor: Executor, folder: str, tasks: Sequence[Task], done: int, progress: Callable[[float], None]
+    ) -> None:
+        pending: set[Future[Any]] = set()
+        total = done + len(tasks)
+        try:
+            for task in tasks:
+                pending.add(executor.submit(task.function, folder, *task.arguments))
+            while pending:
+                ended, pending = wait(pending, _LOOK, FIRST_EXCEPTION)
+                for future in ended:
+                    future.result()
+                done += len(ended)
+                progress(done / total)
+        finally:
+            for future in pending:
+                future.cancel()
+            # The files of a task that is still at work should not come after what its caller does next.
+            wait([future for future in pending if not future.cancelled()])

@@ -1,0 +1,275 @@
+"""Encoding any surface: in one piece where it fits into memory, by bands where it does not or others shall help."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast, overload
+
+from numpy.typing import ArrayLike
+
+from ..encoding import encoder
+from ..encoding.losses import at_holes
+from ..errors import FormatError, FormatWarning, OptionError, TooLargeError
+from ..library import require
+from ..quality import Limit, Quality
+from ..scratch import Room
+from ..sources import Source, is_source, read_source
+from ..surface import Surface
+from .folders import Folder, check_out, replacing
+from .made import Made
+from .memory import WHOLE, checked_memory, default_memory, whole_memory
+from .room import CopyRoom
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["default_memory", "encode", "goes_by_bands"]
+
+#: The part of the memory that an array in memory may take.
+_PART = 16
+
+_Progress = Callable[[float], None]
+
+
+@overload
+def encode(
+    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    precision: Limit | None = None,
+    *,
+    rms: Limit | None = None,
+    attribute_precision: Mapping[str, Limit] | None = None,
+    quality: Quality | None = None,
+    progress: _Progress | None = None,
+    out: None = None,
+    memory: int | str | None = None,
+    scratch: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
+) -> bytes: ...
+@overload
+def encode(
+    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    precision: Limit | None = None,
+    *,
+    rms: Limit | None = None,
+    attribute_precision: Mapping[str, Limit] | None = None,
+    quality: Quality | None = None,
+    progress: _Progress | None = None,
+    out: str | os.PathLike[str],
+    memory: int | str | None = None,
+    scratch: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
+) -> None: ...
+def encode(
+    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    precision: Limit | None = None,
+    *,
+    rms: Limit | None = None,
+    attribute_precision: Mapping[str, Limit] | None = None,
+    quality: Quality | None = None,
+    progress: _Progress | None = None,
+    out: str | os.PathLike[str] | None = None,
+    memory: int | str | None = None,
+    scratch: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
+) -> bytes | None:
+    """Encode a surface into a container.
+
+    >>> import numpy as np, lodestream
+    >>> heights = np.add.outer(np.arange(9) ** 2, np.arange(9))
+    >>> container = lodestream.encode(heights)
+    >>> bool((lodestream.decode(container).points == heights).all())
+    True
+
+    A surface that does not fit into memory is a memory-mapped array, ``np.load("heights.npy", mmap_mode="r")``, or one
+    that `read` leaves in files (its ``scratch``), and is encoded by bands of rows into a file, ``out``. The bytes are
+    the same for any memory, and any executor.
+
+    Parameters
+    ----------
+    surface : Surface, array, Source, or Dataset, DataArray or DataTree of xarray
+        An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``. Arrays of Zarr, h5py
+        and Dask, and any object with ``shape``, ``dtype`` and ``read(window)``, are read window by window, once. What
+        is of xarray is taken as by `Surface.from_xarray`, with coordinates, CRS, unit and name, by windows too.
+    precision : float, str, Tolerance or None
+        Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
+        the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
+        unless `attribute_precision` names them.
+    rms : float, str, Tolerance or None
+        Encode for one root mean square error instead: a container as short as possible whose complete surface has at
+        most this error. Quantization steps are chosen for this error alone, and there are few layers before the last.
+    attribute_precision : mapping of str to float, str or Tolerance, optional
+        Maximum error of attributes, by name; or of single channels: of a coordinate ("x", "y" or "z"), of a component
+        of an attribute ("wind_0"), relative to the range of that channel. A coordinate that is named keeps to its own
+        precision, whatever `precision` is; if that is None, the other coordinates come back bit for bit.
+    quality : Quality, optional
+        In place of the three before, which are a shorthand for ``Quality.of(precision, rms, attribute_precision)``.
+    progress : callable, optional
+        Called from time to time with the fraction done, 0 to 1.
+    out : str or path-like, optional
+        The file to write; it appears when it is whole.
+    memory : int or str, optional
+        Bytes to work in, a MiB or more, or text such as ``"512MiB"``, beside arrays that are memory-mapped: what takes
+        more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
+        for each value of such a row are taken in any case. By default a quarter of the machine's memory, and where
+        there is no ``out`` one piece.
+    scratch : str or path-like, optional
+        A folder for the files of a build by bands, about 12 bytes a value; empty, or of a build that was cut. What is
+        made there is kept when the build is interrupted, or fails, and the same call goes on from there; after success
+        it is gone, with the folder if that was not there before. Only one build at a time has a folder. By default one
+        beside ``out`` that is gone afterwards; what a killed process left there is found again.
+    executor : concurrent.futures.Executor, optional
+        Carries out the tasks of a build by bands: processes, or machines that all see ``scratch`` and the files of
+        memory-mapped arrays, as ``distributed.Client(...).get_executor()``. By default threads of this process.
+
+    Returns
+    -------
+    bytes or None
+        A container, see ``docs/format.md``; nothing where there is an ``out``. Values of attributes at holes of the
+        points are not kept; if there are any, a `FormatWarning` says so.
+
+    Raises
+    ------
+    InputError
+        If the surface cannot be encoded, or not with this precision, or if its metadata are larger than
+        `lodestream.container.metadata.MAX_BYTES`.
+    InputError
+        Also if the scratch folder holds anything else, another build is at work there, or a file that the surface is in
+        is written to meanwhile.
+    TooLargeError
+        If a block has more rows or columns than kernels can count, if ``memory`` is given and is too little for a
+        surface that cannot be built by bands, or if there is not room enough on the disk of the scratch folder.
+    OptionError
+        If ``memory`` is no size or less than a MiB, there is no attribute or channel of a given name, an error is no
+        number of 0 or more, both a precision and an error are given, or a quality and one of these.
+    UnavailableError
+        If the compiled kernels are missing; it says how to get them. Also if a worker has another version.
+    OSError
+        If a file cannot be written; before all work if there is no folder for it.
+    """
+    require("encoding")
+    chosen = encoder.chosen_quality(quality, precision, rms, attribute_precision)
+    limit = default_memory() if memory is None else checked_memory(memory)
+    if out is not None:
+        check_out(Path(out))
+    with ExitStack() as stack:
+        folder = Folder(stack, scratch, out)
+        whole = out is None and memory is None and executor is None
+        read = None if isinstance(surface, Surface) else _reading(surface)
+        if read is not None:
+            by_bands = _by_bands(limit, chosen, whole, executor is not None)
+            surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands))
+        elif not isinstance(surface, Surface):
+            surface = Surface(cast("ArrayLike", surface))
+        stacklevel = 4  # the caller of this function, from the one that makes it in one piece
+        if not whole and goes_by_bands(surface, chosen, limit, executor is not None, memory is not None):
+            encoder.check(surface, chosen)
+            left_out = at_holes(surface)
+            if left_out is not None:
+                warnings.warn(left_out, FormatWarning, stacklevel=2)
+            told = encoder.rising(progress or (lambda fraction: None))
+            made = Made(surface, chosen, limit, executor, told, read is not None).container(folder.open())
+            if made is not None:
+                return _given(made, out)
+            stacklevel = 0
+        return _in_memory(surface, chosen, progress, out, stacklevel)
+
+
+def _reading(source: Any) -> Callable[[Room], Surface] | None:
+    """How the surface is read of what is read by windows; None: it is an array in memory."""
+    xr: Any = sys.modules.get("xarray")  # whoever has an object of it has imported it
+    if xr is None or not isinstance(source, xr.Dataset | xr.DataArray | xr.DataTree):
+        return (lambda room: Surface(read_source(source, room))) if is_source(source) else None
+    from ..interop.from_xarray import from_xarray
+
+    def read(room: Room) -> Surface:
+        try:
+            return from_xarray(source, room)
+        except (FormatError, OptionError) as error:
+            raise type(error)(
+                f"{error}; lodestream.Surface.from_xarray takes options, and encode the surface that it makes"
+            ) from None
+
+    return read
+
+
+def _by_bands(limit: int, quality: Quality, whole: bool, wanted: bool) -> Callable[[int], bool]:
+    """Whether an array of so many values goes by bands, as far as its number of values tells."""
+    able = not whole and quality.rms is None
+    return lambda values: able and (wanted or values * WHOLE > limit)
+
+
+def _given(made: Path, out: str | os.PathLike[str] | None) -> bytes | None:
+    if out is None:
+        return made.read_bytes()
+    with replacing(Path(out)) as unfinished:
+        shutil.move(made, unfinished)
+    return None
+
+
+def _in_memory(
+    surface: Surface,
+    quality: Quality,
+    progress: _Progress | None,
+    out: str | os.PathLike[str] | None,
+    stacklevel: int,
+) -> bytes | None:
+    container = encoder.encode(surface, quality=quality, progress=progress, stacklevel=stacklevel)
+    if out is None:
+        return container
+    with replacing(Path(out)) as unfinished:
+        unfinished.write_bytes(container)
+    return None
+
+
+def goes_by_bands(surface: Surface, quality: Quality, memory: int, wanted: bool = False, strict: bool = False) -> bool:
+    """Whether a surface is built by bands: it can be, and takes more memory in one piece or somebody wants it.
+
+    Parameters
+    ----------
+    surface : Surface
+    quality : Quality
+    memory : int
+        In bytes.
+    wanted : bool
+        Whatever memory there is.
+    strict : bool
+        Refuse a surface that takes more and cannot be built by bands.
+
+    Raises
+    ------
+    TooLargeError
+        If it is refused.
+    """
+    needed = whole_memory(surface)
+    reason = _in_one_piece(surface, quality)
+    if reason is None:
+        return wanted or needed > memory
+    if strict and needed > memory:
+        raise TooLargeError(
+            f"expected a surface that takes at most {memory >> 20:,} MiB to encode, got one that takes about "
+            f"{-(-needed >> 20):,} MiB and cannot be built by bands: {reason}"
+        )
+    return False
+
+
+def _in_one_piece(surface: Surface, quality: Quality) -> str | None:
+    """Why a surface cannot be built by bands; None: it can."""
+    if quality.rms is not None:
+        return "a stream for one error (rms) is made of all values together"
+    if len(surface.blocks) > 1:
+        return f"it has {len(surface.blocks)} blocks"
+    block = surface.blocks[0]
+    if block.closed[0]:
+        return "its rows wrap"
+    if surface.joints is not None:
+        return "it tells which of its points are one"
+    if any(a.dtype.kind != "f" and a.dtype.itemsize == 8 for a in (block.points, *block.attributes.values())):
+        return "it has integers of 64 bits"
+    return None

@@ -1,0 +1,184 @@
+"""Checking a container from an untrusted source that does not fit into memory: values and errors by bands of rows."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.digest import little_endian
+from ..container.model import Header
+from ..decoding.by_rows import RowsDecoder, why_not_by_rows
+from ..decoding.inspected_sections import Walked, walk
+from ..decoding.inspection import (
+    READ,
+    Inspection,
+    Measured,
+    check_errors,
+    check_levels,
+    check_values,
+    corners_of,
+    inspect_whole,
+    states_of,
+)
+from ..errors import CorruptStreamError, TooLargeError
+from ..library import require
+from ..parallel import spread
+from ..surface import Block, Surface
+from .measuring import Figures, RowsGiven, RowsMeasurer, distances_of
+
+__all__ = ["inspect"]
+
+#: Bytes that looking a container through takes for each value, in one piece.
+_WHOLE = 24
+#: Of the memory, what decoding a band may take; and points of the levels that are restored as their metadata say.
+_PART, _MOST_POINTS = 4, 1 << 20
+#: How much of it is done when all rows are measured.
+_MEASURED = 0.95
+
+
+def inspect(
+    file: BinaryIO,
+    *,
+    max_vertices: int,
+    memory: int,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> Inspection:
+    """Check a whole container as `lodestream.decoding.inspection.inspect` does, by bands of rows if it is large.
+
+    Of a large one only levels of up to a million points are restored as the metadata say.
+
+    Parameters
+    ----------
+    file : binary file
+        The container and nothing else; seekable.
+    max_vertices : int
+        Larger surfaces are refused.
+    memory : int
+        Bytes to work in, about.
+    progress : callable
+        Called from time to time with the fraction done, 0 to 1.
+
+    Raises
+    ------
+    CorruptStreamError
+        If it is damaged, contradicts itself, or is followed by more bytes; with the offset.
+    TruncatedStreamError
+        If it is cut short; the message names the offset.
+    UnsupportedVersionError
+        If this program does not read its version.
+    TooLargeError
+        If it has more vertices than allowed, or takes more memory and cannot be decoded by bands.
+    UnavailableError
+        If the compiled kernels are missing.
+    """
+    require("looking a container through")
+    walked = walk(
+        file,
+        max_vertices=max_vertices,
+        keeps=lambda header: _fits(header, memory),
+        progress=lambda part: progress(READ * part),
+    )
+    header = walked.index.header
+    if _fits(header, memory):
+        return inspect_whole(walked, progress)
+    if (reason := why_not_by_rows(header)) is not None:
+        raise TooLargeError(
+            f"expected a surface that takes at most {memory >> 20:,} MiB to check, got one that takes about "
+            f"{_values(header) * _WHOLE >> 20:,} MiB and cannot be decoded by bands: {reason}"
+        )
+    return _by_bands(file, walked, memory // _PART, progress)
+
+
+def _values(header: Header) -> int:
+    return sum(rows * columns for (rows, columns), _ in header.blocks) * header.channels
+
+
+def _fits(header: Header, memory: int) -> bool:
+    return _values(header) * _WHOLE <= memory
+
+
+def _by_bands(file: BinaryIO, walked: Walked, memory: int, progress: Callable[[float], None]) -> Inspection:
+    def read(offset: int, length: int) -> bytes:
+        file.seek(offset)
+        return file.read(length)
+
+    index, header = walked.index, walked.index.header
+    decoder = RowsDecoder(read, index)
+    states = list(states_of(walked)) if header.exact else []
+    check_levels(index, lambda level: _level(header, index.metadata_values, level), _MOST_POINTS)
+    groups, passes = decoder.groups(memory), 1 + (len(header.attributes) if index.digest is not None else 0)
+    digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
+    for number, group in enumerate(groups, 1):
+        for band in spread(lambda rows: _band(decoder, rows, states), group):
+            digest.update(little_endian(band.points))
+            corners += band.corners
+            figures += band.figures
+        progress(READ + (_MEASURED - READ) * number / len(groups) / passes)
+    check_values(index, (0 if header.masks[0] is None else int(np.count_nonzero(~header.masks[0])),), corners)
+    if index.digest is not None:
+        # An array is hashed whole before the next one, so each attribute takes another pass.
+        for attribute in range(1, passes):
+            for group in groups:
+                for values in spread(decoder.rows, group):
+                    digest.update(little_endian(values.arrays[attribute]))
+            progress(READ + (_MEASURED - READ) * (attribute + 1) / passes)
+        if digest.hexdigest() != index.digest:
+            problem = f"expected values with the SHA-256 {index.digest}, got {digest.hexdigest()}"
+            raise CorruptStreamError(problem, header.length)
+    if header.exact:
+        check_errors(walked, _errors(header, figures, len(states)), lambda part: None)
+    progress(1.0)
+    return Inspection(index, header.exact)
+
+
+@dataclass(frozen=True)
+class _Band:
+    """What is kept of a band: its points, shape (row, column, component), their corners, and figures if any are."""
+
+    points: NDArray[Any]
+    corners: list[NDArray[Any]]
+    figures: list[Figures]
+
+
+def _band(decoder: RowsDecoder, rows: tuple[int, int], states: Sequence[NDArray[np.int8]]) -> _Band:
+    """Decode some rows, and measure them in these states."""
+    header = decoder.header
+    geometry, tiles = decoder.tiles(rows)
+    arrays = decoder.values(geometry, tiles).arrays
+    mask = None if header.masks[0] is None else header.masks[0][slice(*rows)]
+    figures = []
+    if states:
+        given = RowsGiven.of(arrays[0], arrays, mask, header.geometric)
+        measurer = RowsMeasurer(given, header.lattices, header.geometric, header.predictors, geometry, tiles)
+        figures = [measurer.figures(states)]
+    return _Band(arrays[0], corners_of(arrays[0], mask), figures)
+
+
+def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
+    """A surface of a level's shape whose values are 0: as much as its metadata are about."""
+    shape, masked = header.layout.shape(0, level), header.masks[0] is not None
+    counts = (header.point_channels, *(kind.channels for kind in header.attributes))
+    first = [sum(counts[:number]) for number in range(len(counts))]
+    points, *others = (
+        np.zeros((*shape, count), header.dtypes[channel]) for count, channel in zip(counts, first, strict=True)
+    )
+    attributes = {
+        kind.name: array if kind.components else array[..., 0]
+        for kind, array in zip(header.attributes, others, strict=True)
+    }
+    mask = np.ones(shape, np.bool_) if masked else None
+    block = Block(points[..., 0] if header.flat else points, header.closed, mask=mask, attributes=attributes)
+    return Surface(blocks=[block], metadata=dict(metadata))
+
+
+def _errors(header: Header, figures: list[Figures], states: int) -> list[Measured]:
+    """The errors of all states of the whole surface."""
+    found = [distances_of(figures, number, header.geometric, header.dtypes) for number in range(states)]
+    if any(one is None for one in found):
+        raise TooLargeError("expected values whose squares float64 holds, in a surface this large, got others")
+    return [one for one in found if one is not None]

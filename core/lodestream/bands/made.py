@@ -1,0 +1,218 @@
+"""A container made by bands in a folder: the preparation, the streams that are tried, and what goes on after a cut."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from concurrent.futures import Executor
+from copy import copy
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..encoding import encoder
+from ..encoding.lattice_coordinates import exact_lattices
+from ..encoding.prepared import Prepared, prepare
+from ..errors import InputError
+from ..parallel import threads
+from ..quality import Quality
+from ..scratch import DamagedError, Room, Scratch
+from ..surface import Surface
+from .build import Build
+from .building import Building, OutOfRangeError
+from .executing import Execution
+from .folders import TASKS, remove, replacing
+from .geometry import CORE_POINTS
+from .memory import BESIDE, OF_BAND
+from .references import file_state, root_of
+from .room import FOR_A_VALUE, check_room
+
+__all__ = ["Made"]
+
+#: Values of a band at least and at most.
+_FEWEST, _MOST = 1 << 17, 1 << 22
+#: Arrays of so many bytes that are needed beside the surface are in files.
+_IN_A_FILE = 32 << 20
+
+
+class Made:
+    """A container that is made by bands, or goes on being made.
+
+    Parameters
+    ----------
+    surface : Surface
+        One that `goes_by_bands`.
+    quality : Quality
+    memory : int
+        In bytes.
+    executor : Executor or None
+        None: threads of this process.
+    progress : callable
+        Is told the fraction done, 0 to 1.
+    copied : bool
+        Whether the surface was copied into files for this call, which say nothing about it.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        quality: Quality,
+        memory: int,
+        executor: Executor | None,
+        progress: Callable[[float], None],
+        copied: bool = False,
+    ) -> None:
+        self._surface, self._quality, self._progress, self._executor = surface, quality, progress, executor
+        own = threads()
+        points = surface.blocks[0].shape[0] * surface.blocks[0].shape[1]
+        channels = max(1, sum(a.size for a in self._arrays()) // points)
+        room = max(memory - BESIDE, 0) // (OF_BAND * channels)
+        self._threads = 1 if executor is not None else max(1, min(own, room // _FEWEST))
+        self._points = min(max(room // self._threads, _FEWEST), _MOST)
+        self._core = min(CORE_POINTS, max(self._points // 2, 1 << 12))
+        self._values = points * channels
+        self._copied = copied
+
+    def _arrays(self) -> list[NDArray[Any]]:
+        block = self._surface.blocks[0]
+        return [block.points, *block.attributes.values()]
+
+    def _all(self) -> list[NDArray[Any]]:
+        mask = self._surface.blocks[0].mask
+        return [*self._arrays(), *([] if mask is None else [mask])]
+
+    def container(self, folder: Path) -> Path | None:
+        """The file of the container, in the folder; None: the surface must be encoded in one piece.
+
+        Raises
+        ------
+        InputError
+            If a file that the surface is in has changed meanwhile.
+        TooLargeError
+            If the disk has no room for it.
+        UnavailableError
+            If a worker has another version of this program.
+        """
+        in_memory = sum(array.nbytes for array in self._all() if root_of(array) is None)
+        check_room(folder, self._values * FOR_A_VALUE + in_memory)
+        files = [root_of(array) for array in self._all()]
+        paths = sorted({str(Path(str(root.filename)).resolve()) for root in files if root is not None})
+        states = [file_state(path) for path in paths]
+        # What another build has left, of another surface or another version, has another name.
+        own = folder / TASKS / hashlib.sha256(self._key().encode()).hexdigest()[:16]
+        own.parent.mkdir(exist_ok=True)
+        for path in own.parent.iterdir():
+            if path != own:
+                remove(path)
+        begun, surface = own.exists(), self._surface
+        try:
+            made = self._container(Scratch(own))
+        except DamagedError:
+            if not begun:
+                raise
+            remove(own)  # the machine failed, not only the build
+            self._surface = surface
+            made = self._container(Scratch(own))
+        for path_, state in zip(paths, states, strict=True):
+            if file_state(path_) != state:
+                raise InputError(f"expected {path_} to stay as it is until it is encoded, it was changed meanwhile")
+        return made
+
+    def _container(self, scratch: Scratch) -> Path | None:
+        self._surface = self._in_files(Scratch(scratch.folder / "surface"))
+        # Not the files of the build that was cut: a late task of it could read them while they are written.
+        remove(scratch.folder / "prepared")
+        prepared_files = scratch.folder / "prepared" / uuid4().hex
+        room = Room(lambda: Scratch(prepared_files), 0 if self._executor is not None else _IN_A_FILE)
+        prepared = prepare(self._surface, self._quality, room)
+        if prepared.arrangement is not None:
+            return None
+        raw = sum(array.nbytes for array in self._arrays())
+        best: Path | None = None
+        for bits in (None, *encoder.COARSER):
+            try:
+                found = self._stream(scratch, prepared, bits)
+            except OutOfRangeError:
+                return None
+            if best is None or found.stat().st_size < best.stat().st_size:
+                best = found
+            # What looks like noise is not worth coding, see `encoder`.
+            if prepared.precision is not None or best.stat().st_size <= encoder.longest(raw):
+                break
+        self._progress(1.0)
+        return best
+
+    def _in_files(self, files: Scratch) -> Surface:
+        """The surface with all arrays in files, which tasks open: what is in memory would go to each of them."""
+
+        def kept(name: str, array: NDArray[Any]) -> NDArray[Any]:
+            if root_of(array) is not None:
+                return array
+            if not files.has(name):
+                files.write(name, array)
+            return files.read(name)
+
+        # Copied, not made anew: that would look at all values, and put another mask into memory.
+        block = copy(self._surface.blocks[0])
+        block.points = kept("points", block.points)
+        block.mask = None if block.mask is None else kept("mask", block.mask)
+        block.attributes = {
+            name: kept(f"attributes/{number}", array) for number, (name, array) in enumerate(block.attributes.items())
+        }
+        surface = copy(self._surface)
+        surface.blocks = (block,)
+        return surface
+
+    def _stream(self, scratch: Scratch, prepared: Prepared, bits: int | None) -> Path:
+        name = "exact" if bits is None else f"bits-{bits}"
+        path = scratch.folder / f"{name}.lode"
+        if not path.exists():
+            own = Scratch(scratch.folder / name)
+            build = Build(own, prepared, exact_lattices(prepared, bits), self._points, self._core)
+            build.save()
+            execution = Execution(own, self._executor, self._threads)
+            try:
+                with replacing(path) as unfinished, unfinished.open("wb") as file:
+                    Building(build, execution, self._progress).write(file)
+            except FileNotFoundError as error:
+                if self._executor is None:
+                    raise
+                raise InputError(
+                    f"expected workers that see the files of the build and of the surface, got none of {error.filename}"
+                ) from error
+            finally:
+                build.close()
+            remove(own.folder)
+        return path
+
+    def _key(self) -> str:
+        """What tells this build from others: one that was cut goes on only if nothing of it has changed."""
+        block = self._surface.blocks[0]
+        said = {
+            "version": __version__,
+            "quality": repr(self._quality),
+            "closed": block.closed,
+            "attributes": list(block.attributes),
+            "metadata": hashlib.sha256(repr(self._surface.metadata).encode()).hexdigest(),
+            "arrays": [_identity(array, self._copied) for array in self._all()],
+            "points": [self._points, self._core],
+        }
+        return json.dumps(said)
+
+
+def _identity(array: NDArray[Any], copied: bool) -> list[Any]:
+    """What an array is known by: its file and place there, or the digest of its values."""
+    root = None if copied else root_of(array)
+    if root is None:
+        digest = hashlib.sha256()
+        for rows in array:
+            digest.update(np.ascontiguousarray(rows).data)
+        return [array.shape, array.dtype.str, digest.hexdigest()]
+    path = str(Path(str(root.filename)).resolve())
+    start = array.__array_interface__["data"][0] - root.__array_interface__["data"][0]
+    return [array.shape, array.dtype.str, array.strides, path, root.offset + start, *file_state(path)]

@@ -1,0 +1,57 @@
+"""How much memory encoding takes, in one piece and by bands."""
+
+from __future__ import annotations
+
+from operator import index
+
+from ..container.capacity import memory_limit
+from ..errors import OptionError
+from ..sizes import parse_size
+from ..surface import Surface
+
+__all__ = ["BESIDE", "LEAST", "OF_BAND", "WHOLE", "checked_memory", "default_memory", "least_memory", "whole_memory"]
+
+#: Bytes that encoding takes for each value: in one piece, with holes, and for each value of a band.
+WHOLE, _WHOLE_WITH_HOLES, OF_BAND = 16, 40, 32
+#: What a process takes besides, and the least that may be asked for.
+BESIDE, LEAST = 96 << 20, 1 << 20
+#: Rows of a tile.
+_ROWS = 64
+
+
+def default_memory() -> int:
+    """A quarter of the memory that this process may have, in bytes."""
+    return memory_limit() // 4
+
+
+def checked_memory(memory: int | str) -> int:
+    """A number of bytes to work in, from a number or text such as ``"512MiB"``.
+
+    Raises
+    ------
+    OptionError
+        If it is no size, or less than `LEAST`.
+    """
+    try:
+        size = parse_size(memory) if isinstance(memory, str) else index(memory)
+    except (TypeError, ValueError):
+        size = None
+    if size is None or isinstance(memory, bool):
+        raise OptionError(f'expected memory in bytes, such as {1 << 30} or "512MiB", got {str(memory)[:80]!r}')
+    if not LEAST <= size < 1 << 63:
+        raise OptionError(f"expected {LEAST >> 20} MiB of memory or more to work in, got {str(memory)[:80]!r}")
+    return size
+
+
+def whole_memory(surface: Surface) -> int:
+    """About what encoding a surface in one piece takes, in bytes."""
+    values = sum(array.size for block in surface.blocks for array in (block.points, *block.attributes.values()))
+    holes = any(block.mask is not None for block in surface.blocks)
+    return values * (_WHOLE_WITH_HOLES if holes else WHOLE)
+
+
+def least_memory(surface: Surface) -> int:
+    """About the least that encoding a surface by bands takes, in bytes: the program, and a row of tiles."""
+    block = surface.blocks[0]
+    values = sum(array.size for array in (block.points, *block.attributes.values()))
+    return BESIDE + OF_BAND * values * _ROWS // max(block.shape[0], _ROWS)

@@ -1,0 +1,143 @@
+"""Objects written to a file with their memory-mapped arrays as references, for other processes to open again.
+
+Only files that a build has written itself are read: unpickling runs whatever a file says.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..errors import UnavailableError
+from ..scratch import rows_at_once
+
+__all__ = ["dump", "file_state", "load", "root_of"]
+
+
+#: Attribute of a map: whether it is one of the files that had its name.
+_KNOWN = "_lodestream_files"
+
+_HEAD = f"lodestream {__version__}\n".encode()
+
+
+def dump(value: object, path: Path) -> None:
+    """Write an object; what it holds of memory-mapped arrays stays in their files, which must stay where they are."""
+    unfinished = path.with_name(f"{path.name}.part")
+    with unfinished.open("wb") as file:
+        file.write(_HEAD)
+        _Pickler(file, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+    os.replace(unfinished, path)
+
+
+def load(path: Path) -> Any:
+    """Read an object that `dump` wrote; its memory-mapped arrays are maps that cannot be changed.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the file is not there, or one that its arrays are in.
+    UnavailableError
+        If it was written by another version of this program.
+    """
+    with path.open("rb") as file:
+        if (head := file.readline()) != _HEAD:
+            found, own = (line.decode("ascii", "replace").strip()[:80] for line in (head, _HEAD))
+            raise UnavailableError(f"expected workers of the same version: {found} builds, a worker has {own}")
+        return pickle.load(file)
+
+
+class _Pickler(pickle.Pickler):
+    """Puts the name of a file in place of arrays that are maps of it."""
+
+    def reducer_override(self, value: object) -> Any:
+        """As `pickle` wants it: how an object is made again."""
+        if isinstance(value, np.ndarray) and value.size:
+            root = root_of(value)
+            if root is not None and root.filename is not None:
+                start = value.__array_interface__["data"][0] - root.__array_interface__["data"][0]
+                place = str(Path(root.filename).resolve()), root.offset + start
+                return _mapped, (*place, value.dtype, value.shape, value.strides)
+        return NotImplemented
+
+
+def file_state(path: str | os.PathLike[str]) -> list[int]:
+    """What changes when a file is written to, or another one gets its name, whatever times that one pretends."""
+    state = os.stat(path)
+    return [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
+
+
+def root_of(array: NDArray[Any]) -> np.memmap[Any, Any] | None:
+    """The memory-mapped array that an array, of any shape (row, ...), is a view of, or is itself.
+
+    None also where the values may differ from those of the file: the map is a copy on write, or the file is gone, or
+    another one has its name.
+    """
+    found: np.memmap[Any, Any] | None = None
+    base: NDArray[Any] | None = array
+    while isinstance(base, np.ndarray):
+        if isinstance(base, np.memmap):
+            found = base
+        base = base.base
+    if found is None or found.filename is None or found.mode == "c":
+        return None
+    try:
+        state = os.stat(found.filename)
+    except FileNotFoundError:
+        return None
+    return found if _is_of(found, state) else None
+
+
+def _is_of(root: np.memmap[Any, Any], state: os.stat_result) -> bool:
+    """Whether a map is one of the file of this state, which has its name now.
+
+    Where the system does not tell, the values are compared, and the map remembers what was found: as long as it is
+    there, no other file gets the number of its own.
+    """
+    if _inode(root.__array_interface__["data"][0]) == state.st_ino:
+        return True
+    known = vars(root).setdefault(_KNOWN, {})
+    file = state.st_dev, state.st_ino
+    if file not in known:
+        known[file] = _is_equal(root)
+    same: bool = known[file]
+    return same
+
+
+def _inode(address: int) -> int | None:
+    """The number of the file that is mapped to an address of this process; None: the system does not tell."""
+    try:
+        with open("/proc/self/maps", encoding="ascii", errors="replace") as file:
+            for line in file:
+                span, _, _, _, inode = line.split(maxsplit=5)[:5]
+                start, stop = (int(bound, 16) for bound in span.split("-"))
+                if start <= address < stop:
+                    return int(inode) or None
+    except (OSError, ValueError):  # not on macOS and Windows
+        pass
+    return None
+
+
+def _is_equal(root: np.memmap[Any, Any]) -> bool:
+    """Whether the file that has the name of a map's has its values."""
+    try:
+        again = _mapped(str(root.filename), root.offset, root.dtype, root.shape, root.strides)
+    except (OSError, ValueError):  # it is shorter, or gone
+        return False
+    own, found = (np.asarray(array).ravel(order="K") for array in (root, again))
+    return all(own[part].tobytes() == found[part].tobytes() for part in rows_at_once(own.shape))
+
+
+def _mapped(
+    path: str, offset: int, dtype: np.dtype[Any], shape: tuple[int, ...], strides: tuple[int, ...]
+) -> NDArray[Any]:
+    # Strides of a view may go backwards: the map begins at its lowest address.
+    before = sum(min(0, (length - 1) * stride) for length, stride in zip(shape, strides, strict=True))
+    after = sum(max(0, (length - 1) * stride) for length, stride in zip(shape, strides, strict=True))
+    raw = np.memmap(path, np.uint8, "r", offset + before, (after - before + dtype.itemsize,))
+    return np.ndarray(shape, dtype, raw, -before, strides)

@@ -1,0 +1,82 @@
+"""Room on the disk for the files of a build, looked at before they are written."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ..errors import TooLargeError
+from ..scratch import Room, Scratch
+from .folders import TASKS
+
+__all__ = ["FOR_A_VALUE", "CopyRoom", "check_room"]
+
+#: Bytes of scratch for each value that is encoded by bands.
+FOR_A_VALUE = 12
+
+
+def check_room(folder: Path, needed: int) -> None:
+    """See that the disk has room for so many bytes more in a folder; those of a build that was cut count as free.
+
+    Raises
+    ------
+    TooLargeError
+        If it has not.
+    """
+    free = shutil.disk_usage(folder).free + Scratch(folder / TASKS, make=False).size()
+    if free < needed:
+        raise TooLargeError(
+            f"expected {needed >> 20:,} MiB of room in {folder} for the files of a build by bands, "
+            f"got {free >> 20:,} MiB; scratch= takes another folder"
+        ) from OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class CopyRoom(Room):
+    """Where a source is copied to, if the disk has room for the copy and for the build that comes after.
+
+    Parameters
+    ----------
+    scratch : callable
+        Gives the folder of the copies, a `Scratch`.
+    folder : callable
+        Gives the folder of the build.
+    least : int
+        Arrays of fewer bytes are in memory.
+    by_bands : callable
+        Whether an array of so many values is encoded by bands.
+    """
+
+    def __init__(
+        self,
+        scratch: Callable[[], Scratch],
+        folder: Callable[[], Path],
+        least: int,
+        by_bands: Callable[[int], bool],
+    ) -> None:
+        super().__init__(scratch, least)
+        self._folder, self._by_bands = folder, by_bands
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """A new array of this shape, (row, ...), whatever it holds.
+
+        Raises
+        ------
+        TooLargeError
+            If the disk has no room for it, or none for the build of what is copied into it.
+        """
+        values = math.prod(shape)
+        kind = np.dtype(dtype)
+        size = values * kind.itemsize
+        if self.takes(size):
+            # Integers of 64 bits are encoded in one piece.
+            by_bands = (kind.kind == "f" or kind.itemsize < 8) and self._by_bands(values)
+            check_room(self._folder(), size + (FOR_A_VALUE * values if by_bands else 0))
+        return super().empty(shape, dtype)

@@ -1,0 +1,176 @@
+"""The tasks of a build: each reads files of the scratch folder, or the surface, and leaves files there.
+
+A task is called with the folder, then with numbers. The file that it writes last tells that it is done.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..decoding.rows import RowsGeometry
+from ..encoding.lattice_coordinates import coordinates_of_strip, strips
+from ..entropy.part_table import part_of
+from ..entropy.tiles import Tiles
+from ..transform.predictors import default_predictors
+from ..transform.pyramid import empty
+from . import forward
+from .build import Build
+from .coding import Units, code_segments, code_units, parents_of
+from .measuring import RowsGiven, RowsMeasurer, chunks_of_rows, kinds_of, measured_rows
+from .stored import CORE, kind_of, name_of, read_tiles, transformed
+
+__all__ = [
+    "code",
+    "coordinates",
+    "core",
+    "first_step",
+    "measure",
+    "measurer_of",
+    "sample_pieces",
+    "second_step",
+    "segments",
+]
+
+
+def sample_pieces(build: Build, level: int) -> list[tuple[int, int]]:
+    """The rows of each piece of a level's samples."""
+    if level == build.prepared.layout.levels and build.prepared.surface.blocks[0].mask is not None:
+        return strips(build.prepared)
+    return build.bands.samples(level)
+
+
+def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
+    """Lattice coordinates of a piece of the finest level; ``fit`` as in `core`."""
+    build = Build.open(folder)
+    layout = build.prepared.layout
+    rows = sample_pieces(build, layout.levels)[piece]
+    samples = empty((rows[1] - rows[0], layout.shape(0, layout.levels)[1]))
+    coordinates_of_strip(build.prepared, channel, build.lattices.channels[channel], rows, samples)
+    build.scratch.write(_name("samples", channel, fit, layout.levels, piece), samples)
+    build.scratch.write(_name("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples))
+
+
+def first_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:
+    """The step along the rows' axis of a band; ``fit`` as in `core`."""
+    build = Build.open(folder)
+    layout, own = build.prepared.layout, build.bands.of(level)[band]
+    predictors = _rules(build, channel, fit, level, 0)
+    name = f"{kind_of('samples', bool(fit))}/{channel}/{level}"
+    stepped = forward.first_step(build.scratch, name, sample_pieces(build, level), layout, own, predictors)
+    nodes, details = forward.sampled_rows(stepped, layout, own)
+    build.scratch.write(_name("halves", channel, fit, level, band), stepped)
+    build.scratch.write(_name("nodes", channel, fit, level, band), nodes)
+    build.scratch.write(_name("details", channel, fit, level, band), details)
+
+
+def second_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:
+    """The step along the columns' axis of a band: its coefficients, and samples of the level below.
+
+    ``fit`` as in `core`.
+    """
+    build = Build.open(folder)
+    layout, own = build.prepared.layout, build.bands.of(level)[band]
+    stepped = np.array(build.scratch.read(_name("halves", channel, fit, level, band)))
+    predictors = _rules(build, channel, fit, level, 1)
+    nodes, flat, planes = forward.second_step(stepped, layout, own, predictors, build.table)
+    build.scratch.write(_name("samples", channel, fit, level - 1, band), nodes)
+    build.scratch.write(_name("coefficients", channel, fit, level, band), flat)
+    build.scratch.write(_name("planes", channel, fit, level, band), planes)
+    build.scratch.write(_name("columns", channel, fit, level - 1, band), forward.sampled_columns(nodes))
+
+
+def core(folder: str, channel: int, fit: int) -> None:
+    """The levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
+    build = Build.open(folder)
+    bands, layout = build.bands, build.prepared.layout
+    samples = empty(layout.shape(0, bands.core))
+    pieces = sample_pieces(build, bands.core)
+    name = f"{kind_of('samples', bool(fit))}/{channel}/{bands.core}"
+    forward.read_rows(build.scratch, name, pieces, (0, len(samples)), samples)
+    predictors, flat, planes = forward.core_transform(samples, bands, build.table, bool(fit))
+    build.scratch.write(_name("coefficients", channel, fit, bands.core, CORE), flat)
+    build.scratch.write(_name("planes", channel, fit, bands.core, CORE), planes)
+    build.scratch.write(f"{kind_of('core-rules', bool(fit))}/{channel}", predictors)
+
+
+def code(folder: str, channel: int, level: int, band: int) -> None:
+    """Code the units of a band, or of the core, whole."""
+    build = Build.open(folder)
+    found = code_units(_units(build, channel, level, band))
+    for kind in ("bits", "gains", "early", "strings", "ends"):
+        build.scratch.write(name_of(kind, channel, level, band), getattr(found, kind))
+
+
+def segments(folder: str, channel: int, level: int, band: int) -> None:
+    """Code the small units of a band, or of the core, layer after layer."""
+    build = Build.open(folder)
+    units = _units(build, channel, level, band)
+    states = build.scratch.read("kept-states")[:, units.tiles.start : units.tiles.stop, channel]
+    start = np.maximum(2 * units.tops - 1, 0).astype(np.int8)
+    own = code_segments(units, [start, *states])
+    lengths = np.array([len(data) for data in own], np.int64)
+    build.scratch.write(name_of("segments", channel, level, band), np.frombuffer(b"".join(own), np.uint8))
+    build.scratch.write(name_of("lengths", channel, level, band), lengths)
+
+
+def measure(folder: str, number: int) -> None:
+    """Measure some rows in all states, and code their residual."""
+    build = Build.open(folder)
+    header = build.stored_header()
+    rows = measured_rows(build.prepared, header.chunk, build.points)[number]
+    measurer = measurer_of(build, rows)
+    figures = measurer.figures(list(np.array(build.scratch.read("states"))))
+    last = np.array(build.scratch.read("last-state"))
+    chunks, kept, exact = chunks_of_rows(build.prepared, header, measurer.values(last, kinds_of(build.prepared)), rows)
+    build.scratch.write(f"squares/{number}", figures.squares)
+    build.scratch.write(f"equal/{number}", figures.equal)
+    build.scratch.write(f"counts/{number}", figures.counts)
+    for kind, own in (("chunks", chunks), ("kept-chunks", kept)):
+        build.scratch.write(f"{kind}/{number}", np.frombuffer(b"".join(own), np.uint8))
+        build.scratch.write(f"{kind}-lengths/{number}", np.array([len(chunk) for chunk in own], np.int64))
+    build.scratch.write(f"exact/{number}", np.array(exact))
+
+
+def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
+    """What measures these rows."""
+    geometry, predictors = RowsGeometry(build.prepared.layout, rows, build.bands.core), build.scratch.read("predictors")
+    part = part_of(build.table, geometry.tiles)
+    channels = []
+    for channel in range(build.channels):
+        coefficients = transformed(build, "coefficients", channel)
+        tiles = Tiles(part.table)
+        for run, span in part.spans:
+            true = read_tiles(build, coefficients, channel, run)
+            np.abs(true, out=tiles.known[span])
+            np.sign(true, out=true)
+            tiles.sign[span] = true
+            tiles.early[span] = read_tiles(build, "early", channel, run)
+        channels.append(tiles)
+    prepared = build.prepared
+    given, lattices = RowsGiven.prepared(prepared, rows), build.lattices.channels
+    return RowsMeasurer(given, lattices, prepared.geometric, np.array(predictors), geometry, channels)
+
+
+def _name(kind: str, channel: int, fit: int, level: int, piece: int) -> str:
+    return name_of(kind_of(kind, bool(fit)), channel, level, piece)
+
+
+def _rules(build: Build, channel: int, fit: int, level: int, axis: int) -> NDArray[np.int8]:
+    """Predictors that tell what one axis of a level has; int8, shape (level, axis, 2)."""
+    predictors = default_predictors(build.prepared.layout)
+    predictors[level - 1, axis] = build.scratch.read(f"{kind_of('rules', bool(fit))}/{channel}/{level}/{axis}")
+    return predictors
+
+
+def _units(build: Build, channel: int, level: int, band: int) -> Units:
+    """The units of a piece, ready to be coded."""
+    bands = build.bands
+    tiles = bands.core_tiles if level == bands.core else bands.of(level)[band].tiles
+    parents = parents_of(build.table, tiles) if tiles.start else range(0)
+    coefficients, planes = (transformed(build, kind, channel) for kind in ("coefficients", "planes"))
+    above = read_tiles(build, coefficients, channel, parents) if parents else np.zeros(0, np.int32)
+    true = np.array(build.scratch.read(name_of(coefficients, channel, level, band)))
+    tops = np.array(build.scratch.read(name_of(planes, channel, level, band)))
+    weights, large = build.scratch.read(f"weights/{channel}"), int(build.scratch.read("large"))
+    return Units(build.table, tiles, true, above, weights, tops, large)

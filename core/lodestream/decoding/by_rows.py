@@ -1,0 +1,260 @@
+"""A complete container decoded by bands of rows: memory for the band, whatever the surface is as a whole.
+
+For each band the tiles that it needs are decoded, from the file. Neighbouring bands share some of them, which are
+decoded twice.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from itertools import pairwise
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.chunks import chunk_places
+from ..container.digest import values_digest
+from ..container.model import Chunk, Header, Index, Segment
+from ..container.sections import check_of
+from ..entropy.bitplanes import pass_count
+from ..entropy.part_table import part_of
+from ..entropy.tiles import Tiles, TileTable
+from ..errors import CorruptStreamError
+from ..grid.layout import Layout
+from ..kernels import PART_ROWS
+from ..parallel import spread, threads
+from ..quantization.distortion import store_values
+from ..residual import chunk_coder
+from ..scratch import Room
+from ..surface import Block, Surface
+from .batches import Coded, batch_length, rounds_of
+from .reconstruction import Values
+from .rows import RowsGeometry, RowsReconstructor
+
+__all__ = ["RowsDecoder", "why_not_by_rows"]
+
+#: Levels of at most so many points are decoded whole for each band.
+_CORE_POINTS = 1 << 18
+#: Bytes that decoding takes for each value of a band.
+_BYTES = 40
+
+#: Rows, half-open.
+Span = tuple[int, int]
+
+
+def why_not_by_rows(header: Header) -> str | None:
+    """Why a container cannot be decoded by bands of rows; None: it can."""
+    if len(header.layout.grids) > 1:
+        return "blocks share sides, or there are several"
+    if header.closed[0]:
+        return "its rows wrap"
+    if header.plane is not None:
+        return "x and y are made of rules"
+    return None
+
+
+class RowsDecoder:
+    """Decodes rows of a complete container of one grid.
+
+    Parameters
+    ----------
+    read : callable (offset, length) -> bytes
+        Of the file.
+    index : Index
+        Of the container, see `read_index`.
+    """
+
+    def __init__(self, read: Callable[[int, int], bytes], index: Index) -> None:
+        self._read, self.index, self.header = read, index, index.header
+        self._reading = Lock()
+        layout = self.header.layout
+        small = (level for level in range(layout.levels + 1) if layout.points(level) <= _CORE_POINTS)
+        self._core = max(small, default=0)
+        self._segments: dict[int, list[Segment]] = defaultdict(list)
+        for segment in self.index.segments:
+            self._segments[segment.tile].append(segment)
+        # Once the stream is complete a tile that no layer has announced is known to have nothing but zeros.
+        self._state = np.zeros((len(layout.tiles), self.header.channels), np.int8)
+
+    def surface(self, room: Room, memory: int, progress: Callable[[float], None]) -> Surface:
+        """The whole surface, band by band into arrays that go where there is room.
+
+        Parameters
+        ----------
+        room : Room
+        memory : int
+            Bytes to work in, about; a band has some rows at least.
+        progress : callable
+            Is told the fraction done, 0 to 1.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment or a chunk is damaged, or the SHA-256 of the values is wrong.
+        ValueError
+            If this cannot be decoded by rows, see `why_not_by_rows`.
+        """
+        header = self.header
+        shape, counts = header.shape, (header.point_channels, *(kind.channels for kind in header.attributes))
+        arrays, channel = [], 0
+        for count in counts:
+            arrays.append(room.empty((*shape, count), header.dtypes[channel]))
+            channel += count
+
+        def decode(rows: Span) -> None:
+            for array, own in zip(arrays, self.rows(rows).arrays, strict=True):
+                array[slice(*rows)] = own
+
+        for group in self.groups(memory):
+            spread(decode, group)
+            progress(group[-1][1] / shape[0])
+        points, *attributes = arrays
+        named = {
+            kind.name: array if kind.components else array[..., 0]
+            for kind, array in zip(header.attributes, attributes, strict=True)
+        }
+        block = Block(points[..., 0] if header.flat else points, header.closed, mask=header.masks[0], attributes=named)
+        if self.index.digest is not None and header.exact:
+            found = values_digest([block])
+            if found != self.index.digest:
+                problem = f"expected values with the SHA-256 {self.index.digest}, got {found}"
+                raise CorruptStreamError(problem, header.length)
+        surface = Surface(blocks=[block], metadata=dict(self.index.metadata_values))
+        surface.joints = header.joints
+        return surface
+
+    def groups(self, memory: int) -> list[list[Span]]:
+        """All rows in runs that begin where chunks of residual and cells do, as many together as there are threads.
+
+        Those of a group take so many bytes together, about; a run has some rows at least.
+        """
+        count = threads()
+        bands = self._bands(memory // count)
+        return [bands[first : first + count] for first in range(0, len(bands), count)]
+
+    def _bands(self, memory: int) -> list[Span]:
+        rows, columns = self.header.shape
+        unit = max(PART_ROWS, 1 << self.header.chunk[0])
+        each = unit * max(1, memory // (_BYTES * self.header.channels * unit * columns))
+        return list(pairwise([*range(0, rows, each), rows]))
+
+    def rows(self, rows: Span) -> Values:
+        """Points and attributes of some rows, exact as far as the container is, shape (row, column, component) each.
+
+        The first row begins chunks of residual, and the last one ends them.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment or a chunk is damaged.
+        ValueError
+            If this cannot be decoded by rows.
+        """
+        return self.values(*self.tiles(rows))
+
+    def values(self, geometry: RowsGeometry, channels: list[Tiles]) -> Values:
+        """The values of `rows`, from what `tiles` decoded for them.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a chunk is damaged.
+        """
+        header, columns, rows = self.header, self.header.shape[1], geometry.rows
+        arrays, channel = [], 0
+        for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
+            array = np.empty((rows[1] - rows[0], columns, count), header.dtypes[channel])
+            for component in range(count):
+                made = RowsReconstructor(geometry, header.predictors[channel], channels[channel])
+                lattice = header.lattices[channel]
+                store_values(lattice, made.reconstruct(self._state[:, channel]), array, component)
+                channel += 1
+            arrays.append(array)
+        values = Values(arrays)
+        self._correct(values, rows)
+        if (mask := header.masks[0]) is not None:
+            kept = header.kept_masks[0]
+            shown = mask[slice(*rows)] if kept is None else mask[slice(*rows)] | kept[slice(*rows)]
+            values.clear(~shown, header.hole)
+        return values
+
+    def tiles(self, rows: Span) -> tuple[RowsGeometry, list[Tiles]]:
+        """What some rows need, decoded: the tiles of each channel, as `RowsReconstructor` takes them.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment is damaged.
+        ValueError
+            If this cannot be decoded by rows.
+        """
+        header = self.header
+        geometry = RowsGeometry(header.layout, rows, self._core)
+        runs = _with_parents(header.layout, geometry.tiles)
+        part = part_of(TileTable.of(header.layout), runs)
+        channels = [
+            Tiles(part.table, header.quantiser if channel < header.geometric else None, header.large)
+            for channel in range(header.channels)
+        ]
+        self._decode(channels, part.tiles)
+        return geometry, channels
+
+    def _decode(self, channels: list[Tiles], numbers: NDArray[np.int64]) -> None:
+        """Decode all segments of some tiles, by their numbers in the surface."""
+        coded: list[Coded] = []
+        for tile in numbers.tolist():
+            left: dict[int, int] = {}
+            for segment in self._segments[tile]:
+                first = left.get(segment.channel, pass_count(segment.top))
+                left[segment.channel] = first - segment.passes
+                data = self._checked(segment, "segment")
+                coded.append(Coded(tile, segment.channel, first - 1, segment.passes, data, segment.range.offset))
+        coded.sort(key=lambda one: one.offset)
+        local = {int(tile): place for place, tile in enumerate(numbers)}
+        while coded:
+            count = batch_length(self.header.layout, coded)
+            for readings in rounds_of(channels, [one._replace(tile=local[one.tile]) for one in coded[:count]]):
+                spread(lambda reading: reading.run(), readings)
+            coded = coded[count:]
+
+    def _checked(self, part: Segment | Chunk, what: str) -> bytes:
+        """The bytes of a segment or a chunk."""
+        with self._reading:
+            data = self._read(part.range.offset, part.range.length)
+        if len(data) != part.range.length or check_of(data) != part.check:
+            raise CorruptStreamError(f"expected a {what} with the checksum that the index tells", part.range.offset)
+        return data
+
+    def _correct(self, values: Values, rows: Span) -> None:
+        header, chunks = self.header, self.index.chunks
+        if not chunks:
+            return
+        each = len(chunks) // (2 if header.kept and header.kept[0] else 1)
+        across = ((header.shape[1] - 1 >> header.chunk[1]) + 1) * header.channels
+        first = (rows[0] >> header.chunk[0]) * across
+        numbers = {False: first, True: each + first}
+        for place in chunk_places(header, rows):
+            number = numbers[place.kept]
+            numbers[place.kept] += 1
+            if not chunks[number].range.length:
+                continue
+            data, own = self._checked(chunks[number], "chunk"), values.window(place, rows[0])
+            mask = (header.kept_masks if place.kept else header.masks)[0]
+            chosen = slice(None) if mask is None else mask[slice(*place.rows), slice(*place.columns)]
+            known = own[chosen]
+            restored = chunk_coder.decode_chunk(known.ravel(), data, chunks[number].range.offset)
+            own[chosen] = restored.reshape(known.shape)
+
+
+def _with_parents(layout: Layout, runs: list[range]) -> list[range]:
+    """Runs of tiles, each of the levels after the core's, with the parents of all of them."""
+    found = list(runs)
+    for number in range(len(found) - 1, 1, -1):
+        if found[number]:
+            above, own = layout.tile_arrays.parents(np.array(found[number])), found[number - 1]
+            parents = range(int(above.min()), int(above.max()) + 1)
+            both = (parents, own) if own else (parents,)
+            found[number - 1] = range(min(run.start for run in both), max(run.stop for run in both))
+    return found

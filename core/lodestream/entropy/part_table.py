@@ -1,0 +1,69 @@
+"""Tables of some of a surface's tiles, for flat arrays that hold these alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .tiles import TileTable
+
+__all__ = ["Part", "flat_span", "part_of"]
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some tiles of a surface.
+
+    Attributes
+    ----------
+    table : TileTable
+        Of these tiles alone: its numbers of tiles and bands, and its places in flat arrays, are local; rows and columns
+        in `TileTable.origins` are those of the surface.
+    spans : tuple of (range, slice)
+        For each run of tiles, by their numbers in the surface: where they stand in the flat arrays.
+    """
+
+    table: TileTable
+    spans: tuple[tuple[range, slice], ...]
+
+    def local(self, tile: int) -> int:
+        """The local number of a tile of the surface.
+
+        Raises
+        ------
+        KeyError
+            If it is not one of these.
+        """
+        before = 0
+        for run, _ in self.spans:
+            if tile in run:
+                return before + tile - run.start
+            before += len(run)
+        raise KeyError(tile)
+
+    @property
+    def tiles(self) -> NDArray[np.int64]:
+        """The numbers that the tiles have in the surface, shape (tile,)."""
+        return np.concatenate([np.arange(run.start, run.stop) for run, _ in self.spans])
+
+
+def flat_span(table: TileTable, tiles: range) -> slice:
+    """Where neighbouring tiles stand in the flat arrays of a table."""
+    return slice(int(table.starts[tiles.start]), int(table.starts[tiles.stop]))
+
+
+def part_of(table: TileTable, runs: Iterable[range]) -> Part:
+    """A part of a table: some runs of tiles, in their order, none twice and none empty.
+
+    Bands whose parents are not among them have none. Tiles may have no bands.
+    """
+    runs = [run for run in runs if len(run)]
+    part = TileTable(table.layout, table.coordinate, np.concatenate([np.arange(run.start, run.stop) for run in runs]))
+    spans, done = [], 0
+    for run in runs:
+        spans.append((run, flat_span(part, range(done, done + len(run)))))
+        done += len(run)
+    return Part(part, tuple(spans))

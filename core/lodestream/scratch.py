@@ -1,0 +1,226 @@
+"""The files of a build: arrays by name in one folder, each written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+__all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "rows_at_once"]
+
+_SUFFIX = ".npy"
+_UNFINISHED = ".part"
+
+
+class DamagedError(ValueError):
+    """A file of a scratch folder is not as it was written."""
+
+
+class Scratch:
+    """Arrays by name, in a folder that every worker of a build sees.
+
+    A file appears under its name when it is whole, so that a task whose files are there is done, and a build that was
+    cut goes on with those that are missing. Names have parts between slashes, which become folders.
+
+    Parameters
+    ----------
+    folder : path-like
+        Is made if it is not there.
+    make : bool
+        Whether it is made. It is not made again later: a task that comes too late leaves nothing.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], make: bool = True) -> None:
+        self.folder = Path(folder)
+        if make:
+            self.folder.mkdir(parents=True, exist_ok=True)
+
+    def write(self, name: str, array: NDArray[Any]) -> None:
+        """Keep an array of any shape and dtype under a name; one that is there already is replaced."""
+        with self.writing(name) as path, path.open("wb") as file:
+            np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[Path]:
+        """The path of a file that gets this name when the block ends well, and is gone if it does not."""
+        path = self._made(name)
+        unfinished = path.with_name(f"{path.name}.{uuid4().hex}{_UNFINISHED}")
+        try:
+            yield unfinished
+            os.replace(unfinished, path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def read(self, name: str) -> NDArray[Any]:
+        """The array of this name, of the shape (row, ...) that it was written with, memory-mapped, not to be changed.
+
+        An empty one is in memory.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        DamagedError
+            If the file is not whole, as after a failure of the machine, or holds objects of Python.
+        """
+        path = self._path(name)
+        with path.open("rb") as file:
+            try:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                shape, fortran, dtype = read(file)
+            except ValueError as error:
+                raise DamagedError(f"expected an array in {path}, got something else ({error})") from None
+            if dtype.hasobject:  # the file would say which addresses of memory they are at
+                raise DamagedError(f"expected an array of numbers in {path}, got {dtype} with objects of Python")
+            start, size = file.tell(), os.fstat(file.fileno()).st_size
+        expected = start + math.prod(shape) * dtype.itemsize
+        if size != expected:
+            raise DamagedError(f"expected {expected:,} bytes in {path}, got {size:,}")
+        if 0 in shape:
+            return np.zeros(shape, dtype)
+        return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
+
+    def empty(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """A new array of this shape, (row, ...), in a file of its own, memory-mapped, of zeros; it is there at once.
+
+        One under the name of another replaces it: maps of the former stay as they are.
+
+        Raises
+        ------
+        OSError
+            If there is no room for it on the disk. (Where the system does not tell, the process ends later.)
+        """
+        path = self._made(name)
+        path.unlink(missing_ok=True)
+        if 0 in shape:
+            return np.zeros(shape, dtype)
+        array = np.lib.format.open_memmap(path, "w+", np.dtype(dtype), shape)
+        try:
+            _take(path)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        return array
+
+    def has(self, name: str) -> bool:
+        """Whether an array has this name."""
+        return bool(self.those_of([name]))
+
+    def those_of(self, names: Iterable[str]) -> set[str]:
+        """Those of these names that arrays have.
+
+        Folders are listed, and no file is asked for that may not be there: a file system of a network remembers for a
+        while that it was not, though another machine has written it meanwhile.
+        """
+        listed: dict[Path, frozenset[str]] = {}
+
+        def entries(folder: Path) -> frozenset[str]:
+            if folder not in listed:
+                above = folder == self.folder or folder.name in entries(folder.parent)
+                listed[folder] = frozenset(os.listdir(folder)) if above else frozenset()
+            return listed[folder]
+
+        paths = ((name, self._path(name)) for name in names)
+        return {name for name, path in paths if path.name in entries(path.parent)}
+
+    def remove(self, name: str) -> None:
+        """Forget an array, if it is there, or all whose names begin with this and a slash."""
+        self._path(name).unlink(missing_ok=True)
+        shutil.rmtree(self.folder / name, ignore_errors=True)
+
+    def size(self) -> int:
+        """Bytes of all files, but for those that vanish meanwhile."""
+        return sum(map(_size, _files(self.folder)))
+
+    def clear(self) -> None:
+        """Remove the folder with everything in it."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _made(self, name: str) -> Path:
+        """The path of a name, in a folder that is there."""
+        path = self._path(name)
+        for parent in [*path.relative_to(self.folder).parents][-2::-1]:
+            (self.folder / parent).mkdir(exist_ok=True)
+        return path
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}{_SUFFIX}"
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (Path(above) / name for above, _, names in os.walk(folder) for name in names)
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.lstat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+def _take(path: Path) -> None:
+    """Take the room on the disk that a file has promised: a full disk ends a process that writes to a map of it.
+
+    Raises
+    ------
+    OSError
+        If there is none.
+    """
+    if not hasattr(os, "posix_fallocate"):  # not on macOS and Windows
+        return
+    with path.open("r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from None
+            # Some file systems cannot.
+
+
+class Room:
+    """Where arrays go: large ones into files of a scratch folder, which is made when the first one comes.
+
+    Parameters
+    ----------
+    scratch : callable or None
+        Gives the folder, a `Scratch`. None: all arrays are in memory.
+    least : int
+        Arrays of fewer bytes are in memory.
+    """
+
+    def __init__(self, scratch: Callable[[], Scratch] | None = None, least: int = 0) -> None:
+        self._scratch, self._least, self._count = scratch, least, 0
+
+    def takes(self, size: int) -> bool:
+        """Whether an array of so many bytes is large."""
+        return self._scratch is not None and size >= self._least
+
+    def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        """A new array of this shape, (row, ...), whatever it holds."""
+        if self._scratch is None or not self.takes(math.prod(shape) * np.dtype(dtype).itemsize):
+            return np.empty(shape, dtype)
+        self._count += 1
+        return self._scratch().empty(f"arrays/{self._count}", shape, dtype)
+
+
+#: All arrays are in memory.
+IN_MEMORY = Room()
+
+#: Values that are looked at together where all of them would be too many.
+_AT_ONCE = 1 << 22
+
+
+def rows_at_once(shape: tuple[int, ...]) -> Iterator[slice]:
+    """All rows of an array of this shape, as many at a time as have a few million values, but at least one."""
+    each = max(1, _AT_ONCE // max(math.prod(shape[1:]), 1))
+    return (slice(start, min(start + each, shape[0])) for start in range(0, shape[0], each))

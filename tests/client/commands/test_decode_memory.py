@@ -1,0 +1,111 @@
+"""``decode --memory``: what takes more is decoded by bands or refused, with the memory that it takes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lodestream as ls
+from lodestream.container import capacity
+from lodestream_client.commands.outcome import Outcome
+from tests.core.surfaces import terrain
+
+from ..conftest import Run
+
+LITTLE = ("--memory", "1MiB")
+HEIGHTS = np.rint(300 * terrain((500, 410))).astype(np.int16)
+
+
+@pytest.fixture
+def container(tmp_path: Path) -> Path:
+    path = tmp_path / "a.lode"
+    path.write_bytes(ls.encode(HEIGHTS))
+    return path
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def refused(run: Run, container: Path, out: str, *options: object) -> str:
+    """The message with which a decoding ends that leaves nothing."""
+    to = out if out == "-" else container.with_name(out)
+    code, stdout, stderr = run("decode", container, to, *options)
+    assert (code, stdout) == (1, "")
+    assert stderr.startswith(f"lodestream: {container}: expected ")
+    assert names(container.parent) == {"a.lode"}
+    return stderr
+
+
+@pytest.mark.parametrize("memory", [LITTLE, ()])
+def test_more_vertices_than_allowed_are_refused_by_bands_too(
+    run: Run, container: Path, memory: tuple[str, ...]
+) -> None:
+    found = refused(run, container, "a.npy", *memory, "--max-vertices", 1_000)
+    assert "expected at most 1,000 vertices (max_vertices), got 205,000" in found
+    assert run("decode", container, container.with_name("a.npy"), *memory, "--max-vertices", 205_000)[0] == 0
+
+
+@pytest.mark.parametrize(("out", "name", "size"), [("a.vts", "vts", 9), ("a.npz", "npz", 6), ("a.obj", "obj", 28)])
+def test_a_format_that_is_written_whole_is_refused_if_it_takes_more(
+    run: Run, container: Path, out: str, name: str, size: int
+) -> None:
+    found = refused(run, container, out, *LITTLE)
+    assert (
+        f"at most 1 MiB to write as {name}, got one that takes about {size} MiB; npy, geotiff, cog, netcdf, zarr are"
+        in found
+    )
+    assert run("decode", container, container.with_name(out), "--memory", "64MiB")[0] == 0
+    # A level, and a window, take what they take.
+    assert run("decode", container, container.with_name(out), *LITTLE, "--level", 4)[0] == 0
+    assert run("decode", container, container.with_name(out), *LITTLE, "--roi", "0:9,0:9")[0] == 0
+
+
+def test_what_is_not_decoded_by_bands_is_refused_with_the_reason(run: Run, container: Path) -> None:
+    words = "at most 1 MiB to decode, got one that takes about 2 MiB and is not decoded by bands: "
+    assert words + "standard output is written in one piece" in refused(run, container, "-", *LITTLE)
+    for options in (("--partial",), ("--until-rms", "0.1d")):
+        assert words + "only the whole surface is" in refused(run, container, "a.npy", *LITTLE, *options)
+    container.write_bytes(ls.encode(ls.Surface(HEIGHTS, (True, False))))
+    assert words + "its rows wrap" in refused(run, container, "a.npy", *LITTLE)
+
+
+def test_without_the_option_the_machine_is_the_limit(
+    run: Run, container: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(capacity, "memory_limit", lambda: 4 << 20)
+    assert "at most 4 MiB to write as vts" in refused(run, container, "a.vts")
+    monkeypatch.setattr(capacity, "memory_limit", lambda: 16 << 20)
+    assert run("decode", container, container.with_name("a.vts"))[0] == 0
+
+
+def test_a_damaged_container_is_named_and_what_was_there_is_kept(
+    run: Run, container: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = bytearray(container.read_bytes())
+    data[len(data) // 2] ^= 1
+    container.write_bytes(data)
+    out = container.with_name("a.npy")
+    out.write_bytes(b"of yesterday")
+    code, _, stderr = run("decode", container, out, *LITTLE)
+    assert code == 1
+    assert stderr.startswith(f"lodestream: {container}: expected a ")
+    assert out.read_bytes() == b"of yesterday"
+    assert names(out.parent) == {"a.lode", "a.npy"}
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (OSError(28, "No space left on device"), 1)])
+def test_a_decoding_that_is_cut_leaves_what_was_there(
+    run: Run, container: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, code: int
+) -> None:
+    def fails(*arguments: object) -> None:
+        raise error
+
+    out = container.with_name("a.npy")
+    out.write_bytes(b"of yesterday")
+    monkeypatch.setattr(Outcome, "write", fails)
+    assert run("decode", container, out, *LITTLE)[0] == code
+    assert out.read_bytes() == b"of yesterday"
+    assert names(out.parent) == {"a.lode", "a.npy"}

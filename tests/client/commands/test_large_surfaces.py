@@ -1,0 +1,325 @@
+"""``encode`` and ``decode`` of surfaces larger than memory: the same bytes, cut builds, workers of a cluster."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lodestream as ls
+from lodestream.bands import cluster, tasks
+from lodestream.bands.folders import build_folder
+from lodestream_client.commands import decode_by_rows, values
+from lodestream_client.commands.building_options import BuildingOptions, work_folder
+from tests.clusters import local_cluster
+from tests.core.surfaces import terrain
+
+from ..conftest import Run
+from .test_program import COMMAND, environment
+
+LITTLE = ("--memory", "1MiB")
+
+#: Seconds until a build in a process of its own must have come so far.
+PATIENCE = 60
+
+
+@pytest.fixture(scope="module")
+def heights() -> NDArray[np.int16]:
+    """The values of a file that takes a few seconds."""
+    return np.rint(300 * terrain((1100, 900))).astype(np.int16)
+
+
+@pytest.fixture
+def file(heights: NDArray[np.int16], tmp_path: Path) -> Path:
+    path = tmp_path / "a.npy"
+    np.save(path, heights)
+    return path
+
+
+@pytest.fixture(scope="module")
+def expected(heights: NDArray[np.int16], tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("large") / "a.npy"
+    np.save(path, heights)
+    return ls.encode(ls.read(path))
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """The bytes of a file, or of all files in a folder."""
+    files = [it for it in path.rglob("*") if it.is_file()] if path.is_dir() else [path]
+    return {it.relative_to(path).as_posix(): it.read_bytes() for it in files}
+
+
+def begun(file: Path, out: Path, scratch: Path, *options: object) -> subprocess.Popen[bytes]:
+    """A build in a process of its own, some units of which are coded."""
+    slow = {**environment(), "LODESTREAM_THREADS": "1"}
+    command = [*COMMAND, "encode", str(file), str(out), *LITTLE, *map(str, options)]
+    process = subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    end = time.monotonic() + PATIENCE
+    while not list(scratch.glob("build/tasks/*/exact/ends/**/*.npy")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    return process
+
+
+def ended(process: subprocess.Popen[bytes], number: int) -> tuple[int, bytes]:
+    """Its exit code and standard error after a signal."""
+    process.send_signal(number)
+    _, stderr = process.communicate(timeout=PATIENCE)
+    return process.returncode, stderr
+
+
+@pytest.fixture
+def repeated(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Tasks of the phases before coding that are carried out from here on, by name."""
+    called: list[str] = []
+
+    def counted(name: str, task: Callable[..., None]) -> Callable[..., None]:
+        def call(folder: str, *arguments: int) -> None:
+            called.append(name)
+            task(folder, *arguments)
+
+        return call
+
+    for name in ("coordinates", "first_step", "second_step", "core"):
+        monkeypatch.setattr(tasks, name, counted(name, getattr(tasks, name)))
+    return called
+
+
+def test_little_memory_gives_the_same_bytes(
+    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
+) -> None:
+    code, stdout, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE, "--json")
+    assert code == 0, stderr
+    assert repeated, "by bands"
+    assert (tmp_path / "a.lode").read_bytes() == expected
+    assert json.loads(stdout)["bytes"] == len(expected)
+    assert names(tmp_path) == {"a.npy", "a.lode"}
+    repeated.clear()
+    assert run("encode", file, tmp_path / "b.lode")[0] == 0
+    assert not repeated
+    assert (tmp_path / "b.lode").read_bytes() == expected
+
+
+@pytest.mark.parametrize("out", ["a.npy", "a.tif", "a.nc", "a.zarr"])
+def test_decode_with_little_memory_writes_the_same_file(
+    run: Run, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
+) -> None:
+    needed = {"a.tif": "rasterio", "a.nc": "h5netcdf", "a.zarr": "zarr"}
+    if out in needed:
+        pytest.importorskip(needed[out])
+    (tmp_path / "a.lode").write_bytes(expected)
+    by_bands, decode = list[str](), decode_by_rows._decode
+
+    def counted(decoder: object, path: Path, *rest: object) -> None:
+        by_bands.append(path.name)
+        decode(decoder, path, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(decode_by_rows, "_decode", counted)
+    assert run("decode", tmp_path / "a.lode", tmp_path / f"whole-{out}")[0] == 0
+    code, stdout, stderr = run("decode", tmp_path / "a.lode", tmp_path / out, *LITTLE, "--json")
+    assert code == 0, stderr
+    assert by_bands == [out]
+    assert json.loads(stdout)["ended"] == "complete"
+    assert contents(tmp_path / out) == contents(tmp_path / f"whole-{out}")
+    assert names(tmp_path) == {"a.lode", out, f"whole-{out}"}
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.usefixtures("interrupts")
+def test_a_build_that_is_cut_goes_on_in_its_folder(
+    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str], number: signal.Signals
+) -> None:
+    scratch, out = tmp_path / "scratch", tmp_path / "a.lode"
+    code, stderr = ended(begun(file, out, scratch, "--scratch", scratch), number)
+    if number == signal.SIGKILL:
+        assert code == -number
+    else:
+        assert code == 128 + number
+        assert stderr.count(b"\n") == 3
+        assert f"lodestream: {scratch} is kept: the same command goes on".encode() in stderr
+    assert names(tmp_path) == {"a.npy", "scratch"}
+    assert run("encode", file, out, *LITTLE, "--scratch", scratch)[0] == 0
+    assert not repeated, "the phases before coding were done"
+    assert out.read_bytes() == expected
+    assert names(tmp_path) == {"a.npy", "a.lode"}
+
+
+@pytest.mark.parametrize(
+    ("error", "kept"),
+    [(ls.UnavailableError("lost"), True), (CancelledError("lost"), True), (ls.InputError("expected another"), False)],
+)
+def test_the_folder_is_named_where_the_command_goes_on(
+    error: Exception, kept: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = BuildingOptions(None, tmp_path / "scratch", None)
+    with pytest.raises(type(error)), work_folder(options, "a.lode"):
+        raise error
+    assert ("is kept: the same command goes on" in capsys.readouterr().err) == kept
+    assert names(tmp_path) == {"scratch"}
+
+
+def test_another_command_in_the_folder_of_a_build_that_was_cut_begins_anew(
+    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
+) -> None:
+    scratch, out = tmp_path / "scratch", tmp_path / "a.lode"
+    ended(begun(file, out, scratch, "--scratch", scratch, "--name", "hill"), signal.SIGKILL)
+    assert run("encode", file, out, *LITTLE, "--scratch", scratch)[0] == 0
+    assert repeated
+    assert out.read_bytes() == expected
+    assert names(tmp_path) == {"a.npy", "a.lode"}
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_an_interrupted_build_without_a_folder_leaves_nothing(file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.lode"
+    code, stderr = ended(begun(file, out, tmp_path / "a.lode.build"), signal.SIGINT)
+    assert (code, stderr.splitlines()[-1]) == (130, b"lodestream: interrupted")
+    assert b"kept" not in stderr
+    assert names(tmp_path) == {"a.npy"}
+
+
+def test_a_killed_build_without_a_folder_is_found_again(
+    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
+) -> None:
+    out = tmp_path / "a.lode"
+    ended(begun(file, out, tmp_path / "a.lode.build"), signal.SIGKILL)
+    assert names(tmp_path) == {"a.npy", "a.lode.build"}
+    assert run("encode", file, out, *LITTLE)[0] == 0
+    assert not repeated
+    assert out.read_bytes() == expected
+    assert names(tmp_path) == {"a.npy", "a.lode"}
+
+
+@pytest.mark.parametrize("command", ["encode", "decode"])
+@pytest.mark.parametrize("size", ["much", "-5", "0", "5lb", ""])
+def test_memory_that_is_no_size(run: Run, file: Path, tmp_path: Path, command: str, size: str) -> None:
+    code, stdout, stderr = run(command, file, tmp_path / "a.lode", f"--memory={size}")
+    assert (code, stdout) == (2, "")
+    assert "argument --memory: expected" in stderr
+    assert repr(size) in stderr
+    assert names(tmp_path) == {"a.npy"}
+
+
+@pytest.mark.parametrize("command", ["encode", "decode"])
+def test_too_little_memory_is_refused(run: Run, file: Path, tmp_path: Path, command: str) -> None:
+    code, stdout, stderr = run(command, file, tmp_path / "a.lode", "--memory", "1KiB")
+    assert (code, stdout) == (2, "")
+    assert "argument --memory: expected at least 1MiB to work in, got '1KiB'" in stderr
+
+
+def test_memory_that_will_be_exceeded_is_told(run: Run, file: Path, tmp_path: Path) -> None:
+    code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE)
+    assert code == 0
+    assert "--memory 1.0 MB is exceeded: this surface takes about 15.8 MB at least\n" in stderr
+    assert "exceeded" not in run("encode", file, tmp_path / "a.lode", "--memory", "1GiB")[2]
+
+
+def test_a_second_command_does_not_disturb_the_first(
+    run: Run, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, code, said = tmp_path / "a.lode", tasks.code, list[str]()
+
+    def second(*arguments: int) -> None:
+        if not said:
+            said.append("")
+            with pytest.raises(ls.InputError) as refused, build_folder(Path(f"{out}.build"), (), False):
+                pytest.fail("two at once")
+            said.append(str(refused.value))
+        code(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tasks, "code", second)
+    assert run("encode", file, out, *LITTLE)[0] == 0
+    assert "another one is at work there" in said[1]
+    assert names(tmp_path) == {"a.npy", "a.lode"}
+
+
+def test_a_folder_of_something_else_is_not_touched(run: Run, file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "diaries"
+    folder.mkdir()
+    (folder / "diary.txt").write_text("dear diary")
+    for scratch in (folder, file):
+        code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE, "--scratch", scratch)
+        assert code == 1
+        assert stderr == (
+            f"lodestream: expected {scratch} to be empty or of a build that was cut, got something else, which stays\n"
+        )
+    assert (folder / "diary.txt").read_text() == "dear diary"
+    assert names(tmp_path) == {"a.npy", "diaries"}
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--rms", "3"), "a stream for one error (rms) is made of all values together"),
+        (("--closed", "rows"), "its rows wrap"),
+    ],
+)
+@pytest.mark.parametrize("scratch", [False, True])
+def test_what_cannot_be_built_by_bands_says_why(
+    run: Run, file: Path, tmp_path: Path, options: tuple[str, ...], reason: str, scratch: bool
+) -> None:
+    more = ("--scratch", tmp_path / "scratch") if scratch else ()
+    code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE, *options, *more)
+    assert code == 1
+    assert "expected a surface that takes at most 1 MiB to encode, got one that takes about 16 MiB" in stderr
+    assert f"cannot be built by bands: {reason}" in stderr
+    assert not (tmp_path / "a.lode").exists()
+
+
+def test_workers_of_a_cluster_give_the_same_bytes(run: Run, file: Path, expected: bytes, tmp_path: Path) -> None:
+    with local_cluster(2) as workers:
+        code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE, "--dask", workers.scheduler_address)
+    assert code == 0, stderr
+    assert (tmp_path / "a.lode").read_bytes() == expected
+    assert names(tmp_path) == {"a.npy", "a.lode"}
+
+
+def be_impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait a second for schedulers."""
+    monkeypatch.setattr(cluster, "_PATIENCE", 1)
+
+
+def test_a_scheduler_that_does_not_answer(
+    run: Run, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    be_impatient(monkeypatch)
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
+        code, _, stderr = run("encode", file, tmp_path / "a.lode", "--dask", address)
+    assert code == 1
+    assert f"expected the address of a Dask scheduler, got '{address}': " in stderr
+    assert names(tmp_path) == {"a.npy"}
+
+
+@pytest.mark.parametrize(
+    "address", ["", "nowhere", "http://127.0.0.1:8786", "nonsense://x", "tcp://a:b", "tcp://:8786", "a:70000"]
+)
+def test_what_is_no_address_of_a_scheduler_is_refused_at_once(
+    run: Run, file: Path, tmp_path: Path, address: str
+) -> None:
+    code, stdout, stderr = run("encode", file, tmp_path / "a.lode", f"--dask={address}")
+    assert (code, stdout) == (2, "")
+    assert "argument --dask: expected the address of a Dask scheduler such as tcp://10.0.0.1:8786, got" in stderr
+
+
+@pytest.mark.parametrize(
+    "address", ["tcp://10.0.0.1:8786", "10.0.0.1:8786", "tls://host.example:1", "tcp://[::1]:8786"]
+)
+def test_addresses_of_schedulers(address: str) -> None:
+    assert values.parse_scheduler(address) == address

@@ -1,0 +1,127 @@
+"""Containers built by bands: the bytes of those that are built in one piece."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lodestream.bands import build, building
+from lodestream.bands.build import Build
+from lodestream.bands.building import Building
+from lodestream.bands.executing import Execution
+from lodestream.bands.geometry import CORE_POINTS
+from lodestream.decoding.decoder import decode
+from lodestream.encoding.encoder import encode
+from lodestream.encoding.lattice_coordinates import exact_lattices
+from lodestream.encoding.prepared import prepare
+from lodestream.quality import Quality
+from lodestream.scratch import Scratch
+from lodestream.surface import Surface
+
+from ..surfaces import terrain
+
+
+def _built(surface: Surface, points: int, core_points: int, threads: int = 1, **quality: Any) -> bytes:
+    out = io.BytesIO()
+    prepared = prepare(surface, Quality.of(**quality))
+    with tempfile.TemporaryDirectory() as folder:
+        scratch = Scratch(folder)
+        made = Build(scratch, prepared, exact_lattices(prepared), points, core_points)
+        made.save()
+        Building(made, Execution(scratch, None, threads), lambda fraction: None).write(out)
+        made.close()
+    return out.getvalue()
+
+
+def _heights(shape: tuple[int, int]) -> NDArray[np.int16]:
+    return np.rint(200 * terrain(shape)).astype(np.int16)
+
+
+def _surfaces() -> dict[str, tuple[Surface, dict[str, Any]]]:
+    heights = _heights((310, 270))
+    mask = np.hypot(*np.mgrid[-155:155, -135:135]) < 120
+    rng = np.random.default_rng(4)
+    columns = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    ring = np.stack(np.broadcast_arrays(np.cos(columns), np.sin(columns), np.arange(150)[:, None] / 50), axis=-1)
+    speed = rng.normal(size=heights.shape).astype(np.float32)
+    speed[3, 5] = np.nan
+    return {
+        "integers": (Surface(heights), {}),
+        "floats": (Surface(terrain((300, 290)).astype(np.float32)), {}),
+        "doubles": (Surface(terrain((260, 290))), {}),
+        "precision": (Surface(terrain((300, 290)).astype(np.float32)), {"precision": "1e-4d"}),
+        "holes": (Surface(heights, mask=mask), {}),
+        "floats with holes": (Surface(np.where(mask, heights, np.nan).astype(np.float32)), {}),
+        "attributes": (Surface(heights, attributes={"speed": speed, "kind": (heights > 0).astype(np.uint8)}), {}),
+        "ring": (Surface(ring.astype(np.float32), (False, True)), {}),
+        "cylinder": (Surface(heights, (False, True)), {"precision": 3.0}),
+        "noise": (Surface(rng.integers(0, 2**31, (200, 210)).astype(np.int32)), {}),
+        "narrow": (Surface(_heights((1500, 5))), {}),
+        "wide": (Surface(_heights((5, 1500))), {}),
+        "constant": (Surface(np.full((140, 150), 7.0)), {}),
+    }
+
+
+SURFACES = _surfaces()
+
+
+@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize(("points", "core_points"), [(1, 600), (30_000, 600), (30_000, CORE_POINTS)])
+def test_bands_give_the_bytes_of_one_piece(name: str, points: int, core_points: int) -> None:
+    surface, quality = SURFACES[name]
+    whole = encode(surface, **quality)
+    assert _built(surface, points, core_points, threads=1 + points % 2, **quality) == whole
+
+
+def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = _heights((310, 270))
+    monkeypatch.setattr(building, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
+    expected = _built(Surface(heights), 30_000, 600)
+    code, late = Building._code, list[Path]()
+
+    def after_late_tasks(self: Building) -> None:
+        folder = self._build.scratch.folder
+        for kind in ("coefficients", "planes", "rules", "core-rules"):
+            for path in sorted((folder / f"plain-{kind}").rglob("*.npy")):
+                own = str(path.relative_to(folder).with_suffix("")).removeprefix("plain-")
+                assert not self._build.scratch.has(own)
+                self._build.scratch.write(own, np.load(path) + 1)
+                late.append(path)
+        code(self)
+
+    monkeypatch.setattr(Building, "_code", after_late_tasks)
+    container = _built(Surface(heights), 30_000, 600)
+    assert len(late) > 10
+    assert container == expected
+    assert np.array_equal(decode(container).points, heights)
+
+
+def test_builds_whose_folders_are_gone_are_forgotten(tmp_path: Path) -> None:
+    def saved(name: str) -> Build:
+        prepared = prepare(Surface(_heights((20, 30))), Quality())
+        made = Build(Scratch(tmp_path / name), prepared, exact_lattices(prepared), 1000)
+        made.save()
+        opened = Build.open(str(tmp_path / name))
+        assert Build.open(str(tmp_path / name)) is opened
+        return made
+
+    first = saved("first")
+    first.scratch.clear()
+    second = saved("second")
+    assert list(build._OPENED) == [str(tmp_path / "second")]
+    second.save()
+    for name in ("third", "fourth"):
+        last = saved(name)
+    assert list(build._OPENED) == [str(tmp_path / "third"), str(tmp_path / "fourth")]
+    last.close()
+    assert list(build._OPENED) == [str(tmp_path / "third")]
+    with pytest.raises(FileNotFoundError):
+        Build.open(str(tmp_path / "first"))
+    saved("third").close()
+    assert not build._OPENED

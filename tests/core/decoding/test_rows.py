@@ -1,0 +1,78 @@
+"""Some rows in any state: the rows of the whole in that state."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lodestream.decoding.reconstruction import reconstruct_channel
+from lodestream.decoding.rows import RowsGeometry, RowsReconstructor
+from lodestream.entropy.dequantize import UNANNOUNCED
+from lodestream.entropy.part_table import Part, flat_span, part_of
+from lodestream.entropy.tiles import Tiles, TileTable
+from lodestream.grid.layout import Grid, Layout
+from lodestream.transform.predictors import default_predictors
+
+lengths = st.integers(1, 70) | st.integers(1, 300)
+
+
+def _part(tiles: Tiles, geometry: RowsGeometry) -> Tiles:
+    """The same tiles as far as the geometry needs them."""
+    part: Part = part_of(tiles.table, geometry.tiles)
+    own = Tiles(part.table)
+    for run, span in part.spans:
+        whole = flat_span(tiles.table, run)
+        for mine, every in ((own.known, tiles.known), (own.sign, tiles.sign), (own.early, tiles.early)):
+            mine[span] = every[whole]
+    return own
+
+
+@settings(deadline=None)
+@given(
+    st.tuples(lengths, lengths),
+    st.booleans(),
+    st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    st.floats(0, 1),
+    st.floats(0, 1),
+    st.integers(0, 12),
+    st.integers(0, 2**32 - 1),
+)
+def test_rows_are_those_of_the_whole(
+    shape: tuple[int, int], closed: bool, tile: tuple[int, int], one: float, other: float, core: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    layout = Layout.single(shape, (False, closed), tile)
+    tiles = Tiles(TileTable.of(layout))
+    tiles.known[:] = rng.integers(0, 2**12, tiles.known.size)
+    tiles.sign[:] = np.where(tiles.known, rng.choice([-1, 1], tiles.sign.size), 0)
+    tiles.early[:] = rng.integers(0, 13, tiles.early.size)
+    predictors = default_predictors(layout)
+    predictors[...] = rng.integers(-20, 30, predictors.shape)
+    header: Any = SimpleNamespace(layout=layout, predictors=[predictors], geometric=1)
+    start, stop = sorted((int(one * shape[0]), int(other * shape[0])))
+    rows = min(start, shape[0] - 1), max(stop, min(start, shape[0] - 1) + 1)
+    geometry = RowsGeometry(layout, rows, min(core, layout.levels))
+    made = [RowsReconstructor(geometry, predictors, own) for own in (tiles, _part(tiles, geometry))]
+    state = np.full(len(layout.tiles), UNANNOUNCED, np.int8)
+    for _ in range(4):
+        changed = rng.random(state.shape) < 0.5
+        changed[: layout.tiles_of(int(rng.integers(0, layout.levels + 1))).start] = False
+        state = np.where(changed, rng.choice([0, 0, 0, 1, 4, 7, UNANNOUNCED], state.shape), state).astype(np.int8)
+        (whole,), fraction = reconstruct_channel(header, 0, tiles, state, layout.levels)
+        for reconstructor in made:
+            found = reconstructor.reconstruct(state)
+            assert found[1] == fraction
+            np.testing.assert_array_equal(found[0], whole[rows[0] : rows[1]])
+
+
+def test_rows_that_wrap_are_refused() -> None:
+    grid = Grid((9, 9), (True, False))
+    with pytest.raises(ValueError, match="do not wrap"):
+        RowsGeometry(Layout([grid], (3, 3)), (0, 3), 0)
+    with pytest.raises(ValueError, match="one grid"):
+        RowsGeometry(Layout([Grid((9, 9)), Grid((9, 9))], (3, 3)), (0, 3), 0)
