@@ -116,6 +116,24 @@ def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tab
         assert not tab.view.get_by_label("Stop when below a pixel").is_checked()
 
 
+def test_what_is_chosen_before_the_surface_is_known_holds_for_its_first_picture(tabs: Tabs, host: Path) -> None:
+    path = host / "surface.lode"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:10])
+    with ranged(host) as server:
+        tab = tabs(f"{server.url}/index.html")
+        tab.shown("Failed")
+        tab.choose("Colour map", "cividis")
+        tab.view.get_by_label("Quad lines").check()
+        tab.button("Try again").click()
+        tab.shown("Failed")
+        path.write_bytes(whole)
+        tab.button("Try again").click()
+        tab.everything("m")
+        assert tab.view.get_by_label("Colour map").input_value() == "cividis"
+        assert tab.view.get_by_label("Quad lines").is_checked()
+
+
 @pytest.fixture(scope="module")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files of the npm package, built as they are for its registry."""

@@ -105,6 +105,7 @@ export class LodestreamView extends HTMLElement {
         ),
       ),
     );
+    this.lookPanel.draw(this.look, [Number.NaN, Number.NaN], false);
     this.legend.draw(null);
     this.scales.draw(0, "", null);
     this.probe.clear();
@@ -258,6 +259,7 @@ export class LodestreamView extends HTMLElement {
     this.stopBelowPixel(this.getAttribute("autostop") !== "off");
     this.look = { ...this.look, field: this.shared.field ?? { kind: "height" }, range: this.shared.range ?? null };
     this.session.setField(this.look.field);
+    this.colour();
     this.focusPanel.begin(this.shared.rate);
   }
 
@@ -274,7 +276,7 @@ export class LodestreamView extends HTMLElement {
   /** Begins anew, seen as it is now. */
   private again(): void {
     const below = this.session?.stopsBelowPixel ?? true;
-    this.shared = this.view();
+    this.shared = this.viewpoint.framing === null ? this.ordered() : this.view();
     this.open();
     this.stopBelowPixel(below);
   }
@@ -397,13 +399,15 @@ export class LodestreamView extends HTMLElement {
   private changeLook(look: Look): void {
     const before = this.look;
     this.setLook(look);
-    this.tell("look", changesOf(before, this.look));
+    const changes = changesOf(before, this.look);
+    if (this.viewpoint.framing === null) this.shared = sharedWith(this.shared, changes);
+    this.tell("look", changes);
   }
 
   private setLook(look: Look): void {
     const { session } = this;
     const before = this.look;
-    if (look.field !== before.field) {
+    if (!sameField(look.field, before.field)) {
       session?.setField(look.field);
       look = { ...look, map: mapFor(look.field, session?.info ?? null), range: null };
     }
@@ -508,6 +512,13 @@ export class LodestreamView extends HTMLElement {
       ...(range === null ? {} : { range }),
       ...(rate === null ? {} : { rate }),
     };
+  }
+
+  /** What the first picture is to look like: what nobody has set is left to the surface, which is not known yet. */
+  private ordered(): SharedView {
+    const { rate: _, ...shared } = this.shared;
+    const { chosenRate: rate } = this.focusPanel;
+    return rate === null ? shared : { ...shared, rate };
   }
 
   /** Shows the view of an address that the user has entered. */
