@@ -6,7 +6,7 @@ import re
 
 __all__ = ["parse_size"]
 
-_UNITS = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
+_UNITS: dict[str, int] = {"": 1} | {letter: 1000**power for power, letter in enumerate("kmgt", 1)}
 _UNITS |= {f"{letter}i": 1024**power for power, letter in enumerate("kmgt", 1)}
 
 _SIZE = re.compile(r"\s*(\d{1,18})(\.\d{1,9})?\s*([a-z]{0,3})\s*", re.ASCII)
