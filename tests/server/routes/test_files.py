@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import closing
 from http.client import HTTPConnection
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -20,6 +21,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.formats import write_stream
+from lodestream_server import running_server
 from lodestream_server.builds import levels
 from tests.server.helpers import eventually, hills, npy, push
 
@@ -233,6 +235,19 @@ def test_levels_come_in_what_other_programs_read(
     heights = level.points if level.points.ndim == 2 else level.points[..., 2]
     # Text goes from north to south, and y grows with the rows here.
     np.testing.assert_array_equal(heights.astype(expected.dtype), expected[::-1] if name == "asc" else expected)
+
+
+def test_a_server_of_one_thread_makes_every_format(tmp_path: Path) -> None:
+    formats = ["npy", "npz", "p3d", "ply", "vts"]
+    formats += ["nc"] if find_spec("h5netcdf") else []
+    formats += ["tif", "cog", "asc"] if find_spec("rasterio") else []
+    with (
+        running_server(tmp_path / "data", workers=1, threads=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=120) as client,
+    ):
+        address = push(client, npy(hills(33, 20)))["url"]
+        answers = {name: client.get(f"{address}/levels/2", params={"format": name}) for name in formats}
+    assert {name: answer.status_code for name, answer in answers.items()} == dict.fromkeys(formats, 200)
 
 
 def test_what_does_not_exist_is_named(http: httpx.Client, surface: dict[str, Any]) -> None:

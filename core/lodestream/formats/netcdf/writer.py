@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
 from typing import Any, BinaryIO
@@ -52,16 +52,24 @@ def write(surface: Surface, file: BinaryIO) -> None:
             # Signals are handled in the main thread: an interruption in a call that HDF5 makes kills the process.
             with ThreadPoolExecutor(1) as aside:
                 stop = Event()
-                writing = aside.submit(_write_all, path, contents, stop)
                 try:
-                    writing.result()
-                except BaseException:
-                    stop.set()
-                    raise
+                    writing = aside.submit(_write_all, path, contents, stop)
+                except RuntimeError:  # a server's process may have no second thread, and nobody interrupts it
+                    _write_all(path, contents, stop)
+                else:
+                    _wait(writing, stop)
         except (ValueError, TypeError, KeyError) as error:
             raise FormatError(f"expected a surface that NetCDF can hold, got one that it refuses: {error}") from None
         with path.open("rb") as written:
             shutil.copyfileobj(written, file)
+
+
+def _wait(writing: Future[None], stop: Event) -> None:
+    try:
+        writing.result()
+    except BaseException:
+        stop.set()
+        raise
 
 
 def _write_all(path: Path, contents: Contents, stop: Event) -> None:
