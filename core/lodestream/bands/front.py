@@ -40,7 +40,7 @@ _Progress = Callable[[float], None]
 
 @overload
 def encode(
-    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    surface: Surface | ArrayLike | Source | os.PathLike[str] | xarray.Dataset | xarray.DataArray | xarray.DataTree,
     precision: Limit | None = None,
     *,
     rms: Limit | None = None,
@@ -54,7 +54,7 @@ def encode(
 ) -> bytes: ...
 @overload
 def encode(
-    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    surface: Surface | ArrayLike | Source | os.PathLike[str] | xarray.Dataset | xarray.DataArray | xarray.DataTree,
     precision: Limit | None = None,
     *,
     rms: Limit | None = None,
@@ -67,7 +67,7 @@ def encode(
     executor: Executor | None = None,
 ) -> None: ...
 def encode(
-    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    surface: Surface | ArrayLike | Source | os.PathLike[str] | xarray.Dataset | xarray.DataArray | xarray.DataTree,
     precision: Limit | None = None,
     *,
     rms: Limit | None = None,
@@ -93,10 +93,11 @@ def encode(
 
     Parameters
     ----------
-    surface : Surface, array, Source, or Dataset, DataArray or DataTree of xarray
+    surface : Surface, array, Source, path, or Dataset, DataArray or DataTree of xarray
         An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``. Arrays of Zarr, h5py
         and Dask, and any object with ``shape``, ``dtype`` and ``read(window)``, are read window by window, once. What
-        is of xarray is taken as by `Surface.from_xarray`, with coordinates, CRS, unit and name, by windows too.
+        is of xarray is taken as by `Surface.from_xarray`, with coordinates, CRS, unit and name, by windows too. A path,
+        str or path-like, is that of a file or a Zarr store, which is read as by `read`.
     precision : float, str, Tolerance or None
         Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
         the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
@@ -183,6 +184,10 @@ def encode(
 
 def _reading(source: Any) -> Callable[[Room], Surface] | None:
     """How the surface is read of what is read by windows; None: it is an array in memory."""
+    if isinstance(source, str | os.PathLike):
+        from ..formats import read as read_file
+
+        return lambda room: read_file(source, room=room)
     xr: Any = sys.modules.get("xarray")  # whoever has an object of it has imported it
     if xr is None or not isinstance(source, xr.Dataset | xr.DataArray | xr.DataTree):
         return (lambda room: Surface(read_source(source, room))) if is_source(source) else None

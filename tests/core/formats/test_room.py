@@ -40,14 +40,14 @@ def _write(path: Path, kind: str) -> None:
     elif kind == "round":
         round_ = {"geotransform": [-180.0, 360 / 70, 0.0, 50.0, 0.0, -0.01], "crs": "EPSG:4326"}
         ls.write(ls.Surface(values, metadata=round_), path)
-    elif kind in ("nc", "classic nc"):
-        _write_netcdf(path, values, mask, "h5netcdf" if kind == "nc" else "scipy")
+    else:
+        _write_dataset(path, values, mask, kind)
 
 
-def _write_netcdf(path: Path, values: NDArray[np.int16], mask: NDArray[np.bool_], engine: Any) -> None:
+def _write_dataset(path: Path, values: NDArray[np.int16], mask: NDArray[np.bool_], kind: str) -> None:
     """Packed heights with holes in the middle only, and what becomes an attribute."""
     xarray = pytest.importorskip("xarray")
-    pytest.importorskip("h5netcdf")
+    pytest.importorskip("zarr" if "zarr" in kind else "h5netcdf")
     packed = {"_FillValue": np.int16(-9999), "scale_factor": np.float32(0.5), "units": "m"}
     variables = {
         "z": (("lat", "lon"), np.where(mask, values, np.int16(-9999)), packed),
@@ -55,13 +55,18 @@ def _write_netcdf(path: Path, values: NDArray[np.int16], mask: NDArray[np.bool_]
         "lat": ("lat", 50 - np.arange(1300) / 100, {"units": "degrees_north"}),
         "lon": ("lon", 10 + np.arange(70) / 100, {"units": "degrees_east"}),
     }
-    xarray.Dataset(variables).to_netcdf(path, engine=engine)
+    dataset = xarray.Dataset(variables)
+    if "zarr" in kind:
+        dataset.to_zarr(path, zarr_format=int(kind[-1]), consolidated=False, encoding={"z": {"chunks": (300, 30)}})
+    else:
+        dataset.to_netcdf(path, engine="h5netcdf" if kind == "nc" else "scipy")
 
 
 KINDS = {
     **dict.fromkeys(("npy", "swapped", "fortran", "xyz"), ".npy"),
     **dict.fromkeys(("tif", "float tif", "bands", "round"), ".tif"),
     **dict.fromkeys(("nc", "classic nc"), ".nc"),
+    **dict.fromkeys(("zarr 2", "zarr 3"), ".zarr"),
 }
 
 
@@ -72,7 +77,7 @@ def test_what_is_read_is_the_same(tmp_path: Path, kind: str, monkeypatch: pytest
         pytest.importorskip("rasterio")
     path = tmp_path / f"surface{KINDS[kind]}"
     _write(path, kind)
-    options: dict[str, Any] = {"variable": "z", "attributes": "kind"} if KINDS[kind] == ".nc" else {}
+    options: dict[str, Any] = {"variable": "z", "attributes": "kind"} if KINDS[kind] in (".nc", ".zarr") else {}
     expected = ls.read(path, **options)
     monkeypatch.setattr(gdal, "_TILE_ROWS", 100)
     monkeypatch.setattr(gdal, "_AT_ONCE", 1)
