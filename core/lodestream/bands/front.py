@@ -165,7 +165,8 @@ def encode(
         read = None if isinstance(surface, Surface) else _reading(surface)
         if read is not None:
             by_bands = _by_bands(limit, chosen, whole, executor is not None)
-            surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands))
+            given = None if memory is None else limit
+            surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands, given))
         elif not isinstance(surface, Surface):
             surface = Surface(cast("ArrayLike", surface))
         stacklevel = 4  # the caller of this function, from the one that makes it in one piece

@@ -93,7 +93,7 @@ def read(
         say so.
     room : Room, optional
         Where large arrays go: NPY files are memory-mapped; rasters, NetCDF and Zarr are read window by window into
-        files. Other formats are read into memory all the same.
+        files, and so are binary PLOT3D and raw .vts. Other formats are read into memory all the same.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 

@@ -161,7 +161,7 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str = 
     if choice.heights is None:
         points = np.stack(np.broadcast_arrays(x.values, y.values), axis=-1)
         surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
-        return _closed_fields(source, dataset, choice, merge(surface, source.closed))
+        return _closed_fields(source, dataset, choice, merge(surface, source.closed, room=source.room))
     variable = dataset.variables[choice.heights]
     heights, valid = _values(source, variable, choice.index)
     mask = _both(mask, valid)
