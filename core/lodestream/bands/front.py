@@ -118,8 +118,8 @@ def encode(
     memory : int or str, optional
         Bytes to work in, a MiB or more, or text such as ``"512MiB"``, beside arrays that are memory-mapped: what takes
         more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
-        for each value of such a row are taken in any case, and 6 for each point of a surface with holes. By default a quarter of the machine's memory, and where
-        there is no ``out`` one piece.
+        for each value of such a row are taken in any case, and 6 for each point of a surface with
+        holes. By default a quarter of the machine's memory, and where there is no ``out`` one piece.
     scratch : str or path-like, optional
         A folder for the files of a build by bands, about 12 bytes a value; empty, or of a build that was cut. What is
         made there is kept when the build is interrupted, or fails, and the same call goes on from there; after success

@@ -219,7 +219,7 @@ def readable(name: str) -> Format:
 
 def _check_regular(path: Path) -> None:
     if not stat.S_ISREG(path.stat().st_mode):
-        raise FormatError("expected a regular file, got a folder, pipe or device")
+        raise FormatError("expected a regular file, got a folder, a pipe or a device")
 
 
 def _of_folder(path: Path, wanted: str | None) -> Format:
