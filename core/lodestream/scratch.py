@@ -196,10 +196,12 @@ class Room:
         Gives the folder, a `Scratch`. None: all arrays are in memory.
     least : int
         Arrays of fewer bytes are in memory.
+    memory : int, optional
+        Bytes that may be taken for what cannot go into files, where somebody has said so.
     """
 
-    def __init__(self, scratch: Callable[[], Scratch] | None = None, least: int = 0) -> None:
-        self._scratch, self._least, self._count = scratch, least, 0
+    def __init__(self, scratch: Callable[[], Scratch] | None = None, least: int = 0, memory: int | None = None) -> None:
+        self._scratch, self._least, self.memory, self._count = scratch, least, memory, 0
 
     def takes(self, size: int) -> bool:
         """Whether an array of so many bytes is large."""

@@ -112,7 +112,7 @@ class Block:
             valid = ~(hidden if hidden.ndim == 2 else np.asarray(hidden[..., :3].any(axis=2)))
         if mask is not None:
             # What is memory-mapped may be larger than memory.
-            given = np.asarray(mask) if isinstance(mask, np.memmap) else np.array(mask)
+            given = np.asarray(mask) if _is_mapped(mask) else np.array(mask)
             if given.shape != self.shape or given.dtype != np.bool_:
                 raise InputError(f"expected a mask of booleans of shape {self.shape}, got {given.dtype} {given.shape}")
             valid = given if valid is None else valid & given
@@ -423,6 +423,15 @@ def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:
         return None
     hidden = values.mask
     return np.broadcast_to(hidden, np.shape(values)) if np.any(hidden) else None
+
+
+def _is_mapped(array: object) -> bool:
+    """Whether an array is memory-mapped, or a view of one that is."""
+    while isinstance(array, np.ndarray):
+        if isinstance(array, np.memmap):
+            return True
+        array = array.base
+    return False
 
 
 def _native(array: NDArray[Any], what: str) -> NDArray[Any]:

@@ -72,6 +72,15 @@ def _netcdf(path: Path) -> None:
         dataset.to_netcdf(path, engine="scipy")
 
 
+def _zarr(path: Path) -> None:
+    pytest.importorskip("zarr")
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("scipy")
+    _netcdf(path.with_suffix(".nc"))
+    with xarray.open_dataset(path.with_suffix(".nc"), engine="scipy") as dataset:
+        dataset.to_zarr(path, zarr_format=2)
+
+
 def _png(path: Path) -> None:
     pytest.importorskip("PIL")
     from PIL import Image
@@ -148,6 +157,7 @@ _MAKERS: dict[str, Callable[[Path], Any]] = {
     "hill.tif": _tiff,
     "hill.dem": _dem,
     "sea.nc": _netcdf,
+    "sea.zarr": _zarr,
     "fuji.png": _png,
     "hill.asc": _ascii,
     "N37W122.hgt": _hgt,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import CorruptStreamError, StreamError, TooLargeError, TruncatedStreamError
+from lodestream.errors import CorruptStreamError, LodestreamError, StreamError, TooLargeError, TruncatedStreamError
 from lodestream.target import Target
 
 from .inputs import named
@@ -27,6 +26,8 @@ __all__ = ["by_rows"]
 _WHOLE = 12
 #: The part of the memory that an array in memory may take.
 _PART = 16
+#: In the folder on the way to the file: arrays, and the file with what its writer makes beside it.
+_VALUES, _FILE = "values", "file"
 
 
 def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callable[[float], None]) -> bool:
@@ -152,10 +153,11 @@ def _decode(
     started: float,
     progress: Callable[[float], None],
 ) -> None:
+    from lodestream.bands.folders import passing_folder
     from lodestream.scratch import Room, Scratch
 
-    with tempfile.TemporaryDirectory(prefix=f".{out.name[:50]}.", dir=out.resolve().parent) as folder:
-        surface = decoder.surface(Room(lambda: Scratch(folder), memory // _PART), memory, progress)
+    with passing_folder(out, (_VALUES, _FILE)) as folder:
+        surface = decoder.surface(Room(lambda: Scratch(folder / _VALUES), memory // _PART), memory, progress)
         index, last = decoder.index, decoder.index.levels[-1]
         outcome = Outcome(
             surface,
@@ -170,5 +172,29 @@ def _decode(
             "complete",
             dict(zip(decoder.header.channel_names, last.channels, strict=False)),
         )
-        outcome.write(options.out)
+        _write(outcome, out, folder / _FILE)
         outcome.report(options.json)
+
+
+def _write(outcome: Outcome, out: Path, folder: Path) -> None:
+    """Write the file in a folder of its own, where writers may leave others too, and put it in its place.
+
+    What is there and no file, such as a pipe, is written to as it is. Where a folder is to be written, its writer says
+    what is in its way.
+    """
+    from lodestream.formats import for_writing
+
+    if out.exists() and (not out.is_file() or for_writing(out).write is None):
+        outcome.write(str(out))
+        return
+    folder.mkdir()
+    made = folder / out.name
+    try:
+        outcome.write(str(made))
+        made.replace(out.resolve())  # a link stays a link
+    except LodestreamError as error:
+        error.args = tuple(str(part).replace(str(made), str(out)) for part in error.args)
+        raise
+    except OSError as error:
+        error.filename, error.filename2 = str(out), None
+        raise

@@ -238,8 +238,10 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
     with ExitStack() as stack:
         files = stack.enter_context(input_files(options.files))
         first = files.paths[0]
-        with first.open("rb") as file:
-            ready = len(files.paths) == 1 and file.read(len(_MAGIC)) == _MAGIC
+        ready = False
+        if len(files.paths) == 1 and not first.is_dir():  # a Zarr store is a folder
+            with first.open("rb") as file:
+                ready = file.read(len(_MAGIC)) == _MAGIC
         if ready:
             _refuse_options(options.surface, "a container")
             yield lambda _: FileSource(first, options.name)

@@ -104,9 +104,11 @@ def _local(source: Any, quality: Quality | None) -> Source:
         return _encoded(source, quality, "")
     if isinstance(source, str | os.PathLike):
         path = Path(source)
-        with path.open("rb") as file:
-            ready = file.read(len(MAGIC)) == MAGIC
-        return FileSource(path) if ready else _encoded(ls.read(path), quality, path.stem)
+        if not path.is_dir():  # as a Zarr store is
+            with path.open("rb") as file:
+                if file.read(len(MAGIC)) == MAGIC:
+                    return FileSource(path)
+        return _encoded(ls.read(path), quality, path.stem)
     hint = "; a view has surface()" if isinstance(source, ls.View) else ""
     raise InputError(
         "expected a Surface, an array of points, a container as bytes, the path of a file or a URL, "

@@ -122,6 +122,8 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
 
     Raises
     ------
+    InputError
+        If a path is that of a folder.
     OptionError
         If there are options for a container, which takes none but a name.
     OSError
@@ -132,6 +134,11 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
         for name, source in parcel.files:
             if isinstance(source, str | os.PathLike):
                 path = Path(source)
+                if path.is_dir():
+                    raise InputError(
+                        f"expected a file to upload, got the folder {path}: lodestream encode makes a container of a "
+                        "Zarr store"
+                    )
                 files.append((name or path.name, stack.enter_context(path.open("rb"))))
             elif isinstance(source, bytes | bytearray | memoryview):
                 files.append((name, io.BytesIO(source)))

@@ -12,6 +12,7 @@ import os
 import platform
 import secrets
 import shutil
+import stat
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -25,7 +26,7 @@ try:
 except ImportError:  # not on Windows
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["TASKS", "Folder", "build_folder", "check_out", "remove", "replacing"]
+__all__ = ["TASKS", "Folder", "build_folder", "check_out", "passing_folder", "remove", "replacing"]
 
 #: What `encode` makes in its folder: copies of a source, and builds by what they are of.
 _SOURCE, TASKS = "source", "tasks"
@@ -33,6 +34,11 @@ _SOURCE, TASKS = "source", "tasks"
 _MARK = ".lodestream-build"
 _OURS = b"A folder of a build of Lodestream, which has made it and removes it.\n"
 _THEIRS = b"A folder that a build of Lodestream works in. What it has made is removed with this file.\n"
+_PASSING = (
+    b"A folder of a command of Lodestream, on the way to a file. It is removed when no process has it any more.\n"
+)
+#: How the name of such a folder ends.
+_ON_THE_WAY = ".lodestream"
 #: Bytes of a mark that are read.
 _MOST = 1 << 10
 #: What is on its way out: nobody can write there under its former name any more.
@@ -172,6 +178,73 @@ def build_folder(folder: Path, entries: Collection[str], named: bool) -> Iterato
         _let_go(handle)
 
 
+@contextmanager
+def passing_folder(beside: Path, entries: Collection[str]) -> Iterator[Path]:
+    """A folder beside a file for what is made on the way to it, gone afterwards.
+
+    Such folders that a killed process of this user and machine has left there are removed first.
+
+    Parameters
+    ----------
+    beside : Path
+    entries : collection of str
+        Names in it under which all is that is made there; nothing else is ever removed.
+
+    Raises
+    ------
+    OSError
+        If it cannot be made.
+    """
+    above = beside.resolve().parent
+    for left in above.glob(f".*{_ON_THE_WAY}") if fcntl is not None else ():
+        with suppress(OSError):  # it is another user's, or somebody is at work there
+            _remove_left(left, entries)
+    folder = above / f".{beside.name[:50]}.{secrets.token_hex(6)}{_ON_THE_WAY}"
+    folder.mkdir(0o700)
+    handle = os.open(folder / _MARK, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    _HELD.add(handle)
+    try:
+        _lock(handle, folder)
+        os.write(
+            handle, _PASSING + _signature()
+        )  # when it is locked: before that nobody takes it for one that was left
+        yield folder
+    finally:
+        if handle in _HELD:  # else this is a fork
+            if fcntl is None:
+                _let_go(handle)
+            with suppress(OSError):
+                _remove_passing(folder, entries)
+            _let_go(handle)
+
+
+def _remove_left(folder: Path, entries: Collection[str]) -> None:
+    """Remove a folder of `passing_folder` if nobody is at work there, and it is certain that it is one."""
+    state = folder.lstat()
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid():
+        return
+    handle = os.open(folder / _MARK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        mark = os.fstat(handle)
+        said = os.read(handle, _MOST).splitlines(keepends=True)
+        ours = stat.S_ISREG(mark.st_mode) and mark.st_nlink == 1 and mark.st_uid == os.geteuid()
+        here = len(said) == 2 and said[1].endswith(_signature().partition(b" on ")[2])
+        if ours and here and said[0] == _PASSING:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # an error where file systems have no locks
+            _remove_passing(folder, entries)
+    finally:
+        os.close(handle)
+
+
+def _remove_passing(folder: Path, entries: Collection[str]) -> None:
+    """Remove what was made, then the mark: what is left of a removal that was cut has its mark still."""
+    for entry in entries:
+        shutil.rmtree(folder / entry, ignore_errors=True)
+    if {path.name for path in folder.iterdir()} == {_MARK}:
+        (folder / _MARK).unlink()
+        folder.rmdir()
+
+
 def _let_go(handle: int) -> None:
     if handle not in _HELD:
         return  # it was done before, or in this process, a fork of the one that builds
@@ -267,7 +340,11 @@ def _sign(handle: int, made: bool) -> None:
     whose = _first_line(handle) or (_OURS if made else _THEIRS)
     os.lseek(handle, 0, os.SEEK_SET)
     os.ftruncate(handle, 0)
-    os.write(handle, whose + f"process {os.getpid()} on {platform.node()}\n".encode("ascii", "replace"))
+    os.write(handle, whose + _signature())
+
+
+def _signature() -> bytes:
+    return f"process {os.getpid()} on {platform.node()}\n".encode("ascii", "replace")
 
 
 def _first_line(handle: int) -> bytes:

@@ -40,7 +40,7 @@ _Progress = Callable[[float], None]
 
 @overload
 def encode(
-    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    surface: Surface | ArrayLike | Source | os.PathLike[str] | xarray.Dataset | xarray.DataArray | xarray.DataTree,
     precision: Limit | None = None,
     *,
     rms: Limit | None = None,
@@ -54,7 +54,7 @@ def encode(
 ) -> bytes: ...
 @overload
 def encode(
-    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    surface: Surface | ArrayLike | Source | os.PathLike[str] | xarray.Dataset | xarray.DataArray | xarray.DataTree,
     precision: Limit | None = None,
     *,
     rms: Limit | None = None,
@@ -67,7 +67,7 @@ def encode(
     executor: Executor | None = None,
 ) -> None: ...
 def encode(
-    surface: Surface | ArrayLike | Source | xarray.Dataset | xarray.DataArray | xarray.DataTree,
+    surface: Surface | ArrayLike | Source | os.PathLike[str] | xarray.Dataset | xarray.DataArray | xarray.DataTree,
     precision: Limit | None = None,
     *,
     rms: Limit | None = None,
@@ -93,10 +93,11 @@ def encode(
 
     Parameters
     ----------
-    surface : Surface, array, Source, or Dataset, DataArray or DataTree of xarray
+    surface : Surface, array, Source, path, or Dataset, DataArray or DataTree of xarray
         An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``. Arrays of Zarr, h5py
         and Dask, and any object with ``shape``, ``dtype`` and ``read(window)``, are read window by window, once. What
-        is of xarray is taken as by `Surface.from_xarray`, with coordinates, CRS, unit and name, by windows too.
+        is of xarray is taken as by `Surface.from_xarray`, with coordinates, CRS, unit and name, by windows too. A path,
+        str or path-like, is that of a file or a Zarr store, which is read as by `read`.
     precision : float, str, Tolerance or None
         Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
         the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
@@ -117,8 +118,8 @@ def encode(
     memory : int or str, optional
         Bytes to work in, a MiB or more, or text such as ``"512MiB"``, beside arrays that are memory-mapped: what takes
         more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
-        for each value of such a row are taken in any case. By default a quarter of the machine's memory, and where
-        there is no ``out`` one piece.
+        for each value of such a row are taken in any case, and 6 for each point of a surface with
+        holes. By default a quarter of the machine's memory, and where there is no ``out`` one piece.
     scratch : str or path-like, optional
         A folder for the files of a build by bands, about 12 bytes a value; empty, or of a build that was cut. What is
         made there is kept when the build is interrupted, or fails, and the same call goes on from there; after success
@@ -164,7 +165,8 @@ def encode(
         read = None if isinstance(surface, Surface) else _reading(surface)
         if read is not None:
             by_bands = _by_bands(limit, chosen, whole, executor is not None)
-            surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands))
+            given = None if memory is None else limit
+            surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands, given))
         elif not isinstance(surface, Surface):
             surface = Surface(cast("ArrayLike", surface))
         stacklevel = 4  # the caller of this function, from the one that makes it in one piece
@@ -183,6 +185,10 @@ def encode(
 
 def _reading(source: Any) -> Callable[[Room], Surface] | None:
     """How the surface is read of what is read by windows; None: it is an array in memory."""
+    if isinstance(source, str | os.PathLike):
+        from ..formats import read as read_file
+
+        return lambda room: read_file(source, room=room)
     xr: Any = sys.modules.get("xarray")  # whoever has an object of it has imported it
     if xr is None or not isinstance(source, xr.Dataset | xr.DataArray | xr.DataTree):
         return (lambda room: Surface(read_source(source, room))) if is_source(source) else None

@@ -28,7 +28,7 @@ from .building import Building, OutOfRangeError
 from .executing import Execution
 from .folders import TASKS, remove, replacing
 from .geometry import CORE_POINTS
-from .memory import BESIDE, OF_BAND
+from .memory import BESIDE, OF_BAND, masks_memory
 from .references import file_state, root_of
 from .room import FOR_A_VALUE, check_room
 
@@ -71,7 +71,7 @@ class Made:
         own = threads()
         points = surface.blocks[0].shape[0] * surface.blocks[0].shape[1]
         channels = max(1, sum(a.size for a in self._arrays()) // points)
-        room = max(memory - BESIDE, 0) // (OF_BAND * channels)
+        room = max(memory - BESIDE - masks_memory(surface), 0) // (OF_BAND * channels)
         self._threads = 1 if executor is not None else max(1, min(own, room // _FEWEST))
         self._points = min(max(room // self._threads, _FEWEST), _MOST)
         self._core = min(CORE_POINTS, max(self._points // 2, 1 << 12))

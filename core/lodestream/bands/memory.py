@@ -9,10 +9,22 @@ from ..errors import OptionError
 from ..sizes import parse_size
 from ..surface import Surface
 
-__all__ = ["BESIDE", "LEAST", "OF_BAND", "WHOLE", "checked_memory", "default_memory", "least_memory", "whole_memory"]
+__all__ = [
+    "BESIDE",
+    "LEAST",
+    "OF_BAND",
+    "WHOLE",
+    "checked_memory",
+    "default_memory",
+    "least_memory",
+    "masks_memory",
+    "whole_memory",
+]
 
 #: Bytes that encoding takes for each value: in one piece, with holes, and for each value of a band.
 WHOLE, _WHOLE_WITH_HOLES, OF_BAND = 16, 40, 32
+#: Bytes that masks take for each point of a surface with holes, whatever the band.
+_MASKS = 6
 #: What a process takes besides, and the least that may be asked for.
 BESIDE, LEAST = 96 << 20, 1 << 20
 #: Rows of a tile.
@@ -54,4 +66,10 @@ def least_memory(surface: Surface) -> int:
     """About the least that encoding a surface by bands takes, in bytes: the program, and a row of tiles."""
     block = surface.blocks[0]
     values = sum(array.size for array in (block.points, *block.attributes.values()))
-    return BESIDE + OF_BAND * values * _ROWS // max(block.shape[0], _ROWS)
+    return BESIDE + masks_memory(surface) + OF_BAND * values * _ROWS // max(block.shape[0], _ROWS)
+
+
+def masks_memory(surface: Surface) -> int:
+    """About what masks take where a surface is encoded by bands, in bytes: which points are holes is known of all."""
+    block = surface.blocks[0]
+    return 0 if block.mask is None else _MASKS * block.shape[0] * block.shape[1]

@@ -72,6 +72,7 @@ def read_into(
         lambda: Scratch(folder).folder,
         limit // _PART,
         lambda values: by_bands and values * WHOLE > limit,
+        memory,
     )
     surface = read(first, *more, room=room, **options)
     for path, state in zip(paths, states, strict=True):

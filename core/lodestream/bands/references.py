@@ -5,8 +5,10 @@ Only files that a build has written itself are read: unpickling runs whatever a 
 
 from __future__ import annotations
 
+import hashlib
 import os
 import pickle
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -67,9 +69,25 @@ class _Pickler(pickle.Pickler):
 
 
 def file_state(path: str | os.PathLike[str]) -> list[int]:
-    """What changes when a file is written to, or another one gets its name, whatever times that one pretends."""
+    """What changes when a file is written to, or another one gets its name, whatever times that one pretends.
+
+    Of a folder, what changes when this happens to any file in it.
+    """
     state = os.stat(path)
-    return [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
+    own = [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
+    return [*own, _state_within(path)] if stat.S_ISDIR(state.st_mode) else own
+
+
+def _state_within(folder: str | os.PathLike[str]) -> int:
+    digest = hashlib.sha256()
+    for above, folders, names in os.walk(folder):
+        folders.sort()
+        for name in sorted(names):
+            path = os.path.join(above, name)
+            state = os.lstat(path)
+            said = path, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+            digest.update(repr(said).encode("utf-8", "surrogateescape"))
+    return int.from_bytes(digest.digest()[:8], "big")
 
 
 def root_of(array: NDArray[Any]) -> np.memmap[Any, Any] | None:

@@ -52,6 +52,8 @@ class CopyRoom(Room):
         Arrays of fewer bytes are in memory.
     by_bands : callable
         Whether an array of so many values is encoded by bands.
+    memory : int, optional
+        See `Room`.
     """
 
     def __init__(
@@ -60,8 +62,9 @@ class CopyRoom(Room):
         folder: Callable[[], Path],
         least: int,
         by_bands: Callable[[int], bool],
+        memory: int | None = None,
     ) -> None:
-        super().__init__(scratch, least)
+        super().__init__(scratch, least, memory)
         self._folder, self._by_bands = folder, by_bands
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -5,6 +5,8 @@ A task is called with the folder, then with numbers. The file that it writes las
 
 from __future__ import annotations
 
+from uuid import uuid4
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +14,7 @@ from ..decoding.rows import RowsGeometry
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
 from ..entropy.part_table import part_of
 from ..entropy.tiles import Tiles
+from ..scratch import Room, Scratch
 from ..transform.predictors import default_predictors
 from ..transform.pyramid import empty
 from . import forward
@@ -33,6 +36,10 @@ __all__ = [
 ]
 
 
+#: Bytes of an array of a strip that is in a file.
+_IN_A_FILE = 1 << 20
+
+
 def sample_pieces(build: Build, level: int) -> list[tuple[int, int]]:
     """The rows of each piece of a level's samples."""
     if level == build.prepared.layout.levels and build.prepared.surface.blocks[0].mask is not None:
@@ -45,10 +52,17 @@ def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
     build = Build.open(folder)
     layout = build.prepared.layout
     rows = sample_pieces(build, layout.levels)[piece]
-    samples = empty((rows[1] - rows[0], layout.shape(0, layout.levels)[1]))
-    coordinates_of_strip(build.prepared, channel, build.lattices.channels[channel], rows, samples)
-    build.scratch.write(_name("samples", channel, fit, layout.levels, piece), samples)
-    build.scratch.write(_name("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples))
+    shape = rows[1] - rows[0], layout.shape(0, layout.levels)[1]
+    # A strip with holes may be larger than a band.
+    own = Scratch(build.scratch.folder / "strips" / uuid4().hex, make=build.prepared.surface.blocks[0].mask is not None)
+    room = Room(lambda: own, _IN_A_FILE)
+    try:
+        samples = room.empty(shape, np.int32) if own.folder.exists() else empty(shape)
+        coordinates_of_strip(build.prepared, channel, build.lattices.channels[channel], rows, samples, room)
+        build.scratch.write(_name("samples", channel, fit, layout.levels, piece), samples)
+        build.scratch.write(_name("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples))
+    finally:
+        own.clear()
 
 
 def first_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:

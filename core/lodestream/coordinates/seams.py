@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import DTYPES, Block, Closed, Surface
 
 __all__ = ["merge", "restore", "shapes_in_files", "unwrap", "wrapped"]
@@ -28,7 +29,9 @@ _FEWEST = 4
 Turns = tuple[int, float]
 
 
-def merge(surface: Surface, closed: Closed | None = None, *, angle: Turns | None = None) -> Surface:
+def merge(
+    surface: Surface, closed: Closed | None = None, *, angle: Turns | None = None, room: Room = IN_MEMORY
+) -> Surface:
     """Merge repeated last rows and columns into closed axes, of every block.
 
     Points repeat where their bits do, and those of their mask and attributes. A row whose points all coincide is a pole
@@ -42,6 +45,8 @@ def merge(surface: Surface, closed: Closed | None = None, *, angle: Turns | None
         The axes that may be merged; None: both.
     angle : (int, float), optional
         A channel, and the full turn by which its last row or column may differ from the first.
+    room : Room
+        Where arrays without their last column go.
 
     Returns
     -------
@@ -59,7 +64,7 @@ def merge(surface: Surface, closed: Closed | None = None, *, angle: Turns | None
             by = _repeats(block, axis, angle)
             if by is not None:
                 found[axis] = True
-                block = _without_last(block, axis)
+                block = _without_last(block, axis, room)
                 if angle is not None and by:
                     turn = [angle[0], by, axis]
         blocks.append(block)
@@ -104,13 +109,20 @@ def _repeats(block: Block, axis: int, angle: Turns | None) -> float | None:
     return None if collapsed else turn
 
 
-def _without_last(block: Block, axis: int) -> Block:
-    kept = (slice(None, -1), slice(None)) if axis == 0 else (slice(None), slice(None, -1))
+def _without_last(block: Block, axis: int, room: Room) -> Block:
+    def kept(array: NDArray[Any]) -> NDArray[Any]:
+        if axis == 0:
+            return array[:-1]
+        found = room.empty((array.shape[0], array.shape[1] - 1, *array.shape[2:]), array.dtype)
+        for rows in rows_at_once(found.shape):
+            found[rows] = array[rows, :-1]
+        return found
+
     return Block(
-        block.points[kept],
+        kept(block.points),
         (block.closed[0] or axis == 0, block.closed[1] or axis == 1),
-        mask=None if block.mask is None else block.mask[kept],
-        attributes={name: array[kept] for name, array in block.attributes.items()},
+        mask=None if block.mask is None else kept(block.mask),
+        attributes={name: kept(array) for name, array in block.attributes.items()},
     )
 
 

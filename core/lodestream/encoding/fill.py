@@ -23,7 +23,7 @@ from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed
 from ..transform.lifting import forward_step
 from ..transform.predictors import predictor
-from ..transform.pyramid import allocate, forward, inverse
+from ..transform.pyramid import PADDING, forward, inverse
 
 __all__ = ["fill_channel", "fill_holes", "settle_holes"]
 
@@ -95,43 +95,46 @@ def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, 
         values[rows][hidden] = np.clip(inside, low, high)
 
 
-def settle_holes(coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout: Layout) -> NDArray[np.int32]:
+def settle_holes(
+    coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout: Layout, room: Room = IN_MEMORY
+) -> None:
     """Move what is under holes so that the transform has fewer coefficients to code.
 
     Parameters
     ----------
     coordinates : int32, shape (row, column)
-        Lattice coordinates of one channel, holes filled (`fill_holes`). Not changed.
+        Lattice coordinates of one channel, holes filled (`fill_holes`). Those at holes are changed, and stay within the
+        range of the valid points.
     mask : bool, shape (row, column)
         True where a point is valid.
     layout : Layout
         As the channel will be coded, of one grid.
-
-    Returns
-    -------
-    int32, shape (row, column)
-        The same at valid points; holes within the range of the valid points.
+    room : Room
+        Where an array of the size of the coordinates goes.
     """
-    settled = coordinates.copy()
     if mask.all() or not mask.any():
-        return settled
-    low, high = coordinates[mask].min(), coordinates[mask].max()
-    work = allocate(layout.grids[0].shape)
+        return
+    strips = list(rows_at_once(coordinates.shape))
+    ends = [(own.min(), own.max()) for strip in strips if (own := coordinates[strip][mask[strip]]).size]
+    low, high = min(least for least, _ in ends), max(most for _, most in ends)
+    height, width = layout.grids[0].shape
+    work = room.empty((height, width + PADDING), np.int32)[:, :width]
     rows, columns = layout.shape(0, 0)
-    work[...] = settled
+    work[...] = coordinates
     predictors = forward([work], layout)
     threshold = _FIRST_THRESHOLD * max(2, int(np.median(np.abs(work[::3, ::3]))))
     while threshold:
         coarsest = work[:rows, :columns].copy()
-        work[np.abs(work) <= threshold] = 0
+        for strip in strips:
+            work[strip][np.abs(work[strip]) <= threshold] = 0
         work[:rows, :columns] = coarsest
         inverse([work], layout, predictors, layout.levels)
-        np.copyto(settled, np.clip(work, low, high), where=~mask)
+        for strip in strips:
+            np.copyto(coordinates[strip], np.clip(work[strip], low, high), where=~mask[strip])
         threshold >>= 1
         if threshold:
-            work[...] = settled
+            work[...] = coordinates
             _forward_again(work, layout, predictors)
-    return settled
 
 
 def _forward_again(values: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8]) -> None:

@@ -13,6 +13,7 @@ from ..grid.connectivity import stored
 from ..grid.layout import Layout
 from ..quantization.lattice import Lattice, find_lattice, offset_lattice, precision_lattice, short_lattice
 from ..quantization.lattice_choice import attribute_lattices, channel_of, choose_lattices
+from ..scratch import IN_MEMORY, Room
 from ..transform.pyramid import allocate
 from .arranging import lines
 from .holes import given_channel, known_values
@@ -147,9 +148,17 @@ def strips(prepared: Prepared) -> list[tuple[int, int]]:
 
 
 def coordinates_of_strip(
-    prepared: Prepared, channel: int, lattice: Lattice, rows: tuple[int, int], out: NDArray[np.int32]
+    prepared: Prepared,
+    channel: int,
+    lattice: Lattice,
+    rows: tuple[int, int],
+    out: NDArray[np.int32],
+    room: Room = IN_MEMORY,
 ) -> None:
-    """Put coordinates of one of the `strips` into ``out``, int32, shape (row, column); or of any rows without holes."""
+    """Put coordinates of one of the `strips` into ``out``, int32, shape (row, column); or of any rows without holes.
+
+    What this takes for a strip with holes goes where there is ``room``.
+    """
     block, within = prepared.surface.blocks[0], slice(*rows)
     lattice.coordinates(prepared.channel(0, channel)[within], out=out)
     if block.mask is None:
@@ -163,7 +172,7 @@ def coordinates_of_strip(
     layout = prepared.layout
     if rows != (0, layout.shape(0, layout.levels)[0]):
         layout = Layout.single(out.shape, (False, block.closed[1]), layout.tile)
-    out[...] = settle_holes(out, mask[within], layout)
+    settle_holes(out, mask[within], layout, room)
 
 
 def _of_patches(prepared: Prepared, channel: int, lattice: Lattice, arrays: list[NDArray[np.int32]]) -> None:

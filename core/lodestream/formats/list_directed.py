@@ -17,6 +17,8 @@ __all__ = ["is_text", "read_numbers"]
 
 _CHUNK = 1 << 20
 _LONGEST_LINE = 1 << 20
+#: Bytes that a number takes while all are put together.
+_EACH = 16
 
 #: Characters of numbers, separators and repeat counts, with the letters of D, E, NaN and Infinity.
 _CHARACTERS = b"0123456789+-.,* \t\r\n\x1aDEdeINFTYAinftya"
@@ -36,8 +38,14 @@ def is_text(head: bytes) -> bool:
     return not head.translate(None, _CHARACTERS) and bool(head.strip())
 
 
-def read_numbers(path: Path) -> tuple[NDArray[np.float64], int]:
+def read_numbers(path: Path, memory: int | None = None) -> tuple[NDArray[np.float64], int]:
     """Read all numbers of a file.
+
+    Parameters
+    ----------
+    path : Path
+    memory : int, optional
+        Bytes that this may take.
 
     Returns
     -------
@@ -51,11 +59,11 @@ def read_numbers(path: Path) -> tuple[NDArray[np.float64], int]:
     FormatError
         When something is no number, naming its line.
     TooLargeError
-        When repeat counts expand the file implausibly.
+        When repeat counts expand the file implausibly, or there is too little memory.
     """
     limit = max(_HARMLESS_BYTES, _MAX_EXPANSION * path.stat().st_size) // 8
     runs: list[NDArray[np.float64]] = []
-    count = integers = 0
+    count = integers = read = 0
     only_integers = True
     for line, text in _chunks(path):
         run = _numbers(line, text, limit - count)
@@ -64,6 +72,13 @@ def read_numbers(path: Path) -> tuple[NDArray[np.float64], int]:
             integers += more
         runs.append(run)
         count += len(run)
+        read += len(text)
+        if memory is not None and _EACH * count > memory:
+            needed = _EACH * count * path.stat().st_size // max(read, 1)
+            raise TooLargeError(
+                f"expected numbers that take at most {number(memory >> 20)} MiB to read, got text that takes about "
+                f"{number(needed >> 20)} MiB: only binary files are read by windows"
+            )
     return np.concatenate([np.empty(0), *runs]), integers
 
 

@@ -88,7 +88,9 @@ def place(
     for channel, plane in enumerate((*planes, heights)):
         points[..., channel] = plane
     degrees = [channel for channel, coordinate in enumerate((x, y)) if coordinate.degrees]
-    surface = merge(Surface(points, **extras, metadata=values), closed, angle=(degrees[0], TURN) if degrees else None)
+    surface = merge(
+        Surface(points, **extras, metadata=values), closed, angle=(degrees[0], TURN) if degrees else None, room=room
+    )
     if len(degrees) != 1:
         return surface
     if closed is None:

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from .notes import warn
 from .source import Source
 
-__all__ = ["HELP", "Cut", "cuts"]
+__all__ = ["HELP", "Cut", "cuts", "stacked"]
 
 #: Help for the option, for the table of formats.
 HELP = "index planes of a volume, as axis and index, separated by commas: i0, j3, k-1 (the last); each is a block"
@@ -47,11 +47,31 @@ class Cut:
     key: tuple[int | slice, int | slice, int | slice]
     shape: tuple[int, int]
 
-    def of(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Take the surface out of the block's values, an array of shape (k * j * i, ...) with i running fastest."""
+    def view(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The surface in the block's values, an array of shape (k * j * i, ...) with i running fastest; not copied."""
         i, j, k = self.dims
         volume = values.reshape(k, j, i, *values.shape[1:])
-        return np.ascontiguousarray(volume[self.key].reshape(*self.shape, *values.shape[1:]))
+        return volume[self.key].reshape(*self.shape, *values.shape[1:])
+
+    def of(self, values: NDArray[Any], room: Room = IN_MEMORY) -> NDArray[Any]:
+        """A copy of `view` in the machine's byte order, where there is room for it; made some rows at a time."""
+        view = self.view(values)
+        found = room.empty(view.shape, view.dtype.newbyteorder("="))
+        for rows in rows_at_once(view.shape):
+            found[rows] = view[rows]
+        return found
+
+
+def stacked(channels: Sequence[NDArray[Any]], room: Room) -> NDArray[Any]:
+    """Arrays of shape (row, column) as the channels of one in the machine's byte order, where there is room for it.
+
+    It is made some rows at a time, and the arrays are not copied.
+    """
+    found = room.empty((*channels[0].shape, len(channels)), channels[0].dtype.newbyteorder("="))
+    for rows in rows_at_once(found.shape):
+        for number, values in enumerate(channels):
+            found[rows, :, number] = values[rows]
+    return found
 
 
 def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[list[Cut]], dict[str, Any]]:

@@ -37,7 +37,7 @@ def sniff(path: str | os.PathLike[str], *, filename: str | None = None, format_n
     Parameters
     ----------
     path : str or path-like
-        An existing file.
+        An existing file, or a folder.
     filename : str, optional
         The file's original name, if `path` has another; only its suffix matters, and only for text.
     format_name : str, optional
@@ -74,7 +74,7 @@ def read(
     Parameters
     ----------
     path : str or path-like
-        A file of one of the `formats`.
+        A file of one of the `formats`, or the folder of a Zarr store.
     *more : str or path-like
         Further files of the same surface, for formats that take them (`Format.more`).
     closed : {"auto", "none", "rows", "cols", "both"} or (bool, bool)
@@ -92,8 +92,8 @@ def read(
         The format that the file must have, or a suffix of it without the dot ("hgt"), for a file whose name does not
         say so.
     room : Room, optional
-        Where large arrays go: NPY files are memory-mapped, rasters are read band by band into files. Other formats, and
-        what those hold beside numbers in the machine's byte order, are read into memory all the same.
+        Where large arrays go: NPY files are memory-mapped; rasters, NetCDF and Zarr are read window by window into
+        files, and so are binary PLOT3D and raw .vts. Other formats are read into memory all the same.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -174,6 +174,8 @@ def _closed(surface: Surface, closed: Closed) -> Surface:
 
 
 def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
+    if path.is_dir():
+        return _of_folder(path, wanted)
     _check_regular(path)
     with path.open("rb") as file:
         head = file.read(_HEAD)
@@ -216,14 +218,19 @@ def readable(name: str) -> Format:
 
 
 def _check_regular(path: Path) -> None:
-    mode = path.stat().st_mode
-    if stat.S_ISDIR(mode) and any((path / name).exists() for name in ("zarr.json", ".zgroup", ".zarray")):
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise FormatError("expected a regular file, got a folder, a pipe or a device")
+
+
+def _of_folder(path: Path, wanted: str | None) -> Format:
+    found = next((it for it in FORMATS if it.folder and it.folder(path)), None)
+    if wanted is not None and (format_ := readable(wanted)) != found:
         raise FormatError(
-            "expected a file, got a Zarr store: open it with xarray, and give one of its arrays to lodestream.encode, "
-            "which reads it by windows"
+            f"expected a file of format {format_.name}, got {'a folder' if found is None else found.name}"
         )
-    if not stat.S_ISREG(mode):
-        raise FormatError("expected a regular file, got a folder, pipe or device")
+    if found is None:
+        raise FormatError("expected a regular file or the folder of a Zarr store, got another folder")
+    return found
 
 
 def _readable() -> str:

@@ -11,7 +11,7 @@ from ..surface import Surface
 from . import bezier, glb, npy, npz, npz_writer, off, text_arrays
 from .netcdf import reader as netcdf
 from .netcdf import writer as netcdf_writer
-from .netcdf import zarr_store
+from .netcdf import zarr_reader, zarr_store
 from .obj import reader as obj
 from .obj import writer as obj_writer
 from .pcd import reader as pcd
@@ -66,6 +66,8 @@ class Format:
     write_beside : callable or None
         Takes a `Surface` and the path of its file or folder, for a format of several files: it puts them all in place,
         complete or not at all. `write` makes a ZIP archive of them then, if there is one.
+    folder : callable or None
+        ``folder(path)`` tells whether a folder has this format; None if it is a file.
     memory : int
         Bytes that writing takes for each point, beside the surface, about; 0 where it takes some rows at a time, of a
         surface that is in files.
@@ -85,6 +87,7 @@ class Format:
     process: bool = False
     write_suffixes: tuple[str, ...] = ()
     write_beside: Callable[[Surface, Path], None] | None = None
+    folder: Callable[[Path], bool] | None = None
     memory: int = 0
 
     @property
@@ -145,6 +148,9 @@ FORMATS = (
         name="zarr",
         suffixes=zarr_store.SUFFIXES,
         sniff=zarr_store.sniff,
+        folder=zarr_reader.is_store,
+        read=zarr_reader.read,
+        options={key: text for key, text in netcdf.READ_OPTIONS.items() if key != "resolution"},
         write_beside=zarr_store.write_beside,
     ),
     Format(

@@ -108,7 +108,7 @@ def check(
     found = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
     for format_ in found:
         if format_.read is None:
-            readable = ", ".join(item.name for item in formats() if item.read)
+            readable = ", ".join(item.name for item in formats() if item.read and not item.folder)
             raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
     _check_allowed(found[0].names, names[0], allowed)
     for key in options.chosen:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import signal
 import socket
@@ -136,6 +137,47 @@ def test_decode_with_little_memory_writes_the_same_file(
     assert json.loads(stdout)["ended"] == "complete"
     assert contents(tmp_path / out) == contents(tmp_path / f"whole-{out}")
     assert names(tmp_path) == {"a.lode", out, f"whole-{out}"}
+
+
+@pytest.mark.parametrize("at", ["values", "file"])
+def test_what_a_killed_decode_left_is_removed_by_the_next(run: Run, expected: bytes, tmp_path: Path, at: str) -> None:
+    pytest.importorskip("rasterio")
+    (tmp_path / "a.lode").write_bytes(expected)
+    out = tmp_path / "a.tif"
+    out.write_text("as it was")
+    slow = {**environment(), "LODESTREAM_THREADS": "1"}
+    command = [*COMMAND, "decode", str(tmp_path / "a.lode"), str(out), *LITTLE]
+    process = subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    end = time.monotonic() + PATIENCE
+    while not list(tmp_path.glob(f".a.tif.*/{at}/*")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.001)
+    ended(process, signal.SIGKILL)
+    assert len(names(tmp_path)) == 3
+    assert out.read_text() == "as it was"
+    assert run("decode", tmp_path / "a.lode", tmp_path / "b.npy", *LITTLE)[0] == 0
+    assert names(tmp_path) == {"a.lode", "a.tif", "b.npy"}
+
+
+def test_errors_name_the_file_and_not_the_folder_on_the_way(
+    run: Run, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("zarr")
+    (tmp_path / "a.lode").write_bytes(expected)
+    (tmp_path / "a.zarr").write_text("a file")
+    code, _, stderr = run("decode", tmp_path / "a.lode", tmp_path / "a.zarr", *LITTLE)
+    assert code == 1
+    assert "a.zarr: expected a place for the folder of a Zarr store, got a file" in stderr
+
+    def full(surface: object, path: str) -> None:
+        raise OSError(errno.ENOSPC, "no space left", path)
+
+    monkeypatch.setattr("lodestream.formats.write", full)
+    code, _, stderr = run("decode", tmp_path / "a.lode", tmp_path / "a.npy", *LITTLE)
+    assert code == 1
+    assert f"{tmp_path / 'a.npy'}: no space left" in stderr
+    assert names(tmp_path) == {"a.lode", "a.zarr"}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import multiprocessing
 import os
 import signal
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 
 from lodestream.bands import folders
-from lodestream.bands.folders import build_folder, remove, replacing
+from lodestream.bands.folders import build_folder, passing_folder, remove, replacing
 from lodestream.errors import InputError
 from lodestream.scratch import Scratch
 
@@ -214,3 +215,107 @@ def test_two_that_write_one_file_do_not_mix(tmp_path: Path) -> None:
         second.write_bytes(b"second")
     assert path.read_bytes() == b"first"
     assert names(tmp_path) == {"a.lode"}
+
+
+def _passing(above: Path, ready: Connection) -> None:
+    with passing_folder(above / "a.npy", ENTRIES) as folder:
+        fill(folder)
+        ready.send(folder.name)
+        time.sleep(600)
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> Path:
+    """A folder on the way to a file, of a process that was killed."""
+    ours, theirs = multiprocessing.Pipe()
+    process = multiprocessing.get_context("spawn").Process(target=_passing, args=(tmp_path, theirs))
+    process.start()
+    name = ours.recv()
+    with passing_folder(tmp_path / "b.npy", ENTRIES) as own:
+        assert names(tmp_path) == {name, own.name}, "somebody is at work there"
+    assert names(tmp_path) == {name}
+    process.kill()
+    process.join()
+    return tmp_path / str(name)
+
+
+def test_what_a_killed_process_left_on_the_way_to_a_file_is_removed(left: Path) -> None:
+    with passing_folder(left.parent / "other.tif", ENTRIES) as folder:
+        assert names(left.parent) == {folder.name}
+        assert folder.stat().st_mode & 0o777 == 0o700
+    assert not names(left.parent)
+
+
+def _other_words(folder: Path) -> None:
+    (folder / folders._MARK).write_text("A folder of mine.\nprocess 1 on here\n")
+
+
+def _other_machine(folder: Path) -> None:
+    mark = folder / folders._MARK
+    mark.write_text(mark.read_text().rpartition(" on ")[0] + " on another-machine\n")
+
+
+def _no_mark(folder: Path) -> None:
+    (folder / folders._MARK).unlink()
+
+
+def _linked_mark(folder: Path) -> None:
+    mark = folder / folders._MARK
+    mark.rename(folder.parent / "kept")
+    mark.symlink_to(folder.parent / "kept")
+
+
+def _two_names(folder: Path) -> None:
+    os.link(folder / folders._MARK, folder.parent / "kept")
+
+
+def _pipe_for_a_mark(folder: Path) -> None:
+    (folder / folders._MARK).unlink()
+    os.mkfifo(folder / folders._MARK)
+
+
+@pytest.mark.parametrize("change", [_other_words, _other_machine, _no_mark, _linked_mark, _two_names, _pipe_for_a_mark])
+def test_what_may_be_of_somebody_else_stays(left: Path, change: Callable[[Path], None]) -> None:
+    change(left)
+    before = {path: path.lstat().st_size for path in left.parent.rglob("*")}
+    with passing_folder(left.parent / "a.npy", ENTRIES):
+        pass
+    assert {path: path.lstat().st_size for path in left.parent.rglob("*")} == before
+
+
+def test_a_link_of_such_a_name_is_not_followed(left: Path, tmp_path: Path) -> None:
+    left.rename(tmp_path / "elsewhere")
+    left.symlink_to(tmp_path / "elsewhere")
+    with passing_folder(tmp_path / "a.npy", ENTRIES):
+        pass
+    assert (tmp_path / "elsewhere" / "tasks" / "x.npy").exists()
+    assert left.is_symlink()
+
+
+def test_what_others_put_there_stays_with_the_mark(left: Path) -> None:
+    (left / "diary.txt").write_text("dear diary")
+    for _ in range(2):
+        with passing_folder(left.parent / "a.npy", ENTRIES):
+            pass
+        assert names(left) == {"diary.txt", folders._MARK}
+
+
+def test_a_file_system_without_locks_keeps_what_was_left(left: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def without(handle: int, how: int) -> None:
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.setattr("lodestream.bands.folders.fcntl.flock", without)
+    with passing_folder(left.parent / "a.npy", ENTRIES):
+        pass
+    assert (left / "tasks" / "x.npy").exists()
+
+
+def test_after_an_error_too_it_is_gone(tmp_path: Path) -> None:
+    def interrupted() -> None:
+        with passing_folder(tmp_path / "a.npy", ENTRIES) as folder:
+            fill(folder)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert not names(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import socket
 import struct
 import tempfile
@@ -308,7 +309,9 @@ def test_obj_stops_reading_at_the_limit(tmp_path: Path) -> None:
 
 
 def test_folders_and_pipes_are_refused(tmp_path: Path) -> None:
-    refuse(tmp_path, FormatError, "expected a regular file, got a folder, pipe or device")
+    refuse(tmp_path, FormatError, "expected a regular file or the folder of a Zarr store, got another folder")
+    os.mkfifo(tmp_path / "pipe")
+    refuse(tmp_path / "pipe", FormatError, "expected a regular file, got a folder, a pipe or a device")
 
 
 def test_options_are_checked_before_the_file_is_read(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lodestream import formats
 from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
 from lodestream.formats.list_directed import read_numbers
+from lodestream.scratch import Room
 from lodestream.surface import Surface
 
 Dims = tuple[int, ...]
@@ -62,6 +63,16 @@ class Written:
             words += map(repr, self.coordinates(block).reshape(-1).tolist())
             words += map(str, self.blank(block).tolist() * self.iblank)
         return "\n".join(words) + "\n"
+
+
+def test_text_that_takes_more_memory_is_refused_with_its_figure(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(300.0), np.arange(400.0))
+    path = tmp_path / "a.fmt"
+    path.write_text("300 400 1\n" + "\n".join(map(repr, np.stack((x, y, x * y)).ravel().tolist())))
+    expected = r"at most 1 MiB to read, got text that takes about [56] MiB: only binary files are read by windows"
+    with pytest.raises(TooLargeError, match=expected):
+        formats.read(path, room=Room(memory=1 << 20))
+    assert formats.read(path, room=Room(memory=16 << 20)).shape == (400, 300)
 
 
 @st.composite

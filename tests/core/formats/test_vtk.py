@@ -18,9 +18,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream import formats
+from lodestream.bands.references import root_of
 from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError, UnavailableError
-from lodestream.formats.vtk import grids
+from lodestream.formats.vtk import grids, xml_files
 from lodestream.mesh.cells import unpack_cells
+from lodestream.scratch import Room, Scratch
 
 pytest.importorskip("vtkmodules")
 
@@ -271,10 +273,78 @@ def test_a_reader_that_ends_has_not_refused_the_file(
 ) -> None:
     script, path = tmp_path / "reader.py", tmp_path / "a.vts"
     script.write_text(f"import os, signal, sys\n{death}\n")
-    path.write_bytes(appended(len(RAW)))
+    path.write_bytes(vts(in_base64(len(RAW))))
     monkeypatch.setattr(grids, "_SCRIPT", script)
     with pytest.raises(UnavailableError, match=rf"ended before it had answered \({words}\); it may take \d+ MiB and"):
         formats.read(path)
+
+
+def _raw(path: Path, order: str) -> None:
+    """A volume with every kind of point data, and data of cells, appended as bytes."""
+    dims = (7, 5, 4)
+    count = 7 * 5 * 4
+    ghosts = np.zeros(count, np.uint8)
+    ghosts[::9] = 2
+    arrays: dict[str, NDArray[Any]] = {
+        "speed": np.arange(count, dtype=np.int16),
+        "kind": np.arange(count * 2, dtype=np.uint32).reshape(count, 2),
+        "up": points_of(dims, "f4"),
+        "place": points_of(dims, "f4")[:, :2].copy(),
+        "paint": (points_of(dims) % 256).astype(np.uint8),
+        "vtkGhostType": ghosts,
+        "area": np.arange(6.0 * 4 * 3),
+    }
+    grid = grid_of(dims, points_of(dims, "f4"), arrays)
+    data = grid.GetPointData()
+    data.SetActiveNormals("up")
+    data.SetActiveTCoords("place")
+    data.SetActiveScalars("paint")
+    told: dict[str, Any] = {"SetDataModeToAppended": None, "SetEncodeAppendedData": 0, "SetCompressorTypeToNone": None}
+    write(vtkXMLStructuredGridWriter(), grid, path, **told, **{order: None})
+
+
+@pytest.mark.parametrize("plane", ["i0", "j2,k-1", "k1"])
+@pytest.mark.parametrize("order", ["SetByteOrderToLittleEndian", "SetByteOrderToBigEndian"])
+@pytest.mark.filterwarnings("ignore::lodestream.FormatWarning")
+def test_what_is_mapped_is_what_vtk_reads(
+    tmp_path: Path, plane: str, order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _raw(tmp_path / "g.vts", order)
+    room = Room(lambda: Scratch(tmp_path / "room"), 1)
+    with monkeypatch.context() as context:
+        context.setattr(grids, "_SCRIPT", None)  # VTK is not asked
+        found = formats.read(tmp_path / "g.vts", plane=plane, room=room)
+    monkeypatch.setattr(xml_files, "_mapped", lambda *_: None)
+    expected = formats.read(tmp_path / "g.vts", plane=plane)
+    assert found.metadata == expected.metadata
+    for one, other in zip(found.blocks, expected.blocks, strict=True):
+        assert one.points.dtype == other.points.dtype
+        np.testing.assert_array_equal(one.points, other.points)
+        assert one.holes == other.holes
+        assert set(one.attributes) == {"speed", "kind", "normal", "uv", "color"}
+        assert list(one.attributes) == list(other.attributes)
+        for name, values in one.attributes.items():
+            assert values.dtype == other.attributes[name].dtype
+            np.testing.assert_array_equal(values, other.attributes[name])
+            assert root_of(values) is not None
+
+
+@pytest.mark.parametrize("changed", [(b'"area"', b'"vtkGhostType"'), (b"Float32", b"Int32"), (b'"kind"', b'"speed"')])
+def test_what_cannot_be_mapped_is_left_to_vtk(tmp_path: Path, changed: tuple[bytes, bytes]) -> None:
+    _raw(tmp_path / "g.vts", "SetByteOrderToLittleEndian")
+    content = (tmp_path / "g.vts").read_bytes()
+    assert xml_files._checked(tmp_path / "g.vts")[2] is not None
+    (tmp_path / "g.vts").write_bytes(content.replace(*changed))
+    assert xml_files._checked(tmp_path / "g.vts")[2] is None
+
+
+def test_what_vtk_reads_is_refused_with_its_memory(tmp_path: Path) -> None:
+    dims = (300, 200, 1)
+    write(vtkXMLStructuredGridWriter(), grid_of(dims, points_of(dims)), tmp_path / "g.vts")
+    expected = r"at most 1 MiB to read by VTK, got one that takes about 5 MiB: only \.vts of one piece, uncompressed"
+    with pytest.raises(TooLargeError, match=expected):
+        formats.read(tmp_path / "g.vts", room=Room(memory=1 << 20))
+    assert formats.read(tmp_path / "g.vts", room=Room(memory=8 << 20)).shape == (200, 300)
 
 
 def test_an_xml_file_that_promises_too_much_is_refused(tmp_path: Path) -> None:

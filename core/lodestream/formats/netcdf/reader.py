@@ -24,7 +24,7 @@ from . import hdf5_guard, vmec
 from .choice import Choice, choose, others
 from .names import AXIS_WORDS, axis_words
 
-__all__ = ["KINDS", "READ_OPTIONS", "pieces", "read", "sniff", "surface_of"]
+__all__ = ["KINDS", "READ_OPTIONS", "chosen_of", "pieces", "read", "sniff", "surface_of"]
 
 #: What is read by other rules than a NetCDF of heights.
 KINDS = ("vmec",)
@@ -73,14 +73,25 @@ def read(source: Source) -> Surface:
         check_allowed(("netcdf",), source.allowed)
         if "resolution" in source.options:
             raise OptionError("expected resolution= for a VMEC file only, got another NetCDF")
-        choice = choose(source, dataset)
-        source.check_array(choice.shape, np.dtype(np.float64))
-        source.check_expansion(choice.nbytes)
-        left_out = others(dataset, choice)
-        surface = surface_of(source, dataset, choice)
+        source.check_expansion(choose(source, dataset).nbytes)
+        surface, left_out = chosen_of(source, dataset, "netcdf")
     if left_out:  # said here, for the libraries' own warnings are not shown while the file is open
         warn(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
     return surface
+
+
+def chosen_of(source: Source, dataset: Any, format_name: str) -> tuple[Surface, list[str]]:
+    """What is chosen of an xarray Dataset, with values as they are stored; and the variables that are left out.
+
+    Raises
+    ------
+    InputError
+        If nothing can be chosen, or it is no surface.
+    """
+    choice = choose(source, dataset)
+    source.check_array(choice.shape, np.dtype(np.float64))
+    left_out = others(dataset, choice)
+    return surface_of(source, dataset, choice, format_name), left_out
 
 
 @contextmanager
@@ -125,7 +136,7 @@ def _opened(source: Source) -> Iterator[Any]:
         raise FormatError(f"expected a whole NetCDF, got one that is not readable: {reason[:120]}") from None
 
 
-def surface_of(source: Source, dataset: Any, choice: Choice) -> Surface:
+def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str = "netcdf") -> Surface:
     """What was chosen of an xarray Dataset, with values as they are stored.
 
     Raises
@@ -134,7 +145,7 @@ def surface_of(source: Source, dataset: Any, choice: Choice) -> Surface:
         If the arrays are no surface.
     """
     said = {} if choice.heights is None else _metadata(dataset, dataset.variables[choice.heights])
-    metadata = source.metadata("netcdf") | _tags(dataset, choice, said.get("crs"))
+    metadata = source.metadata(format_name) | _tags(dataset, choice, said.get("crs"))
     mask: NDArray[np.bool_] | None = None
     axes: list[Coordinate | None] = []
     for found in (choice.x, choice.y):
@@ -150,7 +161,7 @@ def surface_of(source: Source, dataset: Any, choice: Choice) -> Surface:
     if choice.heights is None:
         points = np.stack(np.broadcast_arrays(x.values, y.values), axis=-1)
         surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
-        return _closed_fields(source, dataset, choice, merge(surface, source.closed))
+        return _closed_fields(source, dataset, choice, merge(surface, source.closed, room=source.room))
     variable = dataset.variables[choice.heights]
     heights, valid = _values(source, variable, choice.index)
     mask = _both(mask, valid)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FormatError
+from ...scratch import Room
 from ..list_directed import is_text, read_numbers
 from ..planes import Dims
 from ..source import Source, number
@@ -175,8 +176,8 @@ class Layout:
 class _Text:
     text = True
 
-    def __init__(self, path: Path) -> None:
-        self._numbers, self._integers = read_numbers(path)
+    def __init__(self, path: Path, room: Room) -> None:
+        self._numbers, self._integers = read_numbers(path, room.memory)
         self.size = len(self._numbers)
 
     def integers(self, place: int, count: int, endian: str) -> tuple[int, ...] | None:
@@ -212,11 +213,11 @@ class _Binary:
         return self._bytes[place : place + count * dtype.itemsize].view(dtype)
 
 
-def open_numbers(path: Path) -> Numbers:
-    """Open a file; text is read as a whole, a binary file is mapped into memory."""
+def open_numbers(path: Path, room: Room) -> Numbers:
+    """Open a file; text is read as a whole, where there is memory for it, a binary file is mapped into memory."""
     with path.open("rb") as file:
         text = is_text(file.read(4096))
-    return _Text(path) if text else _Binary(path)
+    return _Text(path, room) if text else _Binary(path)
 
 
 def dimensions_of(source: Source) -> dict[str, object]:

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 from ...coordinates import seams
 from ...errors import FormatError, OptionError
+from ...scratch import Room, rows_at_once
 from ...surface import Block, Surface
 from .. import planes
 from ..list_directed import is_text
 from ..notes import warn
-from ..planes import Cut
+from ..planes import Cut, stacked
 from ..source import Source
 from .layouts import REFERENCES, Layout, Numbers, dimensions_of, find_layout, open_numbers
 
@@ -68,7 +69,7 @@ def read(source: Source) -> Surface:
     OptionError
         If there are two Q files.
     """
-    numbers = open_numbers(source.path)
+    numbers = open_numbers(source.path, source.room)
     layout = find_layout(numbers, ["grid"], dimensions_of(source))
     chosen = source.integer_option("block", 1, len(layout.dims))
     given = range(len(layout.dims)) if chosen is None else [chosen - 1]
@@ -79,49 +80,64 @@ def read(source: Source) -> Surface:
     attributes: list[dict[str, NDArray[Any]]] = [{} for _ in indices]
     functions = 0
     for path in source.more:
-        fields = _Fields(path, layout, functions)
+        fields = _Fields(path, layout, functions, source.room)
         functions += fields.functions
         if fields.metadata and "scalars" in metadata:
             raise OptionError(f"expected one Q file, got another: {path.name}")
         metadata |= fields.metadata
         for index, cut, values in zip(indices, taken, attributes, strict=True):
-            values |= fields.read(index, cut)
+            values |= fields.read(index, cut, source.room)
     places = layout.places_of_blocks()
     blanks = [_iblank(numbers, layout, places[index], cut) for index, cut in zip(indices, taken, strict=True)]
-    if any(blank is not None and not np.isin(blank, (0, 1)).all() for blank in blanks):
-        for blank, values in zip(blanks, attributes, strict=True):
+    if any(blank is not None and _says_more(blank) for blank in blanks):
+        for blank, cut, values in zip(blanks, taken, attributes, strict=True):
             if blank is not None:
-                values["iblank"] = blank
+                values["iblank"] = cut.of(blank, source.room)
     blocks = [
         Block(
-            _points(numbers, layout, places[index], cut), mask=None if blank is None else blank != 0, attributes=values
+            _points(numbers, layout, places[index], cut, source.room),
+            mask=None if blank is None else _mask(cut.view(blank), source.room),
+            attributes=values,
         )
         for index, cut, blank, values in zip(indices, taken, blanks, attributes, strict=True)
     ]
-    return seams.merge(Surface(blocks=blocks, metadata=metadata), source.closed)
+    return seams.merge(Surface(blocks=blocks, metadata=metadata), source.closed, room=source.room)
 
 
-def _points(numbers: Numbers, layout: Layout, place: int, cut: Cut) -> NDArray[Any]:
+def _points(numbers: Numbers, layout: Layout, place: int, cut: Cut, room: Room) -> NDArray[Any]:
     count = prod(cut.dims)
     channels = [
-        cut.of(numbers.array(place + axis * count * layout.item, count, layout, "f"))
+        cut.view(numbers.array(place + axis * count * layout.item, count, layout, "f"))
         for axis in range(layout.dimensions)
     ]
-    return np.stack(channels, axis=-1)
+    return stacked(channels, room)
 
 
 def _iblank(numbers: Numbers, layout: Layout, place: int, cut: Cut) -> NDArray[Any] | None:
+    """IBLANK of a whole block, int32, shape (k * j * i,), where a file has it."""
     if not layout.iblank:
         return None
     count = prod(cut.dims)
-    return cut.of(numbers.array(place + layout.dimensions * count * layout.item, count, layout, "i"))
+    return numbers.array(place + layout.dimensions * count * layout.item, count, layout, "i")
+
+
+def _says_more(blank: NDArray[Any]) -> bool:
+    """Whether IBLANK says more than which points are holes."""
+    return not all(np.isin(blank[part], (0, 1)).all() for part in rows_at_once(blank.shape))
+
+
+def _mask(blank: NDArray[Any], room: Room) -> NDArray[np.bool_]:
+    mask = room.empty(blank.shape, np.bool_)
+    for rows in rows_at_once(blank.shape):
+        mask[rows] = blank[rows] != 0
+    return mask
 
 
 class _Fields:
     """A Q file or function file that belongs to a grid."""
 
-    def __init__(self, path: Path, grid: Layout, functions: int) -> None:
-        self._numbers = open_numbers(path)
+    def __init__(self, path: Path, grid: Layout, functions: int, room: Room) -> None:
+        self._numbers = open_numbers(path, room)
         known: dict[str, object] = {"blocks": grid.multi, "dimensions": grid.dimensions}
         if grid.precision and not self._numbers.text:
             known |= {"endian": grid.endian, "records": grid.records}
@@ -147,19 +163,20 @@ class _Fields:
             warn("left out the reference numbers of later blocks of a Q file, which differ from those of the first")
         return {name: float(value) for name, value in zip(_REFERENCES, values[0], strict=True)}
 
-    def read(self, index: int, cut: Cut) -> dict[str, NDArray[Any]]:
+    def read(self, index: int, cut: Cut, room: Room) -> dict[str, NDArray[Any]]:
         """Read the fields of one block."""
         layout = self._layout
         place = self._places[index]
         count = prod(cut.dims)
         fields = [
-            cut.of(self._numbers.array(place + field * count * layout.item, count, layout, "f"))
+            self._numbers.array(place + field * count * layout.item, count, layout, "f")
             for field in range(layout.variables[index])
         ]
         if layout.kind == "function":
-            return {f"function_{self._first + number + 1}": values for number, values in enumerate(fields)}
+            named = {f"function_{self._first + number + 1}": values for number, values in enumerate(fields)}
+            return {name: cut.of(values, room) for name, values in named.items()}
         return {
-            "density": fields[0],
-            "momentum": np.stack(fields[1:-1], axis=-1),
-            "stagnation_energy": fields[-1],
+            "density": cut.of(fields[0], room),
+            "momentum": stacked([cut.view(values) for values in fields[1:-1]], room),
+            "stagnation_energy": cut.of(fields[-1], room),
         }

@@ -12,9 +12,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from math import prod
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from ...coordinates.seams import merge
 from ...errors import FormatError, TooLargeError, UnavailableError
 from ...mesh.cells import pack_cells
+from ...scratch import Room
 from ...surface import Block, Surface
 from ..attributes import COLOR, NORMAL, TEXTURE
 from ..notes import keep_words, listing, warn
@@ -32,10 +34,12 @@ from ..planes import Cut, Dims, cuts
 from ..source import Source, number
 from .ghosts import HIDDEN_CELL, HIDDEN_POINT
 
-__all__ = ["Reading", "check_arrays", "read_grids", "without_hidden"]
+__all__ = ["Mapped", "Reading", "check_arrays", "read_grids", "without_hidden"]
 
 #: What VTK may take for a small file, beside what it takes for itself.
 _MEMORY = 128 << 20
+#: And what it takes for each byte of the arrays, about.
+_OF_ARRAYS = 3
 
 #: VTK looks through all arrays of a grid to add one.
 _MOST_ARRAYS = 1_000
@@ -47,6 +51,25 @@ _SECONDS, _BYTES_A_SECOND = 20, 1 << 20
 _LAST_SECONDS = 10.0  # for a process that says nothing any more
 _SCRIPT = Path(__file__).with_name("process.py")
 _ROLES = {"normals": (NORMAL, (3,), "f"), "texture": (TEXTURE, (2,), "f")}
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """A grid whose arrays are memory-mapped.
+
+    Attributes
+    ----------
+    dims : (int, int, int)
+        Points along i, j and k.
+    arrays : tuple of (str, str, array)
+        Role, name and values, shape (point,) or (point, component); roles are those of `process`.
+    left_out : tuple of str
+        Names of data that do not belong to points.
+    """
+
+    dims: Dims
+    arrays: tuple[tuple[str, str, NDArray[Any]], ...]
+    left_out: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +85,15 @@ class Reading:
         Bytes of its arrays, or what they can be.
     dims : (int, int, int) or None
         Points along i, j and k, where that is known.
+    mapped : Mapped or None
+        What the file has, where it can be memory-mapped; then VTK does not read it.
     """
 
     kind: str
     path: Path
     promised: int
     dims: Dims | None = None
+    mapped: Mapped | None = None
 
 
 def check_arrays(count: int) -> None:
@@ -99,8 +125,10 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
     FormatError
         When VTK refuses a file; with its reason.
     """
-    if importlib.util.find_spec("vtkmodules") is None:
+    for_vtk = [file for file in files if file.mapped is None]
+    if for_vtk and importlib.util.find_spec("vtkmodules") is None:
         raise UnavailableError(f"expected VTK for {format_name}, which is not installed: install lodestream[vtk]")
+    _check_memory(source, for_vtk)
     known = [file.dims for file in files if file.dims is not None]
     taken, metadata = cuts(source, known) if len(known) == len(files) else ([], {})
     blocks: list[Block] = []
@@ -109,15 +137,15 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
     left_out: list[str] = []
     words: dict[str, str] = {}
     for file in files:
-        with _started(file) as (grids, output):
+        with _grids(file, source.room) as (grids, arrays):
             if not known:
                 taken, metadata = cuts(source, [tuple(grid["dims"]) for grid in grids])
             for grid in grids:
-                planes = [_Plane(cut) for cut in taken[count]] if count < len(taken) else []
+                planes = [_Plane(cut, source.room) for cut in taken[count]] if count < len(taken) else []
                 if not planes or tuple(grid["dims"]) != planes[0].cut.dims:
                     raise FormatError(f"expected one grid for each header, got others in {file.path.name}")
                 count += 1
-                _receive(grid, planes, output)
+                _take(arrays, len(grid["arrays"]), planes)
                 for plane in planes:
                     block, face = plane.block()
                     blocks.append(block)
@@ -130,7 +158,35 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
     if any(faces):
         metadata["faces"] = faces if len(faces) > 1 else faces[0]
     metadata = source.metadata(format_name) | words | metadata
-    return merge(Surface(blocks=blocks, metadata=metadata), source.closed)
+    return merge(Surface(blocks=blocks, metadata=metadata), source.closed, room=source.room)
+
+
+#: Role, name and values of arrays, as they are read.
+_Arrays = Iterator[tuple[str, str, NDArray[Any]]]
+
+
+def _check_memory(source: Source, files: Sequence[Reading]) -> None:
+    """Refuse what VTK, which reads files as a whole, takes too much memory for."""
+    needed = sum(_OF_ARRAYS * file.promised for file in files)
+    if source.room.memory is not None and needed > source.room.memory:
+        raise TooLargeError(
+            f"expected a file that takes at most {number(source.room.memory >> 20)} MiB to read by VTK, got one that "
+            f"takes about {number(-(-needed >> 20))} MiB: only .vts of one piece, uncompressed, appended and raw, are "
+            "read by planes"
+        )
+
+
+@contextmanager
+def _grids(file: Reading, room: Room) -> Iterator[tuple[list[Any], _Arrays]]:
+    """The description of the grids of a file, and their arrays, one after the other."""
+    if file.mapped is not None:
+        mapped = file.mapped
+        grid = {"dims": mapped.dims, "arrays": mapped.arrays, "left_out": mapped.left_out, "words": {}}
+        yield [grid], iter(mapped.arrays)
+        return
+    with _started(file) as (grids, output):
+        described = (array for grid in grids for array in grid["arrays"])
+        yield grids, ((array["role"], array["name"], _received(output, array, room)) for array in described)
 
 
 @contextmanager
@@ -179,12 +235,10 @@ def _printable(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)[:400]
 
 
-def _receive(grid: Any, planes: Sequence[_Plane], output: IO[bytes]) -> None:
-    """Take the arrays of one grid from the pipe, and of each what the planes need."""
+def _take(arrays: _Arrays, count: int, planes: Sequence[_Plane]) -> None:
+    """Take the arrays of one grid, and of each what the planes need."""
     dims = planes[0].cut.dims
-    for array in grid["arrays"]:
-        values = _received(output, np.dtype(array["dtype"]), tuple(array["shape"]))
-        role, name = array["role"], array["name"]
+    for role, name, values in islice(arrays, count):
         if role not in ("axis", "cell_ghost") and len(values) != prod(dims):
             raise FormatError(f"expected {number(prod(dims))} values of {name or 'the points'}, got {len(values)}")
         unheld = role == "cell_ghost" and any(_hidden_cells(values, plane.cut) is None for plane in planes)
@@ -197,8 +251,8 @@ def _receive(grid: Any, planes: Sequence[_Plane], output: IO[bytes]) -> None:
 class _Plane:
     """A surface of one grid, while its arrays arrive."""
 
-    def __init__(self, cut: Cut) -> None:
-        self.cut = cut
+    def __init__(self, cut: Cut, room: Room) -> None:
+        self.cut, self._room = cut, room
         self._points: NDArray[Any] | None = None
         self._axes: list[NDArray[Any]] = []
         self._attributes: dict[str, NDArray[Any]] = {}
@@ -212,11 +266,11 @@ class _Plane:
         elif role == "cell_ghost":
             self._hidden = _hidden_cells(values, self.cut)
         elif role == "points":
-            self._points = self.cut.of(values)
+            self._points = self.cut.of(values, self._room)
         elif role == "point_ghost":
             self._mask = self.cut.of(values) & HIDDEN_POINT == 0
         else:
-            self._attributes[_attribute_name(role, name, values)] = self.cut.of(values)
+            self._attributes[_attribute_name(role, name, values)] = self.cut.of(values, self._room)
 
     def block(self) -> tuple[Block, dict[str, Any]]:
         """The surface, and what is to be said of its faces."""
@@ -231,8 +285,8 @@ class _Plane:
         return Block(points, mask=mask, attributes=self._attributes), face
 
 
-def _received(output: IO[bytes], dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    values = np.empty(shape, dtype)
+def _received(output: IO[bytes], array: Mapping[str, Any], room: Room) -> NDArray[Any]:
+    values = room.empty(tuple(array["shape"]), np.dtype(array["dtype"]))
     rest = values.reshape(-1).view(np.uint8).data
     while rest:
         got = output.read(min(len(rest), 1 << 20))

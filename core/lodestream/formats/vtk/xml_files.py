@@ -16,12 +16,15 @@ from pathlib import Path
 from typing import Any
 from xml.parsers import expat
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ...errors import FormatError, TooLargeError
 from ...surface import Surface
 from .. import planes
 from ..planes import Dims
 from ..source import Source, number
-from .grids import Reading, check_arrays, read_grids
+from .grids import Mapped, Reading, check_arrays, read_grids
 
 __all__ = ["MORE", "OPTIONS", "SUFFIXES", "read", "sniff"]
 
@@ -32,6 +35,9 @@ MORE = "one more block each"
 _CHUNK = 1 << 16
 _SIZES = {"Int8": 1, "UInt8": 1, "Int16": 2, "UInt16": 2, "Int32": 4, "UInt32": 4, "Int64": 8, "UInt64": 8}
 _SIZES |= {"Float32": 4, "Float64": 8}
+#: Kind and bits in the name of a type, and numpy's letter of the kind.
+_TYPE, _LETTERS = re.compile(r"(U?Int|Float)(8|16|32|64)"), {"Int": "i", "UInt": "u", "Float": "f"}
+_GHOSTS = "vtkGhostType"
 _SECTIONS = ("PointData", "CellData", "Points")
 
 #: VTK looks through all attributes of an element to add one.
@@ -60,11 +66,11 @@ def read(source: Source) -> Surface:
     readings = []
     for path in (source.path, *source.more):
         try:
-            dims, promised = _checked(path)
+            dims, promised, mapped = _checked(path)
         except FormatError as error:
             raise FormatError(f"{path.name}: {error}" if source.more else str(error)) from None
         source.check_expansion(promised)
-        readings.append(Reading("xml", path, promised, dims))
+        readings.append(Reading("xml", path, promised, dims, mapped))
     return read_grids(source, "vts", readings)
 
 
@@ -74,6 +80,7 @@ class _Array:
 
     attributes: dict[str, str]
     tuples: int
+    section: str = ""
     text: str = ""
     characters: int = 0
 
@@ -102,14 +109,15 @@ class _Found:
     pieces: int = 0
     named: int = 0  # arrays of any kind, of field data too
     section: str = ""
+    active: dict[str, str] = field(default_factory=dict)  # which point data are scalars, normals, ...
     arrays: list[_Array] = field(default_factory=list)
     open_array: bool = False
     appended: dict[str, str] | None = None
     appended_at: int = -1
 
 
-def _checked(path: Path) -> tuple[Dims, int]:
-    """Check the headers of a file; give the points of its grid along i, j and k and the bytes of its arrays."""
+def _checked(path: Path) -> tuple[Dims, int, Mapped | None]:
+    """Check the headers of a file; give the points of its grid along i, j and k, the bytes of its arrays, and them."""
     found = _parsed(path)
     kind = found.root.get("type", "none")
     if kind == "vtkMultiBlockDataSet":
@@ -125,7 +133,71 @@ def _checked(path: Path) -> tuple[Dims, int]:
     for array in found.arrays:
         _check_array(path, found, array)
     i, j, k = _lengths(found.whole)
-    return (i, j, k), promised
+    return (i, j, k), promised, _mapped(path, found, (i, j, k))
+
+
+#: Which role the point data have that an attribute of their element names.
+_ACTIVE = {"Normals": "normals", "TCoords": "texture", "Scalars": "scalars"}
+
+
+def _mapped(path: Path, found: _Found, dims: Dims) -> Mapped | None:
+    """The arrays of a file as maps of it; None where VTK must read them.
+
+    That is where there is more than one piece, or data of fields, or cells are hidden, or arrays are not bytes as they
+    are in memory.
+    """
+    raw = found.appended is not None and found.appended.get("encoding", "base64") == "raw"
+    one = found.pieces == 1 and found.piece == found.whole and found.named == len(found.arrays)
+    if not raw or not one or found.root.get("compressor"):
+        return None
+    arrays: list[tuple[str, str, NDArray[Any]]] = []
+    left_out: list[str] = []
+    names: set[tuple[str, str | None]] = set()
+    for array in found.arrays:
+        key = array.section, array.attributes.get("Name")
+        hides = key[1] == _GHOSTS and (array.section == "CellData" or array.attributes.get("type") != "UInt8")
+        if hides or key in names or (key[1] is None and array.section != "Points"):
+            return None
+        names.add(key)
+        if array.section == "CellData":
+            left_out.append(array.name)
+            continue
+        values = _values(path, found, array)
+        if values is None:
+            return None
+        arrays.append((_role(found, array), "" if array.section == "Points" else str(key[1]), values))
+    points = [values for role, _, values in arrays if role == "points"]
+    if len(points) != 1 or points[0].shape[1:] != (3,) or points[0].dtype.kind != "f":
+        return None
+    arrays.sort(key=lambda one: one[0] != "points")
+    return Mapped(dims, tuple(arrays), tuple(left_out))
+
+
+def _role(found: _Found, array: _Array) -> str:
+    if array.section == "Points":
+        return "points"
+    name = array.attributes.get("Name")
+    if name == _GHOSTS:
+        return "point_ghost"
+    return next((role for key, role in _ACTIVE.items() if found.active.get(key) == name), "point")
+
+
+def _values(path: Path, found: _Found, array: _Array) -> NDArray[Any] | None:
+    """The values of an array, shape (point,) or (point, component), where they are appended as bytes."""
+    if array.attributes.get("format") != "appended":
+        return None
+    place, room = _place(path, found, array)
+    words = _TYPE.fullmatch(array.attributes.get("type", ""))
+    if place is None or words is None:
+        return None
+    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
+    dtype = np.dtype(f"{order}{_LETTERS[words[1]]}{int(words[2]) // 8}")
+    place += 8 if found.root.get("header_type", "UInt32") == "UInt64" else 4
+    components = int(array.attributes.get("NumberOfComponents", "1"))
+    if array.tuples * components * dtype.itemsize > room:
+        return None
+    shape = (array.tuples,) if components == 1 else (array.tuples, components)
+    return np.memmap(path, dtype, "r", place, shape)
 
 
 class _Parser:
@@ -159,13 +231,15 @@ class _Parser:
                 lengths = _lengths(found.piece)
                 if found.section == "CellData":
                     lengths = tuple(max(length - 1, 1) for length in lengths)
-                found.arrays.append(_Array(attributes, prod(lengths)))
+                found.arrays.append(_Array(attributes, prod(lengths), found.section))
                 found.open_array = True
             case "AppendedData":
                 found.appended = attributes
                 found.appended_at = self.expat.CurrentByteIndex
             case _ if name in _SECTIONS:
                 found.section = name
+                if name == "PointData":
+                    found.active = attributes
 
     def _end(self, name: str) -> None:
         self.found.open_array = False
@@ -260,23 +334,30 @@ def _head(path: Path, found: _Found, array: _Array, length: int) -> tuple[bytes 
     in_base64 = 4 * ((length + 2) // 3)
     if array.attributes.get("format") == "binary":
         return _decoded(array.text.encode("ascii", "replace")[:in_base64], length), array.characters * 3 // 4
-    offset = array.attributes.get("offset", "")
-    if found.appended is None or not re.fullmatch(r"\d{1,18}", offset):
+    place, room = _place(path, found, array)
+    if found.appended is None or place is None:
         return None, 0
     raw = found.appended.get("encoding", "base64") == "raw"
     with path.open("rb") as file:
-        file.seek(found.appended_at)
-        start = file.read(1 << 12)
-        mark = start.find(b"_", start.find(b">"))
-        place = found.appended_at + mark + 1 + int(offset)
-        room = path.stat().st_size - place
-        if mark < 0 or room <= 0:
-            return None, 0
         file.seek(place)
         content = file.read(length if raw else in_base64)
     if raw:
         return content if len(content) == length else None, room
     return _decoded(content, length), room * 3 // 4
+
+
+def _place(path: Path, found: _Found, array: _Array) -> tuple[int | None, int]:
+    """Where an appended array begins in the file, or None where it lies outside; and how many bytes follow there."""
+    offset = array.attributes.get("offset", "")
+    if found.appended is None or not re.fullmatch(r"\d{1,18}", offset):
+        return None, 0
+    with path.open("rb") as file:
+        file.seek(found.appended_at)
+        start = file.read(1 << 12)
+    mark = start.find(b"_", start.find(b">"))
+    place = found.appended_at + mark + 1 + int(offset)
+    room = path.stat().st_size - place
+    return (None, 0) if mark < 0 or room <= 0 else (place, room)
 
 
 def _decoded(content: bytes, length: int) -> bytes | None:

@@ -1,0 +1,233 @@
+"""Zarr stores, versions 2 and 3 of the format: one variable as heights, by the rules of the reader of NetCDF."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from math import prod
+from pathlib import Path
+from typing import Any
+
+from ...errors import FormatError, InputError, TooLargeError, UnavailableError
+from ...sources import read_source
+from ...surface import Surface
+from ..notes import listing, warn
+from ..source import Source
+from .reader import chosen_of
+
+__all__ = ["folder_size", "is_store", "read"]
+
+#: What a folder has that is a group or an array.
+_HEADS = ("zarr.json", ".zgroup", ".zarray")
+
+#: Codecs and filters of both versions that turn bytes into numbers and do nothing else: pickle runs what a file says.
+_CODECS = frozenset(
+    (
+        *("bytes", "transpose", "sharding_indexed", "lodestream", "vlen-utf8", "vlen-bytes"),
+        *("blosc", "bz2", "gzip", "lz4", "lzma", "pcodec", "zlib", "zstd", "zfpy"),
+        *("astype", "bitround", "delta", "fixedscaleoffset", "packbits", "quantize", "shuffle"),
+        *("adler32", "crc32", "crc32c", "fletcher32", "jenkins_lookup3"),
+    )
+)
+
+
+def is_store(folder: Path) -> bool:
+    """Whether a folder is a store, or a group or an array in one."""
+    return any((folder / name).is_file() for name in _HEADS)
+
+
+def folder_size(folder: Path) -> int:
+    """Bytes of all files in a folder, but for those that vanish meanwhile."""
+    paths = (os.path.join(above, name) for above, _, names in os.walk(folder) for name in names)
+    return sum(os.lstat(path).st_size for path in paths if os.path.lexists(path))
+
+
+def read(source: Source) -> Surface:
+    """Read one variable of a group, its coordinates, and those that options make attributes; or the only array.
+
+    An array that is no member of a group is of shape (row, column) or (row, column, channel), and has its unit at most.
+    What is large for the room is read by windows of whole chunks. Chunks that are not there have the fill value.
+
+    Raises
+    ------
+    UnavailableError
+        If zarr or xarray is not installed.
+    FormatError
+        If the store is not whole, or a file of it lies elsewhere.
+    """
+    source = replace(source, size=folder_size(source.path))
+    notes: list[str] = []
+    with _opened(source, notes) as (array, dataset):
+        if dataset is None:
+            surface = _of_array(source, array)
+        else:
+            _check_chunks(source, (it.encoding.get("chunks") or () for it in dataset.variables.values()))
+            surface, left_out = chosen_of(source, dataset, "zarr")
+            if left_out:
+                notes.append(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
+    for text in notes:  # said here, for the libraries' own warnings are not shown while the store is open
+        warn(text)
+    return surface
+
+
+def _of_array(source: Source, array: Any) -> Surface:
+    if source.options:
+        raise FormatError(f"expected a group of variables for {', '.join(source.options)}=, got a single array")
+    source.check_array(tuple(array.shape), array.dtype)
+    _check_chunks(source, [array.chunks])
+    unit = array.attrs.get("units")
+    said = {"unit": unit} if isinstance(unit, str) and unit.strip() else {}
+    return Surface(read_source(array, source.room), metadata=source.metadata("zarr") | said)
+
+
+def _check_chunks(source: Source, chunks: Iterable[tuple[int, ...]]) -> None:
+    """Refuse chunks of implausibly more values than the store has bytes: each is in memory as a whole."""
+    for chunk in chunks:
+        source.check_expansion(8 * prod(chunk))
+
+
+@contextmanager
+def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any]]:
+    """The array that a store is, or the group that it is as a Dataset with values as they are stored.
+
+    Of a group, variables with codecs that are not known are left out, and named in the notes.
+    """
+    try:
+        import xarray
+        import zarr
+    except ImportError:
+        raise UnavailableError(
+            "expected zarr and xarray for Zarr stores, which are not both installed: install lodestream[zarr]"
+        ) from None
+    store = _store(zarr, source.path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # What a store says of its members in one place could be other than what their folders say.
+            node = (
+                zarr.open(store, mode="r")
+                if _is_array(source.path)
+                else zarr.open_group(store, mode="r", use_consolidated=False)
+            )
+            if isinstance(node, zarr.Array):
+                if unknown := _unknown(node.metadata.to_dict()):
+                    raise FormatError(f"expected an array in codecs that are known, got {unknown[:60]!r}")
+                yield node, None
+                return
+            left_out = _left_out(node)
+            if left_out:
+                notes.append(f"left out variables: {listing(left_out.values())}")
+            with xarray.open_dataset(
+                store,
+                engine="zarr",
+                consolidated=False,
+                decode_cf=False,
+                create_default_indexes=False,
+                cache=False,
+                chunks=None,
+                drop_variables=list(left_out),
+            ) as dataset:
+                yield None, dataset
+    except UnavailableError:
+        raise
+    except InputError as error:
+        raise type(error)("; ".join([str(error), *notes])) from None
+    except MemoryError:
+        raise TooLargeError("expected a Zarr store that fits into memory, got one that promises more") from None
+    except Exception as error:  # none of these libraries says what it may raise
+        reason = " ".join(str(error).replace(os.fspath(store.root), "the store").split()) or type(error).__name__
+        raise FormatError(f"expected a whole Zarr store, got one that is not readable: {reason[:120]}") from None
+
+
+def _left_out(group: Any) -> dict[str, str]:
+    """The arrays of a group that are no variables for us, each with the reason in words.
+
+    Raises
+    ------
+    FormatError
+        If there is no other.
+    """
+    found: dict[str, str] = {}
+    others = False
+    for name, array in group.arrays():
+        described = array.metadata.to_dict()
+        if codec := _unknown(described):
+            found[name] = f"{name} (codec {codec[:40]!r}, which is not known)"
+        elif array.ndim and not (described.get("dimension_names") or array.attrs.get("_ARRAY_DIMENSIONS")):
+            found[name] = f"{name} (dimensions without names)"
+        else:
+            others = True
+    if found and not others:
+        raise FormatError(
+            f"expected variables over named dimensions in a Zarr store, got {listing(found.values())}; the folder of "
+            "an array is read alone"
+        )
+    return found
+
+
+def _is_array(folder: Path) -> bool:
+    if (folder / ".zarray").is_file():
+        return True
+    try:
+        with (folder / "zarr.json").open("rb") as file:
+            return bool(json.load(file).get("node_type") == "array")
+    except FileNotFoundError:
+        return False
+
+
+def _store(zarr: Any, folder: Path) -> Any:
+    """The store of a folder, to be read only: files of it that are links to others, or no files, are refused."""
+    root = os.path.realpath(folder)
+
+    def check(key: str) -> None:
+        path = os.path.realpath(os.path.join(root, key))
+        if path != root and not path.startswith(os.path.join(root, "")):
+            raise FormatError(f"expected a Zarr store whose files lie in its folder, got {key[:60]!r}, which leads out")
+        try:
+            mode = os.stat(path).st_mode
+        except OSError:
+            return  # zarr knows what a file that is not there means
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            raise FormatError(f"expected a Zarr store of regular files, got {key[:60]!r}, which is none")
+
+    class Store(zarr.storage.LocalStore):  # type: ignore[misc, unused-ignore]
+        def get_sync(self, key: str, **options: Any) -> Any:
+            check(key)
+            return super().get_sync(key, **options)
+
+        async def get(self, key: str, prototype: Any = None, byte_range: Any = None) -> Any:
+            check(key)
+            return await super().get(key, prototype, byte_range)
+
+        async def get_partial_values(self, prototype: Any, key_ranges: Iterable[tuple[str, Any]]) -> Any:
+            wanted = list(key_ranges)
+            for key, _ in wanted:
+                check(key)
+            return await super().get_partial_values(prototype, wanted)
+
+    return Store(root, read_only=True)
+
+
+def _unknown(described: Mapping[str, Any]) -> str:
+    """The first codec of an array that is none of `_CODECS`; empty: there is none."""
+    coded = described.get("codecs", ())
+    if described.get("zarr_format") == 2:
+        coded = [described.get("compressor"), *(described.get("filters") or ())]
+    for codec in coded:
+        if codec is None:
+            continue
+        said = codec if isinstance(codec, Mapping) else codec.get_config() if hasattr(codec, "get_config") else {}
+        name = str(said.get("name", said.get("id", "")))
+        if name.removeprefix("numcodecs.") not in _CODECS:
+            return name or "one without a name"
+        inner = said.get("configuration")
+        if isinstance(inner, Mapping):
+            for part in ("codecs", "index_codecs"):  # of shards
+                if found := _unknown({"codecs": inner.get(part, ())}):
+                    return found
+    return ""
