@@ -260,7 +260,7 @@ def test_memory_that_is_no_size(run: Run, file: Path, tmp_path: Path, command: s
 def test_too_little_memory_is_refused(run: Run, file: Path, tmp_path: Path, command: str) -> None:
     code, stdout, stderr = run(command, file, tmp_path / "a.lode", "--memory", "1KiB")
     assert (code, stdout) == (2, "")
-    assert "argument --memory: expected at least 1MiB to work in, got '1KiB'" in stderr
+    assert "argument --memory: expected 1 MiB of memory or more to work in, got '1KiB'" in stderr
 
 
 def test_memory_that_will_be_exceeded_is_told(run: Run, file: Path, tmp_path: Path) -> None:
