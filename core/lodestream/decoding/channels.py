@@ -23,7 +23,7 @@ from ..parallel import spread, threads
 from ..quantization.distortion import store_values
 from ..transform.lifting import FRACTION_BITS, inverse_step
 from ..transform.predictors import predictor
-from ..transform.pyramid import PADDING, empty, inverse, refine
+from ..transform.pyramid import PADDING, grids, inverse, refine
 from .crop import AxisCrop, crop_axis
 from .levels import known_levels
 
@@ -62,7 +62,7 @@ def reconstruct_channel(
     """
     layout = header.layout
     whole, bare = known_levels(layout, state, level)
-    coefficients = [empty(layout.shape(number, level)) for number in range(len(layout.grids))]
+    coefficients = grids(layout, level)
     tiles.spread_levels(level, state, coefficients, whole, bare=bare)
     coordinate = channel < header.geometric
     inverse(coefficients, layout, header.predictors[channel], level, whole, coordinate, bare=bare)
