@@ -74,7 +74,8 @@ def has_bands(header: Header, level: int) -> bool:
     layout = header.layout
     if len(layout.grids) > 1 or level == 0 or layout.steps(0, level)[0].wraps:
         return False
-    return layout.points(level) > (_SMALL if threads() == 1 else min(_SMALL, _SHARED))
+    points, least = layout.points(level), min(_SMALL, _SHARED)
+    return points > least and points > (_SMALL if threads() == 1 else least)
 
 
 def values_of_grid(
