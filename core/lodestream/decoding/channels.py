@@ -52,8 +52,11 @@ def reconstruct_channel(
     tiles: Tiles,
     state: NDArray[np.int8],
     level: int,
+    coefficients: list[NDArray[np.int32]] | None = None,
 ) -> Coordinates:
     """One channel of the grids of ``level`` in a state.
+
+    ``coefficients`` are where it is made, whatever they hold: int32 arrays as of `grids`, new ones if not given.
 
     Returns
     -------
@@ -62,7 +65,7 @@ def reconstruct_channel(
     """
     layout = header.layout
     whole, bare = known_levels(layout, state, level)
-    coefficients = grids(layout, level)
+    coefficients = grids(layout, level) if coefficients is None else coefficients
     tiles.spread_levels(level, state, coefficients, whole, bare=bare)
     coordinate = channel < header.geometric
     inverse(coefficients, layout, header.predictors[channel], level, whole, coordinate, bare=bare)
@@ -99,7 +102,7 @@ def values_of_grid(
     def show_whole(channel: int) -> None:
         number, component = places[channel]
         own = tiles[channel], state[:, channel]
-        (made,), fraction = reconstruct_channel(header, channel, *own, level)
+        (made,), fraction = reconstruct_channel(header, channel, *own, level, [_room(*shape)])
         store_values(header.lattices[channel], (made, fraction), arrays[number], component)
 
     if not has_bands(header, level):
