@@ -96,7 +96,7 @@ static bool points_of(const int64_t *step, struct plane of, int64_t count, struc
 /* A side's points at level 0, or the details along it, from the points of an interface. */
 static bool take(const int64_t *step, struct plane into, struct plane source, int32_t *work, int64_t work_count) {
     bool nodes = step[KIND] == LODE_INVERSE_NODES;
-    int64_t count = step[COLUMNS], first = nodes ? 0 : count - step[MIDPOINTS];
+    int64_t count = step[COLUMNS];
     struct line side, points;
     if (!line_of(step, into, count, &side) || !points_of(step, source, count, &points))
         return false;
@@ -105,13 +105,13 @@ static bool take(const int64_t *step, struct plane into, struct plane source, in
             side.x[i * side.by] = points.x[i * points.by];
         return true;
     }
-    if (first < 0 || step[MIDPOINTS] < 1 || work_count < count)
+    if (step[MIDPOINTS] < 1 || step[MIDPOINTS] > count || work_count < count)
         return false;
     for (int64_t i = 0; i < count; i++)
         work[i] = step[BY] ? points.x[i * points.by] : 0; /* points that are one have no details */
     if (!lift(0, step, 1, work, 1, count, count, work + count, work_count - count))
         return false;
-    for (int64_t i = first; i < count; i++)
+    for (int64_t i = count - step[MIDPOINTS]; i < count; i++)
         side.x[i * side.by] = work[i];
     return true;
 }

@@ -60,7 +60,7 @@ class _Steps(NamedTuple):
 
 
 def memory_of(arrays: Sequence[NDArray[np.int32]], layout: Layout, level: int) -> NDArray[np.int32] | None:
-    """What `inverse_levels` takes: the flat array that all of these are windows of.
+    """What `inverse_levels` takes: the flat array, shape (number,), that all of these, (row, column), are windows of.
 
     None where there is none, or more values than a call may have.
     """

@@ -125,6 +125,12 @@ def _turned(kind: int, **fields: int) -> None:
     kernels.inverse(step, planes, np.arange(12, dtype=np.int32), np.empty(200, np.int32))
 
 
+@pytest.mark.parametrize("midpoints", [0, -1, 2, 4, -(2**63), 2**63 - 1])
+def test_more_or_fewer_details_than_a_line_has_are_refused(midpoints: int) -> None:
+    with pytest.raises(ValueError, match="do not fit"):
+        _turned(kernels.INVERSE_DETAILS, midpoints=midpoints)
+
+
 @pytest.mark.parametrize("kind", [kernels.INVERSE_NODES, kernels.INVERSE_DETAILS])
 @pytest.mark.parametrize(
     "fields",
