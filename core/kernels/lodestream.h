@@ -60,20 +60,32 @@ LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t ro
 
 /* inverse.c ------------------------------------------------------------------------------------------------------ */
 
-#define LODE_INVERSE_STEP 48
+#define LODE_INVERSE_STEP 53
+#define LODE_INVERSE_PLANE 4
 #define LODE_INVERSE_NOTHING 0
 #define LODE_INVERSE_REFINE 3
+#define LODE_INVERSE_NODES 4
+#define LODE_INVERSE_DETAILS 5
 
-/* Inverse steps of the lifting one after another, in place, in the first rows and columns of a plane.
+/* Inverse steps of the lifting one after another, in place, in the first rows and columns of some planes.
  *
- * steps: rows of LODE_INVERSE_STEP: what is done, the axis, rows and columns of the plane that take part, and
- *        `midpoints`, `run`, `a`, `b` and `table` as lode_lift takes them. What is done is one of
- *        LODE_INVERSE_NOTHING; 1 and LODE_LIFT_BARE, as for lode_lift; LODE_INVERSE_REFINE: values are kept within
- *        +-2^24 and multiplied by 8, and only rows and columns matter.
- * work:  as much as the step takes that needs most.
+ * steps:  rows of LODE_INVERSE_STEP: what is done, the number of the plane, the axis, rows and columns that take part,
+ *         `midpoints`, `run`, `a`, `b` and `table` as lode_lift takes them, then `source`, `from`, `by` and `line`.
+ * planes: rows of LODE_INVERSE_PLANE: where in `x` a plane begins, its rows and columns, and from one row to the next.
+ * x:      all planes.
+ * work:   as much as the step takes that needs most; LODE_INVERSE_DETAILS takes `columns` more than lode_lift.
+ *
+ * 1 and LODE_LIFT_BARE are done as by lode_lift, LODE_INVERSE_NOTHING does nothing. LODE_INVERSE_REFINE keeps values
+ * within +-2^24 and multiplies them by 8; only rows and columns matter.
+ *
+ * LODE_INVERSE_NODES makes the first `columns` values of the line of number `line` along the axis those of another
+ * plane's first column: of the plane `source`, from row `from` on, each `by` rows after the one before, which is 1, -1
+ * or 0. LODE_INVERSE_DETAILS makes the last `midpoints` of so many values the details that a forward step finds in such
+ * points, and 0 where `by` is: they are one point. For both `rows` means nothing.
+ *
  * Together the steps should have no more than some million values. Returns 0. */
-LODE_API int64_t lode_inverse(const int64_t *steps, int64_t steps_count, int32_t *x, int64_t rows, int64_t columns,
-                              int64_t pitch, int32_t *work, int64_t work_count);
+LODE_API int64_t lode_inverse(const int64_t *steps, int64_t steps_count, const int64_t *planes, int64_t planes_count,
+                              int32_t *x, int64_t x_count, int32_t *work, int64_t work_count);
 
 /* mask.c --------------------------------------------------------------------------------------------------------- */
 

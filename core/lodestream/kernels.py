@@ -22,7 +22,10 @@ __all__ = [
     "DIFFERENCES_MEMORY",
     "DIFFERENCES_MODEL",
     "INDICES",
+    "INVERSE_DETAILS",
+    "INVERSE_NODES",
     "INVERSE_NOTHING",
+    "INVERSE_PLANE",
     "INVERSE_REFINE",
     "INVERSE_STEP",
     "LIFT_STRIP",
@@ -279,9 +282,9 @@ LIFT_BARE = 2
 lift = Kernel("lift", *[INTEGER] * 2, writes_plane(_I32), *[INTEGER] * 2, reads(_I64), *[INTEGER] * 3, writes(_I32))
 
 # inverse.c
-INVERSE_STEP = 48
-INVERSE_NOTHING, INVERSE_REFINE = 0, 3
-inverse = Kernel("inverse", reads(_I64), writes_plane(_I32), writes(_I32))
+INVERSE_STEP, INVERSE_PLANE = 53, 4
+INVERSE_NOTHING, INVERSE_REFINE, INVERSE_NODES, INVERSE_DETAILS = 0, 3, 4, 5
+inverse = Kernel("inverse", reads(_I64), reads(_I64), writes(_I32), writes(_I32))
 
 # mask.c
 MASK_GROUP = 16

@@ -57,8 +57,7 @@ def spread(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Re
         none is still being worked on when it is raised. An interruption of the caller's thread ends it alike.
     """
     queue = list(items)
-    count = min(threads(), len(queue))
-    if count < 2:
+    if len(queue) < 2 or (count := min(threads(), len(queue))) < 2:
         return [work(item) for item in queue]
     return _Spread(work, queue).results(count - 1)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import trimesh
     import xarray
 
-__all__ = ["DTYPES", "Block", "Closed", "Surface"]
+__all__ = ["DTYPES", "Block", "Closed", "Surface", "finite_block"]
 
 #: Whether the rows and the columns of a grid wrap: ``(True, False)`` means that axis 0 is a circle.
 Closed = tuple[bool, bool]
@@ -67,17 +67,9 @@ class Block:
         mask: ArrayLike | None = None,
         attributes: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        array = np.asarray(points)
-        if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] < 2):
-            raise InputError(
-                f"expected an array of shape (H, W), (H, W, 2), (H, W, 3) or (H, W, C > 3), got shape {array.shape}"
-            )
-        if array.shape[0] * array.shape[1] < 2:
-            raise InputError(f"expected a grid of at least two points, got {array.shape[0]} x {array.shape[1]}")
-        if len(closed) != 2:
-            raise InputError(f"expected closed=(rows, columns), got {closed!r}")
-        self.points: NDArray[Any] = _native(array, "points")
-        self.closed: Closed = (bool(closed[0]), bool(closed[1]))
+        self.points: NDArray[Any]
+        self.closed: Closed
+        self.points, self.closed = _checked(points, closed)
         hidden = _hidden(points)
         self.mask: NDArray[np.bool_] | None = self._valid(mask, hidden)
         if hidden is not None:
@@ -415,6 +407,37 @@ class Surface:
 
     def __repr__(self) -> str:
         return f"Surface({', '.join(map(repr, self.blocks))})"
+
+
+def finite_block(
+    points: NDArray[Any], closed: Closed, mask: NDArray[np.bool_] | None, attributes: dict[str, NDArray[Any]]
+) -> Block:
+    """A block of points that are known to be finite where they are valid, as some are: they are not looked through.
+
+    Raises
+    ------
+    InputError
+        If the shapes are not those of a `Block`.
+    """
+    block = Block.__new__(Block)
+    block.points, block.closed = _checked(points, closed)
+    block.mask = None if mask is None or mask.all() else mask.copy()
+    block.attributes = {name: block._attribute(name, values) for name, values in attributes.items()}
+    return block
+
+
+def _checked(points: ArrayLike, closed: Closed) -> tuple[NDArray[Any], Closed]:
+    """What a block keeps of both, if they may be those of one."""
+    array = np.asarray(points)
+    if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] < 2):
+        raise InputError(
+            f"expected an array of shape (H, W), (H, W, 2), (H, W, 3) or (H, W, C > 3), got shape {array.shape}"
+        )
+    if array.shape[0] * array.shape[1] < 2:
+        raise InputError(f"expected a grid of at least two points, got {array.shape[0]} x {array.shape[1]}")
+    if len(closed) != 2:
+        raise InputError(f"expected closed=(rows, columns), got {closed!r}")
+    return _native(array, "points"), (bool(closed[0]), bool(closed[1]))
 
 
 def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:

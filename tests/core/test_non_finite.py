@@ -21,6 +21,7 @@ from lodestream.container.frames import section_extent
 from lodestream.entropy.mask import encode_mask
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
+from lodestream.surface import finite_block
 
 from .surfaces import follow, index_of, terrain, torus
 
@@ -416,3 +417,24 @@ def test_a_block_says_which_holes_are_kept() -> None:
     assert kept is not None
     assert np.argwhere(kept).tolist() == [[1, 1], [2, 2], [3, 3]]
     assert ls.Block(np.arange(20).reshape(4, 5), mask=mask).kept is None
+
+
+@pytest.mark.parametrize("shape", [(3, 4), (3, 4, 3)])
+def test_a_block_of_finite_points_is_the_block_that_is_looked_through(shape: tuple[int, ...]) -> None:
+    points, mask = np.arange(np.prod(shape), dtype=np.float64).reshape(shape), np.ones(shape[:2], np.bool_)
+    named = {"kind": np.arange(12).reshape(3, 4)}
+    for holes in (0, 2):
+        mask[0, :holes] = False
+        found = finite_block(points, (True, False), mask, named)
+        expected = ls.Block(points, (True, False), mask=mask, attributes=named)
+        assert np.shares_memory(found.points, points)
+        assert found.closed == expected.closed
+        assert found.holes == expected.holes == holes
+        assert (found.mask is None) == (expected.mask is None)
+        assert found.mask is not mask
+        np.testing.assert_array_equal(found.attributes["kind"], named["kind"])
+    for wrong in (np.zeros((1, 1)), np.zeros((3, 4, 1)), np.zeros(5)):
+        with pytest.raises(ls.InputError):
+            finite_block(wrong, (False, False), None, {})
+    with pytest.raises(ls.InputError):
+        finite_block(points, (False, False), None, {"kind": np.zeros((2, 2))})

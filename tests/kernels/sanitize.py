@@ -37,7 +37,7 @@ MORE_TESTS = tuple(
         ("mesh", ("mesh_walks", "hostile_walks", "mesh_attributes")),
         ("quantization", ("distortion", "mesh_lattice")),
         ("residual", ("chunk_coder",)),
-        ("transform", ("lifting", "pyramid")),
+        ("transform", ("all_levels", "lifting", "pyramid")),
     )
     for name in names
 )

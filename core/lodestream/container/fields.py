@@ -12,6 +12,7 @@ __all__ = ["LARGEST", "FieldReader", "FieldWriter", "told", "told_roughly"]
 LARGEST = 2**63 - 1
 # An error is the highest of the 63 bits below the sign of a float64, so many of them, in so many bytes.
 _TOLD, _TOLD_ROUGHLY = (31, 4), (16, 2)
+_PATTERN, _FLOAT = struct.Struct(">Q"), struct.Struct(">d")
 _INFINITY = 0x7FF << 52
 
 
@@ -32,8 +33,8 @@ def _upper(error: float, bits: int) -> int:
 
 
 def _from_upper(upper: int, bits: int) -> float:
-    (number,) = struct.unpack(">d", (upper << 63 - bits).to_bytes(8))
-    return float(number)
+    number: float = _FLOAT.unpack(_PATTERN.pack(upper << 63 - bits))[0]
+    return number
 
 
 class FieldWriter:
@@ -172,10 +173,12 @@ class FieldReader:
         return self._errors(*_TOLD_ROUGHLY)
 
     def _errors(self, bits: int, size: int) -> tuple[float, float]:
-        start, limit = self.at, _INFINITY >> 63 - bits
-        rms, worst = (int.from_bytes(self.take(size), "little") for _ in range(2))
+        start, limit = self.place, _INFINITY >> 63 - bits
+        rms, worst = int.from_bytes(self.take(size), "little"), int.from_bytes(self.take(size), "little")
         if rms >= limit or worst >= limit:
-            raise CorruptStreamError(f"expected errors of 0 or more, got the patterns {rms:x} and {worst:x}", start)
+            raise CorruptStreamError(
+                f"expected errors of 0 or more, got the patterns {rms:x} and {worst:x}", self.offset + start
+            )
         return _from_upper(rms, bits), _from_upper(worst, bits)
 
     def end(self) -> None:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
 from . import sections
@@ -36,8 +35,7 @@ _KNOWN = {
 }
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(NamedTuple):
     """A section whose CRC holds: its payload stands at ``payload_offset``, all of it at ``offset`` to ``end``."""
 
     kind: int

@@ -14,7 +14,7 @@ from ..errors import CorruptStreamError
 from ..grid.connectivity import Arrangement, Patch, whole_patch
 from ..grid.layout import Layout
 from ..grid.multiblock import grids_of, shared_points
-from ..grid.patches import level_shapes
+from ..grid.patches import Numbered, level_shapes, numbered_by_block
 from ..joints import Change, Groups, Joints, Runs
 from ..quantization.band_steps import Quantiser
 from ..quantization.lattice import Lattice
@@ -212,6 +212,11 @@ class Header:
             return self.arrangement.patches
         (rows, columns), closed = self.blocks[0]
         return (whole_patch(0, (rows, columns), closed),)
+
+    @cached_property
+    def block_patches(self) -> list[Numbered]:
+        """The patches of each block, with their numbers."""
+        return numbered_by_block(self.patches, len(self.blocks))
 
     @cached_property
     def layout(self) -> Layout:

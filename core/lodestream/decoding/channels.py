@@ -23,7 +23,7 @@ from ..parallel import spread, threads
 from ..quantization.distortion import store_values
 from ..transform.lifting import FRACTION_BITS, inverse_step
 from ..transform.predictors import predictor
-from ..transform.pyramid import PADDING, empty, inverse, refine
+from ..transform.pyramid import PADDING, grids, inverse, refine
 from .crop import AxisCrop, crop_axis
 from .levels import known_levels
 
@@ -52,8 +52,11 @@ def reconstruct_channel(
     tiles: Tiles,
     state: NDArray[np.int8],
     level: int,
+    coefficients: list[NDArray[np.int32]] | None = None,
 ) -> Coordinates:
     """One channel of the grids of ``level`` in a state.
+
+    ``coefficients`` are where it is made, whatever they hold: int32 arrays as of `grids`, new ones if not given.
 
     Returns
     -------
@@ -62,7 +65,7 @@ def reconstruct_channel(
     """
     layout = header.layout
     whole, bare = known_levels(layout, state, level)
-    coefficients = [empty(layout.shape(number, level)) for number in range(len(layout.grids))]
+    coefficients = grids(layout, level) if coefficients is None else coefficients
     tiles.spread_levels(level, state, coefficients, whole, bare=bare)
     coordinate = channel < header.geometric
     inverse(coefficients, layout, header.predictors[channel], level, whole, coordinate, bare=bare)
@@ -74,7 +77,8 @@ def has_bands(header: Header, level: int) -> bool:
     layout = header.layout
     if len(layout.grids) > 1 or level == 0 or layout.steps(0, level)[0].wraps:
         return False
-    return layout.points(level) > (_SMALL if threads() == 1 else min(_SMALL, _SHARED))
+    points, least = layout.points(level), min(_SMALL, _SHARED)
+    return points > least and points > (_SMALL if threads() == 1 else least)
 
 
 def values_of_grid(
@@ -98,7 +102,7 @@ def values_of_grid(
     def show_whole(channel: int) -> None:
         number, component = places[channel]
         own = tiles[channel], state[:, channel]
-        (made,), fraction = reconstruct_channel(header, channel, *own, level)
+        (made,), fraction = reconstruct_channel(header, channel, *own, level, [_room(*shape)])
         store_values(header.lattices[channel], (made, fraction), arrays[number], component)
 
     if not has_bands(header, level):

@@ -19,6 +19,8 @@ def known_levels(layout: Layout, state: NDArray[np.int8], level: int) -> tuple[i
     """
     starts = layout.starts[: level + 1]
     own = state[: layout.tiles_of(level).stop]
+    if not own.any():
+        return level, []
     unknown = np.flatnonzero(np.maximum.reduceat(own, starts)[1:])
     whole = int(unknown[0]) if unknown.size else level
     if layout.shared:

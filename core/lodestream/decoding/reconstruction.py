@@ -17,7 +17,7 @@ from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
 from ..entropy.tiles import Reading, Tiles, TileTable
 from ..errors import CorruptStreamError
-from ..grid.patches import assemble, level_masks, numbered_by_block
+from ..grid.patches import assemble, level_masks
 from ..parallel import spread
 from ..quantization.distortion import store_values
 from ..residual import chunk_coder
@@ -322,13 +322,17 @@ def initial_state(header: Header) -> NDArray[np.int8]:
 
     What has no coefficient, or none other than 0 in its whole level, is known.
     """
-    layout, channels = header.layout, slice(0, header.geometric)
-    zeros = [[bits >> level & 1 for bits in header.empty] for level in range(layout.levels + 1)]
-    known = np.array(zeros, np.bool_).reshape(-1, header.channels)[layout.tile_levels]
-    for coordinate in (True, False):
-        known[:, channels] |= (np.diff(TileTable.of(layout, coordinate).first) == 0)[:, None]
-        channels = slice(header.geometric, None)
-    return np.where(known, np.int8(0), np.int8(UNANNOUNCED))
+    layout = header.layout
+    state = np.full((len(layout.tiles), header.channels), UNANNOUNCED, np.int8)
+    for channel, bits in enumerate(header.empty):
+        for level in range(bits.bit_length()):
+            if bits >> level & 1:
+                tiles = layout.tiles_of(level)
+                state[tiles.start : tiles.stop, channel] = 0
+    for coordinate, channels in ((True, slice(header.geometric)), (False, slice(header.geometric, None))):
+        if (without := TileTable.of(layout, coordinate).without_bands).size:
+            state[without, channels] = 0
+    return state
 
 
 @dataclass
@@ -384,6 +388,5 @@ def to_values(header: Header, reconstructions: Sequence[Coordinates], level: int
 
 def _arranged(header: Header, level: int, grids: list[list[NDArray[Any]]], block: int) -> list[NDArray[Any]]:
     """The arrays of a block from those of patches, which stand by array and patch."""
-    own = numbered_by_block(header.patches, len(header.blocks))[block]
-    shape = header.blocks[block][0]
+    own, shape = header.block_patches[block], header.blocks[block][0]
     return [np.ascontiguousarray(assemble(own, header.layout, level, shape, arrays)) for arrays in grids]

@@ -13,10 +13,10 @@ from ..container.digest import DIGEST, values_digest
 from ..container.model import Header
 from ..coordinates.height_fields import level_metadata, to_xyz
 from ..errors import CorruptStreamError, InputError, OptionError
-from ..grid.patches import level_masks, level_positions, numbered_by_block
+from ..grid.patches import level_masks, level_positions
 from ..joints import Nodes
 from ..planning.selection import Selection, restored
-from ..surface import Block, Closed, Surface
+from ..surface import Block, Closed, Surface, finite_block
 from ..target import Region
 from .reconstruction import Reconstruction, Values
 from .window_metadata import window_closed, window_grid, window_metadata
@@ -83,7 +83,7 @@ class View:
         InputError
             If there are several blocks; use `surface`.
         """
-        return self.surface().points
+        return self._shown(self._reconstruction.header.levels).points
 
     def prepare(self) -> None:
         """Decode what has come until here, so that the points of this view or a later one are made sooner.
@@ -110,7 +110,7 @@ class View:
         InputError
             If there are several blocks and none was given.
         """
-        surface = self.surface(level)
+        surface = self._shown(level)
         if block is None:
             return surface.points
         if not 0 <= block < len(surface.blocks):
@@ -162,19 +162,26 @@ class View:
         CorruptStreamError
             If the SHA-256 of the complete surface is wrong, or no value is finite.
         """
-        header, region = self._reconstruction.header, self._selection.region
+        header = self._reconstruction.header
         shown = header.levels if level is None else level
-        if not 0 <= shown <= header.levels:
-            raise OptionError(f"expected a level of 0 to {header.levels}, got {shown}")
-        if region is not None and shown != header.levels:
-            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {shown}")
+        surface = self._shown(shown, metadata)
+        whole = shown == header.levels and self._selection.region is None
+        surface.joints = header.joints if whole else header.joints.at(self._nodes(shown))
+        return surface
+
+    def _shown(self, level: int, metadata: Mapping[str, Any] | None = None) -> Surface:
+        """`surface`, but for which of its points are one: who asks for points alone need not wait for that."""
+        header, region = self._reconstruction.header, self._selection.region
+        if not 0 <= level <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
+        if region is not None and level != header.levels:
+            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
         values = dict(self._metadata if metadata is None else metadata)
-        if shown != header.levels:  # the grid of that level, without what a seam repeats
+        if level != header.levels:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
-        surface, values = self._positioned(Surface(blocks=self._blocks(shown)), values, shown)
-        self._check_digest(surface, shown)
+        surface, values = self._positioned(Surface(blocks=self._blocks(level)), values, level)
+        self._check_digest(surface, level)
         surface.metadata = values
-        surface.joints = header.joints.at(self._nodes(shown))
         return surface
 
     def _repr_html_(self) -> str:
@@ -218,7 +225,10 @@ class View:
         if mask is not None and selection.region is None and not mask.any():
             mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
         points = points[..., 0] if header.flat else points
+        finite = selection.region is None and not self._corrected and all(own.finite for own in header.lattices)
         try:
+            if finite:
+                return finite_block(points, closed, mask, named)
             return Block(points, closed, mask=mask, attributes=named)
         except InputError as error:
             if selection.region is not None:
@@ -251,8 +261,9 @@ class View:
         """Hold the values to the SHA-256 that came with them, where this is the complete surface and it is exact."""
         header, selection = self._reconstruction.header, self._selection
         promised = self._digest.get(DIGEST)
-        whole = selection.region is None and selection.channels(header).all() and level == header.levels
-        if promised is not None and whole and self.complete and header.exact:
+        if promised is None or not self.complete or not header.exact or level != header.levels:
+            return
+        if selection.region is None and selection.channels(header).all():
             found = values_digest(surface.blocks)
             if promised != found:
                 raise CorruptStreamError(f"expected values with the SHA-256 {promised}, got {found}", header.length)
@@ -262,7 +273,7 @@ class View:
         header, region = self._reconstruction.header, self._selection.region
         if region is not None:
             return [(np.arange(*region[0]), np.arange(*region[1]))]
-        owned = zip(numbered_by_block(header.patches, len(header.blocks)), header.blocks, strict=True)
+        owned = zip(header.block_patches, header.blocks, strict=True)
         return [level_positions(own, len(header.patches), header.layout, level, shape) for own, (shape, _) in owned]
 
     def _kept(self, finest: bool) -> NDArray[np.bool_] | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,11 +58,16 @@ def spread_bands(
     ValueError
         Where a band does not lie inside the flat arrays, or its columns do not inside ``out``.
     """
+    for batch in _batches(bands, numbers) if known.size > _AT_ONCE else [numbers] if numbers.size else []:
+        kernels.spread(known, sign, early, bands, origins, steps, batch, state, finer, out, *origin)
+
+
+def _batches(bands: NDArray[np.int64], numbers: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """The bands of each call."""
     sizes = np.cumsum(bands[numbers, ROWS] * bands[numbers, COLUMNS])
     start = 0
     while start < numbers.size:
         reached = sizes[start - 1] if start else 0
         stop = max(start + 1, int(np.searchsorted(sizes, reached + _AT_ONCE, side="right")))
-        batch = numbers[start:stop]
-        kernels.spread(known, sign, early, bands, origins, steps, batch, state, finer, out, *origin)
+        yield numbers[start:stop]
         start = stop

@@ -103,6 +103,11 @@ class TileTable:
         return np.ascontiguousarray(np.array(columns).T)
 
     @cached_property
+    def without_bands(self) -> NDArray[np.int64]:
+        """The tiles that have none, int64, shape (tile,)."""
+        return np.flatnonzero(np.diff(self.first) == 0)
+
+    @cached_property
     def origins(self) -> NDArray[np.int64]:
         """Of each band: its tile, and its first row and column in the array of coefficients; int64, shape (band, 3)."""
         arrays = self._arrays()
@@ -248,10 +253,14 @@ class Tiles:
     def readings(self, runs: Sequence[Run], ends: Sequence[int]) -> list[Reading]:
         """What decodes the runs up to each of ``ends``, from the end before it."""
         told = np.array([(tile, first, last, len(data)) for tile, first, last, data in runs], np.int64).reshape(-1, 4)
-        tile, first, last, length = told.T
-        bands = self.table.first[tile]
-        count, start = self.table.first[tile + 1] - bands, np.cumsum(length) - length
-        table = np.stack([bands, count, tile, first, last, start, length, tile >= self.large], axis=1)
+        tile, length = told[:, 0], told[:, 3]
+        table = np.empty((len(told), 8), np.int64)  # bands, their number, tile, first, last, start, length, large
+        table[:, 0] = self.table.first[tile]
+        table[:, 1] = self.table.first[tile + 1] - table[:, 0]
+        table[:, 2:5] = told[:, :3]
+        table[:, RUN_START] = length.cumsum() - length
+        table[:, 6] = length
+        table[:, 7] = tile >= self.large
         made, begin = [], 0
         for end in ends:
             own = table[begin:end]

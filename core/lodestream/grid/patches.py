@@ -113,10 +113,12 @@ def level_masks(
 
     They do where the full grid, which ``masks`` are of, has a point at their place.
     """
+    if level == layout.levels:
+        return list(masks)
     found: list[NDArray[np.bool_] | None] = []
     for own, mask in zip(numbered_by_block(patches, len(masks)), masks, strict=True):
         coarse = mask
-        if mask is not None and level < layout.levels:
+        if mask is not None:
             shape = mask.shape[0], mask.shape[1]
             coarse = mask[np.ix_(*level_positions(own, len(patches), layout, level, shape))]
         found.append(coarse)

@@ -66,6 +66,12 @@ class Lattice:
         """Distance between neighbouring values, in their unit."""
         return 1.0 / self.step if self.rule == "decimal" else self.step
 
+    @property
+    def finite(self) -> bool:
+        """Whether values are finite as float64, whichever int32 their coordinates are."""
+        most, origin = 2.0**31, abs(self.origin)
+        return math.isfinite((most + origin) / self.step if self.rule == "decimal" else most * self.step + origin)
+
     def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any], fraction: int = 0) -> NDArray[Any]:
         """Values of lattice coordinates over 2**fraction, int32 of any shape, in the given dtype."""
         q = coordinates.astype(np.float64)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from functools import lru_cache
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..grid.axis import AxisStep
 from ..grid.layout import Layout, Source
-from .all_levels import fits, inverse_levels
+from .all_levels import inverse_levels, memory_of
 from .fitting import fitted_predictor
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
 from .predictors import INTERFACES, default_predictors, fitted_steps, predictor
@@ -27,6 +28,7 @@ __all__ = [
     "copied",
     "empty",
     "forward",
+    "grids",
     "inverse",
     "inverse_level",
     "refine",
@@ -55,6 +57,17 @@ def empty(shape: tuple[int, int]) -> NDArray[np.int32]:
     """As `allocate`, shape (row, column), whatever it holds."""
     rows, columns = shape
     return np.empty((rows, columns + PADDING), np.int32)[:, :columns]
+
+
+def grids(layout: Layout, level: int) -> list[NDArray[np.int32]]:
+    """As `empty`, of each grid of a level, shape (row, column) each, one after another in one piece of memory."""
+    shapes = [layout.shape(number, level) for number in range(len(layout.grids))]
+    ends = list(accumulate((rows * (columns + PADDING) for rows, columns in shapes), initial=0))
+    memory = np.empty(ends[-1], np.int32)
+    return [
+        memory[first:last].reshape(rows, columns + PADDING)[:, :columns]
+        for (first, last), (rows, columns) in zip(pairwise(ends), shapes, strict=True)
+    ]
 
 
 def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -121,9 +134,12 @@ def inverse(
 ) -> None:
     """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
 
-    The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2). Without ``whole``,
-    the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count lattice steps, those
-    above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than ``level``.
+    The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2). Small arrays of
+    `grids` take one call of a kernel, others one for each step.
+
+    Without ``whole``, the forward transform is undone exactly. Otherwise details of the levels up to ``whole`` count
+    lattice steps, those above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than
+    ``level``.
 
     Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
     would only add errors of its own from level to level.
@@ -133,8 +149,8 @@ def inverse(
     With ``start``, the arrays hold the grids of that level already, as this leaves them there with the same ``whole``.
     Details of the levels in ``bare`` are 0, whatever stands in their places; none where sides come from interfaces.
     """
-    if fits(layout, level) and not layout.shared:
-        inverse_levels(arrays[0], layout, predictors, level, whole, start or 0, bare)
+    if (memory := memory_of(arrays, layout, level)) is not None:
+        inverse_levels(memory, arrays, layout, predictors, level, whole, coordinate, start, bare)
         return
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.interface]
     if coordinate and start is None:

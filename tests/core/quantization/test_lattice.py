@@ -262,3 +262,14 @@ def with_every_step(values: NDArray[np.float32]) -> Lattice | None:
             half = float((int((high - low) / step) + 2) // 2)
             return Lattice("affine", float(np.rint(low / step)) * step + half * step, step)
     return None
+
+
+@pytest.mark.parametrize("rule", ["affine", "decimal"])
+@pytest.mark.parametrize("origin", [0.0, -1e9, 1e300, -1.7e308])
+@pytest.mark.parametrize("step", [1e-300, 1e-3, 1.0, 1e250, 1e299, 1e308])
+def test_a_lattice_knows_whether_its_values_are_finite(rule: str, origin: float, step: float) -> None:
+    lattice = Lattice(rule, origin, step)
+    with np.errstate(over="ignore"):
+        values = lattice.values(np.array([-(2**31), -1, 0, 1, 2**31 - 1], np.int32), np.dtype("f8"))
+    assert np.isfinite(values).all() or not lattice.finite
+    assert lattice.finite == (np.isfinite(values).all() and np.isfinite(abs(values).max() * (1 + 1e-9)))
