@@ -1,4 +1,4 @@
-"""All levels of the only grid of a surface undone in one call of a kernel.
+"""All levels of the only grid of a surface undone in one call of a kernel, or one level of a part of it.
 
 Small surfaces have many levels of few values, and so have prefixes of large ones, whose finest levels hold no details.
 """
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import kernels
+from ..grid.axis import AxisStep
 from ..grid.layout import REMEMBERED, Layout
 from .lifting import REACH, work_room
 from .predictors import FOUR_POINT, INTERFACES, is_fitted
 
-__all__ = ["fits", "inverse_levels"]
+__all__ = ["LevelInverse", "fits", "inverse_levels"]
 
 #: Values of a level that are undone in one call.
 _AT_ONCE = 1 << 20
@@ -26,6 +27,8 @@ _AT_ONCE = 1 << 20
 _KIND, _AXIS, _ROWS, _COLUMNS, _MIDPOINTS, _RUN, _A, _B, _TABLE = range(9)
 #: Rows of a level: a place for `refine`, then the axes in reverse.
 _EACH = 3
+#: The axes in the order in which they are undone, and the rows of their steps.
+_PLACES = (1, 1), (0, 2)
 
 
 class _Steps(NamedTuple):
@@ -70,11 +73,61 @@ def inverse_levels(
         table[_EACH * (whole - start), _KIND] = kernels.INVERSE_REFINE
     for finer in bare:
         if start < finer <= level:
-            first = _EACH * (finer - 1 - start) + 1
-            own = table[first : first + 2]
-            own[own[:, _KIND] == 1, _KIND] = kernels.LIFT_BARE
-            own[0, _ROWS] = steps.coarse[finer]  # no other row has anything
+            first = _EACH * (finer - 1 - start)
+            _bare(table[first : first + _EACH], steps.coarse[finer])
     kernels.inverse(table, array, np.empty(steps.room[level], np.int32))
+
+
+def _bare(table: NDArray[np.int64], coarse: int) -> None:
+    """Rows of a level, of so many rows of nodes, become those of one without details."""
+    steps = table[1:]
+    steps[steps[:, _KIND] == 1, _KIND] = kernels.LIFT_BARE
+    steps[0, _ROWS] = coarse  # no other row has anything
+
+
+class LevelInverse:
+    """The step that makes one level, of a grid or of a part of it, undone in one call.
+
+    Parameters
+    ----------
+    steps : (AxisStep, AxisStep)
+        Along the columns' axis and along the rows' axis.
+    rules : ((int, int), (int, int))
+        The third step's (a, b) of either.
+    """
+
+    def __init__(self, steps: tuple[AxisStep, AxisStep], rules: tuple[tuple[int, int], tuple[int, int]]) -> None:
+        table, self._room = _level(steps)
+        for axis, place in _PLACES:
+            table[place, _A : _B + 1] = rules[axis]
+        self._table, self._coarse = table, steps[0].coarse
+
+    def __call__(self, array: NDArray[np.int32], refined: bool, bare: bool) -> None:
+        """Turn nodes and details into the finer level, in place, shape (row, column).
+
+        ``refined``: the nodes become steps over 2**`FRACTION_BITS` first, see `pyramid.refine`. ``bare``: the details
+        are 0, whatever stands in their places.
+        """
+        table = self._table.copy()
+        if refined:
+            table[0, _KIND] = kernels.INVERSE_REFINE
+        if bare:
+            _bare(table, self._coarse)
+        kernels.inverse(table, array, np.empty(self._room, np.int32))
+
+
+def _level(steps: tuple[AxisStep, AxisStep]) -> tuple[NDArray[np.int64], int]:
+    """The rows of a level in the kernel's table, but for what a channel and a state have of their own; and its room."""
+    table, room = np.zeros((_EACH, kernels.INVERSE_STEP), np.int64), 0
+    shape = steps[0].length, steps[1].length
+    table[0, [_KIND, _ROWS, _COLUMNS]] = kernels.INVERSE_NOTHING, steps[0].coarse, steps[1].coarse
+    for axis, place in _PLACES:
+        step = steps[axis]
+        if step.midpoints:
+            table[place, :_A] = 1, axis, *shape, step.midpoints, step.run
+            table[place, _TABLE:] = step.extension(REACH).ravel()
+            room = max(room, work_room(step, axis, shape[1 - axis]))
+    return table, room
 
 
 @lru_cache(maxsize=REMEMBERED)
@@ -83,18 +136,11 @@ def _steps(layout: Layout) -> _Steps:
     rules = np.full(_EACH * layout.levels, layout.levels * INTERFACES)
     coarse, room = [0], [0]
     for level in range(1, layout.levels + 1):
-        steps, shape = layout.steps(0, level), layout.shape(0, level)
-        first = _EACH * (level - 1)
-        table[first, [_KIND, _ROWS, _COLUMNS]] = kernels.INVERSE_NOTHING, *layout.shape(0, level - 1)
-        most = room[-1]
-        for place, axis in ((first + 1, 1), (first + 2, 0)):
-            step = steps[axis]
-            if step.midpoints:
-                table[place, :_A] = 1, axis, *shape, step.midpoints, step.run
-                table[place, _TABLE:] = step.extension(REACH).ravel()
-                most = max(most, work_room(step, axis, shape[1 - axis]))
-            if is_fitted(step):
-                rules[place] = (level - 1) * INTERFACES + axis
+        steps, first = layout.steps(0, level), _EACH * (level - 1)
+        table[first : first + _EACH], most = _level(steps)
+        for axis, place in _PLACES:
+            if is_fitted(steps[axis]):
+                rules[first + place] = (level - 1) * INTERFACES + axis
         coarse.append(steps[0].coarse)
-        room.append(most)
+        room.append(max(room[-1], most))
     return _Steps(table, rules, coarse, room)
