@@ -36,15 +36,16 @@ struct rule {
     int32_t unit;
 };
 
-/* A band where it is known, and where its rows from `first` to `last` - 1 go. */
+/* A band where it is known, and where its rows from `first` to `last` - 1 go, of these the columns from `begin` to
+ * `end` - 1. */
 struct places {
     const int32_t *magnitudes;
     const int8_t *signs;
     const uint8_t *early;
     int64_t stride;
-    int32_t *out; /* of row `first` */
+    int32_t *out; /* of row `first` and column `begin` */
     int64_t pitch;
-    int64_t first, last, columns;
+    int64_t first, last, begin, end;
 };
 
 LODE_INLINE int32_t plus(int32_t a, int32_t b) {
@@ -104,34 +105,43 @@ LODE_INLINE void spread_row(const int32_t *restrict magnitudes, const int8_t *re
 
 static void spread_band(struct places at, struct rule rule) {
     for (int64_t i = at.first; i < at.last; i++, at.out += at.pitch) {
-        const int32_t *magnitudes = at.magnitudes + i * at.stride;
-        const int8_t *signs = at.signs + i * at.stride;
-        const uint8_t *early = at.early + i * at.stride;
+        int64_t place = i * at.stride + at.begin, count = at.end - at.begin;
+        const int32_t *magnitudes = at.magnitudes + place;
+        const int8_t *signs = at.signs + place;
+        const uint8_t *early = at.early + place;
         if (rule.half && rule.step > 1)
-            spread_row(magnitudes, signs, early, at.out, at.columns, rule, true, true);
+            spread_row(magnitudes, signs, early, at.out, count, rule, true, true);
         else if (rule.half)
-            spread_row(magnitudes, signs, early, at.out, at.columns, rule, true, false);
+            spread_row(magnitudes, signs, early, at.out, count, rule, true, false);
         else if (rule.step > 1)
-            spread_row(magnitudes, signs, early, at.out, at.columns, rule, false, true);
+            spread_row(magnitudes, signs, early, at.out, count, rule, false, true);
         else
-            spread_row(magnitudes, signs, early, at.out, at.columns, rule, false, false);
+            spread_row(magnitudes, signs, early, at.out, count, rule, false, false);
     }
 }
 
+/* Which of a band's rows or columns, `length` of them, lie among the `count` of a plane: the band's first one has the
+ * number `start` there. Whether any does. */
+static bool part_of(int64_t length, int64_t start, int64_t count, int64_t *first, int64_t *last) {
+    *first = start < 0 ? -start : 0;
+    *last = length < count - start ? length : count - start;
+    return *first < *last;
+}
+
 /* A band of indices that are known: the trellis follows them in raster order of blocks, as they were coded. */
-static void spread_trellis(struct places at, int64_t rows, struct rule rule) {
+static void spread_trellis(struct places at, int64_t rows, int64_t columns, struct rule rule) {
     int32_t less = (rule.step + 1) / 2;
     for (int64_t top = at.first / BLOCK * BLOCK; top < at.last; top += BLOCK) {
         unsigned state = 0;
-        for (int64_t left = 0; left < at.columns; left += BLOCK)
+        for (int64_t left = 0; left < columns; left += BLOCK)
             for (int64_t i = top; i < top + BLOCK && i < rows; i++)
-                for (int64_t j = left; j < left + BLOCK && j < at.columns; j++) {
+                for (int64_t j = left; j < left + BLOCK && j < columns; j++) {
                     int32_t magnitude = at.magnitudes[i * at.stride + j];
                     int32_t value = plus(times(least(magnitude, rule.most), rule.step), -less * ODD[state]);
                     value = least(magnitude != 0 ? value : 0, rule.limit);
                     state = TRANSITIONS[state][magnitude & 1];
-                    if (i >= at.first && i < at.last)
-                        at.out[(i - at.first) * at.pitch + j] =
+                    if (i >= at.first && i < at.last && j >= at.begin && j < at.end)
+                        at.out[(i - at.first) * at.pitch + j - at.begin] =
                             times(times(at.signs[i * at.stride + j], value), rule.unit);
                 }
     }
@@ -139,7 +149,7 @@ static void spread_trellis(struct places at, int64_t rows, struct rule rule) {
 
 static void clear(struct places at) {
     for (int64_t i = at.first; i < at.last; i++, at.out += at.pitch)
-        for (int64_t j = 0; j < at.columns; j++)
+        for (int64_t j = 0; j < at.end - at.begin; j++)
             at.out[j] = 0;
 }
 
@@ -151,7 +161,7 @@ int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sig
                     int64_t first_column) {
     if (sign_count != known_count || early_count != known_count || bands_count != steps_count * BAND_FIELDS ||
         origins_count != steps_count * ORIGIN_FIELDS || (rows > 1 && pitch < columns) || first_row < 0 ||
-        first_row > INT32_MAX || first_column < 0)
+        first_row > INT32_MAX || first_column < 0 || first_column > INT32_MAX)
         return LODE_REFUSED;
     for (int64_t i = 0; i < numbers_count; i++) {
         if (numbers[i] < 0 || numbers[i] >= steps_count)
@@ -159,23 +169,30 @@ int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sig
         const int64_t *band = bands + numbers[i] * BAND_FIELDS, *origin = origins + numbers[i] * ORIGIN_FIELDS;
         int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = origin[0];
         int64_t height = band[BAND_ROWS], width = band[BAND_COLUMNS];
-        if (origin[1] < 0 || origin[1] > INT32_MAX || origin[2] < first_column || height < 0 || width < 0 ||
-            height > INT32_MAX || stride < width || stride < 1 || stride > INT32_MAX || offset < 0 ||
+        if (origin[1] < 0 || origin[1] > INT32_MAX || origin[2] < 0 || origin[2] > INT32_MAX || height < 0 ||
+            width < 0 || height > INT32_MAX || stride < width || stride < 1 || stride > INT32_MAX || offset < 0 ||
             offset > known_count - width || (height - 1) * stride > known_count - width - offset || tile < 0 ||
             tile >= state_count || state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
             return LODE_REFUSED;
-        int64_t top = origin[1] - first_row, left = origin[2] - first_column;
-        if (left > columns - width)
-            return LODE_REFUSED;
-        int64_t first = top < 0 ? -top : 0, last = height < rows - top ? height : rows - top;
-        if (first >= last)
+        int64_t top = origin[1] - first_row, left = origin[2] - first_column, first, last, begin, end;
+        if (!part_of(height, top, rows, &first, &last) || !part_of(width, left, columns, &begin, &end))
             continue;
-        struct places at = {known + offset, sign + offset, early + offset, stride, out + (top + first) * pitch + left,
-                            pitch,          first,         last,           width};
+        struct places at = {
+            .magnitudes = known + offset,
+            .signs = sign + offset,
+            .early = early + offset,
+            .stride = stride,
+            .out = out + (top + first) * pitch + left + begin,
+            .pitch = pitch,
+            .first = first,
+            .last = last,
+            .begin = begin,
+            .end = end,
+        };
         if (state[tile] >= LODE_UNANNOUNCED)
             clear(at);
         else if (step > 0 && state[tile] == 0)
-            spread_trellis(at, height, rule_of(0, step, tile >= finer));
+            spread_trellis(at, height, width, rule_of(0, step, tile >= finer));
         else
             spread_band(at, rule_of(state[tile], step, tile >= finer));
     }

@@ -320,8 +320,7 @@ LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, 
  * steps:   of each band its quantiser's step, below 2^26; 0 where there is none, and `known` are no indices.
  * state:   passes that remain of each tile, or LODE_UNANNOUNCED, which gives zeros.
  * finer:   coefficients of the tiles from this one on are multiplied by 8.
- * out:     begins at `first_row` and `first_column` of all coefficients. Its columns hold those of the bands; rows of
- *          bands that lie above or below are left out.
+ * out:     begins at `first_row` and `first_column` of all coefficients. What bands have outside of it is left out.
  */
 LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
                              const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,

@@ -29,7 +29,8 @@ from ..errors import CorruptStreamError, TooLargeError
 from ..library import require
 from ..parallel import spread
 from ..surface import Block, Surface
-from .measuring import Figures, RowsGiven, RowsMeasurer, distances_of
+from .measuring import Figures, RowsMeasurer, distances_of
+from .windows import RowsGiven
 
 __all__ = ["inspect"]
 

@@ -17,25 +17,22 @@ from ..container.chunks import ChunkPlace, chunk_places
 from ..container.fields import told, told_roughly
 from ..container.model import Errors, Header
 from ..decoding.reconstruction import Values
-from ..decoding.rows import RowsGeometry, RowsReconstructor
-from ..encoding.holes import given_arrays
+from ..decoding.rows import KnownState, RowsGeometry, RowsReconstructor, known_state
 from ..encoding.prepared import Prepared
 from ..encoding.residual_encoder import ChunkCoder
 from ..entropy.tiles import Tiles
-from ..kernels import PART_ROWS
+from ..kernels import PART_COLUMNS, PART_ROWS
+from ..parallel import spread
 from ..quantization.distortion import (
-    Original,
-    distance_figures,
     errors_of_figures,
-    other_originals,
     store_values,
 )
 from ..quantization.lattice import Lattice
-from ..transform.pyramid import PADDING
+from .windows import RowsGiven, WindowMeasurer, window_core
 
 __all__ = [
+    "BANDS_TOGETHER",
     "Figures",
-    "RowsGiven",
     "RowsMeasurer",
     "ValuesOfRows",
     "chunks_of_rows",
@@ -45,8 +42,15 @@ __all__ = [
     "measured_rows",
 ]
 
-#: Rows, half-open.
+#: Rows or columns, half-open.
 Span = tuple[int, int]
+
+#: Rows and points of the windows that are measured one after another. Each level is made with 26 points more on every
+#: side, which speaks against smaller windows; memory speaks against larger ones.
+_WINDOW_ROWS, _WINDOW_POINTS = 1024, 1 << 21
+#: Rows that are measured together have so many times the points of a band of the transform. What their tiles hold takes
+#: 8 bytes a value.
+BANDS_TOGETHER = 2
 
 
 @dataclass(frozen=True)
@@ -69,74 +73,30 @@ class Figures:
 
 
 def measured_rows(prepared: Prepared, chunk: tuple[int, int], points: int) -> list[Span]:
-    """The rows of a surface of one grid in runs that are measured together, of about so many points each.
+    """The rows of a surface of one grid in runs that are measured together.
 
-    ``chunk`` are the rows and columns of a chunk of residual, as exponents of two.
+    ``chunk`` are the rows and columns of a chunk of residual, as exponents of two; ``points`` are those of a band of
+    the transform, which takes about as much memory.
     """
     rows, columns = prepared.layout.shape(0, prepared.layout.levels)
     unit = max(PART_ROWS, 1 << chunk[0])
-    each = unit * max(1, points // (unit * columns))
+    each = unit * max(1, BANDS_TOGETHER * points // (unit * columns))
     return [(start, min(start + each, rows)) for start in range(0, rows, each)]
 
 
-@dataclass(frozen=True)
-class RowsGiven:
-    """The given values of some rows of a surface of one grid, which reconstructions are compared with.
-
-    Attributes
-    ----------
-    coordinates : Original
-    others : list of (Original, int)
-        Of each channel that is no coordinate: the array it is in, and its number there.
-    """
-
-    coordinates: Original
-    others: list[tuple[Original, int]]
-
-    @staticmethod
-    def of(
-        points: NDArray[Any], arrays: Sequence[NDArray[Any]], mask: NDArray[np.bool_] | None, geometric: int
-    ) -> RowsGiven:
-        """What is compared of some rows.
-
-        Parameters
-        ----------
-        points : shape (row, column, channel)
-            Finite where errors are counted.
-        arrays : sequence of arrays, shape (row, column, channel)
-            Points and attributes as they were given.
-        mask : bool, shape (row, column), or None
-            True where a point is valid.
-        geometric : int
-            The first so many channels of the points are coordinates.
-        """
-        others: list[tuple[Original, int]] = []
-        if sum(array.shape[2] for array in arrays) > geometric:
-            found = other_originals(None, [arrays], [mask], geometric)
-            others = [(originals[0], channel) for originals, channel in found]
-        return RowsGiven(Original(np.ascontiguousarray(points), mask), others)
-
-    @staticmethod
-    def prepared(prepared: Prepared, rows: Span) -> RowsGiven:
-        """Rows of a surface that is encoded."""
-        block, within = prepared.surface.blocks[0], slice(*rows)
-        mask = None if block.mask is None else block.mask[within]
-        arrays = [array[within] for array in given_arrays(block)]
-        return RowsGiven.of(prepared.arrays[0][0][within], arrays, mask, prepared.geometric)
-
-
 class RowsMeasurer:
-    """Measures rows of a surface of one grid in one state after another.
+    """Measures rows of a surface of one grid in many states.
 
     Parameters
     ----------
     given : RowsGiven
-        Of the geometry's rows.
+        Of the rows.
     lattices : sequence of Lattice, one for each channel
     geometric : int
         Channels that are coordinates.
     predictors : int8, shape (channel, level, axis, 2)
     geometry : RowsGeometry
+        Of the rows, the first of which is a multiple of `PART_ROWS`.
     tiles : sequence of Tiles, one for each channel
         Of the geometry's tiles, see `RowsReconstructor`.
     """
@@ -151,64 +111,85 @@ class RowsMeasurer:
         tiles: Sequence[Tiles],
     ) -> None:
         self._given, self._lattices, self._geometric = given, lattices, geometric
-        self._channels = [RowsReconstructor(geometry, own, mine) for own, mine in zip(predictors, tiles, strict=True)]
-        first, last = geometry.rows
-        self._shape = last - first, geometry.layout.shape(0, geometry.layout.levels)[1]
-        self._canvas = np.empty((geometric, self._shape[0], self._shape[1] + PADDING), np.int32)
+        self._predictors, self._geometry, self._tiles = predictors, geometry, tiles
+        (first, last), layout = geometry.rows, geometry.layout
+        self._core = min(geometry.core, window_core(layout))
+        self._shape = last - first, layout.shape(0, layout.levels)[1]
 
     def figures(self, states: Sequence[NDArray[np.int8]]) -> Figures:
         """What the rows tell of the errors of states, int8, shape (tile, channel) each."""
-        found = [self._of_state(state) for state in states]
-        originals = [self._given.coordinates, *(original for original, _ in self._given.others)]
-        counts = np.array([original.count for original in originals], np.int64)
-        return Figures(np.stack([squares for squares, _ in found]), np.stack([equal for _, equal in found]), counts)
+        known = [self._known(state) for state in states]
+        counts = [self._given.coordinates.count, *(original.count for original, _ in self._given.others)]
+        kinds = (1 + self._geometric if self._geometric > 1 else 1) + len(self._given.others)
+        cells = [-(-length // size) for length, size in zip(self._shape, (PART_ROWS, PART_COLUMNS), strict=True)]
+        squares, equal = np.empty((len(states), *cells, kinds, 2)), np.ones((len(states), kinds), np.bool_)
 
-    def _of_state(self, state: NDArray[np.int8]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        geometric = self._geometric
-        fractions = [self._reconstruct(k, k, state) for k in range(geometric)]
-        parts = [self._compare(self._given.coordinates, self._lattices[:geometric], self._canvas, fractions, 0)]
-        for number, (original, channel) in enumerate(self._given.others, geometric):
-            fraction = self._reconstruct(0, number, state)
-            lattices = self._lattices[number : number + 1]
-            parts.append(self._compare(original, lattices, self._canvas[:1], [fraction], channel))
-        squares, equal = zip(*parts, strict=True)
-        return np.concatenate(squares, axis=2), np.concatenate(equal)
+        def measure(window: tuple[Span, Span]) -> NDArray[np.bool_]:
+            (top, bottom), (left, right) = window
+            rows = slice(top // PART_ROWS, -(-bottom // PART_ROWS))
+            columns = slice(left // PART_COLUMNS, -(-right // PART_COLUMNS))
+            same = np.empty((len(states), kinds), np.bool_)
+            measuring = self._window(window)
+            for number, state in enumerate(known):
+                squares[number, rows, columns], same[number] = measuring.measure(state)
+            return same
 
-    def _reconstruct(self, place: int, channel: int, state: NDArray[np.int8]) -> int:
-        rows, fraction = self._channels[channel].reconstruct(np.ascontiguousarray(state[:, channel]))
-        self._canvas[place, :, :-PADDING] = rows
-        return fraction
+        for same in spread(measure, self._windows()):
+            equal &= same
+        return Figures(squares, equal, np.array(counts, np.int64))
 
-    @staticmethod
-    def _compare(
-        original: Original, lattices: Sequence[Any], canvas: NDArray[np.int32], fractions: Sequence[int], channel: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        squares = distance_figures(original, lattices, canvas, fractions, channel)
-        equal = np.zeros(squares.shape[2], np.bool_)
-        if original.points.dtype.itemsize == 8 and not squares[..., 1].any():
-            # Squares of the smallest differences vanish: only a look at the values tells that there are none.
-            columns = original.points.shape[1]
-            same = np.empty((*original.points.shape[:2], len(lattices)), original.points.dtype)
-            for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
-                store_values(lattice, (canvas[number, :, :columns], fraction), same, number)
-            wanted = original.points[..., channel : channel + len(lattices)]
-            chosen = slice(None) if original.counted is None else original.counted
-            equal[:] = np.array_equal(wanted[chosen], same[chosen])
-        return squares, equal
+    def _known(self, state: NDArray[np.int8]) -> list[KnownState]:
+        """A state, int8, shape (tile, channel), as far as each channel's tiles are concerned."""
+        return [
+            known_state(tiles.table, np.ascontiguousarray(state[:, channel]))
+            for channel, tiles in enumerate(self._tiles)
+        ]
+
+    def _windows(self) -> list[tuple[Span, Span]]:
+        """The windows that are measured one after another, by their rows and columns, from the first row on."""
+        rows, columns = self._shape
+        down = min(rows, _WINDOW_ROWS)
+        points = min(_WINDOW_POINTS, rows * columns // 2)
+        across = PART_COLUMNS * max(1, points // (PART_COLUMNS * down))
+        if self._geometry.layout.grids[0].closed[1]:
+            across = columns  # each would be made of all of them
+        return [
+            ((top, min(top + down, rows)), (left, min(left + across, columns)))
+            for top in range(0, rows, down)
+            for left in range(0, columns, across)
+        ]
+
+    def _window(self, window: tuple[Span, Span]) -> WindowMeasurer:
+        return WindowMeasurer(self._given.window(*window), self._lattices, self._geometric, self._made(window))
+
+    def _made(self, window: tuple[Span, Span]) -> list[RowsReconstructor]:
+        """What reconstructs a window, of each channel."""
+        (top, bottom), columns = window
+        first, layout = self._geometry.rows[0], self._geometry.layout
+        geometry = RowsGeometry(layout, (first + top, first + bottom), self._core, columns)
+        return [
+            RowsReconstructor(geometry, own, tiles) for own, tiles in zip(self._predictors, self._tiles, strict=True)
+        ]
 
     def values(self, state: NDArray[np.int8], kinds: Sequence[tuple[int, np.dtype[Any]]]) -> Values:
         """The rows of all channels in a state, int8, shape (tile, channel), as `to_values` makes them of a block.
 
         ``kinds`` are the components and the dtype of the points, and of each attribute.
         """
-        channel, arrays = 0, []
-        for components, dtype in kinds:
-            array = np.empty((*self._shape, components), dtype)
-            for component in range(components):
-                made = self._channels[channel].reconstruct(np.ascontiguousarray(state[:, channel]))
-                store_values(self._lattices[channel], made, array, component)
-                channel += 1
-            arrays.append(array)
+        known = self._known(state)
+        arrays = [np.empty((*self._shape, components), dtype) for components, dtype in kinds]
+
+        def store(window: tuple[Span, Span]) -> None:
+            channel, made = 0, self._made(window)
+            for array, (components, dtype) in zip(arrays, kinds, strict=True):
+                for component in range(components):
+                    coordinates = made[channel].reconstruct(known[channel])
+                    values = np.empty(coordinates[0].shape, dtype)
+                    store_values(self._lattices[channel], coordinates, values[..., None], 0)
+                    array[slice(*window[0]), slice(*window[1]), component] = values
+                    channel += 1
+
+        spread(store, self._windows())
         return Values(arrays)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from ..entropy.part_table import flat_span
 from .build import Build
 
-__all__ = ["PLAIN", "kind_of", "name_of", "pieces_of", "read_tiles", "transformed"]
+__all__ = ["PLAIN", "kind_of", "name_of", "pieces_of", "read_tiles", "stored_tiles", "transformed"]
 
 #: The file that says which channels are transformed with the default predictors, bool, shape (channel,).
 PLAIN = "plain"
@@ -44,22 +45,29 @@ def pieces_of(build: Build) -> list[tuple[int, int, range]]:
     return pieces + [(level, band.number, band.tiles) for level in bands.levels for band in bands.of(level)]
 
 
-def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[Any]:
-    """What neighbouring tiles of a level, or of levels of the core, have in the flat array of a kind, shape (number,).
+def stored_tiles(build: Build, kind: str, channel: int, tiles: range) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """What neighbouring tiles of a level, or of levels of the core, have in the flat array of a kind, piece by piece.
 
-    There is at least one tile.
+    Yields where a piece goes among that of these tiles, and what it has, shape (number,), not to be changed.
     """
     table, bands = build.table, build.bands
     level = build.prepared.layout.level_of(tiles.start)
     wanted = flat_span(table, tiles)
-    found: NDArray[Any] | None = None
     for at, number, own in pieces_of(build):
         if at != max(level, bands.core) or own.stop <= tiles.start or own.start >= tiles.stop:
             continue
         piece, place = build.scratch.read(name_of(kind, channel, at, number)), flat_span(table, own)
         low, high = max(place.start, wanted.start), min(place.stop, wanted.stop)
+        yield slice(low - wanted.start, high - wanted.start), piece[low - place.start : high - place.start]
+
+
+def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[Any]:
+    """The same in one array, shape (number,). There is at least one tile."""
+    span = flat_span(build.table, tiles)
+    found: NDArray[Any] | None = None
+    for place, piece in stored_tiles(build, kind, channel, tiles):
         if found is None:
-            found = np.empty(wanted.stop - wanted.start, piece.dtype)
-        found[low - wanted.start : high - wanted.start] = piece[low - place.start : high - place.start]
+            found = np.empty(span.stop - span.start, piece.dtype)
+        found[place] = piece
     assert found is not None  # every tile is in a piece
     return found

@@ -20,8 +20,9 @@ from ..transform.pyramid import empty
 from . import forward
 from .build import Build
 from .coding import Units, code_segments, code_units, parents_of
-from .measuring import RowsGiven, RowsMeasurer, chunks_of_rows, kinds_of, measured_rows
-from .stored import CORE, kind_of, name_of, read_tiles, transformed
+from .measuring import RowsMeasurer, chunks_of_rows, kinds_of, measured_rows
+from .stored import CORE, kind_of, name_of, read_tiles, stored_tiles, transformed
+from .windows import RowsGiven, window_core
 
 __all__ = [
     "code",
@@ -148,18 +149,20 @@ def measure(folder: str, number: int) -> None:
 
 def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
     """What measures these rows."""
-    geometry, predictors = RowsGeometry(build.prepared.layout, rows, build.bands.core), build.scratch.read("predictors")
+    layout, predictors = build.prepared.layout, build.scratch.read("predictors")
+    geometry = RowsGeometry(layout, rows, min(build.bands.core, window_core(layout)))
     part = part_of(build.table, geometry.tiles)
     channels = []
     for channel in range(build.channels):
         coefficients = transformed(build, "coefficients", channel)
         tiles = Tiles(part.table)
         for run, span in part.spans:
-            true = read_tiles(build, coefficients, channel, run)
-            np.abs(true, out=tiles.known[span])
-            np.sign(true, out=true)
-            tiles.sign[span] = true
-            tiles.early[span] = read_tiles(build, "early", channel, run)
+            known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
+            for place, true in stored_tiles(build, coefficients, channel, run):
+                np.abs(true, out=known[place])
+                np.sign(true, out=sign[place], casting="unsafe")
+            for place, passes in stored_tiles(build, "early", channel, run):
+                early[place] = passes
         channels.append(tiles)
     prepared = build.prepared
     given, lattices = RowsGiven.prepared(prepared, rows), build.lattices.channels

@@ -31,7 +31,7 @@ from ..scratch import Room
 from ..surface import Block, Surface
 from .batches import Coded, batch_length, rounds_of
 from .reconstruction import Values
-from .rows import RowsGeometry, RowsReconstructor
+from .rows import RowsGeometry, RowsReconstructor, known_state
 
 __all__ = ["RowsDecoder", "why_not_by_rows"]
 
@@ -169,7 +169,8 @@ class RowsDecoder:
             for component in range(count):
                 made = RowsReconstructor(geometry, header.predictors[channel], channels[channel])
                 lattice = header.lattices[channel]
-                store_values(lattice, made.reconstruct(self._state[:, channel]), array, component)
+                state = known_state(channels[channel].table, self._state[:, channel])
+                store_values(lattice, made.reconstruct(state), array, component)
                 channel += 1
             arrays.append(array)
         values = Values(arrays)

@@ -213,7 +213,7 @@ class _Level:
         for part, first in ((canvas[:nodes], crop.first), (canvas[nodes:], self._steps[0].coarse + crop.first)):
             if len(part):
                 numbers = self._numbers[(self._first < first + len(part)) & (self._last > first)]
-                self._tiles.spread_rows(numbers, self._state, part, first, bool(self.fraction))
+                self._tiles.spread_part(numbers, self._state, part, (first, 0), bool(self.fraction))
 
 
 def _room(rows: int, columns: int) -> NDArray[np.int32]:

@@ -1,43 +1,62 @@
-"""Some rows of a surface of one grid in any states, from a part of its tiles.
+"""Some rows of a surface of one grid, or a window of them, in any states, from a part of its tiles.
 
-Level by level from a coarse one, which is reconstructed whole, only the rows are made that the next finer level needs:
-`crop_axis` tells which. Levels hold fewer and fewer points, so all of them take little more than the rows themselves.
+Level by level from a coarse one, which is reconstructed whole, only that is made which the next finer level needs:
+`crop_axis` tells what. Levels hold fewer and fewer points, so all of them take little more than the window itself. What
+a state shares with the one before it is not made again.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..entropy.band_fields import ROWS
+from ..entropy.band_fields import COLUMNS, ROWS
 from ..entropy.tiles import Tiles, TileTable
 from ..grid.layout import Layout
-from ..transform.lifting import FRACTION_BITS, inverse_step
+from ..transform.all_levels import LevelInverse
+from ..transform.lifting import FRACTION_BITS
 from ..transform.predictors import predictor
-from ..transform.pyramid import empty, inverse, refine
+from ..transform.pyramid import PADDING, inverse
 from .crop import AxisCrop, crop_axis
 from .levels import known_levels
 
-__all__ = ["RowsGeometry", "RowsReconstructor"]
+__all__ = ["KnownState", "RowsGeometry", "RowsReconstructor", "known_state"]
 
-#: Rows, half-open.
+#: Rows or columns, half-open.
 Span = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class _Step:
-    """One level of the way up: which rows it takes and makes."""
+    """One level of the way up: what it takes and makes along both axes, and which part of that is wanted."""
 
     level: int
-    crop: AxisCrop
-    wanted: int
-    taken: Span
+    crops: tuple[AxisCrop, AxisCrop]
+    part: tuple[Span, Span]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns that are made, those beside what is wanted included."""
+        return self.crops[0].step.length, self.crops[1].step.length
+
+    @property
+    def coarse(self) -> tuple[int, int]:
+        """Rows and columns of nodes that are taken."""
+        return self.crops[0].step.coarse, self.crops[1].step.coarse
+
+    def spans(self, layout: Layout, axis: int) -> tuple[Span, Span]:
+        """The nodes and the details that are taken along an axis, among all coefficients."""
+        crop, nodes = self.crops[axis], layout.shape(0, self.level - 1)[axis]
+        first, details = crop.first, crop.step.length - crop.step.coarse
+        return (first, first + crop.step.coarse), (nodes + first, nodes + first + details)
 
 
 class RowsGeometry:
-    """What some rows of a surface need.
+    """What some rows of a surface need, or a window of them.
 
     Parameters
     ----------
@@ -47,96 +66,162 @@ class RowsGeometry:
         Half-open.
     core : int
         The level that is reconstructed whole.
-
-    Attributes
-    ----------
-    tiles : list of range
-        The numbers of the tiles that are needed, in their order: of all levels up to the core, then of each finer one.
+    columns : (int, int), optional
+        Half-open; all if not given. Where columns wrap all of them are made whatever is wanted.
     """
 
-    def __init__(self, layout: Layout, rows: Span, core: int) -> None:
+    def __init__(self, layout: Layout, rows: Span, core: int, columns: Span | None = None) -> None:
         if len(layout.grids) != 1 or layout.grids[0].closed[0]:
             raise ValueError("expected a layout of one grid whose rows do not wrap")
         self.layout, self.rows, self.core = layout, rows, core
-        steps, span = [], rows
+        self.columns = columns or (0, layout.shape(0, layout.levels)[1])
+        steps, spans = [], (rows, self.columns)
         for level in range(layout.levels, core, -1):
-            crop = crop_axis(layout.steps(0, level)[0], *span)
-            taken = crop.first, crop.first + crop.step.coarse
-            steps.append(_Step(level, crop, span[1] - span[0], taken))
-            span = taken
+            across, down = layout.steps(0, level)
+            crops = crop_axis(across, *spans[0]), crop_axis(down, *spans[1])
+            above, left = (
+                (crop.start, crop.start + stop - start) for crop, (start, stop) in zip(crops, spans, strict=True)
+            )
+            steps.append(_Step(level, crops, (above, left)))
+            above, left = ((crop.first, crop.first + crop.step.coarse) for crop in crops)
+            spans = above, left
         self.steps = steps[::-1]
-        self.core_rows = span
-        self.tiles = [range(layout.tiles_of(core).stop)]
-        for step in self.steps:
-            self.tiles.append(self._tiles_of(step))
+        self.core_part = spans
+
+    @cached_property
+    def tiles(self) -> list[range]:
+        """The numbers of the tiles that are needed for all columns, in their order.
+
+        Of all levels up to the core, then of each finer one.
+        """
+        return [range(self.layout.tiles_of(self.core).stop), *(self._tiles_of(step) for step in self.steps)]
 
     def _tiles_of(self, step: _Step) -> range:
         """The tiles of a level that have nodes or details in the rows; they are neighbours."""
-        layout, own = self.layout, self.layout.tiles_of(step.level)
-        nodes, coarse = step.taken, layout.shape(0, step.level - 1)[0]
-        details = coarse + nodes[0], coarse + nodes[0] + step.crop.step.length - step.crop.step.coarse
-        bands = layout.tile_arrays.bands(np.arange(own.start, own.stop), True)
+        own = self.layout.tiles_of(step.level)
+        bands = self.layout.tile_arrays.bands(np.arange(own.start, own.stop), True)
         first, last = bands.start[:, 0], bands.start[:, 0] + bands.shape[:, 0]
-        taken = [(first < stop) & (last > start) for start, stop in (nodes, details)]
+        taken = [(first < stop) & (last > start) for start, stop in step.spans(self.layout, 0)]
         found = own.start + bands.tile[taken[0] | taken[1]]
         return range(int(found[0]), int(found[-1]) + 1) if found.size else range(0)
 
 
+class KnownState(NamedTuple):
+    """A state as far as a part of the tiles is concerned.
+
+    Attributes
+    ----------
+    passes : int8, shape (tile,)
+        Passes that remain of each tile of the part.
+    whole, bare : int, list of int
+        See `known_levels`: of the whole surface.
+    """
+
+    passes: NDArray[np.int8]
+    whole: int
+    bare: list[int]
+
+
+def known_state(table: TileTable, state: NDArray[np.int8]) -> KnownState:
+    """A state, int8, shape (tile,) of all tiles of the surface, as far as those of a table are concerned."""
+    layout = table.layout
+    return KnownState(state[np.asarray(table.members)], *known_levels(layout, state, layout.levels))
+
+
+class _Quarter(NamedTuple):
+    """Nodes or details of a level along either axis: their bands, and where they go.
+
+    ``numbers`` are those of the bands in the table, int64, shape (band,); ``part`` is a view of the level's grid,
+    ``origin`` its first row and column among all coefficients.
+    """
+
+    numbers: NDArray[np.int64]
+    part: NDArray[np.int32]
+    origin: tuple[int, int]
+
+
+class _Grid:
+    """Room for a level's grid, or for a part of it: ``array``, int32, shape (row, column).
+
+    ``wanted`` are the rows and columns of it that are wanted, ``frame`` these and more columns, in one piece.
+    """
+
+    def __init__(self, shape: tuple[int, int], wanted: tuple[Span, Span]) -> None:
+        (top, bottom), (left, right) = wanted
+        pitch = shape[1] + PADDING
+        flat = np.empty((shape[0] + 1) * pitch, np.int32)
+        self.array = flat[: shape[0] * pitch].reshape(-1, pitch)[:, : shape[1]]
+        first = top * pitch + left
+        self.frame = flat[first : first + (bottom - top) * pitch].reshape(-1, pitch)
+        self.wanted = self.frame[:, : right - left]
+
+
 class RowsReconstructor:
-    """Reconstructs the rows of one channel, in one state after another.
+    """Reconstructs the rows, or the window, of one channel, in one state after another.
 
     Parameters
     ----------
     geometry : RowsGeometry
     predictors : int8, shape (level, axis, 2)
     tiles : Tiles
-        Of the tiles of the geometry, numbered anew in their order, with all that is to be known of them; or of all
-        tiles of the surface.
+        Of the tiles of the geometry and any others, numbered anew in their order, with all that is to be known of them;
+        or of all tiles of the surface. Those of levels up to the core are all there.
+
+    Attributes
+    ----------
+    frame : int32, shape (row, column and `PADDING` or more)
+        What was reconstructed last, in one piece. What the columns beyond hold means nothing.
     """
 
     def __init__(self, geometry: RowsGeometry, predictors: NDArray[np.int8], tiles: Tiles) -> None:
         self._geometry, self._layout, self._predictors = geometry, geometry.layout, predictors
-        self._tiles, table = tiles, tiles.table
-        chosen = np.asarray(table.members)
-        self._numbers = chosen
-        first = table.origins[:, 1]
-        last = first + table.bands[:, ROWS]
-        self._bands = {step.level: self._placed(table, chosen, step, first, last) for step in geometry.steps}
-        self._canvases = {
-            step.level: empty((step.crop.step.length, self._layout.shape(0, step.level)[1])) for step in geometry.steps
-        }
-        self._core = empty(self._layout.shape(0, geometry.core))
+        self._tiles, layout = tiles, geometry.layout
+        self._core = _Grid(layout.shape(0, geometry.core), geometry.core_part)
+        self._grids = [_Grid(step.shape, step.part) for step in geometry.steps]
+        self.frame = (self._grids or [self._core])[-1].frame
+        self._quarters = [self._quarters_of(*own) for own in zip(geometry.steps, self._grids, strict=True)]
+        self._inverses = []
+        for step in geometry.steps:
+            across, down = (
+                predictor(predictors, layout.grids[0], full, step.level, axis)
+                for axis, full in enumerate(layout.steps(0, step.level))
+            )
+            crops = step.crops
+            self._inverses.append(LevelInverse((crops[0].step, crops[1].step), (across, down)))
+        origins = tiles.table.origins
+        #: Of the core, then of each step: the tiles that are looked at.
+        self._used = [np.arange(layout.tiles_of(geometry.core).stop)]
+        for own in self._quarters:
+            numbers = [quarter.numbers for quarter in own]
+            self._used.append(np.unique(origins[np.concatenate(numbers), 0]) if own else np.zeros(0, np.int64))
+        self._before: KnownState | None = None
 
-    def _placed(
-        self,
-        table: TileTable,
-        chosen: NDArray[np.int64],
-        step: _Step,
-        first: NDArray[np.int64],
-        last: NDArray[np.int64],
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The bands that have nodes, and details, of a level's rows, by their numbers in the table."""
-        own = self._layout.tiles_of(step.level)
-        span = np.searchsorted(chosen, [own.start, own.stop])
+    def _quarters_of(self, step: _Step, grid: _Grid) -> list[_Quarter]:
+        """The parts of a level's grid that hold its coefficients."""
+        table, own = self._tiles.table, self._layout.tiles_of(step.level)
+        span = np.searchsorted(np.asarray(table.members), [own.start, own.stop])
         numbers = np.arange(table.first[span[0]], table.first[span[1]])
-        nodes, details = step.taken, self._details(step)
-        nodes_of, details_of = (
-            numbers[(first[numbers] < stop) & (last[numbers] > start)] for start, stop in (nodes, details)
-        )
-        return nodes_of, details_of
+        first = table.origins[numbers, 1:]
+        last = first + table.bands[numbers][:, [ROWS, COLUMNS]]
+        spans = [step.spans(self._layout, axis) for axis in range(2)]
+        quarters = []
+        for down, across in ((0, 1), (1, 0), (1, 1)):
+            starts, stops = np.array([spans[0][down], spans[1][across]]).T
+            taken = ((first < stops) & (last > starts)).all(axis=1)
+            rows, columns = (
+                slice(count, None) if details else slice(count)
+                for count, details in zip(step.coarse, (down, across), strict=True)
+            )
+            quarters.append(_Quarter(numbers[taken], grid.array[rows, columns], (int(starts[0]), int(starts[1]))))
+        return [quarter for quarter in quarters if len(quarter.numbers) and quarter.part.size]
 
-    def _details(self, step: _Step) -> Span:
-        """The rows of a level's details among those of all coefficients."""
-        start = self._layout.shape(0, step.level - 1)[0] + step.crop.first
-        return start, start + step.crop.step.length - step.crop.step.coarse
-
-    def reconstruct(self, state: NDArray[np.int8]) -> tuple[NDArray[np.int32], int]:
-        """The rows in a state.
+    def reconstruct(self, state: KnownState) -> tuple[NDArray[np.int32], int]:
+        """The rows, or the window, in a state.
 
         Parameters
         ----------
-        state : int8, shape (tile,)
-            Passes that remain of each tile of the surface.
+        state : KnownState
+            Of the tiles' table.
 
         Returns
         -------
@@ -145,34 +230,42 @@ class RowsReconstructor:
             is this object's: the next call changes it.
         """
         layout, geometry = self._layout, self._geometry
-        whole, bare = known_levels(layout, state, layout.levels)
-        own = np.ascontiguousarray(state[self._numbers])
-        core = geometry.core
-        self._tiles.spread_levels(core, own, [self._core], whole, bare=[level for level in bare if level <= core])
-        inverse([self._core], layout, self._predictors, core, whole, bare=bare)
-        rows = self._core[slice(*geometry.core_rows)]
-        for step in geometry.steps:
-            rows = self._finer(step, rows, own, whole, step.level in bare)
+        whole, bare = state.whole, state.bare
+        shared = self._shared_with(state)
+        self._before = state
+        if not shared:
+            known = [level for level in bare if level <= geometry.core]
+            self._tiles.spread_levels(geometry.core, state.passes, [self._core.array], whole, bare=known)
+            inverse([self._core.array], layout, self._predictors, geometry.core, whole, bare=bare)
+        rows = self._core.wanted
+        for number, grid in enumerate(self._grids):
+            if number + 1 >= shared:
+                self._finer(number, rows, state)
+            rows = grid.wanted
         return rows, FRACTION_BITS if whole < layout.levels else 0
 
-    def _finer(
-        self, step: _Step, nodes: NDArray[np.int32], state: NDArray[np.int8], whole: int, bare: bool
-    ) -> NDArray[np.int32]:
-        layout, level, crop = self._layout, step.level, step.crop
-        full = layout.steps(0, level)
-        rules = [predictor(self._predictors, layout.grids[0], own, level, axis) for axis, own in enumerate(full)]
-        canvas, count = self._canvases[level], crop.step.coarse
-        corner = canvas[:count, : full[1].coarse]
-        corner[...] = nodes
-        if level == whole + 1:
-            refine(corner)
+    def is_shown(self, state: KnownState) -> bool:
+        """Whether the state before shows the same."""
+        return self._shared_with(state) == len(self._used)
+
+    def _shared_with(self, state: KnownState) -> int:
+        """How many grids, the core's and those of finer levels, are the same as in the state before."""
+        before = self._before
+        if before is None:
+            return 0
+        for number, used in enumerate(self._used):
+            level = self._geometry.core + number
+            # Up to the level that is known whole they count lattice steps, beyond it finer ones.
+            if min(before.whole, level) != min(state.whole, level) or (before.passes[used] != state.passes[used]).any():
+                return number
+        return len(self._used)
+
+    def _finer(self, number: int, nodes: NDArray[np.int32], state: KnownState) -> None:
+        """Make the grid of a step from its nodes."""
+        step, array = self._geometry.steps[number], self._grids[number].array
+        bare = step.level in state.bare
+        array[: step.coarse[0], : step.coarse[1]] = nodes
         if not bare:
-            parts = (canvas[:count], step.taken[0]), (canvas[count:], self._details(step)[0])
-            for numbers, (part, first) in zip(self._bands[level], parts, strict=True):
-                if len(part):
-                    self._tiles.spread_rows(numbers, state, part, first, level > whole)
-        if full[1].midpoints:
-            inverse_step(canvas[:count] if bare else canvas, 1, full[1], rules[1], bare)
-        if crop.step.midpoints:
-            inverse_step(canvas, 0, crop.step, rules[0], bare)
-        return canvas[crop.start : crop.start + step.wanted]
+            for numbers, part, origin in self._quarters[number]:
+                self._tiles.spread_part(numbers, state.passes, part, origin, step.level > state.whole)
+        self._inverses[number](array, step.level == state.whole + 1, bare)

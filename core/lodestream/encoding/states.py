@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -19,6 +20,8 @@ __all__ = ["Canvases", "StateReconstructor"]
 
 #: Levels of at most this share of the points are kept, which all together take a twelfth of a canvas.
 _KEPT = 16
+#: Levels of fewer points are made again: that takes less than the calls to keep each by itself.
+_WORTH = 1 << 12
 
 #: Room for reconstructions: int32, shape (coordinate, row, column and `PADDING` more), of each grid.
 Canvases = list[NDArray[np.int32]]
@@ -32,7 +35,7 @@ class _Kept:
     ----------
     state : int8, shape (tile,)
     grids : list of lists of int32 arrays, shape (row, column)
-        Copies of the grids of each level, from 0 on; of those that are kept.
+        Copies of the grids of the coarsest levels that are kept.
     """
 
     state: NDArray[np.int8]
@@ -64,7 +67,7 @@ class StateReconstructor:
         ]
         self._header, self._tiles = header, tiles
         most = layout.points(layout.levels) // _KEPT
-        self._levels = [level for level in range(layout.levels) if layout.points(level) <= most]
+        self._levels = [level for level in range(layout.levels) if _WORTH <= layout.points(level) <= most]
         self._kept: dict[int, _Kept] = {}
 
     def reconstruct(self, place: int, channel: int, state: NDArray[np.int8]) -> int:
@@ -82,15 +85,18 @@ class StateReconstructor:
         arrays = [canvas[place, :, :-PADDING] for canvas in self.canvases]
         whole, bare = known_levels(layout, state, layout.levels)
         kept = self._kept.get(channel)
-        levels = 0 if kept is None else min(_first_changed(layout, kept.state, state), len(kept.grids))
-        self._kept[channel] = kept = _Kept(state.copy(), [] if kept is None else kept.grids[:levels])
-        start = levels - 1 if levels else None
+        shared = 0
+        if kept is not None:
+            changed = _first_changed(layout, kept.state, state)
+            shared = min(bisect_left(self._levels, changed), len(kept.grids))
+        self._kept[channel] = kept = _Kept(state.copy(), [] if kept is None else kept.grids[:shared])
+        start = self._levels[shared - 1] if shared else None
         if start is not None:
-            for array, grid in zip(arrays, kept.grids[start], strict=True):
+            for array, grid in zip(arrays, kept.grids[-1], strict=True):
                 array[: grid.shape[0], : grid.shape[1]] = grid
         self._tiles[channel].spread_levels(layout.levels, state, arrays, whole, start, bare)
         rules, coordinate = header.predictors[channel], channel < header.geometric
-        for level in self._levels[levels:]:
+        for level in self._levels[shared:]:
             inverse(arrays, layout, rules, level, whole, coordinate, start, bare)
             start = level
             corners = zip(arrays, (layout.shape(k, level) for k in range(len(arrays))), strict=True)

@@ -51,12 +51,12 @@ def spread_bands(
         Coefficients of the tiles from this one on are multiplied by 2**`lifting.FRACTION_BITS` and kept within their
         bounds.
     out : int32, shape (row, column)
-        Coefficients from the row and column ``origin`` on; updated. Rows of bands that lie above or below are left out.
+        Coefficients from the row and column ``origin`` on; updated. What bands have outside of it is left out.
 
     Raises
     ------
     ValueError
-        Where a band does not lie inside the flat arrays, or its columns do not inside ``out``.
+        Where a band does not lie inside the flat arrays.
     """
     for batch in _batches(bands, numbers) if known.size > _AT_ONCE else [numbers] if numbers.size else []:
         kernels.spread(known, sign, early, bands, origins, steps, batch, state, finer, out, *origin)

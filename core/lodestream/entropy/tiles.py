@@ -328,22 +328,27 @@ class Tiles:
                 own = np.arange(*span) if len(coefficients) == 1 else numbers[slice(*np.searchsorted(numbers, span))]
                 self._spread(own, state, array, finer)
 
-    def spread_rows(
-        self, numbers: NDArray[np.int64], state: NDArray[np.int8], rows: NDArray[np.int32], first: int, finer: bool
+    def spread_part(
+        self,
+        numbers: NDArray[np.int64],
+        state: NDArray[np.int8],
+        part: NDArray[np.int32],
+        origin: tuple[int, int],
+        finer: bool,
     ) -> None:
-        """`spread` what some bands have in some rows of a grid, zeros where they were not announced.
+        """`spread` what some bands have in a part of a grid, zeros where they were not announced.
 
         Parameters
         ----------
         numbers : int64, shape (band,)
             In the table.
         state : int8, shape (tile,)
-        rows : int32, shape (row, column)
-            The grid's coefficients from row ``first`` on.
+        part : int32, shape (row, column)
+            The grid's coefficients from the row and column ``origin`` on.
         finer : bool
             They are multiplied by 2**`FRACTION_BITS`.
         """
-        self._spread(numbers, state, rows, 0 if finer else len(self.table.members), (first, 0))
+        self._spread(numbers, state, part, 0 if finer else len(self.table.members), origin)
 
     def band(self, number: int, state: NDArray[np.int8], finer: bool) -> NDArray[np.int32]:
         """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column).

@@ -1,4 +1,4 @@
-"""All levels of a channel undone in one call of a kernel.
+"""All levels of a channel undone in one call of a kernel, or one level of a part of a grid.
 
 Small surfaces have many levels of few values, and so have prefixes of large ones, whose finest levels hold no details.
 """
@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import kernels
+from ..grid.axis import AxisStep
 from ..grid.layout import REMEMBERED, Layout, Source
 from .lifting import REACH, work_room
 from .predictors import FOUR_POINT, INTERFACES, is_fitted
 
-__all__ = ["inverse_levels", "memory_of"]
+__all__ = ["LevelInverse", "inverse_levels", "memory_of"]
 
 #: Values of a level that are undone in one call.
 _AT_ONCE = 1 << 20
@@ -92,12 +93,17 @@ def inverse_levels(
     told, fitted, rules, room = _told(layout, coordinate or not layout.shared, level, whole, start, tuple(bare))
     table = told.copy()
     table[fitted, _A : _B + 1] = predictors[rules[:, 0], rules[:, 1]]
+    kernels.inverse(table, _planes(arrays, memory), memory, np.empty(room, np.int32))
+
+
+def _planes(arrays: Sequence[NDArray[np.int32]], memory: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Where arrays lie within their memory, as the kernel takes it: int64, shape (array, 4)."""
     first = _address(memory)
     planes = [
         ((_address(array) - first) // array.itemsize, *array.shape, array.strides[0] // array.itemsize)
         for array in arrays
     ]
-    kernels.inverse(table, np.array(planes, np.int64), memory, np.empty(room, np.int32))
+    return np.array(planes, np.int64)
 
 
 def _address(array: NDArray[np.int32]) -> int:
@@ -166,10 +172,8 @@ def _of_grid(layout: Layout, number: int, level: int, coordinate: bool) -> Itera
     yield _Step([kernels.INVERSE_NOTHING, number, 0, *layout.shape(number, level - 1)])
 
     def lifted(kind: int, axis: int, shape: tuple[int, int]) -> tuple[list[int], tuple[int, int] | None]:
-        step = steps[axis]
-        rule = (level - 1, INTERFACES if grid.interface else axis) if is_fitted(step) else None
-        table = step.extension(REACH).ravel().tolist()
-        return [kind, number, axis, *shape, step.midpoints, step.run, *FOUR_POINT, *table], rule
+        rule = (level - 1, INTERFACES if grid.interface else axis) if is_fitted(steps[axis]) else None
+        return _fields(kind, number, axis, shape, steps[axis], FOUR_POINT), rule
 
     if coordinate and not grid.interface:
         for side, source in enumerate(grid.sources):
@@ -185,6 +189,13 @@ def _of_grid(layout: Layout, number: int, level: int, coordinate: bool) -> Itera
             fields, rule = lifted(1, axis, shape)
             coarse = steps[0].coarse if axis == 1 else -1
             yield _Step(fields, rule=rule, coarse=coarse, room=work_room(steps[axis], axis, shape[1 - axis]))
+
+
+def _fields(
+    kind: int, plane: int, axis: int, shape: tuple[int, int], step: AxisStep, rule: tuple[int, int]
+) -> list[int]:
+    """A row of the table for a step of the lifting."""
+    return [kind, plane, axis, *shape, step.midpoints, step.run, *rule, *step.extension(REACH).ravel().tolist()]
 
 
 def _nodes(layout: Layout, number: int) -> Iterator[_Step]:
@@ -209,3 +220,49 @@ def _points(layout: Layout, source: Source, level: int) -> tuple[int, int, int]:
     if count == 1:
         return source.grid, 0, 0
     return (source.grid, count - 1, -1) if source.reversed else (source.grid, 0, 1)
+
+
+class LevelInverse:
+    """The step that makes one level, of a grid or of a part of it, undone in one call.
+
+    Parameters
+    ----------
+    steps : (AxisStep, AxisStep)
+        Along the columns' axis and along the rows' axis.
+    rules : ((int, int), (int, int))
+        The third step's (a, b) of either.
+    """
+
+    def __init__(self, steps: tuple[AxisStep, AxisStep], rules: tuple[tuple[int, int], tuple[int, int]]) -> None:
+        shape, self._coarse = (steps[0].length, steps[1].length), steps[0].coarse
+        rows, self._room = [[kernels.INVERSE_NOTHING, 0, 0, steps[0].coarse, steps[1].coarse]], 0
+        for axis in (1, 0):
+            if steps[axis].midpoints:
+                rows.append(_fields(1, 0, axis, shape, steps[axis], rules[axis]))
+                self._room = max(self._room, work_room(steps[axis], axis, shape[1 - axis]))
+        self._table = np.zeros((len(rows), kernels.INVERSE_STEP), np.int64)
+        for own, row in zip(self._table, rows, strict=True):
+            own[: len(row)] = row
+
+    def __call__(self, array: NDArray[np.int32], refined: bool, bare: bool) -> None:
+        """Turn nodes and details into the finer level, in place.
+
+        Parameters
+        ----------
+        array : int32, shape (row, column)
+            With all its columns side by side, in a C-contiguous array.
+        refined : bool
+            The nodes become steps over 2**`FRACTION_BITS` first, see `pyramid.refine`.
+        bare : bool
+            The details are 0, whatever stands in their places.
+        """
+        table = self._table.copy()
+        if refined:
+            table[0, _KIND] = kernels.INVERSE_REFINE
+        if bare:
+            table[1:, _KIND] = kernels.LIFT_BARE
+            table[table[:, _AXIS] == 1, _ROWS] = self._coarse  # no other row has anything
+        memory = array if array.base is None else array.base
+        assert isinstance(memory, np.ndarray)
+        memory = memory.reshape(-1)
+        kernels.inverse(table, _planes([array], memory), memory, np.empty(self._room, np.int32))

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lodestream.decoding.reconstruction import reconstruct_channel
-from lodestream.decoding.rows import RowsGeometry, RowsReconstructor
+from lodestream.decoding.rows import RowsGeometry, RowsReconstructor, known_state
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.entropy.part_table import Part, flat_span, part_of
 from lodestream.entropy.tiles import Tiles, TileTable
@@ -32,18 +32,23 @@ def _part(tiles: Tiles, geometry: RowsGeometry) -> Tiles:
     return own
 
 
+def _span(ends: list[float], length: int) -> tuple[int, int]:
+    start, stop = sorted(int(end * length) for end in ends)
+    start = min(start, length - 1)
+    return start, max(stop, start + 1)
+
+
 @settings(deadline=None)
 @given(
     st.tuples(lengths, lengths),
     st.booleans(),
     st.tuples(st.integers(1, 4), st.integers(1, 4)),
-    st.floats(0, 1),
-    st.floats(0, 1),
+    st.lists(st.floats(0, 1), min_size=4, max_size=4),
     st.integers(0, 12),
     st.integers(0, 2**32 - 1),
 )
-def test_rows_are_those_of_the_whole(
-    shape: tuple[int, int], closed: bool, tile: tuple[int, int], one: float, other: float, core: int, seed: int
+def test_windows_are_those_of_the_whole(
+    shape: tuple[int, int], closed: bool, tile: tuple[int, int], ends: list[float], core: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     layout = Layout.single(shape, (False, closed), tile)
@@ -54,20 +59,28 @@ def test_rows_are_those_of_the_whole(
     predictors = default_predictors(layout)
     predictors[...] = rng.integers(-20, 30, predictors.shape)
     header: Any = SimpleNamespace(layout=layout, predictors=[predictors], geometric=1)
-    start, stop = sorted((int(one * shape[0]), int(other * shape[0])))
-    rows = min(start, shape[0] - 1), max(stop, min(start, shape[0] - 1) + 1)
-    geometry = RowsGeometry(layout, rows, min(core, layout.levels))
-    made = [RowsReconstructor(geometry, predictors, own) for own in (tiles, _part(tiles, geometry))]
+    rows, columns = _span(ends[:2], shape[0]), _span(ends[2:], shape[1])
+    core = min(core, layout.levels)
+    every, some = RowsGeometry(layout, rows, core), RowsGeometry(layout, rows, core, columns)
+    assert every.tiles == some.tiles
+    part = _part(tiles, every)
+    made = [
+        (RowsReconstructor(geometry, predictors, own), own, geometry.columns)
+        for geometry in (every, some)
+        for own in (tiles, part)
+    ]
     state = np.full(len(layout.tiles), UNANNOUNCED, np.int8)
     for _ in range(4):
         changed = rng.random(state.shape) < 0.5
         changed[: layout.tiles_of(int(rng.integers(0, layout.levels + 1))).start] = False
         state = np.where(changed, rng.choice([0, 0, 0, 1, 4, 7, UNANNOUNCED], state.shape), state).astype(np.int8)
         (whole,), fraction = reconstruct_channel(header, 0, tiles, state, layout.levels)
-        for reconstructor in made:
-            found = reconstructor.reconstruct(state)
+        for reconstructor, own, taken in made:
+            known = known_state(own.table, state)
+            found = reconstructor.reconstruct(known)
             assert found[1] == fraction
-            np.testing.assert_array_equal(found[0], whole[rows[0] : rows[1]])
+            np.testing.assert_array_equal(found[0], whole[slice(*rows), slice(*taken)])
+            assert reconstructor.is_shown(known)
 
 
 def test_rows_that_wrap_are_refused() -> None:

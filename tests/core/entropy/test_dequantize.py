@@ -169,9 +169,9 @@ def test_what_does_not_lie_inside_is_refused() -> None:
         ("bands", (1, COLUMNS), 2**62),
         ("origins", (1, 0), -1),
         ("origins", (1, 0), 2),
-        ("origins", (0, 2), 0),
+        ("origins", (0, 2), -1),
         ("origins", (1, 1), 2**31),
-        ("origins", (1, 2), 13),
+        ("origins", (1, 2), 2**31),
         ("origins", (1, 1), -(2**63)),
         ("origins", (1, 2), -(2**63)),
         ("steps", 0, -1),
@@ -192,14 +192,17 @@ def test_what_does_not_lie_inside_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("step", "remaining"), [(0, 0), (0, 3), (5, 0), (5, 3), (0, UNANNOUNCED)])
-def test_rows_above_and_below_are_left_out(step: int, remaining: int) -> None:
+def test_what_lies_outside_is_left_out(step: int, remaining: int) -> None:
     case = Case([(19, 11), (12, 9)], [step, step], [remaining, remaining], 9, 3)
     whole, arrays = case.expected(1), (case.known, case.sign, case.early, case.bands, case.origins, case.steps)
-    for start in range(len(whole)):
-        for stop in range(start + 1, len(whole) + 1, 3):
-            out = case.empty()[start:stop]
-            spread_bands(*arrays, np.arange(2), case.state, 1, out, (2 + start, 1))
-            np.testing.assert_array_equal(out, whole[start:stop])
+    rows, columns = whole.shape
+    for top, left in [*((k, 0) for k in range(rows)), *((0, k) for k in range(columns)), (6, 5), (13, 14)]:
+        for bottom in range(top + 1, rows + 1, 3):
+            for right in range(left + 1, columns + 1, 4):
+                part = slice(top, bottom), slice(left, right)
+                out = case.empty()[part]
+                spread_bands(*arrays, np.arange(2), case.state, 1, out, (2 + top, 1 + left))
+                np.testing.assert_array_equal(out, whole[part])
 
 
 @given(seed=st.integers(0, 2**32), step=st.sampled_from([0, 1, 2**26 - 1]))
