@@ -54,8 +54,9 @@ export class SocketTransport<View extends ViewInfo> {
         );
       }
       if (isClosing(heard)) return lost(download, heard.code, heard.reason);
+      const waited = seconds() - asked;
       await journey.pace(heard.length);
-      journey.take(() => download.receive(heard, seconds()));
+      journey.take(() => download.receive(heard, seconds(), waited));
       this.flush();
       await journey.room();
     }
