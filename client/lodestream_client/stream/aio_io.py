@@ -171,10 +171,9 @@ class AsyncIO:
         """Close what is open, but for what was asked for ahead."""
         if self._socket is not None and how.abort:
             self._socket.transport.abort()
-        elif self._socket is not None and how.wait:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(how.wait):
-                    await self._socket.wait_closed()
+        elif self._socket is not None and how.over:
+            # What was sent is still delivered; closing a WebSocket would first wait for the other side's close frame.
+            self._socket.transport.close()
         socket, self._socket = self._socket, None
         response, self._response, self._body = self._response, None, None
         if socket is not None:

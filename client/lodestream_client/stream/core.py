@@ -61,6 +61,7 @@ class Core:
             until = effect.until if self._viewed is None else effect.until + session.clock() - self._viewed
             until = until if session.close_by is None else min(until, session.close_by)
             self._effect = effect if until == effect.until else Hear(until)
+            session.asked = session.clock()
         elif session.stopped and isinstance(effect, Dial | Get | Read):
             # The other side need not be told, so nobody waits for what it says.
             self.failed(TruncatedStreamError(f"expected more of {session.url}, but was stopped"))

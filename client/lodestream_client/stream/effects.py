@@ -143,13 +143,13 @@ class HangUp:
 
     Attributes
     ----------
-    wait : float
-        Seconds for the other side to close first: closing first would cut off its last messages on some stacks.
+    over : bool
+        The last messages have been received and sent: nothing of the other side is waited for.
     abort : bool
         Without a word to the other side, which has not been heard of.
     """
 
-    wait: float = 0.0
+    over: bool = False
     abort: bool = False
 
 

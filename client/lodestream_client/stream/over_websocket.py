@@ -44,10 +44,12 @@ def receive(session: Session) -> Flow[None]:
             if left is not None and left <= patience:
                 continue
             raise session.silent()
+        waited = session.clock() - session.asked
         yield from session.pace(len(message))
-        session.take(partial(download.receive, message, session.clock()))
+        session.take(partial(download.receive, message, session.clock(), waited))
     yield Send()
-    yield HangUp(wait=session.options.close_timeout)
+    # Whoever receives has everything: a close frame from the other side, a round trip later, would tell nothing.
+    yield HangUp(over=True)
 
 
 def _opened(session: Session) -> Flow[Download]:

@@ -64,6 +64,8 @@ class Session:
         Connections and requests so far.
     turns : int
         How often the region that comes first has changed.
+    asked : float
+        When the message that is waited for was asked for, by `clock`: since then there is nothing else to do.
     stopped : bool
         Whether this side wants no more.
     close_by : float or None
@@ -102,6 +104,7 @@ class Session:
         self.ranges: RangeDownload | None = None
         self.connections = 0
         self.turns = 0
+        self.asked = 0.0
         self.stopped = False
         self.close_by: float | None = None
         self.withheld = ""

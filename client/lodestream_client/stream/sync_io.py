@@ -181,18 +181,12 @@ class SyncIO:
 
     def _leave(self, how: HangUp) -> None:
         """Close what is open, but for what was asked for ahead."""
-        from websockets.exceptions import ConnectionClosed
-
-        try:
-            if self._socket is not None and how.abort:
-                with suppress(OSError):
-                    self._socket.socket.shutdown(socket.SHUT_RDWR)
-            elif self._socket is not None and how.wait:
-                with suppress(TimeoutError, ConnectionClosed):
-                    self._socket.recv(how.wait, decode=False)
-        finally:
-            self._socket, self._answer, self._body = None, None, iter(())
-            self._opened.close()
+        if self._socket is not None and (how.abort or how.over):
+            # What was sent is still delivered; closing a WebSocket would first wait for the other side's close frame.
+            with suppress(OSError):
+                self._socket.socket.shutdown(socket.SHUT_RDWR)
+        self._socket, self._answer, self._body = None, None, iter(())
+        self._opened.close()
 
     def close(self, how: HangUp) -> None:
         """Close everything, for good."""

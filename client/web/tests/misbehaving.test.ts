@@ -188,6 +188,22 @@ describe("a server", () => {
     expect((error as Error).message).toMatch(/\(and by WebSocket: /);
   });
 
+  it("that does not close after the end is not waited for, and has been told bye", async () => {
+    const heard: Uint8Array[] = [];
+    const gone: Promise<void>[] = [];
+    const url = await scripted((socket) => {
+      // Only its closing is left out.
+      socket.close = () => undefined;
+      socket.on("message", (data) => heard.push(new Uint8Array(data as Buffer)));
+      gone.push(new Promise((resolve) => socket.on("close", () => resolve())));
+    });
+    const stream = streamOf(url, { closeTimeout: 1e6, window: 1e6 });
+    const views = await all(stream);
+    expect(views.at(-1)!.complete).toBe(true);
+    await Promise.all(gone);
+    expect(heard.at(-1)).toEqual(serialize({ type: "bye" }));
+  });
+
   it("that does not answer a stop is left after closeTimeout", async () => {
     const stream = streamOf(await scripted(instead(6, () => undefined)), { silence: 20 });
     for await (const _ of stream) if (stream.reception.dataBytes > 300) break;

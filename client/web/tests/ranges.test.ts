@@ -3,7 +3,7 @@ import { describe, expect, it } from "vitest";
 import { OptionError } from "../src/errors";
 import { RangeSet } from "../src/planning/byte-ranges";
 import { absolute, makeTarget, tolerance } from "../src/planning/target";
-import { SMALL_MESSAGE, Window } from "../src/protocol/flow-control";
+import { FIRST_WINDOW, SMALL_MESSAGE, Window } from "../src/protocol/flow-control";
 import { BASE_CREDIT, MAX_CREDIT, MAX_DATA, MIN_WINDOW } from "../src/protocol/messages";
 import { Link, windowFor } from "../src/transfer/pacing";
 import { MemoryStore } from "../src/transfer/store";
@@ -14,7 +14,7 @@ interface Recorded {
   most: number;
   heard: number;
   begun: boolean;
-  steps: [granted: number, arrived: number, now: number][];
+  steps: [granted: number, arrived: number, now: number, waited: number][];
   sizes: [size: number, due: number][];
 }
 
@@ -115,7 +115,7 @@ describe("the window", () => {
     [12.5e6, 0.02],
   ])("keeps a link of %d bytes/s and %d s busy by little more than it holds", (rate, roundTrip) => {
     const { use, most } = transfer(rate, roundTrip, Math.round(rate * 60));
-    expect(most).toBeLessThanOrEqual(Math.max(MIN_WINDOW, 5 * rate * roundTrip));
+    expect(most).toBeLessThanOrEqual(Math.max(FIRST_WINDOW, 2.4 * rate * roundTrip));
     expect(use).toBeGreaterThan(0.95);
   });
 
@@ -131,9 +131,10 @@ describe("the window", () => {
       const window = new Window();
       window.allow(most);
       window.heard(heard);
-      if (begun) window.began(0);
-      const found = steps.map(([granted, arrived, now]) => {
+      if (begun) window.began(0, heard);
+      const found = steps.map(([granted, arrived, now, waited]) => {
         if (granted > 0) window.grant(granted, now);
+        window.waited(waited);
         window.arrive(arrived, now);
         return [window.size, window.due(window.size - arrived)];
       });
@@ -187,9 +188,10 @@ function transfer(rate: number, roundTrip: number, total: number): { use: number
   const window = new Window();
   window.allow(MAX_CREDIT);
   let [outstanding, credit] = [window.size, window.size];
-  let [free, now, sent, most, largest] = [0, 0, 0, 0, 0];
+  let [free, now, sent, most, largest, ready] = [0, 0, 0, 0, 0, roundTrip];
   window.grant(window.size, 0);
   window.heard(roundTrip);
+  window.began(0, roundTrip);
   const events: { at: number; grant: boolean; size: number }[] = [];
   const later = (at: number, grant: boolean, size: number): void => {
     let place = events.length;
@@ -216,6 +218,8 @@ function transfer(rate: number, roundTrip: number, total: number): { use: number
       continue;
     }
     outstanding -= event.size;
+    window.waited(now - ready);
+    ready = now;
     window.arrive(event.size, now);
     const grant = window.due(outstanding);
     if (grant > 0) {

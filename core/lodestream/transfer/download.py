@@ -94,7 +94,7 @@ class Download:
         """Bytes of the container that may still arrive without further credit."""
         return self._connection.credit
 
-    def receive(self, message: bytes, now: float | None = None) -> list[DownloadEvent]:
+    def receive(self, message: bytes, now: float | None = None, waited: float | None = None) -> list[DownloadEvent]:
         """Take one message; returns the views that it completes, and an `Ended` if it is the last.
 
         Data that still arrive after `stop` are decoded but give no views.
@@ -104,6 +104,9 @@ class Download:
         message : bytes
         now : float or None
             Time in seconds, by the clock used for `tick`; without it a measured window does not change.
+        waited : float or None
+            Seconds of them for which the caller waited for this message, and did nothing else; the first windows then
+            grow faster.
 
         Raises
         ------
@@ -117,6 +120,8 @@ class Download:
             If the server ends before it has sent what it announced.
         """
         self.reception.wire_bytes += len(message)
+        if waited is not None:
+            self.window.waited(waited)
         event = self._connection.receive(message)
         if isinstance(event, Segments):
             return self._take(event, now)
@@ -253,7 +258,7 @@ class Download:
         if now is not None and self._opened is not None:
             self.window.heard(now - self._opened)
             if not self._reopened:
-                self.window.began(self._opened)
+                self.window.began(self._opened, now)
         self.window.allow(self._connection.most)
         self._grant(now)
         self.reception.identify(event.container, event.size)

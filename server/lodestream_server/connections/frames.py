@@ -2,20 +2,22 @@
 
 uvicorn answers each ping at once, whether or not the client reads the pongs, and processes all received frames before
 anything else gets its turn. Here received data are processed in small pieces, and frames and unsent bytes of pongs are
-counted. A connection that exceeds a limit is cut: a client that does this does not read a close frame.
+counted. A connection that exceeds a limit is cut: a client that does this does not read a close frame. What is sent is
+joined to larger packets.
 """
 
 from __future__ import annotations
 
-from asyncio import BaseProtocol
+from asyncio import BaseProtocol, BaseTransport, Transport
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
 
 from ..operation.pace import Pace
 from .cuts import Allowance, Cuts
+from .joined import Joined
 
 __all__ = ["call_when_lost", "stream_connections"]
 
@@ -88,6 +90,9 @@ class _Connection(WebSocketsSansIOProtocol):
         self._seen = 0
         self._fragments = 0
         self._control_bytes = 0
+
+    def connection_made(self, transport: BaseTransport) -> None:
+        super().connection_made(cast(Transport, Joined(cast(Transport, transport))))
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)

@@ -17,7 +17,7 @@ from websockets.typing import Subprotocol
 import lodestream as ls
 import lodestream_client as client
 from lodestream.errors import ProtocolError, RemoteProtocolError
-from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, SUBPROTOCOL, End, Error, Opened, Segments
+from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, SUBPROTOCOL, Bye, End, Error, Opened, Segments
 from lodestream.protocol.wire import serialize
 from lodestream_client import sync
 
@@ -215,8 +215,16 @@ def test_a_server_that_does_not_take_leave(asynchronous: bool, container_file: P
     data = container_file.read_bytes()
     header = header_of(data, len(data))
     slices = [serialize(Segments(at, data[at : at + 60_000])) for at in range(0, len(data), 60_000)]
-    with websocket_server(says(header, *slices, serialize(End("complete")))) as url:
-        follow(url, asynchronous, window=BASE_CREDIT)  # returns within the time for closing
+    heard: list[bytes | str] = []
+
+    def behave(connection: ServerConnection) -> None:
+        for message in (header, *slices, serialize(End("complete"))):
+            connection.send(message)
+        heard.extend(connection)
+
+    with websocket_server(behave) as url:
+        follow(url, asynchronous, window=BASE_CREDIT, close_timeout=1e6)  # nor is it waited for
+    assert heard[-1] == serialize(Bye())
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.errors import OptionError
-from lodestream.protocol.flow_control import SMALL_MESSAGE, FlowWindow
+from lodestream.protocol.flow_control import FIRST_WINDOW, SMALL_MESSAGE, FlowWindow
 from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT, MAX_DATA, MIN_WINDOW
 
 
@@ -25,20 +25,30 @@ class Outcome:
 
 
 def transfer(
-    rate: float, round_trip: float, total: int, *, burst: float = 0.0, share: int = 16, most_credit: int = MAX_CREDIT
+    rate: float,
+    round_trip: float,
+    total: int,
+    *,
+    burst: float = 0.0,
+    share: int = 16,
+    most_credit: int = MAX_CREDIT,
+    work: float = 0.0,
+    told: bool = True,
 ) -> Outcome:
     """Receive so many bytes over a link that lets nothing through but every ``burst`` seconds.
 
-    The server keeps so much credit, and sends messages of a share of the most that there was.
+    The server keeps so much credit, and sends messages of a share of the most that there was. The client computes so
+    many seconds for each byte, and tells how long it waited for messages in between.
     """
     window = FlowWindow()
     window.allow(most_credit)
     outstanding = credit = window.size
     window.grant(window.size, 0.0)
     window.heard(round_trip)
-    window.began(0.0)
+    window.began(0.0, round_trip)
     events: list[tuple[float, int, str, int]] = []
     free = now = sent = most = settled = 0.0
+    ready = round_trip
     count = largest = 0
 
     def send(now: float) -> None:
@@ -58,12 +68,17 @@ def transfer(
             credit = min(credit + size, most_credit)
             send(now)
             continue
+        assert outstanding <= window.size or outstanding <= most, "no grant goes beyond the window"
+        waited, now = max(now - ready, 0.0), max(now, ready)
+        ready = now + work * size
         outstanding -= size
+        if told:
+            window.waited(waited)
         window.arrive(size, now)
         if grant := window.due(outstanding):
             window.grant(grant, now)
             outstanding += grant
-            heapq.heappush(events, (now + round_trip / 2, count, "grant", grant))
+            heapq.heappush(events, (ready + round_trip / 2, count, "grant", grant))
             count += 1
         most = max(most, outstanding)
         settled = max(settled, outstanding) if sent > total / 2 else 0
@@ -76,7 +91,7 @@ def test_a_link_is_kept_busy_by_little_more_than_it_holds(rate: float, round_tri
     outcome = transfer(rate, round_trip, round(rate * 60))
     product = rate * round_trip
     enough = 1.1 * (product + 0.005 * rate) + 2.5 * SMALL_MESSAGE
-    assert outcome.most <= max(MIN_WINDOW, enough, 5 * product)
+    assert outcome.most <= max(FIRST_WINDOW, enough, 2.2 * product)
     assert outcome.settled <= max(MIN_WINDOW, enough)
     assert outcome.use > 0.95
 
@@ -92,6 +107,45 @@ def test_a_fast_link_is_filled_soon_by_no_more_than_1_2_times_what_it_holds(rate
 def test_a_server_of_an_earlier_release_is_kept_busy_too(rate: float, round_trip: float) -> None:
     outcome = transfer(rate, round_trip, round(rate * 30), share=4, most_credit=BASE_CREDIT)
     assert outcome.use > 0.95
+
+
+@pytest.mark.parametrize("round_trip", [0.005, 0.02, 0.1, 0.3])
+@pytest.mark.parametrize("rate", [1.25e6, 12.5e6, 125e6])
+def test_a_client_that_computes_for_long_is_kept_busy_by_no_more_than_it_needs(rate: float, round_trip: float) -> None:
+    work = 2.5e-7
+    total, used = 20_000_000, min(rate, 1 / work)
+    outcome = transfer(rate, round_trip, total, work=work)
+    assert total / rate / outcome.use <= 1.02 * total / used + 5 * round_trip
+    assert outcome.settled <= max(MIN_WINDOW, 1.5 * used * (round_trip + 0.01) + 2.5 * SMALL_MESSAGE)
+
+
+@pytest.mark.parametrize("told", [False, True])
+@pytest.mark.parametrize("work", [0.0, 2.5e-7])
+@pytest.mark.parametrize("rate", [8e3, 32e3, 125e3, 1.25e6, 12.5e6, 125e6])
+@pytest.mark.parametrize("round_trip", [0.005, 0.02, 0.1])
+def test_waits_that_nobody_tells_cost_no_more_than_some_round_trips(
+    rate: float, round_trip: float, work: float, told: bool
+) -> None:
+    total = round(min(rate * 20, 5e6))
+    outcome = transfer(rate, round_trip, total, work=work, told=told)
+    seconds = total / rate / outcome.use
+    assert seconds <= 1.02 * max(total / rate, total * work) + 8 * round_trip
+    assert outcome.most <= max(FIRST_WINDOW, 4 * rate * (round_trip + 0.005) + 2.5 * SMALL_MESSAGE)
+
+
+@pytest.mark.parametrize(("rate", "growth"), [(1e12, 16), (12.5e6, 16), (1.25e6, 4), (0.7e6, 2.1)])
+def test_the_first_window_grows_to_what_the_link_would_have_carried(rate: float, growth: float) -> None:
+    window = FlowWindow()
+    window.allow(MAX_CREDIT)
+    window.heard(0.1)
+    window.began(0.0, 0.1)
+    now = 0.1
+    for _ in range(FIRST_WINDOW // SMALL_MESSAGE):
+        now += SMALL_MESSAGE / rate
+        window.waited(SMALL_MESSAGE / rate)
+        window.arrive(SMALL_MESSAGE, now)
+    assert window.size == pytest.approx(growth * FIRST_WINDOW, rel=0.1)
+    assert window.size <= max(2 * rate * 0.1, 16 * FIRST_WINDOW)
 
 
 def test_a_link_that_becomes_faster_is_filled_again() -> None:
@@ -120,19 +174,35 @@ def test_a_link_without_limits_gets_all_that_is_allowed() -> None:
 
 
 @given(
-    st.lists(st.tuples(st.integers(1, MAX_DATA), st.floats(0, 10)), max_size=50),
+    st.lists(st.tuples(st.integers(1, MAX_DATA), st.floats(0, 10), st.none() | st.floats(0, 10)), max_size=50),
     st.none() | st.floats(1e-9, 100),
+    st.integers(BASE_CREDIT, MAX_CREDIT),
+    st.booleans(),
 )
-def test_it_stays_within_its_limits_whatever_comes(arrivals: list[tuple[int, float]], heard: float | None) -> None:
+def test_it_stays_within_its_limits_and_always_grants_more_whatever_comes(
+    arrivals: list[tuple[int, float, float | None]], heard: float | None, most: int, timed: bool
+) -> None:
     window, now = FlowWindow(), 0.0
-    window.allow(MAX_CREDIT)
+    window.allow(most)
     if heard is not None:
         window.heard(heard)
-    for size, seconds in arrivals:
+    if timed:
+        window.began(0.0, heard or 0.0)
+    outstanding = window.size
+    window.grant(outstanding)
+    for size, seconds, waited in arrivals:
         now += seconds
-        window.grant(size, now)
-        window.arrive(size, now)
-        assert MIN_WINDOW <= window.size <= MAX_CREDIT
+        if waited is not None:
+            window.waited(waited)
+        came = min(size, outstanding)
+        outstanding -= came
+        window.arrive(came, now)
+        assert MIN_WINDOW <= window.size <= most
+        if grant := window.due(outstanding):
+            window.grant(grant, now)
+            outstanding += grant
+            assert outstanding <= window.size
+        assert outstanding, "the stream goes on"
 
 
 @given(st.none() | st.integers(1, MAX_CREDIT), st.integers(0, MAX_CREDIT))
@@ -147,7 +217,7 @@ def test_without_times_it_stays_as_it_is() -> None:
     for _ in range(100):
         window.grant(MAX_DATA)
         window.arrive(MAX_DATA)
-    assert window.size == MIN_WINDOW
+    assert window.size == FIRST_WINDOW
 
 
 @pytest.mark.parametrize("size", [1, 1000, BASE_CREDIT, MAX_CREDIT])

@@ -24,7 +24,7 @@ def record(random: Random) -> dict[str, object]:
     window.heard(heard)
     begun = random.random() < 0.5
     if begun:
-        window.began(0.0)
+        window.began(0.0, heard)
         now = heard
     steps, sizes = [], []
     for _ in range(300):
@@ -33,8 +33,10 @@ def record(random: Random) -> dict[str, object]:
         now += random.choice((0.0, size / rate, size / rate, random.uniform(0, heard)))
         if granted:
             window.grant(granted, now)
+        waited = random.choice((0.0, size / rate, heard))
+        window.waited(waited)
         window.arrive(size, now)
-        steps.append((granted, size, now))
+        steps.append((granted, size, now, waited))
         sizes.append((window.size, window.due(window.size - size)))
     return {"most": most, "heard": heard, "begun": begun, "steps": steps, "sizes": sizes}
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import lodestream as ls
 from lodestream.errors import RemoteError, RemoteProtocolError
 from lodestream.planning.planner import plan
-from lodestream.protocol.messages import MAX_HELD, MIN_WINDOW, MessageError, Open
+from lodestream.protocol.flow_control import FIRST_WINDOW
+from lodestream.protocol.messages import MAX_HELD, MessageError, Open
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.download import Download
 from lodestream.transfer.receiver_state import ReceiverState
@@ -163,7 +164,7 @@ def test_bytes_behind_the_end_of_the_container_are_refused() -> None:
 
 def test_the_window_grows_on_a_link_that_is_fast_and_far() -> None:
     client = Download()
-    assert client.window.size == MIN_WINDOW
+    assert client.window.size == FIRST_WINDOW
     client.tick(0.0)
     server = Sender(index(), hashlib.sha256(container()).hexdigest())
     now = 0.0

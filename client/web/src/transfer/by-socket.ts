@@ -54,12 +54,14 @@ export class SocketTransport<View extends ViewInfo> {
         );
       }
       if (isClosing(heard)) return lost(download, heard.code, heard.reason);
+      const waited = seconds() - asked;
       await journey.pace(heard.length);
-      journey.take(() => download.receive(heard, seconds()));
+      journey.take(() => download.receive(heard, seconds(), waited));
       this.flush();
       await journey.room();
     }
-    await socket.left(journey.parting());
+    // Whoever receives has everything: that the other side has closed, a round trip later, would tell nothing.
+    socket.close();
   }
 
   /** Set the time, and send what there is to send; returns the seconds left of the target's. */

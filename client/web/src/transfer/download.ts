@@ -73,13 +73,16 @@ export class Download<View extends ViewInfo> {
    * views. Afterwards `reception.ended` says whether that was the last message.
    *
    * @param now Time in seconds, by the clock used for `tick`; without it a measured window does not change.
+   * @param waited Seconds of them for which the caller waited for this message, and did nothing else; the first windows
+   * then grow faster.
    * @throws RemoteError if the server refuses, with its code and reason.
    * @throws RemoteProtocolError, UnsupportedVersionError if it is not a message, or not one that is allowed now.
    * @throws CorruptStreamError if the bytes of the container are damaged.
    * @throws TruncatedStreamError if the server ends before it has sent what it announced.
    */
-  receive(message: Uint8Array, now?: number): View[] {
+  receive(message: Uint8Array, now?: number, waited?: number): View[] {
     this.reception.wireBytes += message.length;
+    if (waited !== undefined) this.window.waited(waited);
     const event = this.connection.receive(message);
     switch (event.type) {
       case "segments":
@@ -211,7 +214,7 @@ export class Download<View extends ViewInfo> {
     this.header = event;
     if (now !== undefined && this.openedAt !== undefined) {
       this.window.heard(now - this.openedAt);
-      if (!this.reopened) this.window.began(this.openedAt);
+      if (!this.reopened) this.window.began(this.openedAt, now);
     }
     this.window.allow(this.connection.most);
     this.grant(now);

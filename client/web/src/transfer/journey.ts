@@ -16,8 +16,6 @@ export interface Journey<View extends ViewInfo> {
   readonly turns: number;
   /** Seconds without data after which a connection counts as lost. */
   patience(): number;
-  /** How long the other side may take to close. */
-  parting(): number;
   /** Declare a connection, or a request, that has been answered as expected. */
   met(): void;
   /** Bytes to take at once, so that at a limited rate they come one after another. */

@@ -89,19 +89,7 @@ export class Socket {
     this.wake?.();
   }
 
-  /** Wait until the other side has closed, at most so many seconds, then close. */
-  async left(seconds: number): Promise<void> {
-    const until = performance.now() + 1000 * seconds;
-    this.waiting.length = 0;
-    while (this.closing === undefined) {
-      const rest = (until - performance.now()) / 1000;
-      if (rest <= 0) break;
-      await this.woken(rest);
-    }
-    this.close();
-  }
-
-  /** Close without waiting. */
+  /** Close without waiting; what was sent is still delivered. */
   close(): void {
     this.socket.onmessage = null;
     this.socket.close();

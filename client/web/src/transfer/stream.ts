@@ -219,11 +219,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   // What the transports need.
 
   patience(): number {
-    return this.closeBy === undefined ? this.silence : this.parting();
-  }
-
-  parting(): number {
-    if (this.closeBy === undefined) return this.closeTimeout;
+    if (this.closeBy === undefined) return this.silence;
     return Math.max(Math.min(this.silence, this.closeBy - seconds()), 0.001);
   }
 
