@@ -112,7 +112,9 @@ def test_an_array_with_names_of_dimensions_is_the_variable_of_its_group(tmp_path
     with pytest.warns(ls.FormatWarning, match="speed"):
         surface = ls.read(tmp_path / "a.zarr" / "depth", time="2001-02")
     whole = ls.read(tmp_path / "a.zarr", **OPTIONS)
-    assert surface.mask is not None and not surface.mask[10:15, 20:30].any() and surface.metadata["name"] == "depth"
+    assert surface.mask is not None
+    assert not surface.mask[10:15, 20:30].any()
+    assert surface.metadata["name"] == "depth"
     np.testing.assert_array_equal(surface.points, whole.points)
     assert surface.metadata["geotransform"] == whole.metadata["geotransform"]
 
