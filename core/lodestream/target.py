@@ -40,12 +40,16 @@ def check_integer(what: str, value: Any) -> int:
 
 
 def check_spans(region: Region) -> None:
-    """Refuse a region that contains no point, whatever the surface.
+    """Refuse a region that is no pair of pairs, or contains no point, whatever the surface.
 
     Raises
     ------
     OptionError
     """
+    try:
+        (_, _), (_, _) = region
+    except (TypeError, ValueError):
+        raise OptionError(f"expected a region as ((row, end), (column, end)), got {region!r}") from None
     for start, stop in region:
         if not 0 <= start < stop:
             raise OptionError(f"expected a region of at least one row and column, got {start}:{stop}")

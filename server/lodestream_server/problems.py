@@ -245,7 +245,7 @@ async def _refused(request: Request, error: Exception) -> Response:
     code = {404: "not-found", 405: "bad-method"}.get(error.status_code, phrase.lower().replace(" ", "-"))
     detail = error.detail
     if error.status_code == 404 and detail == phrase:
-        detail = "expected a path that /docs lists"
+        detail = f"expected a path that /docs lists, got {request.url.path[:100]!r}"
     headers = dict(error.headers or {})
     if error.status_code == 405:
         # The framework names the methods of the first route of this path only.

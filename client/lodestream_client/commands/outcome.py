@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatError
+from lodestream.errors import FormatError, InputError
 from lodestream.target import Target
 
-from ..terminal.output import human_size, note, print_json, require_folder
+from ..terminal.output import human_size, note, print_json, require_folder, require_parent
 
 if TYPE_CHECKING:
     from lodestream.container import Header
@@ -28,16 +28,20 @@ def check_out(out: str) -> None:
     Raises
     ------
     InputError
-        If the folder does not exist, or no format has this suffix.
+        If the folder does not exist, no format has this suffix, or there is a folder of this name, unless it is empty
+        and the format is a folder.
     """
     if out == "-":
         return
     path = Path(out)
-    require_folder(path)
+    require_parent(path)
 
     from lodestream.formats import for_writing
 
-    for_writing(path)
+    if for_writing(path).folder is None:
+        require_folder(path)
+    elif path.is_dir() and any(path.iterdir()):
+        raise InputError(f"cannot write {path}: it is a folder with files; remove it, or choose another name")
 
 
 def check_grid(out: str, header: Header) -> None:

@@ -30,8 +30,12 @@ def check_watched(out: str) -> None:
     Raises
     ------
     InputError
-        If it is a pipe or a device.
+        If it is a pipe or a device, or its format is a folder, which is not replaced.
     """
+    from lodestream.formats import for_writing
+
+    if for_writing(out).folder is not None:
+        raise InputError(f"cannot write {out} again and again: it is a folder, and only files are replaced")
     try:
         mode = Path(out).stat().st_mode
     except OSError:

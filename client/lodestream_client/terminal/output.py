@@ -46,6 +46,7 @@ __all__ = [
     "progress_bar",
     "replacing",
     "require_folder",
+    "require_parent",
     "say",
     "say_columns",
     "say_script",
@@ -263,8 +264,8 @@ def _drawn(period: float = 30.0) -> rich.progress.Progress:
     )
 
 
-def require_folder(path: Path) -> None:
-    """Check early that the folder of a file exists.
+def require_parent(path: Path) -> None:
+    """Check early that there is a folder to make a file or a folder in.
 
     Raises
     ------
@@ -273,6 +274,17 @@ def require_folder(path: Path) -> None:
     """
     if not path.parent.is_dir():
         raise InputError(f"cannot write {path}: there is no folder {path.parent}")
+
+
+def require_folder(path: Path) -> None:
+    """Check early that the folder of a file exists.
+
+    Raises
+    ------
+    InputError
+        Naming the folder.
+    """
+    require_parent(path)
     if path.is_dir():
         raise InputError(f"cannot write {path}: it is a folder")
 

@@ -6,7 +6,9 @@ import { absolute, makeTarget, tolerance } from "../src/planning/target";
 import { FIRST_WINDOW, SMALL_MESSAGE, Window } from "../src/protocol/flow-control";
 import { BASE_CREDIT, MAX_CREDIT, MAX_DATA, MIN_WINDOW } from "../src/protocol/messages";
 import { Link, windowFor } from "../src/transfer/pacing";
+import { NoStreamError } from "../src/transfer/problems";
 import { MemoryStore } from "../src/transfer/store";
+import { Transports } from "../src/transfer/transports";
 import { run } from "./python";
 
 /** What `tests.core.protocol.windows` prints of a window. */
@@ -231,3 +233,14 @@ function transfer(rate: number, roundTrip: number, total: number): { use: number
   }
   return { use: total / now / rate, most, size: window.size };
 }
+
+describe("an address that neither transport reaches", () => {
+  it.each([
+    ["gone", "gone"],
+    ["odd", "odd (and by WebSocket: gone)"],
+  ])("is told with each reason once: %s", (reason, told) => {
+    const transports = new Transports("http://127.0.0.1:1/v1/surfaces/0", "auto", 0);
+    expect(transports.failed(new NoStreamError("gone"), 0, false)).toBe(0);
+    expect(() => transports.failed(new NoStreamError(reason), 0, false)).toThrow(new NoStreamError(told));
+  });
+});

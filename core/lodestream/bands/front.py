@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..encoding import encoder
 from ..encoding.losses import at_holes
-from ..errors import FormatError, FormatWarning, OptionError, TooLargeError
+from ..errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
 from ..library import require
 from ..quality import Limit, Quality
 from ..scratch import Room
@@ -138,8 +138,8 @@ def encode(
     Raises
     ------
     InputError
-        If the surface cannot be encoded, or not with this precision, or if its metadata are larger than
-        `lodestream.container.metadata.MAX_BYTES`.
+        If the surface cannot be encoded, or not with this precision, if its metadata are larger than
+        `lodestream.container.metadata.MAX_BYTES`, or if the executor is none.
     InputError
         Also if the scratch folder holds anything else, another build is at work there, or a file that the surface is in
         is written to meanwhile.
@@ -155,6 +155,10 @@ def encode(
         If a file cannot be written; before all work if there is no folder for it.
     """
     require("encoding")
+    if executor is not None and not isinstance(executor, Executor):
+        kind = f"{type(executor).__module__}.{type(executor).__qualname__}"
+        hint = ": pass what its get_executor() returns" if hasattr(executor, "get_executor") else ""
+        raise InputError(f"expected a concurrent.futures.Executor as executor, got {kind}{hint}")
     chosen = encoder.chosen_quality(quality, precision, rms, attribute_precision)
     limit = default_memory() if memory is None else checked_memory(memory)
     if out is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from ..container.model import ByteRange, Chunk, Header, Index
 from ..container.reader import INDEX_GROWTH, index_from, index_of, read_metadata
 from ..container.slices import Slices, State
 from ..entropy.dequantize import UNANNOUNCED
-from ..errors import CorruptStreamError, TruncatedStreamError
+from ..errors import CorruptStreamError, InputError, TruncatedStreamError
 from ..library import why_missing
 from ..planning.selection import Selection, select, selection_of
 from ..surface import Surface
@@ -110,7 +111,13 @@ class Decoder:
         ------
         CorruptStreamError, UnsupportedVersionError
             The layers before the damage stay usable.
+        InputError
+            If it is no bytes, but the path of a file.
         """
+        if isinstance(data, str | PathLike):
+            raise InputError(
+                f"expected the bytes of a container, got {data!r:.80}: pass what pathlib.Path(...).read_bytes() returns"
+            )
         self.capacity.take(len(data))
         if self._frames.ended:
             self._take_footer(bytes(data))
@@ -451,6 +458,8 @@ def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | Non
         If the container is cut short; use `Decoder` for a prefix.
     TooLargeError
         If it needs more memory than allowed.
+    InputError
+        If it is no bytes, but the path of a file.
 
     Examples
     --------

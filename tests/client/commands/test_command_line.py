@@ -133,6 +133,19 @@ def test_an_out_that_cannot_be_written(fetch: Fetch, out: str) -> None:
     assert stderr.count("\n") == 1
 
 
+def test_a_store_is_written_into_an_empty_folder_and_into_no_other(
+    fetch: Fetch, terrain: Terrain, tmp_path: Path
+) -> None:
+    zarr = pytest.importorskip("zarr")
+    (tmp_path / "out.zarr").mkdir()
+    assert fetch(out="out.zarr")[0] == 0
+    assert np.array_equal(zarr.open(tmp_path / "out.zarr", mode="r")["height"][:], terrain, equal_nan=True)
+    code, _, stderr = fetch(out="out.zarr")
+    assert code == 1
+    assert "out.zarr: it is a folder with files; remove it, or choose another name" in stderr
+    assert fetch(out="out.zarr/sub.zarr")[0] == 0, "a group of a store that is there"
+
+
 def test_a_limit_out_of_reach_is_complete_with_a_note(run: Run, terrain_file: Path, tmp_path: Path) -> None:
     lossy = tmp_path / "lossy.lode"
     assert run("encode", terrain_file, lossy, "--precision", "2")[0] == 0

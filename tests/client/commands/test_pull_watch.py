@@ -153,3 +153,10 @@ def test_what_cannot_be_watched_is_refused_at_once(run: Run, surface: str, tmp_p
     code, _, stderr = run("pull", surface, pipe, "--watch")
     assert (code, "it is no file" in stderr) == (1, True)
     assert not out.exists()
+
+
+def test_a_store_is_not_replaced_again_and_again(run: Run, surface: str, tmp_path: Path) -> None:
+    code, _, stderr = run("pull", surface, tmp_path / "out.zarr", "--watch")
+    assert code == 1
+    assert "out.zarr again and again: it is a folder, and only files are replaced" in stderr
+    assert list(tmp_path.iterdir()) == [], "refused before the first state"

@@ -92,6 +92,15 @@ def test_a_proxy_that_refuses_sockets_is_gone_around_at_once(body: bytes) -> Non
         made.failed(RemoteError("odd", "gone wrong"), 0.0, progressed=False)
 
 
+def test_what_both_transports_say_is_said_once() -> None:
+    made = Transports(ONE, "auto", 0.0)
+    refusal = refused(501, b"")
+    assert made.failed(refusal, 0.0, progressed=False) == 0
+    with pytest.raises(RemoteError) as raised:
+        made.failed(RemoteError("odd", str(refusal)), 0.0, progressed=False)
+    assert str(raised.value) == str(refusal)
+
+
 def test_what_the_server_itself_says_is_final() -> None:
     made = Transports(ONE, "auto", 60.0)
     with pytest.raises(RemoteError):

@@ -95,6 +95,16 @@ def test_a_surface_of_one_point_is_refused_whoever_builds() -> None:
         ls.encode(np.zeros((1, 1)), executor=executor)
 
 
+def test_what_has_an_executor_is_none() -> None:
+    class Client:
+        """As that of Dask, which has ``submit`` too, but other futures."""
+
+        def get_executor(self) -> None: ...
+
+    with pytest.raises(ls.InputError, match=r"got .*Client: pass what its get_executor\(\) returns"):
+        ls.encode(np.zeros((9, 9)), executor=Client())  # type: ignore[call-overload]
+
+
 def test_an_interrupted_build_leaves_nothing(tmp_path: Path, cut: Callable[[int], None]) -> None:
     cut(1)
     with pytest.raises(KeyboardInterrupt):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -341,3 +342,9 @@ def test_long_segments_are_windows_of_what_arrived_and_those_of_a_caller_s_buffe
         if not isinstance(given, bytes):
             given[:] = bytes(len(container))  # what the caller does next
         np.testing.assert_array_equal(decoder.view().points, heights)
+
+
+@pytest.mark.parametrize("path", ["hill.lode", Path("hill.lode")])
+def test_the_path_of_a_container_is_not_its_bytes(path: Any) -> None:
+    with pytest.raises(ls.InputError, match=r"the bytes of a container, got .*hill.lode.*: pass what .*read_bytes"):
+        ls.decode(path)

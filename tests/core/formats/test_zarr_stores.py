@@ -104,6 +104,21 @@ def test_a_member_of_a_group_without_names_of_dimensions(tmp_path: Path) -> None
     np.testing.assert_array_equal(ls.read(tmp_path / "a.zarr" / "z").points, hills())
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_array_with_names_of_dimensions_is_the_variable_of_its_group(tmp_path: Path, version: Any) -> None:
+    sea().to_zarr(tmp_path / "a.zarr", zarr_format=version)
+    with pytest.raises(ls.FormatError, match=r"expected two dimensions of depth, got 3: choose time \(2\)"):
+        ls.read(tmp_path / "a.zarr" / "depth")  # not 2 x 90 points with 67 attributes
+    with pytest.warns(ls.FormatWarning, match="speed"):
+        surface = ls.read(tmp_path / "a.zarr" / "depth", time="2001-02")
+    whole = ls.read(tmp_path / "a.zarr", **OPTIONS)
+    assert surface.mask is not None
+    assert not surface.mask[10:15, 20:30].any()
+    assert surface.metadata["name"] == "depth"
+    np.testing.assert_array_equal(surface.points, whole.points)
+    assert surface.metadata["geotransform"] == whole.metadata["geotransform"]
+
+
 def test_encode_takes_a_path(tmp_path: Path) -> None:
     store = tmp_path / "a.zarr"
     sea().isel(time=0).drop_vars("speed").to_zarr(store)

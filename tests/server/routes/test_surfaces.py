@@ -209,7 +209,7 @@ def test_what_the_server_says_of_itself(http: httpx.Client) -> None:
 
 def test_problems_have_one_shape(http: httpx.Client) -> None:
     for answer, status, words in (
-        (http.get("/nowhere"), 404, "/docs"),
+        (http.get("/nowhere"), 404, "expected a path that /docs lists, got '/nowhere'"),
         (http.get("/v1/surfaces/0123"), 404, "'0123'"),
         (http.get("/v1/surfaces/" + "x" * 500), 404, "id"),
         (http.get("/v1/surfaces/..%2f..%2fetc"), 404, "expected"),

@@ -82,8 +82,9 @@ export class Transports {
       this.blocked = error;
       return 0;
     }
-    // A wrong address is one by either transport.
-    if (this.current === "http" && this.blocked !== undefined && !this.met && !(error instanceof NotFoundError)) {
+    // What is wrong by either transport in the same way, such as the address, is said once.
+    const twice = error instanceof NotFoundError || error.message === this.blocked?.message;
+    if (this.current === "http" && this.blocked !== undefined && !this.met && !twice) {
       error.message = `${error.message} (and by WebSocket: ${this.blocked.message})`;
     }
     if (!passes(error) || (!this.met && this.attempts >= FIRST_ATTEMPTS - 1)) throw error;

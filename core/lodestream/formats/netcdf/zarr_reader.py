@@ -50,7 +50,8 @@ def folder_size(folder: Path) -> int:
 def read(source: Source) -> Surface:
     """Read one variable of a group, its coordinates, and those that options make attributes; or the only array.
 
-    An array that is no member of a group is of shape (row, column) or (row, column, channel), and has its unit at most.
+    An array with names of dimensions in a group is the variable of that group, so that its fill value, packing and
+    coordinates count. Any other array is of shape (row, column) or (row, column, channel), and has its unit at most.
     What is large for the room is read by windows of whole chunks. Chunks that are not there have the fill value.
 
     Raises
@@ -60,6 +61,9 @@ def read(source: Source) -> Surface:
     FormatError
         If the store is not whole, or a file of it lies elsewhere.
     """
+    folder = Path(os.path.realpath(source.path))
+    if _is_variable(folder):
+        source = replace(source, path=folder.parent, options={"variable": folder.name, **source.options})
     source = replace(source, size=folder_size(source.path))
     notes: list[str] = []
     with _opened(source, notes) as (array, dataset):
@@ -171,13 +175,25 @@ def _left_out(group: Any) -> dict[str, str]:
 
 
 def _is_array(folder: Path) -> bool:
+    return (folder / ".zarray").is_file() or _said(folder / "zarr.json").get("node_type") == "array"
+
+
+def _is_variable(folder: Path) -> bool:
+    """Whether a folder is an array with names of dimensions, in the folder of a group."""
     if (folder / ".zarray").is_file():
-        return True
+        return (folder.parent / ".zgroup").is_file() and bool(_said(folder / ".zattrs").get("_ARRAY_DIMENSIONS"))
+    said = _said(folder / "zarr.json")
+    named = said.get("node_type") == "array" and any(said.get("dimension_names") or ())
+    return named and _said(folder.parent / "zarr.json").get("node_type") == "group"
+
+
+def _said(path: Path) -> Mapping[str, Any]:
+    """The object in a JSON file of a store; empty: there is none. zarr refuses what is damaged, in its own words."""
     try:
-        with (folder / "zarr.json").open("rb") as file:
-            return bool(json.load(file).get("node_type") == "array")
-    except FileNotFoundError:
-        return False
+        said = json.loads(path.read_bytes()) if path.is_file() else {}
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return said if isinstance(said, dict) else {}
 
 
 def _store(zarr: Any, folder: Path) -> Any:
