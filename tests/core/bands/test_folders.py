@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -298,7 +299,7 @@ def test_a_link_that_takes_the_place_of_what_was_left_is_not_followed(
     of_somebody = tmp_path / "of somebody"
     of_somebody.mkdir()
     fill(of_somebody)
-    lock = folders.fcntl.flock
+    lock = fcntl.flock
 
     def meanwhile(handle: int, how: int) -> None:
         lock(handle, how)
