@@ -186,11 +186,11 @@ def _left_out(group: Any) -> dict[str, str]:
 def _is_array(folder: Path) -> bool:
     if (folder / ".zarray").is_file():
         return True
-    head = folder / "zarr.json"
-    if not head.is_file():  # a pipe would have to be waited for
+    try:
+        with (folder / "zarr.json").open("rb") as file:
+            return bool(json.load(file).get("node_type") == "array")
+    except FileNotFoundError:
         return False
-    with head.open("rb") as file:
-        return bool(json.load(file).get("node_type") == "array")
 
 
 def _store(zarr: Any, folder: Path) -> Any:
