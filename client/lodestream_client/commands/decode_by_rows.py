@@ -180,11 +180,13 @@ def _write(outcome: Outcome, out: Path, folder: Path) -> None:
     """Write the file in a folder of its own, where writers may leave others too, and put it in its place.
 
     What is there and no file, such as a pipe, is written to as it is. Where a folder is to be written, its writer says
-    what is in its way.
+    what is in its way. A file and a folder together, as of .vtm, are put in place by their writer, which names both.
     """
     from lodestream.formats import for_writing
 
-    if out.exists() and (not out.is_file() or for_writing(out).write is None):
+    format_ = for_writing(out)
+    together = format_.write is not None and format_.write_beside is not None
+    if together or (out.exists() and (not out.is_file() or format_.write is None)):
         outcome.write(str(out))
         return
     folder.mkdir()

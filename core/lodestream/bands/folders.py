@@ -201,7 +201,11 @@ def passing_folder(beside: Path, entries: Collection[str]) -> Iterator[Path]:
             _remove_left(left, entries)
     folder = above / f".{beside.name[:50]}.{secrets.token_hex(6)}{_ON_THE_WAY}"
     folder.mkdir(0o700)
-    handle = os.open(folder / _MARK, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    try:
+        handle = os.open(folder / _MARK, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+    except OSError:
+        folder.rmdir()  # without a mark nobody would remove it
+        raise
     _HELD.add(handle)
     try:
         _lock(handle, folder)
@@ -219,29 +223,36 @@ def passing_folder(beside: Path, entries: Collection[str]) -> Iterator[Path]:
 
 
 def _remove_left(folder: Path, entries: Collection[str]) -> None:
-    """Remove a folder of `passing_folder` if nobody is at work there, and it is certain that it is one."""
-    state = folder.lstat()
-    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid():
-        return
-    handle = os.open(folder / _MARK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    """Remove a folder of `passing_folder` if nobody is at work there, and it is certain that it is one.
+
+    All is done by the folder that was opened: whoever may write beside it could put a link to another in its place.
+    """
+    opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        mark = os.fstat(handle)
-        said = os.read(handle, _MOST).splitlines(keepends=True)
-        ours = stat.S_ISREG(mark.st_mode) and mark.st_nlink == 1 and mark.st_uid == os.geteuid()
-        here = len(said) == 2 and said[1].endswith(_signature().partition(b" on ")[2])
-        if ours and here and said[0] == _PASSING:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # an error where file systems have no locks
-            _remove_passing(folder, entries)
+        if os.fstat(opened).st_uid != os.geteuid():
+            return
+        handle = os.open(_MARK, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=opened)
+        try:
+            mark = os.fstat(handle)
+            said = os.read(handle, _MOST).splitlines(keepends=True)
+            ours = stat.S_ISREG(mark.st_mode) and mark.st_nlink == 1 and mark.st_uid == os.geteuid()
+            here = len(said) == 2 and said[1].endswith(_signature().partition(b" on ")[2])
+            if ours and here and said[0] == _PASSING:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # an error where file systems have no locks
+                _remove_passing(folder, entries, opened)
+        finally:
+            os.close(handle)
     finally:
-        os.close(handle)
+        os.close(opened)
 
 
-def _remove_passing(folder: Path, entries: Collection[str]) -> None:
+def _remove_passing(folder: Path, entries: Collection[str], opened: int | None = None) -> None:
     """Remove what was made, then the mark: what is left of a removal that was cut has its mark still."""
+    within = Path() if opened is not None else folder
     for entry in entries:
-        shutil.rmtree(folder / entry, ignore_errors=True)
-    if {path.name for path in folder.iterdir()} == {_MARK}:
-        (folder / _MARK).unlink()
+        shutil.rmtree(within / entry, ignore_errors=True, dir_fd=opened)
+    if os.listdir(folder if opened is None else opened) == [_MARK]:
+        os.unlink(within / _MARK, dir_fd=opened)
         folder.rmdir()
 
 

@@ -160,6 +160,19 @@ def test_what_a_killed_decode_left_is_removed_by_the_next(run: Run, expected: by
     assert names(tmp_path) == {"a.lode", "a.tif", "b.npy"}
 
 
+def test_a_file_and_the_folder_that_it_names_are_both_written(run: Run, tmp_path: Path) -> None:
+    rows, columns = np.mgrid[0:300, 0:300].astype(np.float64)
+    points = np.stack([rows + np.sin(columns / 20), columns + np.cos(rows / 30), np.sin(rows / 9)], axis=-1)
+    (tmp_path / "a.lode").write_bytes(ls.encode(ls.Surface(points, attributes={"a": rows, "b": columns}), 1e-3))
+    # Five channels by bands, since they take 12 bytes each in one piece; a .vtm takes 48 for a point.
+    code, _, stderr = run("decode", tmp_path / "a.lode", tmp_path / "a.vtm", "--memory", "5MiB")
+    assert code == 0, stderr
+    assert set(contents(tmp_path)) == {"a.lode", "a.vtm", "a/a_0.vts"}
+    assert 'file="a/a_0.vts"' in (tmp_path / "a.vtm").read_text()
+    found = ls.read(tmp_path / "a" / "a_0.vts")
+    np.testing.assert_array_equal(found.points, ls.decode((tmp_path / "a.lode").read_bytes()).points)
+
+
 def test_errors_name_the_file_and_not_the_folder_on_the_way(
     run: Run, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

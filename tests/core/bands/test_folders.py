@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -290,6 +291,38 @@ def test_a_link_of_such_a_name_is_not_followed(left: Path, tmp_path: Path) -> No
         pass
     assert (tmp_path / "elsewhere" / "tasks" / "x.npy").exists()
     assert left.is_symlink()
+
+
+def test_a_link_that_takes_the_place_of_what_was_left_is_not_followed(
+    left: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    of_somebody = tmp_path / "of somebody"
+    of_somebody.mkdir()
+    fill(of_somebody)
+    lock = fcntl.flock
+
+    def meanwhile(handle: int, how: int) -> None:
+        lock(handle, how)
+        if not left.is_symlink():
+            left.rename(tmp_path / "elsewhere")
+            left.symlink_to(of_somebody)
+
+    with monkeypatch.context() as context:
+        context.setattr("lodestream.bands.folders.fcntl.flock", meanwhile)
+        with passing_folder(tmp_path / "a.npy", ENTRIES):
+            pass
+    assert (of_somebody / "tasks" / "x.npy").exists()
+
+
+def test_a_folder_that_cannot_be_marked_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "no space left")
+
+    with monkeypatch.context() as context:
+        context.setattr("lodestream.bands.folders.os.open", full)
+        with pytest.raises(OSError, match="no space left"), passing_folder(tmp_path / "a.npy", ENTRIES):
+            pass
+    assert not names(tmp_path)
 
 
 def test_what_others_put_there_stays_with_the_mark(left: Path) -> None:

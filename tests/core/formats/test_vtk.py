@@ -329,7 +329,9 @@ def test_what_is_mapped_is_what_vtk_reads(
             assert root_of(values) is not None
 
 
-@pytest.mark.parametrize("changed", [(b'"area"', b'"vtkGhostType"'), (b"Float32", b"Int32"), (b'"kind"', b'"speed"')])
+@pytest.mark.parametrize(
+    "changed", [(b'"area"', b'"vtkGhostType"'), (b"Float32", b"Int32"), (b'"kind"', b'"speed"'), (b'"kind"', b'""')]
+)
 def test_what_cannot_be_mapped_is_left_to_vtk(tmp_path: Path, changed: tuple[bytes, bytes]) -> None:
     _raw(tmp_path / "g.vts", "SetByteOrderToLittleEndian")
     content = (tmp_path / "g.vts").read_bytes()

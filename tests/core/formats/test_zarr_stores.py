@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -173,9 +174,17 @@ def _promises(store: Path) -> None:
 
 
 def _large(store: Path) -> None:
-    for name, shape in (("depth", [1 << 20, 1 << 20]), ("lat", [1 << 20]), ("lon", [1 << 20])):
+    for name, shape in (("depth", [1 << 15, 1 << 15]), ("lat", [1 << 15]), ("lon", [1 << 15])):
         path = store / name / ".zarray"
-        path.write_text(json.dumps({**json.loads(path.read_text()), "shape": shape}))
+        path.write_text(json.dumps({**json.loads(path.read_text()), "shape": shape, "chunks": [256] * len(shape)}))
+
+
+def _grains(store: Path) -> None:
+    path = store / "depth" / ".zarray"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "shape": [9000, 7000], "chunks": [1, 1]}))
+    for name, count in (("lat", 9000), ("lon", 7000)):
+        path = store / name / ".zarray"
+        path.write_text(json.dumps({**json.loads(path.read_text()), "shape": [count], "chunks": [count]}))
 
 
 HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
@@ -186,6 +195,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], None], str]] = {
     "cut": (_cut, "expected a whole Zarr store"),
     "chunk": (_promises, "expands at most 2048 times"),
     "large": (_large, "at most 268,435,456 vertices"),
+    "grains": (_grains, r"at most 65,536 chunks of a Zarr store of [\d,]+ bytes, got an array of 63,000,000"),
 }
 
 
@@ -197,6 +207,21 @@ def test_hostile_stores(tmp_path: Path, kind: str) -> None:
     change(store)
     with pytest.raises(ls.InputError, match=message):
         ls.read(store)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_nobody_waits_for_a_pipe_in_place_of_the_head_of_a_store(tmp_path: Path) -> None:
+    store = tmp_path / "a.zarr"
+    sea().isel(time=0).drop_vars(["speed", "time"]).to_zarr(store, zarr_format=2, consolidated=False)
+    os.mkfifo(store / "zarr.json")
+    program = f"import lodestream; lodestream.read({os.fspath(store)!r})"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert "expected a Zarr store of regular files, got 'zarr.json', which is none" in found.stderr
+
+
+def test_few_chunks_of_many_values_may_all_be_missing(tmp_path: Path) -> None:
+    zarr.create_array(str(tmp_path / "a.zarr"), shape=(300, 200), chunks=(2, 2), dtype="f4", fill_value=3.0)
+    assert (ls.read(tmp_path / "a.zarr").points == 3.0).all()
 
 
 def test_metadata_in_one_place_are_not_believed(tmp_path: Path) -> None:

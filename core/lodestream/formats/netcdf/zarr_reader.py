@@ -17,13 +17,16 @@ from ...errors import FormatError, InputError, TooLargeError, UnavailableError
 from ...sources import read_source
 from ...surface import Surface
 from ..notes import listing, warn
-from ..source import Source
+from ..source import Source, number
 from .reader import chosen_of
 
 __all__ = ["folder_size", "is_store", "read"]
 
 #: What a folder has that is a group or an array.
 _HEADS = ("zarr.json", ".zgroup", ".zarray")
+
+#: So many chunks may all be missing; of more there should be a byte each.
+_HARMLESS_CHUNKS = 1 << 16
 
 #: Codecs and filters of both versions that turn bytes into numbers and do nothing else: pickle runs what a file says.
 _CODECS = frozenset(
@@ -70,7 +73,7 @@ def read(source: Source) -> Surface:
         if dataset is None:
             surface = _of_array(source, array)
         else:
-            _check_chunks(source, (it.encoding.get("chunks") or () for it in dataset.variables.values()))
+            _check_chunks(source, ((it.shape, it.encoding.get("chunks") or ()) for it in dataset.variables.values()))
             surface, left_out = chosen_of(source, dataset, "zarr")
             if left_out:
                 notes.append(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
@@ -83,16 +86,26 @@ def _of_array(source: Source, array: Any) -> Surface:
     if source.options:
         raise FormatError(f"expected a group of variables for {', '.join(source.options)}=, got a single array")
     source.check_array(tuple(array.shape), array.dtype)
-    _check_chunks(source, [array.chunks])
+    _check_chunks(source, [(array.shape, array.chunks)])
     unit = array.attrs.get("units")
     said = {"unit": unit} if isinstance(unit, str) and unit.strip() else {}
     return Surface(read_source(array, source.room), metadata=source.metadata("zarr") | said)
 
 
-def _check_chunks(source: Source, chunks: Iterable[tuple[int, ...]]) -> None:
-    """Refuse chunks of implausibly more values than the store has bytes: each is in memory as a whole."""
-    for chunk in chunks:
+def _check_chunks(source: Source, arrays: Iterable[tuple[tuple[int, ...], tuple[int, ...]]]) -> None:
+    """Refuse chunks, of arrays of some shape, that a store is too small for: too large ones, and too many.
+
+    Each is in memory as a whole. Each is looked for too, which takes half a millisecond and two kilobytes.
+    """
+    for shape, chunk in arrays:
         source.check_expansion(8 * prod(chunk))
+        count = prod(-(-length // side) for length, side in zip(shape, chunk, strict=False))
+        most = max(_HARMLESS_CHUNKS, source.size)
+        if count > most:
+            raise TooLargeError(
+                f"expected at most {number(most)} chunks of a Zarr store of {number(source.size)} bytes, got an array "
+                f"of {number(count)}"
+            )
 
 
 @contextmanager

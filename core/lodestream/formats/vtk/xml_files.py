@@ -156,7 +156,7 @@ def _mapped(path: Path, found: _Found, dims: Dims) -> Mapped | None:
     for array in found.arrays:
         key = array.section, array.attributes.get("Name")
         hides = key[1] == _GHOSTS and (array.section == "CellData" or array.attributes.get("type") != "UInt8")
-        if hides or key in names or (key[1] is None and array.section != "Points"):
+        if hides or key in names or (not key[1] and array.section != "Points"):
             return None
         names.add(key)
         if array.section == "CellData":
