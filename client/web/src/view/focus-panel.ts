@@ -208,7 +208,10 @@ export class FocusPanel {
   }
 
   private slide(to: number): void {
-    this.actions.show(to >= Number(this.slider.max) ? null : to);
+    const following = to >= Number(this.slider.max);
+    // The panel is drawn with the next frame, and the next key may come sooner.
+    if (this.last !== null) this.last = { ...this.last, following };
+    this.actions.show(following ? null : to);
   }
 
   private chooseTarget(): void {
