@@ -51,30 +51,32 @@ What all commands have in common:
 `decode` and `pull`:
 
 - If a limit such as `--until-rms` cannot be reached, the result is the complete surface, with a note.
-- `--until-rms z=0.5 --until-rms speed=0.1` stops where both errors are met, each in its own unit. Of an attribute with
-  components (`wind`) the error is that of the distance; `info` tells the names and errors of all channels.
-  A limit of an attribute that `--attributes` leaves out is refused. Errors of single channels are kept in two bytes,
-  rounded up by at most 1/32, so the error told of one channel may be a little above that of all of them.
-- `decode --memory` is kept where NPY, GeoTIFF or COG is written from a whole container; what takes more is refused,
-  with the memory that it takes ([large.md](large.md)).
+- `--until-rms z=0.5 --until-rms speed=0.1` stops where both errors are met, each in its own unit. For an attribute with
+  components (`wind`) the error is that of the distance; `info` shows the names and errors of all channels. A limit of
+  an attribute that `--attributes` leaves out is refused. Errors of single channels are stored in two bytes, rounded up
+  by at most 1/32, so the error shown for one channel may be slightly above that of all channels together.
+- `decode --memory` writes NPY, GeoTIFF, COG, NetCDF and Zarr by bands within this memory. If another output needs more,
+  it is refused, with the memory that it needs ([large.md](large.md)).
 - `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
-  combined with each other and with the limits; `--roi` can be combined neither with `--level` nor with errors of
-  channels (NAME=E): a container tells bounds of the errors of windows for all channels together.
-- Errors of a window are bounds until it is exact: `--until-rms E` and `--until-max E` stop where the error inside is at
-  most the limit for certain. `info` tells errors of the whole surface only.
+  combined with each other and with the limits. `--roi` cannot be combined with `--level`, nor with errors of channels
+  (NAME=E), because a container has bounds of the errors of windows only for all channels together.
+- Until a window is exact, its errors are upper bounds: `--until-rms E` and `--until-max E` stop where the error inside
+  is certainly at most the limit. `info` shows errors of the whole surface only.
 - With `--json` they print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes` (everything that
-  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `channels` (where the
-  surface has several: the two errors of each that is written, by its name), `seconds` and `ended`: complete, level,
+  was read or received), `level`, `rms`, `max`, `bound` (whether these two are bounds), `channels` (if the surface has
+  several: the RMS and maximum error of each channel that is written, by name), `seconds` and `ended`: complete, level,
   rms, max, channels, bytes, seconds, stopped or truncated.
 
 `pull --watch`:
 
-- OUT and the picture of `--picture` are replaced, never changed in place: whoever opens them finds a whole file. A line
-  on standard error says when OUT was, and with which error.
-- They are written beside the stream, which does not wait for them. What is written next is the newest state, and others
-  are left out. The last one is always written. Notes on what the format cannot hold come once, with it.
-- Name and position of the surface are in each of them, since its metadata are requested first.
+- OUT and the picture of `--picture` are replaced, never changed in place, so a program that opens them finds a complete
+  file. Each time OUT is replaced, a line on standard error says so, with the error of the new file.
+- They are written in parallel with the stream, which does not wait for them. Each time the newest state is written;
+  states in between are skipped. The last state is always written. Notes on what the format cannot hold are printed
+  once, with the last state.
+- OUT cannot be a Zarr store: a folder cannot be replaced in this way.
+- Each of these files has the name and position of the surface, since the metadata are requested first.
 
 An interrupted `pull`:
 
