@@ -1,6 +1,6 @@
 /** The WebAssembly module of the kernels of decoding, compiled once, and instances of it with memory of their own. */
 import { UnavailableError } from "../errors";
-import { KERNELS_BASE64 } from "./module";
+import { KERNELS_HEX } from "./module";
 
 /** Addresses and counts are unsigned numbers of 32 bits, `i64` arrays of pairs of them; kernels/*.c say what each means. */
 export interface KernelExports {
@@ -158,7 +158,9 @@ export function loadKernels(): Promise<WebAssembly.Module> {
 }
 
 async function compile(): Promise<WebAssembly.Module> {
-  const bytes = Uint8Array.from(atob(KERNELS_BASE64), (character) => character.charCodeAt(0));
+  const bytes = Uint8Array.from({ length: KERNELS_HEX.length / 2 }, (_, k) =>
+    Number.parseInt(KERNELS_HEX.slice(2 * k, 2 * k + 2), 16),
+  );
   try {
     return await WebAssembly.compile(bytes);
   } catch (error) {
