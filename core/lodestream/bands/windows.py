@@ -110,7 +110,13 @@ class WindowMeasurer:
         self._before: list[tuple[NDArray[np.float64], NDArray[np.bool_]] | None] = [None] * (1 + len(given.others))
 
     def measure(self, state: list[KnownState]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """See `Figures`, of a state of each channel."""
+        """Sums and largest of the squared distances of the window in a state of each channel.
+
+        Returns
+        -------
+        float64, shape (row of cells, column of cells, kind, 2), and bool, shape (kind,)
+            See `Figures.squares` and `Figures.equal`, of one state.
+        """
         geometric = self._geometric
         parts = [self._compared(0, self._given.coordinates, range(geometric), 0, state)]
         for number, (original, channel) in enumerate(self._given.others):

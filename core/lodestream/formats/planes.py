@@ -54,7 +54,10 @@ class Cut:
         return volume[self.key].reshape(*self.shape, *values.shape[1:])
 
     def of(self, values: NDArray[Any], room: Room = IN_MEMORY) -> NDArray[Any]:
-        """A copy of `view` in the machine's byte order, where there is room for it; made some rows at a time."""
+        """A copy of `view`, shape (row, column) and more, in the machine's byte order, made some rows at a time.
+
+        ``room`` says whether it lies in memory or in a file.
+        """
         view = self.view(values)
         found = room.empty(view.shape, view.dtype.newbyteorder("="))
         for rows in rows_at_once(view.shape):
