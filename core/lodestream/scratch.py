@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from uuid import uuid4
 
@@ -19,6 +20,17 @@ __all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "rows_at_once"]
 
 _SUFFIX = ".npy"
 _UNFINISHED = ".part"
+
+#: Headers are parsed by one thread at a time: Python 3.11 raises SystemError now and then where several parse at once.
+_parsing = Lock()
+
+
+def _parse_anew() -> None:
+    global _parsing
+    _parsing = Lock()
+
+
+os.register_at_fork(after_in_child=_parse_anew)  # another thread may have been parsing when the process forked
 
 
 class DamagedError(ValueError):
@@ -77,7 +89,8 @@ class Scratch:
             try:
                 version = np.lib.format.read_magic(file)
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                shape, fortran, dtype = read(file)
+                with _parsing:
+                    shape, fortran, dtype = read(file)
             except ValueError as error:
                 raise DamagedError(f"expected an array in {path}, got something else ({error})") from None
             if dtype.hasobject:  # the file would say which addresses of memory they are at
