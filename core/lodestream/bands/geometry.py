@@ -91,13 +91,6 @@ class Bands:
         ends[-1] = rows
         return list(pairwise([0, *ends]))
 
-    def band_of_tile(self, tile: int) -> Band | None:
-        """The band that has a tile; None: it is in the core."""
-        level = self.layout.level_of(tile)
-        if level <= self.core:
-            return None
-        return next(band for band in self.of(level) if tile in band.tiles)
-
     def _bands(self, level: int) -> tuple[Band, ...]:
         layout = self.layout
         (rows, columns), (fine, _) = layout.shape(0, level - 1), layout.shape(0, level)
