@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from threading import Condition
-from typing import Generic, TypeVar
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, Generic, TypeVar
+from weakref import ref
 
 from .errors import OptionError
 
@@ -63,70 +66,121 @@ def spread(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Re
 
 
 class _Spread(Generic[_Item, _Result]):
-    """Items that several threads take one after another."""
+    """Items that several threads take one after another.
+
+    A signal may raise KeyboardInterrupt in the caller's thread between any two lines: also after a Condition is
+    acquired and before its block is entered, and then all others would wait for ever. So there is no lock here. Each
+    step that threads share is one call of a deque or a queue, which are written in C and do it whole.
+    """
 
     def __init__(self, work: Callable[[_Item], _Result], items: list[_Item]) -> None:
-        self._work, self._items, self._lock = work, items, Condition()
-        self._next, self._end, self._helping = 0, len(items), 0
+        self._work, self._count = work, len(items)
+        self._waiting = deque(enumerate(items))
+        self._places: deque[None] = deque()
+        self._left: deque[None] = deque()
+        self._woken: SimpleQueue[None] = SimpleQueue()
         self._found: dict[int, _Result] = {}
-        self._errors: dict[int, Exception] = {}
+        self._errors: dict[int, BaseException] = {}
 
     def results(self, others: int) -> list[_Result]:
         """All results in order, with the help of so many other threads."""
-        helping: list[Future[None]] = []
+        self._places.extend([None] * others)
         try:
-            helping += _helpers(self._help, others)
+            _pool().ask(self, others)
             self._take()
         finally:
-            with self._lock:
-                self._end = 0
-            for helper in helping:
-                if not helper.cancel():
-                    helper.result()
-            with self._lock:
-                # A pool that could not start a thread has taken the work all the same: another thread may be at it.
-                self._lock.wait_for(lambda: not self._helping)
+            self._waiting.clear()
+            helping = others - self._close()
+            try:
+                self._wait(helping)
+            except KeyboardInterrupt:
+                self._wait(helping)
+                raise
         if self._errors:
             raise self._errors[min(self._errors)]
-        return [self._found[number] for number in range(len(self._items))]
+        return [self._found[number] for number in range(self._count)]
 
-    def _help(self) -> None:
-        with self._lock:
-            if not self._end:
-                return
-            self._helping += 1
+    def help(self) -> None:
+        """Take items in another thread. After the end there is no place, and nothing is done."""
         try:
+            self._places.pop()
+        except IndexError:
+            return
+        with suppress(BaseException):  # it stands among the errors, for the caller
             self._take()
-        finally:
-            with self._lock:
-                self._helping -= 1
-                self._lock.notify_all()
+        self._left.append(None)
+        self._woken.put(None)
 
     def _take(self) -> None:
         while True:
-            with self._lock:
-                number, self._next = self._next, self._next + 1
-            if number >= self._end:
+            try:
+                number, item = self._waiting.popleft()
+            except IndexError:
                 return
             try:
-                self._found[number] = self._work(self._items[number])
-            except Exception as error:
-                self._errors[number], self._end = error, 0
+                self._found[number] = self._work(item)
+            except BaseException as error:
+                self._errors[number] = error
+                self._waiting.clear()
+                if not isinstance(error, Exception):
+                    raise
+
+    def _close(self) -> int:
+        """Places that nobody has taken, and nobody will."""
+        free = 0
+        with suppress(IndexError):
+            while True:
+                self._places.pop()
+                free += 1
+        return free
+
+    def _wait(self, helping: int) -> None:
+        """Wait until so many threads have left; it may be interrupted and called again."""
+        while len(self._left) < helping:
+            self._woken.get()
 
 
-#: The threads of this process, by how many there are at most. They begin when there is something to do.
-_pools: dict[int, ThreadPoolExecutor] = {}
+class _Pool:
+    """Threads that begin when there is something to do, and end with the process."""
 
+    def __init__(self, most: int) -> None:
+        # References are weak: an end does not wait for a thread that has not come to it, which then finds nothing.
+        self._asked: SimpleQueue[ref[_Spread[Any, Any]]] = SimpleQueue()
+        self._unborn = deque(range(most))
 
-def _helpers(work: Callable[[], None], count: int) -> Iterator[Future[None]]:
-    """So many threads at work, or fewer where no more can be started."""
-    most = threads() - 1
-    pool = _pools.get(most) or _pools.setdefault(most, ThreadPoolExecutor(most, "lodestream"))
-    for _ in range(count):
+    def ask(self, work: _Spread[Any, Any], count: int) -> None:
+        """Have so many threads help when they are free. Where no thread can be started, nobody does."""
+        for _ in range(count):
+            self._asked.put(ref(work))
+            self._start()
+
+    def _start(self) -> None:
         try:
-            yield pool.submit(work)
-        except RuntimeError:  # a limit of the process, or the interpreter is ending
+            number = self._unborn.pop()
+        except IndexError:
             return
+        try:
+            Thread(target=self._serve, name=f"lodestream_{number}", daemon=True).start()
+        except RuntimeError:  # a limit of the process, or the interpreter is ending
+            self._unborn.append(number)
+
+    def _serve(self) -> None:
+        while True:
+            self._help(self._asked.get()())
+
+    @staticmethod
+    def _help(work: _Spread[Any, Any] | None) -> None:
+        if work is not None:
+            work.help()
+
+
+#: The threads of this process, by how many there are at most.
+_pools: dict[int, _Pool] = {}
+
+
+def _pool() -> _Pool:
+    most = threads() - 1
+    return _pools.get(most) or _pools.setdefault(most, _Pool(most))
 
 
 if hasattr(os, "register_at_fork"):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import signal
+import subprocess
+import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
-from typing import NoReturn
+import weakref
 
 import pytest
 
@@ -93,33 +96,75 @@ def test_without_another_thread_the_caller_does_all(monkeypatch: pytest.MonkeyPa
     assert spread(lambda item: item + 1, range(30)) == list(range(1, 31))
 
 
+def test_whoever_comes_late_finds_nothing_and_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "2")
+    monkeypatch.setattr(parallel, "_pools", {})
+    free, busy = threading.Event(), threading.Event()
+
+    class Item:
+        pass
+
+    def outer(item: int) -> None:
+        if threading.current_thread() is not caller:
+            busy.set()
+            assert free.wait(30)
+        else:
+            assert busy.wait(30)
+            items = [Item(), Item(), Item()]
+            gone = [weakref.ref(item) for item in items]
+            # The only other thread is at work: it will be asked in vain.
+            assert spread(lambda item: isinstance(item, Item), items) == [True, True, True]
+            del items
+            gc.collect()
+            assert [item() for item in gone] == [None, None, None]
+            free.set()
+
+    caller = threading.current_thread()
+    spread(outer, range(2))
+    assert spread(lambda item: item, range(100)) == list(range(100))
+
+
+def test_no_item_is_left_out_however_threads_take_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "4")
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for count in range(2, 400):
+            assert spread(lambda item: -item, range(count % 7 + 2)) == [-item for item in range(count % 7 + 2)]
+    finally:
+        sys.setswitchinterval(interval)
+
+
+# Interrupts come at any moment, also where locks are taken. Each must end the work, and nothing may hang or be lost.
+INTERRUPTED = """
+import os, random, signal, sys
+os.environ["LODESTREAM_THREADS"] = "3"
+from lodestream.parallel import spread
+sys.setswitchinterval(1e-6)
+def interrupt(number, frame):
+    raise KeyboardInterrupt
+signal.signal(signal.SIGALRM, interrupt)
+random.seed(1)
+ended = 0
+while ended < 3000:
+    try:
+        signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-5, 1e-3))
+        while True:
+            assert spread(abs, range(-4, 0)) == [4, 3, 2, 1]
+    except KeyboardInterrupt:
+        ended += 1
+print(ended)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no timers that send signals on this system")
+def test_an_interrupt_at_any_moment_leaves_nobody_waiting() -> None:
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout) == (0, "3000\n"), done.stderr
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
-def test_work_that_a_pool_has_taken_is_waited_for_though_it_could_start_no_thread(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv(VARIABLE, "3")
-    free, begun = threading.Event(), threading.Event()
-
-    def refuse() -> NoReturn:
-        raise RuntimeError("can't start new thread")
-
-    def work(item: int) -> int:
-        if item == 0:
-            free.set()
-            assert begun.wait(30)
-        else:
-            begun.set()
-            time.sleep(0.1)
-        return item
-
-    with ThreadPoolExecutor(2) as pool:
-        pool.submit(free.wait, 30)
-        monkeypatch.setattr(pool, "_adjust_thread_count", refuse)
-        monkeypatch.setattr(parallel, "_pools", {2: pool})
-        assert spread(work, range(2)) == [0, 1]
-
-
 def test_a_forked_process_starts_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "2")
     spread(lambda item: time.sleep(0.001), range(8))
