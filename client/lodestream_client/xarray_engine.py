@@ -26,7 +26,7 @@ from lodestream.container.capacity import Capacity
 from lodestream.container.model import ByteRange, Header
 from lodestream.coordinates.height_fields import level_metadata
 from lodestream.decoding.decoder import Decoder, View
-from lodestream.errors import InputError, LodestreamError, OptionError
+from lodestream.errors import InputError, LodestreamError, OptionError, named
 from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
 from lodestream.planning.planner import plan
@@ -86,7 +86,7 @@ class LodeBackend(BackendEntrypoint):
         OptionError
             If a level or block is no integer or not there, or there are several blocks and none is chosen.
         StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
-            If the container is damaged or too large, or cannot be had.
+            If the container is damaged or too large, or cannot be had. A note of the error names the file.
         """
         container = Container(_place(filename_or_obj), token, max_vertices)
         blocks = len(container.header.blocks)
@@ -168,7 +168,8 @@ class Container:
         self._lock = threading.Lock()
         self._windows: OrderedDict[Any, Surface] = OrderedDict()
         self._levels: dict[Any, Surface] = {}
-        self._index = read_index(self._first, self._source.size, Capacity(max_vertices))
+        with named(place):
+            self._index = read_index(self._first, self._source.size, Capacity(max_vertices))
         self.header: Header = self._index.header
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -278,11 +279,12 @@ class Container:
         decoder = Decoder(target, max_vertices=self._given[2])
         chosen = plan(self._index, target)
         places = [*chosen.before, *chosen.ranges]
-        for run in _runs(places):
-            data = self._read(run[0].offset, run[-1].end - run[0].offset)
-            for place in run:
-                start = place.offset - run[0].offset
-                decoder.feed_at(place.offset, data[start : start + place.length])
+        with named(self._given[0]):
+            for run in _runs(places):
+                data = self._read(run[0].offset, run[-1].end - run[0].offset)
+                for place in run:
+                    start = place.offset - run[0].offset
+                    decoder.feed_at(place.offset, data[start : start + place.length])
         return decoder.view()
 
 

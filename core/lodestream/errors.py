@@ -27,6 +27,9 @@ found, and where.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 __all__ = [
     "CorruptStreamError",
     "FormatError",
@@ -45,6 +48,7 @@ __all__ = [
     "TruncatedStreamError",
     "UnavailableError",
     "UnsupportedVersionError",
+    "named",
 ]
 
 
@@ -276,3 +280,13 @@ class RemoteError(LodestreamError):
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
+
+
+@contextmanager
+def named(place: object) -> Iterator[None]:
+    """Add to an error of this package, as a note, which file or address it is about."""
+    try:
+        yield
+    except LodestreamError as error:
+        error.add_note(f"in {place}")
+        raise

@@ -217,8 +217,9 @@ def test_what_cannot_be_opened_is_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(ls.TooLargeError):
         opened(path, max_vertices=1000).z.load()
     (tmp_path / "cut.lode").write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(ls.TruncatedStreamError):
+    with pytest.raises(ls.TruncatedStreamError) as cut:
         opened(tmp_path / "cut.lode")
+    assert cut.value.__notes__ == [f"in {tmp_path / 'cut.lode'}"]
     with pytest.raises(FileNotFoundError):
         opened(tmp_path / "none.lode")
     with pytest.raises(ls.InputError, match="expected a file's name or a URL"):

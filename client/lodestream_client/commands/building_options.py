@@ -48,15 +48,16 @@ def add_building_options(parser: argparse.ArgumentParser) -> None:
         "--scratch",
         type=Path,
         metavar="FOLDER",
-        help="folder for the files of a build by bands, about 12 bytes a value, empty or of a build that was cut; what "
-        "is made there is kept when the build is cut, and the same command goes on from there (default: "
-        "OUT.lode.build, which is gone after an interruption too)",
+        help="folder for the files of a build by bands, about 12 bytes a value, empty or of an interrupted build; after "
+        "an interruption it stays, and the same command continues from there (default: OUT.lode.build, which is removed "
+        "after an interruption too)",
     )
     group.add_argument(
         "--dask",
         type=parse_scheduler,
         metavar="ADDRESS",
-        help="let the workers of a Dask scheduler build, such as tcp://10.0.0.1:8786; they see the same folders",
+        help="address of a Dask scheduler whose workers build, such as tcp://10.0.0.1:8786; they must see the same "
+        "folders",
     )
 
 
@@ -66,8 +67,8 @@ def add_memory_option(group: argparse._ActionsContainer) -> None:
         "--memory",
         type=parse_memory,
         metavar="SIZE",
-        help="memory to work in, such as 512MiB: what takes more in one piece is done by bands of rows (default: a "
-        "quarter of the machine's)",
+        help="working memory, such as 512MiB: surfaces that need more are processed by bands of rows (default: a "
+        "quarter of the machine's memory)",
     )
 
 
@@ -103,5 +104,5 @@ def work_folder(options: BuildingOptions, out: str) -> Iterator[Path]:
         except BaseException as error:
             cut = isinstance(error, KeyboardInterrupt | OSError | UnavailableError) or is_loss(error)
             if named and cut:
-                note(f"{options.scratch} is kept: the same command goes on with what is done")
+                note(f"{options.scratch} is kept: the same command continues from there")
             raise

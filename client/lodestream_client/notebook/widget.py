@@ -167,6 +167,9 @@ class Widget(AnyWidget):
             raise
         self.on_msg(self._hear)
 
+    def __repr__(self) -> str:
+        return f"<Widget {self.name!r}: {self.state}, {self.bytes_received:,} bytes>"
+
     @property
     def target(self) -> Target | None:
         """Where the transmission stops."""

@@ -12,7 +12,7 @@ from ..container import read_index
 from ..container.capacity import Capacity
 from ..coordinates.seams import merge
 from ..decoding.decoder import Decoder
-from ..errors import FormatError, InputError
+from ..errors import FormatError, InputError, named
 from ..formats.attributes import NORMAL, TEXTURE
 from ..formats.notes import keep_words, listing, warn
 from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
@@ -50,9 +50,9 @@ def read(path: str | os.PathLike[str], *, level: int | None = None) -> pyvista.S
     OptionError
         If there is no such level.
     StreamError, TooLargeError
-        If the container is damaged or too large.
+        If the container is damaged or too large. A note of the error names the file.
     """
-    with open(path, "rb") as file:
+    with named(os.fspath(path)), open(path, "rb") as file:
 
         def take(offset: int, length: int) -> bytes:
             file.seek(offset)

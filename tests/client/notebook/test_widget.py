@@ -44,6 +44,7 @@ def test_a_surface_is_encoded_and_comes_over_the_comm(terrain: ls.Surface, fake_
     assert np.array_equal(ls.decode(whole(fake_page, shown)).points, terrain.points)
     assert shown.name == "hills"
     assert shown.fields == ["height", "slope", "change", "none", "rain", "wind", "wind[0]", "wind[1]"]
+    assert repr(shown) == "<Widget 'hills': connecting, 0 bytes>"
 
 
 def test_a_container_is_sent_as_it_is(container: bytes, tmp_path: Path, fake_page: Page) -> None:

@@ -242,8 +242,9 @@ def test_a_container_is_read_whole_or_at_a_level(tmp_path: Path) -> None:
     with pytest.raises(ls.OptionError, match="level"):
         pyvista_grids.read(path, level=99)
     path.write_bytes(path.read_bytes()[:-9])
-    with pytest.raises(ls.TruncatedStreamError):
+    with pytest.raises(ls.TruncatedStreamError) as cut:
         pyvista_grids.read(path)
+    assert cut.value.__notes__ == [f"in {path}"]
 
 
 @pytest.mark.parametrize("polygons", [False, True])
