@@ -48,9 +48,9 @@ def add_building_options(parser: argparse.ArgumentParser) -> None:
         "--scratch",
         type=Path,
         metavar="FOLDER",
-        help="folder for the files of a build by bands, about 12 bytes a value, empty or of an interrupted build; after "
-        "an interruption it stays, and the same command continues from there (default: OUT.lode.build, which is removed "
-        "after an interruption too)",
+        help="folder for the files of a build by bands, about 12 bytes a value, empty or of an interrupted build; "
+        "after an interruption it stays, and the same command continues from there (default: OUT.lode.build, which is "
+        "removed after an interruption too)",
     )
     group.add_argument(
         "--dask",
