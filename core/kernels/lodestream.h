@@ -392,6 +392,38 @@ LODE_API int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, cons
                                  int64_t weights_count, const int32_t *truth, int64_t truth_count, const uint8_t *early,
                                  int64_t early_count, double *errors, int64_t errors_count);
 
+/* layers.c ------------------------------------------------------------------------------------------------------- */
+
+/* Curves stand one after another: for each unit of each channel the bits and gains of its passes, that of the number 0
+ * first, at most 64.
+ *
+ * ends: for each curve, where it ends; the next one begins there.
+ */
+
+/* Gain for each bit of all passes, the same for the passes of a run.
+ *
+ * first, last:    which curves.
+ * falling, known: slopes of all passes of the stream times -1, rising, and the bits of all passes up to each; or none.
+ * share_of_tile:  two runs are two only where that saves this share of the unit's bits so far, and
+ * share_of_stream, segment: this share of the stream's bits at the first run's slope, but not more than `segment` bits.
+ * Returns 0.
+ */
+LODE_API int64_t lode_pass_slopes(const double *bits, int64_t bits_count, const double *gains, int64_t gains_count,
+                                  const int64_t *ends, int64_t ends_count, int64_t first, int64_t last,
+                                  const double *falling, int64_t falling_count, const double *known,
+                                  int64_t known_count, double share_of_tile, double share_of_stream, double segment,
+                                  double *slopes, int64_t slopes_count);
+
+/* Gives a parent's passes of a plane at least the slope of its children's, for the curves from `last` - 1 down to
+ * `first`.
+ *
+ * parents: for each curve the number of its parent's, which is less than its own, or negative.
+ * Returns 0.
+ */
+LODE_API int64_t lode_lift_slopes(const int64_t *ends, int64_t ends_count, const int64_t *parents,
+                                  int64_t parents_count, int64_t first, int64_t last, double *slopes,
+                                  int64_t slopes_count);
+
 /* mesh.c --------------------------------------------------------------------------------------------------------- */
 
 /* Faces are triangles and quads. In all that follows

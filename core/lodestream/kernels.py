@@ -45,6 +45,7 @@ __all__ = [
     "differences",
     "inverse",
     "lift",
+    "lift_slopes",
     "lzf",
     "mask",
     "mesh_bounds",
@@ -65,6 +66,7 @@ __all__ = [
     "most_bits",
     "offsets",
     "pass_gains",
+    "pass_slopes",
     "passes",
     "predictor_bits",
     "predictor_factors",
@@ -352,6 +354,13 @@ passes = Kernel(
 
 # gains.c
 pass_gains = Kernel("pass_gains", reads(_I64), reads(_F64), reads(_I32), reads(_U8), writes(_F64))
+
+# layers.c
+CURVE_PASSES = 64
+_curves = reads(_F64), reads(_F64), reads(_I64)
+_worth: tuple[_Argument, ...] = (reads(_F64), reads(_F64), REAL, REAL, REAL)
+pass_slopes = Kernel("pass_slopes", *_curves, INTEGER, INTEGER, *_worth, writes(_F64))
+lift_slopes = Kernel("lift_slopes", reads(_I64), reads(_I64), INTEGER, INTEGER, writes(_F64))
 
 # mesh.c
 _MESH = [reads(_I32), reads(_I32)]

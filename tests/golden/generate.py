@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.encoding import allocated, encoder, large_units, prepared, quantized, transformed
-from lodestream.encoding.allocation import TileCurve, assign_layers
+from lodestream.encoding.allocation import assign_layers
+from lodestream.encoding.curves import Curves
 from lodestream.entropy.tile_coder import TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather
 from lodestream.transform.predictors import COEFFICIENT_BITS
@@ -65,11 +66,10 @@ class Crafted:
         def planes(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
             return planes_of(table, true, tile) + (self.ones if tile == 0 else 0)
 
-        def assigned(curves: list[TileCurve], *arguments: Any) -> list[NDArray[Any]]:
+        def assigned(curves: Curves, *arguments: Any) -> list[NDArray[Any]]:
             states = assign_layers(curves, *arguments)
             first = np.zeros_like(states[0])
-            for curve in curves:
-                first[curve.tile, curve.channel] = len(curve.bits)
+            first[curves.tile, curves.channel] = curves.counts
             first[0] -= 2 * self.ones
             return [first, *states]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, BinaryIO
@@ -14,8 +14,9 @@ from ..container.codecs import needed_codecs
 from ..container.digest import DIGEST
 from ..container.model import Errors, Header
 from ..container.writer import ContainerWriter
-from ..encoding.allocation import TileCurve, assign_layers
+from ..encoding.allocation import assign_layers
 from ..encoding.corrected import remaining_errors
+from ..encoding.curves import Curves
 from ..encoding.header import header_of
 from ..encoding.large_units import candidate, worth
 from ..encoding.measured import MeasuredLayer, all_passes, kept_layers, level_states, shown_states
@@ -205,20 +206,24 @@ class Building:
     def _large(self) -> int:
         return int(self._read("large"))
 
-    def _curves(self) -> Iterator[TileCurve]:
+    def _curves(self) -> Curves:
         """Of all units, in the order in which they are coded in one piece: by level, tile and channel."""
-        channels = range(self._build.channels)
-        for level, number, tiles in self._pieces:
-            bits = [self._read(name_of("bits", channel, level, number)) for channel in channels]
-            gains = [self._read(name_of("gains", channel, level, number)) for channel in channels]
-            starts = [0] * len(channels)
-            for tile in tiles:
-                for channel in channels:
-                    passes = max(2 * int(self._tops[channel][tile]) - 1, 0)
-                    if passes:
-                        own = slice(starts[channel], starts[channel] + passes)
-                        starts[channel] = own.stop
-                        yield TileCurve(tile, channel, np.array(bits[channel][own]), np.array(gains[channel][own]))
+        found = [self._curves_of(*piece) for piece in self._pieces]
+        return Curves(*(np.concatenate(own) for own in zip(*found, strict=True)))
+
+    def _curves_of(self, level: int, number: int, tiles: range) -> tuple[NDArray[Any], ...]:
+        """The arrays of `Curves` for a piece."""
+        channels = self._build.channels
+        own = np.array([tops[tiles.start : tiles.stop] for tops in self._tops], np.int64)
+        counts = np.maximum(2 * own - 1, 0)
+        passes = [np.repeat(np.arange(len(tiles)), each) for each in counts]
+        order = np.argsort(np.concatenate(passes), kind="stable")  # from one channel after the other to tile by tile
+        bits, gains = (
+            np.concatenate([self._read(name_of(kind, channel, level, number)) for channel in range(channels)])[order]
+            for kind in ("bits", "gains")
+        )
+        tile, channel = np.nonzero(counts.T)
+        return tile + tiles.start, channel, counts[channel, tile], bits, gains
 
     # Layers.
 
@@ -232,13 +237,12 @@ class Building:
     def _choose_layers(self) -> None:
         if self._scratch.has("layers"):
             return
-        curves = list(self._curves())
+        curves = self._curves()
         layers = assign_layers(curves, self._layout, self._build.channels)
-        bytes_ = sum(float(curve.bits.sum()) for curve in curves) / 8
         shown = shown_states(self._header, layers, all_passes(self._tops))
         self._scratch.write("states", np.stack([*shown, *level_states(self._header)]))
         self._scratch.write("last-state", shown[-1])
-        self._scratch.write("coefficient-bytes", np.array(bytes_))
+        self._scratch.write("coefficient-bytes", np.array(curves.bytes))
         self._scratch.write("layers", np.stack(layers))
 
     # Errors and residual.

@@ -15,7 +15,8 @@ from ..entropy.bitplanes import pass_count, pass_gains
 from ..entropy.tile_coder import Channel, Strings, TileCoder
 from ..entropy.tiles import Tiles, TileTable
 from ..parallel import spread
-from .allocation import TileCurve, assign_layers
+from .allocation import assign_layers
+from .curves import Curves, TileCurve
 from .header import header_of
 from .large_units import large_level
 from .quantized import Quantized
@@ -64,13 +65,12 @@ def allocate(quantized: Quantized) -> Allocated:
     tables, geometric = list(quantized.tables), quantized.prepared.geometric
     large = large_level(tables, list(channels), geometric, quantized.quantiser)
     coder = TileCoder(tables, list(channels), geometric, quantized.quantiser, large)
-    curves = list(_curves(quantized, coder))
+    curves = Curves.joined(_curves(quantized, coder))
     states = assign_layers(curves, layout, len(channels), quantized.quantiser is not None)
-    coefficient_bytes = sum(float(curve.bits.sum()) for curve in curves) / 8
     tops = [channel.top for channel in channels]
     header = header_of(quantized.prepared, quantized.lattices, quantized.predictors, tops, quantized.quantiser, large)
     quantized = _without_large(quantized, coder)
-    return Allocated(quantized, header, tuple(coder.tiles), coder.strings, tuple(states), coefficient_bytes)
+    return Allocated(quantized, header, tuple(coder.tiles), coder.strings, tuple(states), curves.bytes)
 
 
 def _without_large(quantized: Quantized, coder: TileCoder) -> Quantized:

@@ -8,22 +8,18 @@ children; layers cut this order so that one is at most `_GROWTH` times as long a
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..grid.layout import Layout
+from .curves import Curves, Worth
 
-__all__ = ["TileCurve", "assign_layers", "hull_slopes"]
+__all__ = ["assign_layers"]
 
 #: A segment takes so many bits besides its passes: in the layer's table, in the index, and to start and end a coder.
 _SEGMENT = 48.0
-#: Two runs are one where as two they save less than this share of the tile's bits so far, or than a segment takes;
-#: early in the stream, where many segments are in the same layer anyway, less than a share of the stream's bits.
-_SHARE_OF_TILE = 0.02
+#: Two runs of a tile are one where as two they save less than a segment takes; early in the stream, where many segments
+#: are in the same layer anyway, less than a share of the stream's bits.
 _SHARE_OF_STREAM = 0.005
 #: What a run adds to a layer besides its passes, in bytes.
 _ENTRY = 5
@@ -41,64 +37,12 @@ _SECOND = 16.0  # times the first layer
 _BYTES_FOR_A_LAYER = 12000
 
 
-@dataclass(frozen=True)
-class TileCurve:
-    """What the coding passes of one tile of one channel cost and gain.
-
-    Attributes
-    ----------
-    bits : float64, shape (pass,)
-        Bits that each pass takes; the last pass has number 0.
-    gains : float64, shape (pass,)
-        By how much the squared error falls with each pass, in the surface's unit.
-    """
-
-    tile: int
-    channel: int
-    bits: NDArray[np.float64]
-    gains: NDArray[np.float64]
-
-
-def hull_slopes(curve: TileCurve, worth: Callable[[float], float] = lambda slope: 0.0) -> NDArray[np.float64]:
-    """Gain for each bit of every pass, shape (pass,): the same for all passes of a run, falling from run to run.
-
-    Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
-    where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): ``worth(s)``, and a share of
-    the tile's bits so far.
-    """
-    runs: list[tuple[float, float, int]] = []  # bits, gain, passes
-    known = 0.0
-    for bits, gain in zip(curve.bits[::-1].tolist(), curve.gains[::-1].tolist(), strict=True):
-        run = (max(bits, 1e-9), max(gain, 0.0), 1)
-        known += run[0]
-        while runs:
-            last = runs[-1]
-            saved = last[1] * run[0] - run[1] * last[0]
-            if saved > 0 and saved >= max(worth(last[1] / last[0]), _SHARE_OF_TILE * known) * (last[1] + run[1]):
-                break
-            runs.pop()
-            run = (run[0] + last[0], run[1] + last[1], run[2] + last[2])
-        runs.append(run)
-    slopes = [gain / bits for bits, gain, passes in runs for _ in range(passes)]
-    return np.array(slopes[::-1])
-
-
-def _worth(curves: list[TileCurve]) -> Callable[[float], float]:
-    """What two runs must save to be two, in bits, by the slope of the first; see `_SHARE_OF_STREAM`."""
-    slopes = np.concatenate([hull_slopes(curve) for curve in curves])
-    order = np.argsort(-slopes, kind="stable")
-    falling = (-slopes[order]).tolist()
-    known = np.cumsum(np.concatenate([curve.bits for curve in curves])[order]).tolist()
-    return lambda slope: min(_SEGMENT, _SHARE_OF_STREAM * known[min(bisect_left(falling, -slope), len(known) - 1)])
-
-
-def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: bool = False) -> list[NDArray[np.int8]]:
+def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = False) -> list[NDArray[np.int8]]:
     """The state after each layer.
 
     Parameters
     ----------
-    curves : list of TileCurve
-        One for each tile and channel that has a bit-plane.
+    curves : Curves
     layout : Layout
     channels : int
         Of the surface; one whose coefficients are all 0 has no curve.
@@ -111,46 +55,34 @@ def assign_layers(curves: list[TileCurve], layout: Layout, channels: int, few: b
         Passes that remain after the layer.
     """
     top = np.zeros((len(layout.tiles), channels), np.int8)
-    if not curves:
+    if not curves.tile.size:
         return [top]
-    worth = _worth(curves)
-    slopes = {(curve.tile, curve.channel): hull_slopes(curve, worth) for curve in curves}
-    _lift_parents(slopes, layout)
-    counts = [curve.bits.size for curve in curves]
-    tile = np.repeat([curve.tile for curve in curves], counts)
-    channel = np.repeat([curve.channel for curve in curves], counts)
-    number = np.concatenate([np.arange(count) for count in counts])
-    slope = np.concatenate([slopes[curve.tile, curve.channel] for curve in curves])
-    order = np.lexsort((channel, -number, tile, -slope))
-    tile, channel, number, slope = tile[order], channel[order], number[order], slope[order]
-    stays = (tile[1:] == tile[:-1]) & (channel[1:] == channel[:-1]) & (slope[1:] == slope[:-1])
-    last = np.append(~stays, True)
-    sizes = np.cumsum(np.concatenate([curve.bits for curve in curves])[order] / 8 + _ENTRY * last)
-    gains = np.cumsum(np.concatenate([curve.gains for curve in curves])[order])
-    for curve in curves:
-        top[curve.tile, curve.channel] = curve.bits.size
+    top[curves.tile, curves.channel] = curves.counts
+    slope = curves.slopes(_worth(curves))
+    curves.lift_parents(slope, layout)
+    unit = np.repeat(curves.tile * channels + curves.channel, curves.counts)
+    number = (np.arange(unit.size) - np.repeat(curves.ends - curves.counts, curves.counts)).astype(np.int8)
+    # By tile, then by number, then by channel where slopes are equal.
+    order = np.lexsort((unit % channels, -number, unit // channels, -slope))
+    unit, number, slope = unit[order], number[order], slope[order]
+    last = np.append((unit[1:] != unit[:-1]) | (slope[1:] != slope[:-1]), True)
+    del slope
+    sizes = np.cumsum(curves.bits[order] / 8 + _ENTRY * last)
+    gains = np.cumsum(curves.gains[order])
     states, state, start = [], top, 0
     for end in _layer_ends(sizes, gains, last, few):
         state = state.copy()
-        np.minimum.at(state, (tile[start:end], channel[start:end]), number[start:end].astype(np.int8))
+        np.minimum.at(state.reshape(-1), unit[start:end], number[start:end])
         states.append(state)
         start = end
     return states
 
 
-def _lift_parents(slopes: dict[tuple[int, int], NDArray[np.float64]], layout: Layout) -> None:
-    """Give a parent's passes of a plane at least the slope of its children's, from the finest level down."""
-    parents = layout.parents.data
-    for (tile, channel), own in sorted(slopes.items(), reverse=True):
-        parent = slopes.get((parents[tile], channel))
-        if parent is None:
-            continue
-        # A plane's passes have the numbers 2 p + 1 and 2 p: the parent's second comes before the child's first.
-        for number in range(0, len(parent), 2):
-            parent[number] = max(parent[number], float(own[number : number + 2].max(initial=0.0)))
-        if len(parent) > len(own):
-            parent[len(own) :] = np.maximum(parent[len(own) :], own.max())
-        parent[:] = np.maximum.accumulate(parent)
+def _worth(curves: Curves) -> Worth:
+    """See `_SHARE_OF_STREAM`."""
+    falling = -curves.slopes()
+    order = np.argsort(falling, kind="stable")
+    return Worth(falling[order], np.cumsum(curves.bits[order]), _SHARE_OF_STREAM, _SEGMENT)
 
 
 def _layer_ends(

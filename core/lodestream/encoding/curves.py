@@ -1,0 +1,139 @@
+"""What the coding passes of all units cost and gain, and for each pass the gain for each bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import kernels
+from ..grid.layout import Layout
+from ..parallel import spread
+
+__all__ = ["Curves", "TileCurve", "Worth"]
+
+#: Two runs are one where as two they save less than this share of the tile's bits so far.
+_SHARE_OF_TILE = 0.02
+#: Curves of one call of a kernel: some hundredths of a second.
+_AT_ONCE = 1 << 14
+
+
+class TileCurve(NamedTuple):
+    """What the coding passes of one tile of one channel cost and gain.
+
+    Attributes
+    ----------
+    bits : float64, shape (pass,)
+        Bits that each pass takes; the last pass has number 0.
+    gains : float64, shape (pass,)
+        By how much the squared error falls with each pass, in the surface's unit.
+    """
+
+    tile: int
+    channel: int
+    bits: NDArray[np.float64]
+    gains: NDArray[np.float64]
+
+
+class Worth(NamedTuple):
+    """What two runs must save to be two: a share of the bits of the stream at the slope of the first, within a limit.
+
+    Attributes
+    ----------
+    falling : float64, shape (pass,)
+        Slopes of all passes of the stream times -1, rising.
+    known : float64, shape (pass,)
+        Bits of all passes up to each of them.
+    share : float
+        Of the stream's bits.
+    most : float
+        In bits.
+    """
+
+    falling: NDArray[np.float64]
+    known: NDArray[np.float64]
+    share: float
+    most: float
+
+
+_NOTHING = Worth(np.zeros(0), np.zeros(0), 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """The curves of all tiles and channels that have a bit-plane, one after another, parents before their children.
+
+    Attributes
+    ----------
+    tile, channel : int64, shape (curve,)
+    counts : int64, shape (curve,)
+        Passes of each, at most 64.
+    bits, gains : float64, shape (pass,)
+        Those of `TileCurve` of all curves.
+    """
+
+    tile: NDArray[np.int64]
+    channel: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    bits: NDArray[np.float64]
+    gains: NDArray[np.float64]
+
+    @classmethod
+    def joined(cls, curves: Iterable[TileCurve]) -> Curves:
+        """These curves, in their order."""
+        given = list(curves)
+        tile, channel, counts = (
+            np.array(own, np.int64)
+            for own in (
+                [curve.tile for curve in given],
+                [curve.channel for curve in given],
+                [curve.bits.size for curve in given],
+            )
+        )
+        nothing = np.zeros(0)
+        bits = np.concatenate([curve.bits for curve in given] or [nothing])
+        gains = np.concatenate([curve.gains for curve in given] or [nothing])
+        return cls(tile, channel, counts, bits, gains)
+
+    @cached_property
+    def ends(self) -> NDArray[np.int64]:
+        """Where each curve ends among the passes: int64, shape (curve,)."""
+        return np.cumsum(self.counts)
+
+    @property
+    def bytes(self) -> float:
+        """What all passes take."""
+        return float(self.bits.sum()) / 8
+
+    def slopes(self, worth: Worth = _NOTHING) -> NDArray[np.float64]:
+        """Gain for each bit of every pass: the same for all passes of a run, falling from run to run of a curve.
+
+        Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
+        where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): what `worth` says, and a
+        share of the tile's bits so far.
+        """
+        slopes = np.empty(self.bits.size)
+        limits = _SHARE_OF_TILE, worth.share, worth.most
+
+        def some(places: tuple[int, int]) -> None:
+            kernels.pass_slopes(self.bits, self.gains, self.ends, *places, worth.falling, worth.known, *limits, slopes)
+
+        spread(some, self._parts())
+        return slopes
+
+    def lift_parents(self, slopes: NDArray[np.float64], layout: Layout) -> None:
+        """Give a parent's passes of a plane at least the slope of its children's, from the finest level down."""
+        at = np.full((len(layout.tiles), int(self.channel.max(initial=0)) + 1), -1)
+        at[self.tile, self.channel] = np.arange(self.tile.size)
+        parents = layout.parents[self.tile]
+        above = np.where(parents < 0, -1, at[parents, self.channel])
+        for places in reversed(self._parts()):
+            kernels.lift_slopes(self.ends, above, *places, slopes)
+
+    def _parts(self) -> list[tuple[int, int]]:
+        return list(pairwise([*range(0, self.tile.size, _AT_ONCE), self.tile.size]))
