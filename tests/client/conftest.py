@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -79,14 +78,6 @@ def run(capsysbinary: pytest.CaptureFixture[bytes]) -> Run:
         return code, captured.out.decode(), captured.err.decode()
 
     return call
-
-
-@pytest.fixture
-def interrupts() -> Iterator[None]:
-    """Programs that are started heed them, also where these tests run in the background and ignore them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,6 @@ LODESTREAM_WEB, and then what is missing is a failure.
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -103,11 +102,3 @@ def outside(tmp_path: Path) -> Path:
     folder = tmp_path / "host"
     folder.mkdir()
     return folder
-
-
-@pytest.fixture
-def interrupts() -> Iterator[None]:
-    """Programs that are started heed them, also where these tests run in the background and ignore them."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)

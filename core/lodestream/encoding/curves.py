@@ -116,6 +116,10 @@ class Curves:
         Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
         where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): what `worth` says, and a
         share of the tile's bits so far.
+
+        Returns
+        -------
+        float64, shape (pass,)
         """
         slopes = np.empty(self.bits.size)
         limits = _SHARE_OF_TILE, worth.share, worth.most
@@ -127,7 +131,14 @@ class Curves:
         return slopes
 
     def lift_parents(self, slopes: NDArray[np.float64], layout: Layout) -> None:
-        """Give a parent's passes of a plane at least the slope of its children's, from the finest level down."""
+        """Give a parent's passes of a plane at least the slope of its children's, from the finest level down.
+
+        Parameters
+        ----------
+        slopes : float64, shape (pass,)
+            Changed in place.
+        layout : Layout
+        """
         at = np.full((len(layout.tiles), int(self.channel.max(initial=0)) + 1), -1)
         at[self.tile, self.channel] = np.arange(self.tile.size)
         parents = layout.parents[self.tile]

@@ -205,7 +205,7 @@ def test_a_build_that_is_cut_goes_on_in_its_folder(
     else:
         assert code == 128 + number
         assert stderr.count(b"\n") == 3
-        assert f"lodestream: {scratch} is kept: the same command goes on".encode() in stderr
+        assert f"lodestream: {scratch} is kept: the same command continues from there".encode() in stderr
     assert names(tmp_path) == {"a.npy", "scratch"}
     assert run("encode", file, out, *LITTLE, "--scratch", scratch)[0] == 0
     assert not repeated, "the phases before coding were done"
@@ -223,7 +223,7 @@ def test_the_folder_is_named_where_the_command_goes_on(
     options = BuildingOptions(None, tmp_path / "scratch", None)
     with pytest.raises(type(error)), work_folder(options, "a.lode"):
         raise error
-    assert ("is kept: the same command goes on" in capsys.readouterr().err) == kept
+    assert ("is kept: the same command continues from there" in capsys.readouterr().err) == kept
     assert names(tmp_path) == {"scratch"}
 
 

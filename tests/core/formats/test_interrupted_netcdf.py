@@ -33,6 +33,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.usefixtures("interrupts")
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are others")
 @pytest.mark.parametrize("call", [1, 2, 5, 12])
 def test_an_interruption_is_told_and_kills_nobody(tmp_path: Path, call: int) -> None:
