@@ -23,6 +23,7 @@ from ..entropy.part_table import part_of
 from ..entropy.tiles import Tiles, TileTable
 from ..errors import CorruptStreamError
 from ..grid.layout import Layout
+from ..grid.patches import level_masks
 from ..kernels import PART_ROWS
 from ..parallel import spread, threads
 from ..quantization.distortion import store_values
@@ -30,6 +31,7 @@ from ..residual import chunk_coder
 from ..scratch import Room
 from ..surface import Block, Surface
 from .batches import Coded, batch_length, rounds_of
+from .level_grids import positioned
 from .reconstruction import Values
 from .rows import RowsGeometry, RowsReconstructor, known_state
 
@@ -56,7 +58,7 @@ def why_not_by_rows(header: Header) -> str | None:
 
 
 class RowsDecoder:
-    """Decodes rows of a complete container of one grid.
+    """Decodes rows of a complete container of one grid, at full resolution or at a coarser level.
 
     Parameters
     ----------
@@ -64,14 +66,28 @@ class RowsDecoder:
         Of the file.
     index : Index
         Of the container, see `read_index`.
+    level : int, optional
+        The finest if not given.
+
+    Attributes
+    ----------
+    level : int
+    shape : (int, int)
+        Rows and columns of the level.
     """
 
-    def __init__(self, read: Callable[[int, int], bytes], index: Index) -> None:
+    def __init__(self, read: Callable[[int, int], bytes], index: Index, level: int | None = None) -> None:
         self._read, self.index, self.header = read, index, index.header
         self._reading = Lock()
         layout = self.header.layout
-        small = (level for level in range(layout.levels + 1) if layout.points(level) <= _CORE_POINTS)
+        self.level = layout.levels if level is None else level
+        self.shape = layout.shape(0, self.level)
+        self._finest = self.level == layout.levels
+        small = (own for own in range(self.level + 1) if layout.points(own) <= _CORE_POINTS)
         self._core = max(small, default=0)
+        mask = level_masks(self.header.patches, layout, self.level, self.header.masks)[0]
+        #: No node of so coarse a level is valid: it shows what stands under the holes.
+        self._mask = mask if mask is None or self._finest or mask.any() else None
         self._segments: dict[int, list[Segment]] = defaultdict(list)
         for segment in self.index.segments:
             self._segments[segment.tile].append(segment)
@@ -79,7 +95,7 @@ class RowsDecoder:
         self._state = np.zeros((len(layout.tiles), self.header.channels), np.int8)
 
     def surface(self, room: Room, memory: int, progress: Callable[[float], None]) -> Surface:
-        """The whole surface, band by band into arrays that go where there is room.
+        """The whole surface, or its level, band by band into arrays that go where there is room.
 
         Parameters
         ----------
@@ -96,8 +112,8 @@ class RowsDecoder:
         ValueError
             If this cannot be decoded by rows, see `why_not_by_rows`.
         """
-        header = self.header
-        shape, counts = header.shape, (header.point_channels, *(kind.channels for kind in header.attributes))
+        header, shape = self.header, self.shape
+        counts = (header.point_channels, *(kind.channels for kind in header.attributes))
         arrays, channel = [], 0
         for count in counts:
             arrays.append(room.empty((*shape, count), header.dtypes[channel]))
@@ -115,15 +131,15 @@ class RowsDecoder:
             kind.name: array if kind.components else array[..., 0]
             for kind, array in zip(header.attributes, attributes, strict=True)
         }
-        block = Block(points[..., 0] if header.flat else points, header.closed, mask=header.masks[0], attributes=named)
-        if self.index.digest is not None and header.exact:
+        block = Block(points[..., 0] if header.flat else points, header.closed, mask=self._mask, attributes=named)
+        if self._finest and self.index.digest is not None and header.exact:
             found = values_digest([block])
             if found != self.index.digest:
                 problem = f"expected values with the SHA-256 {self.index.digest}, got {found}"
                 raise CorruptStreamError(problem, header.length)
         surface = Surface(blocks=[block], metadata=dict(self.index.metadata_values))
         surface.joints = header.joints
-        return surface
+        return surface if self._finest else positioned(surface, header, self.level)
 
     def groups(self, memory: int) -> list[list[Span]]:
         """All rows in runs that begin where chunks of residual and cells do, as many together as there are threads.
@@ -135,7 +151,7 @@ class RowsDecoder:
         return [bands[first : first + count] for first in range(0, len(bands), count)]
 
     def _bands(self, memory: int) -> list[Span]:
-        rows, columns = self.header.shape
+        rows, columns = self.shape
         unit = max(PART_ROWS, 1 << self.header.chunk[0])
         each = unit * max(1, memory // (_BYTES * self.header.channels * unit * columns))
         return list(pairwise([*range(0, rows, each), rows]))
@@ -143,7 +159,7 @@ class RowsDecoder:
     def rows(self, rows: Span) -> Values:
         """Points and attributes of some rows, exact as far as the container is, shape (row, column, component) each.
 
-        The first row begins chunks of residual, and the last one ends them.
+        Of the finest level the first row begins chunks of residual, and the last one ends them.
 
         Raises
         ------
@@ -162,21 +178,22 @@ class RowsDecoder:
         CorruptStreamError
             If a chunk is damaged.
         """
-        header, columns, rows = self.header, self.header.shape[1], geometry.rows
+        header, columns, rows = self.header, self.shape[1], geometry.rows
         arrays, channel = [], 0
         for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
             array = np.empty((rows[1] - rows[0], columns, count), header.dtypes[channel])
             for component in range(count):
                 made = RowsReconstructor(geometry, header.predictors[channel], channels[channel])
                 lattice = header.lattices[channel]
-                state = known_state(channels[channel].table, self._state[:, channel])
+                state = known_state(channels[channel].table, self._state[:, channel], self.level)
                 store_values(lattice, made.reconstruct(state), array, component)
                 channel += 1
             arrays.append(array)
         values = Values(arrays)
-        self._correct(values, rows)
-        if (mask := header.masks[0]) is not None:
-            kept = header.kept_masks[0]
+        if self._finest:
+            self._correct(values, rows)
+        if (mask := self._mask) is not None:
+            kept = header.kept_masks[0] if self._finest else None
             shown = mask[slice(*rows)] if kept is None else mask[slice(*rows)] | kept[slice(*rows)]
             values.clear(~shown, header.hole)
         return values
@@ -192,7 +209,7 @@ class RowsDecoder:
             If this cannot be decoded by rows.
         """
         header = self.header
-        geometry = RowsGeometry(header.layout, rows, self._core)
+        geometry = RowsGeometry(header.layout, rows, self._core, level=self.level)
         runs = _with_parents(header.layout, geometry.tiles)
         part = part_of(TileTable.of(header.layout), runs)
         channels = [

@@ -68,21 +68,26 @@ class RowsGeometry:
         The level that is reconstructed whole.
     columns : (int, int), optional
         Half-open; all if not given. Where columns wrap all of them are made whatever is wanted.
+    level : int, optional
+        Of which rows and columns are wanted, at least ``core``; the finest if not given.
     """
 
-    def __init__(self, layout: Layout, rows: Span, core: int, columns: Span | None = None) -> None:
+    def __init__(
+        self, layout: Layout, rows: Span, core: int, columns: Span | None = None, level: int | None = None
+    ) -> None:
         if len(layout.grids) != 1 or layout.grids[0].closed[0]:
             raise ValueError("expected a layout of one grid whose rows do not wrap")
         self.layout, self.rows, self.core = layout, rows, core
-        self.columns = columns or (0, layout.shape(0, layout.levels)[1])
+        self.level = layout.levels if level is None else level
+        self.columns = columns or (0, layout.shape(0, self.level)[1])
         steps, spans = [], (rows, self.columns)
-        for level in range(layout.levels, core, -1):
-            across, down = layout.steps(0, level)
+        for finer in range(self.level, core, -1):
+            across, down = layout.steps(0, finer)
             crops = crop_axis(across, *spans[0]), crop_axis(down, *spans[1])
             above, left = (
                 (crop.start, crop.start + stop - start) for crop, (start, stop) in zip(crops, spans, strict=True)
             )
-            steps.append(_Step(level, crops, (above, left)))
+            steps.append(_Step(finer, crops, (above, left)))
             above, left = ((crop.first, crop.first + crop.step.coarse) for crop in crops)
             spans = above, left
         self.steps = steps[::-1]
@@ -114,7 +119,7 @@ class KnownState(NamedTuple):
     passes : int8, shape (tile,)
         Passes that remain of each tile of the part.
     whole, bare : int, list of int
-        See `known_levels`: of the whole surface.
+        See `known_levels`: of the whole surface, or of its levels up to the one that is reconstructed.
     """
 
     passes: NDArray[np.int8]
@@ -122,10 +127,13 @@ class KnownState(NamedTuple):
     bare: list[int]
 
 
-def known_state(table: TileTable, state: NDArray[np.int8]) -> KnownState:
-    """A state, int8, shape (tile,) of all tiles of the surface, as far as those of a table are concerned."""
-    layout = table.layout
-    return KnownState(state[np.asarray(table.members)], *known_levels(layout, state, layout.levels))
+def known_state(table: TileTable, state: NDArray[np.int8], level: int | None = None) -> KnownState:
+    """A state, int8, shape (tile,) of all tiles of the surface, as far as those of a table are concerned.
+
+    It is to be reconstructed at ``level``, the finest one if not given.
+    """
+    finest = table.layout.levels if level is None else level
+    return KnownState(state[np.asarray(table.members)], *known_levels(table.layout, state, finest))
 
 
 class _Quarter(NamedTuple):
@@ -242,7 +250,7 @@ class RowsReconstructor:
             if number + 1 >= shared:
                 self._finer(number, rows, state)
             rows = grid.wanted
-        return rows, FRACTION_BITS if whole < layout.levels else 0
+        return rows, FRACTION_BITS if whole < geometry.level else 0
 
     def is_shown(self, state: KnownState) -> bool:
         """Whether the state before shows the same."""

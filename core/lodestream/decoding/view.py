@@ -13,11 +13,12 @@ from ..container.digest import DIGEST, values_digest
 from ..container.model import Header
 from ..coordinates.height_fields import level_metadata, to_xyz
 from ..errors import CorruptStreamError, InputError, OptionError
-from ..grid.patches import level_masks, level_positions
+from ..grid.patches import level_masks
 from ..joints import Nodes
 from ..planning.selection import Selection, restored
 from ..surface import Block, Closed, Surface, finite_block
 from ..target import Region
+from .level_grids import level_nodes
 from .reconstruction import Reconstruction, Values
 from .window_metadata import window_closed, window_grid, window_metadata
 
@@ -273,8 +274,7 @@ class View:
         header, region = self._reconstruction.header, self._selection.region
         if region is not None:
             return [(np.arange(*region[0]), np.arange(*region[1]))]
-        owned = zip(header.block_patches, header.blocks, strict=True)
-        return [level_positions(own, len(header.patches), header.layout, level, shape) for own, (shape, _) in owned]
+        return level_nodes(header, level)
 
     def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
         """Which holes of the only block have values."""

@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream.container.reader import read_index
+from lodestream.decoding import by_rows
 from lodestream.decoding.by_rows import RowsDecoder, why_not_by_rows
 from lodestream.scratch import IN_MEMORY, Room, Scratch
 
@@ -20,9 +23,9 @@ def _read(container: bytes) -> Callable[[int, int], bytes]:
     return lambda offset, length: container[offset : offset + length]
 
 
-def _decoder(container: bytes) -> RowsDecoder:
+def _decoder(container: bytes, level: int | None = None) -> RowsDecoder:
     read = _read(container)
-    return RowsDecoder(read, read_index(read, len(container)))
+    return RowsDecoder(read, read_index(read, len(container)), level)
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -35,7 +38,12 @@ def test_rows_make_the_surface(name: str, memory: int, tmp_path: Path) -> None:
     if decoder.header.plane is not None:
         pytest.skip("x and y are made of rules")
     room = IN_MEMORY if memory == 1 else Room(lambda: Scratch(tmp_path), 1)
-    found = decoder.surface(room, memory, told.append)
+    _check(decoder.surface(room, memory, told.append), expected)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def _check(found: ls.Surface, expected: ls.Surface) -> None:
     assert found.metadata == expected.metadata
     assert found.closed == expected.closed
     assert found.points.dtype == expected.points.dtype
@@ -46,8 +54,60 @@ def test_rows_make_the_surface(name: str, memory: int, tmp_path: Path) -> None:
     assert list(found.attributes) == list(expected.attributes)
     for attribute, values in found.attributes.items():
         np.testing.assert_array_equal(values, expected.attributes[attribute])
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+
+
+def _check_levels(container: bytes) -> None:
+    """All levels, from a part of the container and by rows."""
+    decoder = ls.Decoder()
+    decoder.feed(container)
+    for level in range(decoder.header.levels if decoder.header else 0):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(by_rows, "_CORE_POINTS", 300)
+            found = _decoder(container, level).surface(IN_MEMORY, 1, lambda fraction: None)
+        expected = decoder.surface(level)
+        _check(found, expected)
+        if found.joints is None or expected.joints is None:
+            assert found.joints is expected.joints
+            continue
+        for own, other in zip(found.joints.nodes or (), expected.joints.nodes or (), strict=True):
+            np.testing.assert_array_equal(own[0], other[0])
+            np.testing.assert_array_equal(own[1], other[1])
+
+
+@pytest.mark.parametrize("name", SURFACES)
+def test_rows_make_every_level(name: str) -> None:
+    surface, quality = SURFACES[name]
+    container = ls.encode(surface, **quality)
+    if _decoder(container).header.plane is not None:
+        pytest.skip("x and y are made of rules")
+    _check_levels(container)
+
+
+@given(
+    st.tuples(st.integers(1, 150), st.integers(2, 90)),
+    st.booleans(),
+    st.sampled_from([np.int16, np.uint8, np.float32, np.float64]),
+    st.sampled_from(["all", "holes", "few"]),
+    st.integers(0, 2**32),
+)
+def test_rows_make_every_level_of_any_size(
+    shape: tuple[int, int], closed: bool, dtype: type[np.generic], valid: str, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    heights = (90 + 80 * np.sin(x / 5 + seed) * np.cos(y / 7) + rng.normal(size=shape)).astype(dtype)
+    mask = None
+    if valid != "all":
+        mask = rng.random(shape) < (0.7 if valid == "holes" else 0.01)
+        mask.flat[0] = True
+    surface = ls.Surface(
+        heights,
+        (False, closed and shape[1] > 2),
+        mask=mask,
+        metadata={"geotransform": [3.0, 0.5, 0.0, 7.0, 0.0, -2.0], "unit": "m"},
+        attributes=None if mask is not None else {"rain": rng.integers(0, 9, shape).astype(np.uint16)},
+    )
+    _check_levels(ls.encode(surface))
 
 
 def test_kept_holes_come_back() -> None:
