@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,8 @@ from .inputs import named
 from .outcome import Outcome, check_grid
 
 if TYPE_CHECKING:
-    from lodestream.container import Header
     from lodestream.decoding.by_rows import RowsDecoder
+    from lodestream.planning.byte_ranges import RangeSet
 
     from .decode import DecodeOptions
 
@@ -31,9 +32,9 @@ _VALUES, _FILE = "values", "file"
 
 
 def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callable[[float], None]) -> bool:
-    """Decode by bands, if the whole surface is wanted, takes more than the memory there is, and can be.
+    """Decode by bands, if the whole surface or a level of it is wanted, takes more memory than there is, and can be.
 
-    The surface is decoded into files beside the one that is written, from which that is written then.
+    It is decoded into files beside the one that is written, from which that is written then.
 
     Returns
     -------
@@ -48,29 +49,35 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
     LodestreamError, OSError
         From decoding and writing.
     """
-    if options.target.region is not None or options.target.level is not None:
+    if options.target.region is not None:
         return False
     from lodestream.bands.front import default_memory
     from lodestream.container.capacity import Capacity
     from lodestream.container.reader import read_index
     from lodestream.decoding.by_rows import RowsDecoder
+    from lodestream.planning.byte_ranges import RangeSet
 
     memory = default_memory() if options.memory is None else options.memory
-    size = path.stat().st_size
+    size, seen = path.stat().st_size, RangeSet()
     with path.open("rb") as file:
 
         def read(offset: int, length: int) -> bytes:
             file.seek(offset)
-            return file.read(length)
+            data = file.read(length)
+            seen.add(offset, len(data))
+            return data
 
         capacity = Capacity(options.max_vertices)
         try:
-            decoder = RowsDecoder(read, read_index(read, size, capacity))
+            index = read_index(read, size, capacity)
         except (CorruptStreamError, TruncatedStreamError, TooLargeError):
             return False  # decoding in one piece tells what is wrong with it, and what is left
-        header = decoder.header
+        header, level = index.header, options.target.level
+        if level is not None and level > header.levels:
+            return False  # likewise
+        decoder = RowsDecoder(read, index, level)
         check_grid(options.out, header)
-        needs = _Needs(header, options)
+        needs = _Needs(decoder, options)
         try:
             needs.check(memory)
             if needs.decoding <= memory or needs.reason is not None:
@@ -81,14 +88,14 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
         # Or GDAL would take a twentieth of the machine's memory for what it writes; in megabytes.
         os.environ.setdefault("GDAL_CACHEMAX", str(max(memory >> 22, 32)))
         try:
-            _decode(decoder, Path(options.out), memory, options, started, progress)
+            _decode(decoder, Path(options.out), memory, options, started, progress, seen)
         except StreamError as error:
             raise named(error, options.container) from None
     return True
 
 
 class _Needs:
-    """The memory that decoding all points takes.
+    """The memory that decoding all points of a surface or a level takes.
 
     Attributes
     ----------
@@ -99,14 +106,17 @@ class _Needs:
         Why it is not done by bands; None: it can be.
     """
 
-    def __init__(self, header: Header, options: DecodeOptions) -> None:
+    def __init__(self, decoder: RowsDecoder, options: DecodeOptions) -> None:
         from lodestream.decoding.by_rows import why_not_by_rows
         from lodestream.formats import for_writing, written
         from lodestream.planning.selection import selection_of
 
         self._format = written("npy") if options.out == "-" else for_writing(options.out)
         self._given = options.memory is not None
-        self.points = sum(rows * columns for (rows, columns), _ in header.blocks)
+        header = decoder.header
+        self.points = header.layout.points(decoder.level)
+        if decoder.level == header.levels:
+            self.points = sum(rows * columns for (rows, columns), _ in header.blocks)
         channels = selection_of(options.target).channels(header)
         self.decoding = self.points * int(channels.sum()) * _WHOLE
         self._values = self.points * sum(
@@ -114,8 +124,8 @@ class _Needs:
         )
         if options.out == "-":
             self.reason: str | None = "standard output is written in one piece"
-        elif options.partial or options.target != Target():
-            self.reason = "only the whole surface is, without --partial, limits and --attributes"
+        elif options.partial or replace(options.target, level=None) != Target():
+            self.reason = "only the whole surface or a level is, without --partial, limits and --attributes"
         else:
             self.reason = why_not_by_rows(header)
 
@@ -152,24 +162,26 @@ def _decode(
     options: DecodeOptions,
     started: float,
     progress: Callable[[float], None],
+    seen: RangeSet,
 ) -> None:
     from lodestream.bands.folders import passing_folder
     from lodestream.scratch import Room, Scratch
 
     with passing_folder(out, (_VALUES, _FILE)) as folder:
         surface = decoder.surface(Room(lambda: Scratch(folder / _VALUES), memory // _PART), memory, progress)
-        index, last = decoder.index, decoder.index.levels[-1]
+        index, last = decoder.index, decoder.index.levels[decoder.level]
+        finest = decoder.level == decoder.header.levels
         outcome = Outcome(
             surface,
-            index.surface_end,
-            index.size,
-            index.size,
-            decoder.header.levels,
+            index.surface_end if finest else last.bytes,
+            index.size if finest else seen.total,
+            index.size if finest else seen.total,
+            decoder.level,
             last.rms,
             last.max_error,
             False,
             time.monotonic() - started,
-            "complete",
+            "complete" if finest else "level",
             dict(zip(decoder.header.channel_names, last.channels, strict=False)),
         )
         _write(outcome, out, folder / _FILE)

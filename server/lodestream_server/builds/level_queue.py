@@ -327,7 +327,8 @@ class LevelQueue:
         if most < _LEAST_ROOM:
             raise self._no_room(most)
         folder = self._files.new_folder(job.key)
-        wanted = LevelJob(container, job.key.level, job.key.format_name, folder, most)
+        memory = self._settings.memory_of_levels
+        wanted = LevelJob(container, job.key.level, job.key.format_name, folder, most, memory)
         try:
             await asyncio.to_thread(_make_folders, folder)
             size = await self._insist(wanted, job.key)

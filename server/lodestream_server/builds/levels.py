@@ -33,6 +33,7 @@ from .answers import reason_of
 
 if TYPE_CHECKING:
     from lodestream import Surface
+    from lodestream.container import Header
 
 __all__ = ["MEDIA_TYPES", "FileTooLongError", "LevelJob", "MadeLevel", "RefusedLevel", "make_level", "written_by"]
 
@@ -46,6 +47,10 @@ _LIBRARIES = ("h5netcdf", "h5py", "lodestream", "numpy", "rasterio", "scipy", "v
 
 #: The formats of a level, and what they are called on the way.
 MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}
+
+
+#: Bytes for each value that decoding in one piece takes, and the part of the memory that a band may take.
+_WHOLE, _BAND = 12, 4
 
 
 class FileTooLongError(TooLargeError):
@@ -77,7 +82,9 @@ class LevelJob:
     folder : Path
         Folder to write to; empty at the start.
     most_bytes : int
-        Largest file that may be written.
+        Largest file that may be written; with what is put into files on the way to it, if that is much.
+    memory : int
+        Bytes that making it may take.
     """
 
     container: Path
@@ -85,6 +92,7 @@ class LevelJob:
     format_name: str
     folder: Path
     most_bytes: int
+    memory: int
 
     @property
     def path(self) -> Path:
@@ -143,18 +151,27 @@ def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
     """
     # Errors come back as values: not every exception survives the way between processes.
     try:
-        surface = _decode(job)
-        with _short_files(job):
+        surface, aside = _decode(job)
+        with _short_files(job, aside):
             path = _write(surface, job)
     except LodestreamError as error:
         return RefusedLevel(next(kind.__name__ for kind in _KINDS if isinstance(error, kind)), str(error))
     return MadeLevel(path.stat().st_size)
 
 
-def _decode(job: LevelJob) -> Surface:
+def _decode(job: LevelJob) -> tuple[Surface, int]:
+    """The level, and how many bytes of it are in files.
+
+    Raises
+    ------
+    FileTooLongError
+        If there would be more of them than the file may have.
+    """
     from lodestream import Decoder, Target
     from lodestream.container import read_index
+    from lodestream.decoding.by_rows import RowsDecoder
     from lodestream.planning.planner import plan
+    from lodestream.scratch import Room, Scratch
 
     with job.container.open("rb") as file:
 
@@ -163,11 +180,28 @@ def _decode(job: LevelJob) -> Surface:
             return file.read(length)
 
         index = read_index(read, os.fstat(file.fileno()).st_size)
+        if _goes_by_bands(index.header, job):
+            aside = index.header.layout.points(job.level) * sum(dtype.itemsize for dtype in index.header.dtypes)
+            if aside >= job.most_bytes:
+                raise FileTooLongError(os.strerror(errno.EFBIG))
+            room = Room(lambda: Scratch(job.folder / "values"))
+            rows = RowsDecoder(read, index, job.level)
+            return rows.surface(room, job.memory // _BAND, lambda fraction: None), aside
         chosen = plan(index, Target(level=job.level))
         decoder = Decoder(level=job.level)
         for place in (*chosen.before, *chosen.ranges, *chosen.after):
             decoder.feed_at(place.offset, read(place.offset, place.length))
-    return decoder.surface(job.level)
+    return decoder.surface(job.level), 0
+
+
+def _goes_by_bands(header: Header, job: LevelJob) -> bool:
+    """Whether a level is decoded by bands, and written so: it takes much memory in one piece, and can be."""
+    from lodestream.decoding.by_rows import why_not_by_rows
+    from lodestream.formats import written
+
+    if job.level > header.levels or written(job.format_name).memory or why_not_by_rows(header) is not None:
+        return False
+    return header.layout.points(job.level) * header.channels * _WHOLE > job.memory // 2
 
 
 def _write(surface: Surface, job: LevelJob) -> Path:
@@ -188,8 +222,10 @@ class _Plain:
 
 
 @contextmanager
-def _short_files(job: LevelJob) -> Iterator[None]:
+def _short_files(job: LevelJob, aside: int) -> Iterator[None]:
     """Let files become so long and no longer, those included that a library writes on the way to the format.
+
+    With the bytes that are in files already they have as many as the level's may have.
 
     Raises
     ------
@@ -198,7 +234,8 @@ def _short_files(job: LevelJob) -> Iterator[None]:
     """
     exceeded: list[int] = []
     before, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    most = job.most_bytes if hard == resource.RLIM_INFINITY else min(job.most_bytes, hard)
+    most = job.most_bytes - aside
+    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
     handler = signal.signal(signal.SIGXFSZ, lambda number, frame: exceeded.append(number))
     folder, tempfile.tempdir = tempfile.tempdir, str(job.folder)
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.container import capacity
+from lodestream_client.commands import decode_by_rows
 from lodestream_client.commands.outcome import Outcome
 from tests.core.surfaces import terrain
 
@@ -63,11 +65,34 @@ def test_a_format_that_is_written_whole_is_refused_if_it_takes_more(
     assert run("decode", container, container.with_name(out), *LITTLE, "--roi", "0:9,0:9")[0] == 0
 
 
+@pytest.mark.parametrize("suffix", ["npy", "tif", "nc"])
+def test_a_level_is_decoded_by_bands_to_the_same_file(
+    run: Run, container: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    big, small = container.with_name(f"big.{suffix}"), container.with_name(f"small.{suffix}")
+    levels = ls.Decoder()
+    levels.feed(container.read_bytes())
+    assert levels.header is not None
+    level = levels.header.levels - 1
+    code, whole, _ = run("decode", container, big, "--level", level, "--json")
+    assert code == 0
+    monkeypatch.setattr(decode_by_rows, "_WHOLE", 24)  # of a level of 250 x 205 heights
+    code, banded, _ = run("decode", container, small, *LITTLE, "--level", level, "--json")
+    assert code == 0
+    assert small.read_bytes() == big.read_bytes()
+    told = json.loads(banded)
+    assert told.pop("wire_bytes") <= len(container.read_bytes())
+    assert told == told | {key: json.loads(whole)[key] for key in ("bytes", "level", "rms", "max", "bound", "ended")}
+    assert names(container.parent) == {"a.lode", small.name, big.name}
+    # A level that does not exist is told as it is without the option.
+    assert "expected a level of 0 to 9, got 99" in run("decode", container, small, *LITTLE, "--level", 99)[2]
+
+
 def test_what_is_not_decoded_by_bands_is_refused_with_the_reason(run: Run, container: Path) -> None:
     words = "at most 1 MiB to decode, got one that takes about 2 MiB and is not decoded by bands: "
     assert words + "standard output is written in one piece" in refused(run, container, "-", *LITTLE)
     for options in (("--partial",), ("--until-rms", "0.1d")):
-        assert words + "only the whole surface is" in refused(run, container, "a.npy", *LITTLE, *options)
+        assert words + "only the whole surface or a level is" in refused(run, container, "a.npy", *LITTLE, *options)
     container.write_bytes(ls.encode(ls.Surface(HEIGHTS, (True, False))))
     assert words + "its rows wrap" in refused(run, container, "a.npy", *LITTLE)
 

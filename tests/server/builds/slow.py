@@ -39,6 +39,7 @@ __all__ = [
     "leave",
     "listed",
     "make_coarsest",
+    "make_level_by_bands",
     "make_when_told",
     "miss_when_told",
     "nothing",
@@ -258,6 +259,14 @@ def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
         while not (data / "go").exists() and time.monotonic() < until:
             time.sleep(0.01)
         raise
+
+
+def make_level_by_bands(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Make a level as one that takes more memory than there is, and say that values of it were in files."""
+    made = make_level(replace(job, memory=1))
+    if not (job.folder / "values").is_dir():
+        raise AssertionError("expected values in files")
+    return made
 
 
 def hoard_level(job: LevelJob) -> MadeLevel | RefusedLevel:

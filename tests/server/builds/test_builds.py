@@ -356,7 +356,7 @@ from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
 before = set(sys.modules)
 job = worker.Job((Path("a.npy"),), "a.npy", None, "auto", {"precision": "0.1"}, 10_000, Path("built"))
 assert isinstance(worker.build(job), worker.Built)
-assert isinstance(make_level(LevelJob(job.container, 0, "ply", Path("level"), 10_000)), MadeLevel)
+assert isinstance(make_level(LevelJob(job.container, 0, "ply", Path("level"), 10_000, 1 << 28)), MadeLevel)
 print(*sorted(set(sys.modules) - before), "fastapi" in sys.modules)
 """
     (tmp_path / "a.npy").write_bytes(npy(hills()))

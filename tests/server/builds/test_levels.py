@@ -25,7 +25,7 @@ from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_queue, worker
 from lodestream_server.builds.level_files import Key, Lease, LevelFiles
-from lodestream_server.builds.levels import LevelJob, RefusedLevel, make_level
+from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from tests.server.builds import slow
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.connections import hostile
@@ -522,13 +522,52 @@ def test_the_process_makes_no_file_that_is_longer(tmp_path: Path) -> None:
     with running_server(tmp_path / "data", workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
         container = tmp_path / "data" / "containers" / f"{surface['container']}.lode"
-        refused = make_level(LevelJob(container, len(surface["levels"]) - 1, "npy", _new(tmp_path / "a"), 1000))
+        level = len(surface["levels"]) - 1
+        refused = make_level(LevelJob(container, level, "npy", _new(tmp_path / "a"), 1000, 1 << 28))
         assert isinstance(refused, RefusedLevel)
         assert refused.kind == "FileTooLongError"
-        made = make_level(LevelJob(container, len(surface["levels"]) - 1, "npy", _new(tmp_path / "b"), 10_000))
+        made = make_level(LevelJob(container, level, "npy", _new(tmp_path / "b"), 10_000, 1 << 28))
         assert not isinstance(made, RefusedLevel)
         assert (tmp_path / "b" / "level").read_bytes() == npy(hills())
         assert made.size == len(npy(hills()))
+
+
+@pytest.mark.parametrize("format_name", ["npy", "geotiff", "cog", "netcdf"])
+def test_a_level_larger_than_memory_is_made_by_bands_to_the_same_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_name: str
+) -> None:
+    heights = np.rint(hills(700, 300)).astype(np.int16)
+    mask = np.ones(heights.shape, bool)
+    mask[40:90, 7:200] = False
+    made = io.BytesIO()
+    np.savez(made, points=heights, mask=mask)
+    with running_server(tmp_path, workers=1) as url, client(url) as http:
+        surface = push(http, made.getvalue(), filename="a.npz")
+        addresses = [f"{surface['url']}/levels/{level}" for level in (3, len(surface["levels"]) - 2)] + [
+            finest(surface)
+        ]
+        whole = [http.get(address, params={"format": format_name}).raise_for_status() for address in addresses]
+    monkeypatch.setattr(level_queue, "make_level", slow.make_level_by_bands)  # nothing is kept from server to server
+    with running_server(tmp_path, workers=1) as url, client(url) as http:
+        for before, address in zip(whole, addresses, strict=True):
+            banded = http.get(str(httpx.URL(address).path), params={"format": format_name}).raise_for_status()
+            assert banded.content == before.content
+            assert banded.headers["ETag"] == before.headers["ETag"]
+        assert [path.name for path in (tmp_path / "levels").rglob("values")] == []
+
+
+def test_values_in_files_count_for_the_room_of_a_level(tmp_path: Path) -> None:
+    with running_server(tmp_path / "data", workers=1) as url, client(url) as http:
+        surface = push(http, npy(hills()))
+    container = tmp_path / "data" / "containers" / f"{surface['container']}.lode"
+    level, size = len(surface["levels"]) - 1, len(npy(hills()))
+    for name, most in (("a", 40 * 30 * 4), ("b", 40 * 30 * 4 + size - 1)):
+        refused = make_level(LevelJob(container, level, "npy", _new(tmp_path / name), most, 1 << 10))
+        assert isinstance(refused, RefusedLevel)
+        assert refused.kind == "FileTooLongError"
+    made = make_level(LevelJob(container, level, "npy", _new(tmp_path / "c"), 40 * 30 * 4 + size, 1 << 10))
+    assert isinstance(made, MadeLevel)
+    assert (tmp_path / "c" / "level").read_bytes() == npy(hills())
 
 
 def _new(folder: Path) -> Path:
