@@ -16,10 +16,12 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "rows_at_once"]
+__all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "is_made", "rows_at_once"]
 
 _SUFFIX = ".npy"
 _UNFINISHED = ".part"
+#: Attribute of the maps of files that a `Room` has made.
+_MADE = "_lodestream_made"
 
 #: Headers are parsed by one thread at a time: Python 3.11 raises SystemError now and then where several parse at once.
 _parsing = Lock()
@@ -225,7 +227,14 @@ class Room:
         if self._scratch is None or not self.takes(math.prod(shape) * np.dtype(dtype).itemsize):
             return np.empty(shape, dtype)
         self._count += 1
-        return self._scratch().empty(f"arrays/{self._count}", shape, dtype)
+        made = self._scratch().empty(f"arrays/{self._count}", shape, dtype)
+        vars(made)[_MADE] = True
+        return made
+
+
+def is_made(array: NDArray[Any]) -> bool:
+    """Whether an array, of any shape, is one that a `Room` has put into a file: that file says nothing about it."""
+    return bool(getattr(array, _MADE, False))
 
 
 #: All arrays are in memory.

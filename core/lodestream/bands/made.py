@@ -21,7 +21,7 @@ from ..encoding.prepared import Prepared, prepare
 from ..errors import InputError
 from ..parallel import threads
 from ..quality import Quality
-from ..scratch import DamagedError, Room, Scratch
+from ..scratch import DamagedError, Room, Scratch, is_made
 from ..surface import Surface
 from .build import Build
 from .building import Building, OutOfRangeError
@@ -208,7 +208,7 @@ class Made:
 def _identity(array: NDArray[Any], copied: bool) -> list[Any]:
     """What an array is known by: its file and place there, or the digest of its values."""
     root = None if copied else root_of(array)
-    if root is None:
+    if root is None or is_made(root):
         digest = hashlib.sha256()
         for rows in array:
             digest.update(np.ascontiguousarray(rows).data)

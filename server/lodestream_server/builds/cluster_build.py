@@ -27,7 +27,7 @@ from lodestream.errors import FormatWarning, InputError, LodestreamError, Option
 
 from ..storage.durable import remove
 from .answers import answer_of
-from .worker import Built, Job, Refused, may_pass, moved, raise_where_full, reporter
+from .worker import Built, Job, Refused, may_pass, moved, raise_passing, reporter
 
 __all__ = ["ClusterJob", "build", "check_plain", "keep_parsed"]
 
@@ -77,7 +77,7 @@ def build(task: ClusterJob) -> Built | Refused:
     try:
         return _build(task)
     except LodestreamError as error:
-        raise_where_full(error)
+        raise_passing(error)
         return Refused(str(error), final=not may_pass(error))
 
 

@@ -46,7 +46,7 @@ from lodestream.errors import InputError, TooLargeError
 from ..access.access import key_of
 from ..operation.settings import Settings
 from ..problems import FullError, MissingError
-from ..storage.durable import discard, make_folder
+from ..storage.durable import discard
 from ..storage.records import Record, State
 from ..storage.storage import Storage
 from ..storage.uploads import check_upload
@@ -356,6 +356,7 @@ class Builder:
     async def _insist(self, record: Record) -> State:
         """Try until it is ready or refused."""
         if record.attempts >= _CRASHES:
+            await asyncio.to_thread(self._storage.forget_interrupted, record.id)
             return await self._postpone(record, f"the server ended {record.attempts} times while this was being built")
         deaths = endings = 0
         while True:
@@ -401,7 +402,8 @@ class Builder:
         begun = await asyncio.to_thread(_identities, job.files)
         allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory, self._threads)
         # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
-        call = Call(worker.build, (job,), self._settings.build_seconds, partial(make_folder, folder), allowed)
+        begin = partial(self._storage.new_work, record.id, folder)
+        call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
         self._running[record.id] = _Running(folder, call)
         try:
             result: worker.Built | worker.Parsed | worker.Refused | None = await self._run(self._pool.run(call))
@@ -421,7 +423,7 @@ class Builder:
         finally:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
-            await _removed(folder)
+            await _removed(folder, partial(self._storage.keep_interrupted, record.id) if self._closing else None)
 
     async def _run(self, work: Awaitable[_T]) -> _T | worker.Refused:
         try:
@@ -514,9 +516,18 @@ class Builder:
         )
 
 
-async def _removed(folder: Path) -> None:
-    """Remove what a build has left, also where it is cancelled meanwhile: a thread that has not begun never would."""
-    removing = asyncio.ensure_future(asyncio.to_thread(discard, folder))
+async def _removed(folder: Path, keep: Callable[[Path], None] | None = None) -> None:
+    """Remove what a build has left, also where it is cancelled meanwhile: a thread that has not begun never would.
+
+    What it is to continue from is kept before that, where ``keep`` says how.
+    """
+
+    def remove() -> None:
+        if keep is not None:
+            keep(folder)
+        discard(folder)
+
+    removing = asyncio.ensure_future(asyncio.to_thread(remove))
     try:
         await asyncio.shield(removing)
     except asyncio.CancelledError:

@@ -30,6 +30,7 @@ from lodestream.errors import (
 )
 
 from ..storage.durable import NewFile
+from ..storage.interrupted import BANDS, SCRATCH
 from . import finished
 from .stored_quality import without_quality
 
@@ -51,7 +52,7 @@ __all__ = [
     "may_pass",
     "moved",
     "preload",
-    "raise_where_full",
+    "raise_passing",
     "read_progress",
     "reporter",
 ]
@@ -99,7 +100,7 @@ _SHORT_OF_MEMORY = re.compile(
 )
 
 _PROGRESS = "progress"
-_CONTAINER, _SCRATCH, _READ, _MADE = "container", "scratch", "read", "made"
+_CONTAINER, _READ, _MADE = "container", "read", "made"
 _BLOCK = 1 << 20
 #: The part of the memory that an array of a file may take in memory.
 _PART = 16
@@ -149,7 +150,7 @@ class Job:
     @property
     def scratch(self) -> Path:
         """Folder for what does not fit into memory."""
-        return self.folder / _SCRATCH
+        return self.folder / SCRATCH
 
     @property
     def parsed(self) -> Path:
@@ -240,21 +241,22 @@ def build(job: Job) -> Built | Parsed | Refused:
     except SwitchedOffError as error:
         return Refused(f"{error} {ALLOWED_BY}", final=False)
     except LodestreamError as error:
-        raise_where_full(error)
+        raise_passing(error)
         return Refused(str(error), final=not may_pass(error))
 
 
-def raise_where_full(error: LodestreamError) -> None:
-    """Raise the error of the system that stands behind an error, if it is that the disk is full.
+def raise_passing(error: LodestreamError) -> None:
+    """Raise the error of the system that stands behind an error, if it is that the disk is full or something is in use.
 
-    What was uploaded is not refused then: its build is begun again when there is room.
+    What was uploaded is not refused then: its build is begun again when there is room, or when the process of a server
+    that was killed has let go of the folder that this one continues in.
 
     Raises
     ------
     OSError
     """
     for cause in _causes(error):
-        if isinstance(cause, OSError) and cause.errno in NO_ROOM:
+        if isinstance(cause, OSError) and cause.errno in (*NO_ROOM, errno.EAGAIN):
             raise OSError(cause.errno, os.strerror(cause.errno)) from error
 
 
@@ -319,7 +321,7 @@ def _build(job: Job) -> Built | Parsed:
                 save_surface(surface, Scratch(job.parsed))
                 return Parsed(sum(block.shape[0] * block.shape[1] for block in surface.blocks))
             made = job.folder / _MADE
-            encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.scratch / "build")
+            encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.scratch / BANDS)
             return Built(moved(made, path))
         container = encode(surface, quality=quality, progress=report)
     with NewFile(path) as file:

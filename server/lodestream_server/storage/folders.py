@@ -9,6 +9,7 @@
     DATA/containers/{sha256}.lode     never changed, named by their SHA-256, shared likewise
     DATA/incoming/                    uploads in progress
     DATA/work/                        builds in progress
+    DATA/interrupted/{id}/            what a build by bands had made when it was interrupted
     DATA/levels/                      level files made on request, removed at each start
     DATA/damaged/                     files moved away by a start or by ``lodestream fsck --repair``
     DATA/lock                         locked by the one process that uses the folder
@@ -70,6 +71,11 @@ class Folders:
         return self.root / "work"
 
     @property
+    def interrupted(self) -> Path:
+        """What builds by bands had made when they were interrupted; created when needed."""
+        return self.root / "interrupted"
+
+    @property
     def levels(self) -> Path:
         """Level files that were made on request."""
         return self.root / "levels"
@@ -94,7 +100,7 @@ class Folders:
     @property
     def written(self) -> tuple[Path, ...]:
         """The folders that a server writes to."""
-        return *self.kept, self.incoming, self.work
+        return *self.kept, self.incoming, self.work, self.interrupted
 
     def record(self, surface: str) -> Path:
         """The record of a surface."""

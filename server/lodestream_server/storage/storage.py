@@ -19,7 +19,7 @@ from pathlib import Path
 from lodestream.errors import InputError, LodestreamError, NotFoundError
 
 from ..problems import BusyError, MissingError
-from . import markers
+from . import interrupted, markers
 from .catalog import Catalog, Position
 from .durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from .folders import Folders, is_file, is_folder
@@ -120,6 +120,20 @@ class Storage:
         A folder that still exists at the next start shows that the server ended during the build.
         """
         return self._at.work / f"{surface}.{secrets.token_hex(8)}"
+
+    def keep_interrupted(self, surface: str, work: Path) -> None:
+        """Keep what an interrupted build by bands has made in its folder, see `interrupted.keep`."""
+        interrupted.keep(self._at, surface, work)
+
+    def new_work(self, surface: str, work: Path) -> None:
+        """Create the folder of a build, with what an interrupted attempt had made."""
+        make_folder(work)
+        if interrupted.put_back(self._at, surface, work):
+            _log.info("the build of %s continues from what an interrupted attempt had made", surface)
+
+    def forget_interrupted(self, surface: str) -> None:
+        """Remove what an interrupted attempt had made."""
+        interrupted.forget(self._at, surface)
 
     @property
     def levels(self) -> Path:
@@ -427,6 +441,7 @@ class Storage:
                     raise
             self._catalog.drop(surface)
             try:
+                interrupted.forget(self._at, surface)
                 finish_delete(
                     self._at,
                     record,
