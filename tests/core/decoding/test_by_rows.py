@@ -71,7 +71,6 @@ def test_what_cannot_be_decoded_by_rows_says_so() -> None:
     heights = SURFACES["integers"][0].points
     rows, columns = np.mgrid[:50, :60].astype(float)
     cases = {
-        "wrap": ls.Surface(heights, (True, False)),
         "several": ls.Surface(blocks=[ls.Block(heights), ls.Block(heights)]),
         "rules": ls.Surface(np.stack([columns, rows, np.hypot(rows, columns)], axis=-1)),
     }
