@@ -128,7 +128,7 @@ LODE_API int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int
 /* Squared distances between points and the values of lattice coordinates in the type of the points, by parts of
  * LODE_PART_ROWS x LODE_PART_COLUMNS points, fewer at the ends: those from `first` to `last` - 1 in raster order.
  *
- * points:      (rows, columns, channels); no integers of 64 bits, which float64 cannot tell apart.
+ * points:      (rows, columns, channels); differences of integers of 64 bits are taken in integers, then rounded.
  * coordinates: (compared, height, pitch), of at most three channels from `channel` on; at least as many rows and
  *              columns as points.
  * rules:       (compared, 4): of each lattice decimal, origin, step, scale.

@@ -147,6 +147,18 @@ static inline double seen_float64(double value) {
     return value;
 }
 
+/* The square of the difference of integers that float64 cannot tell apart: it is taken in integers. */
+#define WIDE_INTEGER(type)                                                                                             \
+    static inline double square_##type(type##_t point, double value) {                                                 \
+        type##_t other = to_##type(value);                                                                             \
+        double delta =                                                                                                 \
+            (double)(point > other ? (uint64_t)point - (uint64_t)other : (uint64_t)other - (uint64_t)point);           \
+        return delta * delta;                                                                                          \
+    }
+
+WIDE_INTEGER(int64)
+WIDE_INTEGER(uint64)
+
 #define CONVERT(type)                                                                                                  \
     case NUMBER_##type: {                                                                                              \
         type##_t *own = points;                                                                                        \
@@ -162,6 +174,14 @@ static inline double seen_float64(double value) {
             double delta = (double)own[j] - seen_##type(values[j]);                                                    \
             squares[j] = delta * delta;                                                                                \
         }                                                                                                              \
+        break;                                                                                                         \
+    }
+
+#define SQUARE_WIDE(type)                                                                                              \
+    case NUMBER_##type: {                                                                                              \
+        const type##_t *own = points;                                                                                  \
+        for (int64_t j = 0; j < count; j++)                                                                            \
+            squares[j] = square_##type(own[j], values[j]);                                                             \
         break;                                                                                                         \
     }
 
@@ -187,9 +207,11 @@ static void square(const double *restrict values, int64_t count, int64_t type, c
         SQUARE(int8)
         SQUARE(int16)
         SQUARE(int32)
+        SQUARE_WIDE(int64)
         SQUARE(uint8)
         SQUARE(uint16)
         SQUARE(uint32)
+        SQUARE_WIDE(uint64)
         SQUARE(float32)
         SQUARE(float64)
     }
@@ -375,8 +397,7 @@ int64_t lode_square_distances(const void *points, int64_t points_count, int64_t 
     if (!is_shape(points_count, rows, columns, channels) || rules_count % RULE_NUMBERS || compared < 1 ||
         kinds > MOST_KINDS || channel < 0 || channel > channels - compared ||
         !is_shape(coordinates_count, height, pitch, compared) || height < rows || pitch < columns ||
-        (counted_count && counted_count != rows * columns) || points_type < 0 || points_type >= TYPES ||
-        points_type == NUMBER_int64 || points_type == NUMBER_uint64)
+        (counted_count && counted_count != rows * columns) || points_type < 0 || points_type >= TYPES)
         return LODE_REFUSED;
     int64_t across = (columns + LODE_PART_COLUMNS - 1) / LODE_PART_COLUMNS;
     int64_t down = (rows + LODE_PART_ROWS - 1) / LODE_PART_ROWS;

@@ -276,11 +276,4 @@ def _in_one_piece(surface: Surface, quality: Quality) -> str | None:
         return "a stream for one error (rms) is made of all values together"
     if len(surface.blocks) > 1:
         return f"it has {len(surface.blocks)} blocks"
-    block = surface.blocks[0]
-    if block.closed[0]:
-        return "its rows wrap"
-    if surface.joints is not None:
-        return "it tells which of its points are one"
-    if any(a.dtype.kind != "f" and a.dtype.itemsize == 8 for a in (block.points, *block.attributes.values())):
-        return "it has integers of 64 bits"
     return None

@@ -166,6 +166,7 @@ class Made:
         }
         surface = copy(self._surface)
         surface.blocks = (block,)
+        surface.joints = None  # the values say again which points are one
         return surface
 
     def _stream(self, scratch: Scratch, prepared: Prepared, bits: int | None) -> Path:

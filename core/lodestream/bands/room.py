@@ -76,10 +76,7 @@ class CopyRoom(Room):
             If the disk has no room for it, or none for the build of what is copied into it.
         """
         values = math.prod(shape)
-        kind = np.dtype(dtype)
-        size = values * kind.itemsize
+        size = values * np.dtype(dtype).itemsize
         if self.takes(size):
-            # Integers of 64 bits are encoded in one piece.
-            by_bands = (kind.kind == "f" or kind.itemsize < 8) and self._by_bands(values)
-            check_room(self._folder(), size + (FOR_A_VALUE * values if by_bands else 0))
+            check_room(self._folder(), size + (FOR_A_VALUE * values if self._by_bands(values) else 0))
         return super().empty(shape, dtype)

@@ -146,7 +146,7 @@ class WindowMeasurer:
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         squares = distance_figures(original, lattices, canvas, fractions, channel)
         equal = np.zeros(squares.shape[2], np.bool_)
-        if original.points.dtype.itemsize == 8 and not squares[..., 1].any():
+        if original.points.dtype.kind == "f" and original.points.dtype.itemsize == 8 and not squares[..., 1].any():
             # Squares of the smallest differences vanish: only a look at the values tells that there are none.
             columns = original.points.shape[1]
             same = np.empty((*original.points.shape[:2], len(lattices)), original.points.dtype)

@@ -19,7 +19,7 @@ from ..container.digest import values_digest
 from ..container.model import Chunk, Header, Index, Segment
 from ..container.sections import check_of
 from ..entropy.bitplanes import pass_count
-from ..entropy.part_table import part_of
+from ..entropy.part_table import consecutive, part_of
 from ..entropy.tiles import Tiles, TileTable
 from ..errors import CorruptStreamError
 from ..grid.layout import Layout
@@ -50,8 +50,6 @@ def why_not_by_rows(header: Header) -> str | None:
     """Why a container cannot be decoded by bands of rows; None: it can."""
     if len(header.layout.grids) > 1:
         return "blocks share sides, or there are several"
-    if header.closed[0]:
-        return "its rows wrap"
     if header.plane is not None:
         return "x and y are made of rules"
     return None
@@ -210,7 +208,7 @@ class RowsDecoder:
         """
         header = self.header
         geometry = RowsGeometry(header.layout, rows, self._core, level=self.level)
-        runs = _with_parents(header.layout, geometry.tiles)
+        runs = _with_parents(header.layout, geometry.levels)
         part = part_of(TileTable.of(header.layout), runs)
         channels = [
             Tiles(part.table, header.quantiser if channel < header.geometric else None, header.large)
@@ -266,13 +264,11 @@ class RowsDecoder:
             own[chosen] = restored.reshape(known.shape)
 
 
-def _with_parents(layout: Layout, runs: list[range]) -> list[range]:
-    """Runs of tiles, each of the levels after the core's, with the parents of all of them."""
-    found = list(runs)
+def _with_parents(layout: Layout, levels: list[list[range]]) -> list[range]:
+    """Runs of tiles, of the levels up to the core's and of each finer one, with the parents of all of them."""
+    found = list(levels)
     for number in range(len(found) - 1, 1, -1):
         if found[number]:
-            above, own = layout.tile_arrays.parents(np.array(found[number])), found[number - 1]
-            parents = range(int(above.min()), int(above.max()) + 1)
-            both = (parents, own) if own else (parents,)
-            found[number - 1] = range(min(run.start for run in both), max(run.stop for run in both))
-    return found
+            above = [layout.tile_arrays.parents(np.array(run)) for run in found[number]]
+            found[number - 1] = consecutive(np.concatenate([*above, *map(np.array, found[number - 1])]))
+    return [run for own in found for run in own]

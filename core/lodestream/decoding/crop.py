@@ -21,7 +21,10 @@ from ..transform.lifting import FRACTION_BITS, REACH, inverse_step
 from ..transform.predictors import predictor
 from ..transform.pyramid import allocate, refine
 
-__all__ = ["AxisCrop", "crop_axis", "reconstruct_window"]
+__all__ = ["AxisCrop", "SeamCrop", "crop_across_seam", "crop_axis", "reconstruct_window"]
+
+#: Rows or columns, half-open.
+Span = tuple[int, int]
 
 #: Nodes that the third step wants of a run.
 _LEAST_NODES = 4
@@ -45,6 +48,53 @@ class AxisCrop(NamedTuple):
     first: int
     step: AxisStep
     start: int
+
+
+class SeamCrop(NamedTuple):
+    """What one step along an axis, open or closed, takes for samples that may go on beyond its last one.
+
+    Attributes
+    ----------
+    crops : tuple of AxisCrop
+        One, or two on either side of the gap of a closed axis of odd length, in the order of the samples. Nodes and
+        details of a crop may go on beyond the last ones too, with the first ones.
+    wanted : tuple of (int, int)
+        Where the samples that are wanted stand among those that the crops make, one crop after another; in their order.
+    nodes : (int, int)
+        All nodes that are taken, in this order; the second is more than there are where they go on with the first ones.
+    """
+
+    crops: tuple[AxisCrop, ...]
+    wanted: tuple[Span, ...]
+    nodes: Span
+
+
+def crop_across_seam(step: AxisStep, start: int, stop: int) -> SeamCrop:
+    """What gives the samples from ``start`` to before ``stop`` back.
+
+    Of a closed axis ``stop`` may be up to ``start`` plus the length: the samples then go on with the first ones.
+    """
+    if step.wraps:
+        first = (start >> 1) - _SUPPORT
+        count = ((stop - 1) >> 1) + 2 + _SUPPORT - first
+        if count < step.run:
+            made = AxisStep(2 * count - 1, count, count - 1, count, False, False, False)
+            place, begin = start - 2 * first, first % step.run
+            crop = AxisCrop(begin, made, place)
+            return SeamCrop((crop,), ((place, place + stop - start),), (begin, begin + count))
+    elif stop <= step.length:
+        crop = crop_axis(step, start, stop)
+        own = crop.start, crop.start + stop - start
+        return SeamCrop((crop,), (own,), (crop.first, crop.first + crop.step.coarse))
+    else:
+        # Both sides of the gap are free ends: neither looks at what is on the other one.
+        last, first_ones = crop_axis(step, start, step.length), crop_axis(step, 0, stop - step.length)
+        if first_ones.step.coarse <= last.first:
+            ends = last.start + step.length - start, last.step.length + stop - step.length
+            spans = (last.start, ends[0]), (last.step.length, ends[1])
+            return SeamCrop((last, first_ones), spans, (last.first, step.coarse + first_ones.step.coarse))
+    whole = ((start, min(stop, step.length)), *([(0, stop - step.length)] if stop > step.length else []))
+    return SeamCrop((AxisCrop(0, step, start),), whole, (0, step.coarse))
 
 
 def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from .. import kernels
 from ..grid.layout import Layout
+from ..quantization.lattice import to_dtype
 from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed
 from ..transform.lifting import forward_step
@@ -88,10 +89,8 @@ def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, 
     _fill(heights, known, closed, _SWEEPS, room)
     for rows in strips:
         hidden = ~known[rows]
-        found = heights[rows][hidden]
-        if values.dtype.kind in "iu":
-            np.rint(found, out=found)
-        inside = np.clip(found, float(low), float(high)).astype(values.dtype)
+        found = np.clip(heights[rows][hidden], float(low), float(high))
+        inside = to_dtype(found, values.dtype)  # the largest integers are no float64, which may be beyond them
         values[rows][hidden] = np.clip(inside, low, high)
 
 

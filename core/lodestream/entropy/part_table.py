@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .tiles import TileTable
 
-__all__ = ["Part", "flat_span", "part_of"]
+__all__ = ["Part", "consecutive", "flat_span", "part_of"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,13 @@ class Part:
     def tiles(self) -> NDArray[np.int64]:
         """The numbers that the tiles have in the surface, shape (tile,)."""
         return np.concatenate([np.arange(run.start, run.stop) for run, _ in self.spans])
+
+
+def consecutive(numbers: NDArray[np.int64]) -> list[range]:
+    """Numbers of tiles, shape (tile,), in any order and perhaps more than once, as runs of neighbours."""
+    every = np.unique(numbers)
+    starts = np.flatnonzero(np.diff(every, prepend=-2) > 1).tolist()
+    return [range(int(every[a]), int(every[b - 1]) + 1) for a, b in pairwise([*starts, len(every)])]
 
 
 def flat_span(table: TileTable, tiles: range) -> slice:

@@ -22,7 +22,6 @@ __all__ = [
     "coordinate_distances",
     "distance_figures",
     "errors_of_figures",
-    "has_figures",
     "originals_of",
     "other_originals",
     "store_values",
@@ -185,16 +184,15 @@ def coordinate_distances(
     dtype, count = originals[0].points.dtype, sum(original.count for original in originals)
     if not count:
         return [(0.0, 0.0)] * _kinds(len(lattices))
-    if has_figures(dtype):
-        patches = [
-            distance_figures(original, lattices, place, fractions, channel)
-            for original, place in zip(originals, coordinates, strict=True)
-        ]
-        found = errors_of_figures(patches, count, dtype)
-        if found is not None:
-            if cells is not None and found[0][1]:
-                cells += [patch[..., 0, :] for patch in patches]
-            return found
+    patches = [
+        distance_figures(original, lattices, place, fractions, channel)
+        for original, place in zip(originals, coordinates, strict=True)
+    ]
+    found = errors_of_figures(patches, count, dtype)
+    if found is not None:
+        if cells is not None and found[0][1]:
+            cells += [patch[..., 0, :] for patch in patches]
+        return found
     return _distances_of_values(originals, lattices, coordinates, fractions, channel)
 
 
@@ -205,7 +203,7 @@ def _distances_of_values(
     fractions: Sequence[int],
     channel: int,
 ) -> list[tuple[float, float]]:
-    """As `coordinate_distances`, of integers that float64 cannot tell apart, or where it cannot hold the squares."""
+    """As `coordinate_distances`, where float64 cannot hold the squares."""
     compared = []
     last = channel + len(lattices)
     for original, place in zip(originals, coordinates, strict=True):
@@ -231,11 +229,6 @@ def _distances_of_values(
 
 def _kinds(channels: int) -> int:
     return 1 + channels if channels > 1 else 1
-
-
-def has_figures(dtype: np.dtype[Any]) -> bool:
-    """Whether float64 tells values of this type apart, as `distance_figures` needs it."""
-    return dtype.kind == "f" or dtype.itemsize < 8
 
 
 def distance_figures(
@@ -288,11 +281,11 @@ def errors_of_figures(
     Returns
     -------
     list of (float, float), or None
-        None: float64 does not hold the squares; of values of 8 bytes not even those of the smallest differences.
+        None: float64 does not hold the squares; of floats of 8 bytes not even those of the smallest differences.
     """
     kinds = range(patches[0].shape[2])
     worst = [max(float(patch[..., kind, 1].max()) for patch in patches) for kind in kinds]
-    if worst[0] == 0 and dtype.itemsize < 8:  # squares of narrower types never vanish
+    if worst[0] == 0 and (dtype.kind != "f" or dtype.itemsize < 8):  # squares of other types never vanish
         return [(0.0, 0.0)] * len(worst)
     if not 1e-250 < worst[0] < 1e250:
         return None

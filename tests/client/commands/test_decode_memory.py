@@ -93,8 +93,15 @@ def test_what_is_not_decoded_by_bands_is_refused_with_the_reason(run: Run, conta
     assert words + "standard output is written in one piece" in refused(run, container, "-", *LITTLE)
     for options in (("--partial",), ("--until-rms", "0.1d")):
         assert words + "only the whole surface or a level is" in refused(run, container, "a.npy", *LITTLE, *options)
-    container.write_bytes(ls.encode(ls.Surface(HEIGHTS, (True, False))))
-    assert words + "its rows wrap" in refused(run, container, "a.npy", *LITTLE)
+    rows, columns = np.indices(HEIGHTS.shape)
+    container.write_bytes(ls.encode(ls.Surface(np.stack([columns, rows, HEIGHTS], axis=-1).astype(np.float32))))
+    assert words + "x and y are made of rules" in refused(run, container, "a.npy", *LITTLE)
+
+
+def test_a_torus_is_decoded_by_bands(run: Run, container: Path) -> None:
+    container.write_bytes(ls.encode(ls.Surface(HEIGHTS, (True, True))))
+    assert run("decode", container, container.with_name("a.npy"), *LITTLE)[0] == 0
+    assert np.array_equal(np.load(container.with_name("a.npy")), HEIGHTS)
 
 
 def test_without_the_option_the_machine_is_the_limit(

@@ -320,7 +320,6 @@ def test_a_folder_of_something_else_is_not_touched(run: Run, file: Path, tmp_pat
     ("options", "reason"),
     [
         (("--rms", "3"), "a stream for one error (rms) is made of all values together"),
-        (("--closed", "rows"), "its rows wrap"),
     ],
 )
 @pytest.mark.parametrize("scratch", [False, True])

@@ -27,7 +27,7 @@ from lodestream.surface import Surface
 from ..surfaces import terrain
 
 
-def _built(surface: Surface, points: int, core_points: int, threads: int = 1, **quality: Any) -> bytes:
+def built(surface: Surface, points: int, core_points: int, threads: int = 1, **quality: Any) -> bytes:
     out = io.BytesIO()
     prepared = prepare(surface, Quality.of(**quality))
     with tempfile.TemporaryDirectory() as folder:
@@ -41,6 +41,13 @@ def _built(surface: Surface, points: int, core_points: int, threads: int = 1, **
 
 def _heights(shape: tuple[int, int]) -> NDArray[np.int16]:
     return np.rint(200 * terrain(shape)).astype(np.int16)
+
+
+def _torus(shape: tuple[int, int]) -> NDArray[np.float32]:
+    u, v = (np.arange(n) * 2 * np.pi / n for n in shape)
+    around = 3 + np.cos(v) + 0.01 * terrain(shape)
+    points = np.stack([around * np.cos(u[:, None]), around * np.sin(u[:, None]), np.sin(v) + 0 * around], axis=-1)
+    return points.astype(np.float32)
 
 
 def _surfaces() -> dict[str, tuple[Surface, dict[str, Any]]]:
@@ -61,6 +68,20 @@ def _surfaces() -> dict[str, tuple[Surface, dict[str, Any]]]:
         "attributes": (Surface(heights, attributes={"speed": speed, "kind": (heights > 0).astype(np.uint8)}), {}),
         "ring": (Surface(ring.astype(np.float32), (False, True)), {}),
         "cylinder": (Surface(heights, (False, True)), {"precision": 3.0}),
+        "closed rows": (Surface(heights, (True, False)), {}),
+        "closed rows of odd number": (Surface(heights[:309], (True, False)), {"precision": 3.0}),
+        "closed rows with holes": (Surface(heights[:302], (True, False), mask=mask[:302]), {}),
+        "torus": (Surface(_torus((226, 130)), (True, True)), {}),
+        "torus with attributes": (
+            Surface(_torus((214, 131)), (True, True), attributes={"speed": speed[:214, :131]}),
+            {"precision": "1e-4d"},
+        ),
+        "int64": (Surface(heights.astype(np.int64) * 2**45 + 1), {}),
+        "uint64 with holes": (Surface(heights.astype(np.uint64) + np.uint64(2**63), mask=mask), {"precision": 2e4}),
+        "attributes of 64 bits": (
+            Surface(heights, attributes={"id": rng.integers(-(2**63), 2**63 - 1, (*heights.shape, 2), endpoint=True)}),
+            {},
+        ),
         "noise": (Surface(rng.integers(0, 2**31, (200, 210)).astype(np.int32)), {}),
         "narrow": (Surface(_heights((1500, 5))), {}),
         "wide": (Surface(_heights((5, 1500))), {}),
@@ -76,13 +97,13 @@ SURFACES = _surfaces()
 def test_bands_give_the_bytes_of_one_piece(name: str, points: int, core_points: int) -> None:
     surface, quality = SURFACES[name]
     whole = encode(surface, **quality)
-    assert _built(surface, points, core_points, threads=1 + points % 2, **quality) == whole
+    assert built(surface, points, core_points, threads=1 + points % 2, **quality) == whole
 
 
 def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
     heights = _heights((310, 270))
     monkeypatch.setattr(building, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
-    expected = _built(Surface(heights), 30_000, 600)
+    expected = built(Surface(heights), 30_000, 600)
     code, late = Building._code, list[Path]()
 
     def after_late_tasks(self: Building) -> None:
@@ -96,7 +117,7 @@ def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.Monke
         code(self)
 
     monkeypatch.setattr(Building, "_code", after_late_tasks)
-    container = _built(Surface(heights), 30_000, 600)
+    container = built(Surface(heights), 30_000, 600)
     assert len(late) > 10
     assert container == expected
     assert np.array_equal(decode(container).points, heights)

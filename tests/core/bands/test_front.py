@@ -79,13 +79,14 @@ def test_processes_share_the_work(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 2), (2, 3), (40, 50), (600, 600), (1000, 1000)])
-@pytest.mark.parametrize("kind", ["heights", "holes", "closed columns"])
+@pytest.mark.parametrize("kind", ["heights", "holes", "closed columns", "closed rows", "closed both"])
 def test_small_surfaces_are_built_by_an_executor_too(shape: tuple[int, int], kind: str) -> None:
     heights = np.rint(300 * terrain(shape)).astype(np.int16)
     mask = np.hypot(*np.mgrid[-1 : 1 : shape[0] * 1j, -1 : 1 : shape[1] * 1j]) < 1.2 if kind == "holes" else None
     if mask is not None:
         mask[0, 0] = True
-    surface = ls.Surface(heights, (False, kind == "closed columns"), mask=mask)
+    closed = kind in ("closed rows", "closed both"), kind in ("closed columns", "closed both")
+    surface = ls.Surface(heights, closed, mask=mask)
     with ThreadPoolExecutor(2) as executor:
         assert ls.encode(surface, executor=executor) == ls.encode(surface)
 
@@ -112,10 +113,13 @@ def test_an_interrupted_build_leaves_nothing(tmp_path: Path, cut: Callable[[int]
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("kind", ["heights", "torus of 64 bits"])
 def test_a_named_folder_is_kept_and_the_build_goes_on(
-    tmp_path: Path, cut: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cut: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
     surface, scratch = _heights(), tmp_path / "scratch"
+    if kind != "heights":
+        surface = ls.Surface(surface.points.astype(np.int64) + 2**60, (True, True))
     cut(2)
     with pytest.raises(KeyboardInterrupt):
         ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
@@ -143,19 +147,28 @@ def test_a_build_of_something_else_begins_anew(
     assert (tmp_path / "a.lode").read_bytes() == ls.encode(other)
 
 
-@pytest.mark.parametrize("kind", ["rms", "blocks", "rows wrap", "64 bits"])
+def test_points_that_are_one_are_found_again_in_the_values() -> None:
+    rows, columns = np.mgrid[:300, :280] / 40
+    points = np.stack([np.cos(rows), rows * columns, np.sin(rows + columns)], axis=-1)
+    points[0, 5] = points[-1, 7] = points[9, 0]  # which lie at one place
+    metadata = {"faces": {"joined": True}}
+    whole = ls.encode(ls.Surface(points, metadata=metadata))
+    decoded = ls.decode(whole)
+    assert decoded.joints is not None
+    assert decoded.joints.places.points.size
+    assert ls.encode(decoded, memory=LITTLE) == whole
+    assert decoded.joints is not None
+
+
+@pytest.mark.parametrize("kind", ["rms", "blocks"])
 def test_what_has_no_bands_says_so(kind: str) -> None:
     points = np.rint(300 * terrain((700, 640)))
     quality: Any = {}
     surface = ls.Surface(points.astype(np.int16))
     if kind == "rms":
         quality = {"rms": "1e-3d"}
-    elif kind == "blocks":
-        surface = ls.Surface(blocks=[ls.Block(points), ls.Block(points)])
-    elif kind == "rows wrap":
-        surface = ls.Surface(points.astype(np.int16), (True, False))
     else:
-        surface = ls.Surface(points.astype(np.int64))
+        surface = ls.Surface(blocks=[ls.Block(points), ls.Block(points)])
     with pytest.raises(ls.TooLargeError, match=kind):
         ls.encode(surface, memory=LITTLE, **quality)
 

@@ -35,7 +35,7 @@ def test_sound_containers_pass(name: str) -> None:
     assert told[-1] == 1.0
 
 
-@pytest.mark.parametrize("name", ["integers", "holes", "attributes"])
+@pytest.mark.parametrize("name", ["integers", "holes", "attributes", "torus"])
 @pytest.mark.parametrize("part", [0.0, 0.2])
 @pytest.mark.parametrize("place", [0, 1])
 def test_wrong_errors_are_found(name: str, part: float, place: int) -> None:
@@ -55,8 +55,9 @@ def test_a_flipped_bit_is_found() -> None:
 
 
 def test_what_cannot_be_decoded_by_bands_takes_its_memory() -> None:
-    data = ls.encode(ls.Surface(SURFACES["integers"][0].blocks[0].points, (True, True)))
-    with pytest.raises(ls.TooLargeError, match=r"at most 0 MiB to check, got one that takes about 1 MiB .*: its rows"):
+    block = ls.Block(SURFACES["integers"][0].blocks[0].points)
+    data = ls.encode(ls.Surface(blocks=[block, block]))
+    with pytest.raises(ls.TooLargeError, match=r"at most 0 MiB to check, got one that takes about 3 MiB .*several"):
         _inspected(data)
     assert _inspected(data, 1 << 30).errors_checked
 

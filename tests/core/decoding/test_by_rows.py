@@ -85,13 +85,13 @@ def test_rows_make_every_level(name: str) -> None:
 
 @given(
     st.tuples(st.integers(1, 150), st.integers(2, 90)),
-    st.booleans(),
-    st.sampled_from([np.int16, np.uint8, np.float32, np.float64]),
+    st.tuples(st.booleans(), st.booleans()),
+    st.sampled_from([np.int16, np.uint8, np.int64, np.float32, np.float64]),
     st.sampled_from(["all", "holes", "few"]),
     st.integers(0, 2**32),
 )
 def test_rows_make_every_level_of_any_size(
-    shape: tuple[int, int], closed: bool, dtype: type[np.generic], valid: str, seed: int
+    shape: tuple[int, int], closed: tuple[bool, bool], dtype: type[np.generic], valid: str, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]]
@@ -102,7 +102,7 @@ def test_rows_make_every_level_of_any_size(
         mask.flat[0] = True
     surface = ls.Surface(
         heights,
-        (False, closed and shape[1] > 2),
+        (closed[0] and shape[0] > 2, closed[1] and shape[1] > 2),
         mask=mask,
         metadata={"geotransform": [3.0, 0.5, 0.0, 7.0, 0.0, -2.0], "unit": "m"},
         attributes=None if mask is not None else {"rain": rng.integers(0, 9, shape).astype(np.uint16)},
@@ -131,7 +131,6 @@ def test_what_cannot_be_decoded_by_rows_says_so() -> None:
     heights = SURFACES["integers"][0].points
     rows, columns = np.mgrid[:50, :60].astype(float)
     cases = {
-        "wrap": ls.Surface(heights, (True, False)),
         "several": ls.Surface(blocks=[ls.Block(heights), ls.Block(heights)]),
         "rules": ls.Surface(np.stack([columns, rows, np.hypot(rows, columns)], axis=-1)),
     }

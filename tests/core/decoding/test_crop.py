@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.decoding.crop import crop_axis, reconstruct_window
+from lodestream.decoding.crop import crop_across_seam, crop_axis, reconstruct_window
 from lodestream.decoding.reconstruction import reconstruct_channel
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.entropy.tiles import Tiles, TileTable, gather
@@ -22,6 +22,7 @@ from lodestream.grid.layout import Layout
 from lodestream.grid.support import needed_tiles
 from lodestream.planning.selection import Selection
 from lodestream.target import Region
+from lodestream.transform.lifting import forward_step, inverse_step
 from lodestream.transform.pyramid import allocate, forward
 
 #: What a container does not keep is another matter, see test_losses.
@@ -45,6 +46,42 @@ def test_what_a_step_takes_of_an_axis_gives_what_is_wanted(closed: bool) -> None
                 assert 0 <= crop.first <= crop.first + crop.step.coarse <= step.coarse
                 assert crop.step.coarse + crop.step.midpoints == crop.step.length
                 assert crop.step.length <= max(stop - start + 60, 4) or step.wraps
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_what_a_step_takes_across_the_seam_gives_what_is_wanted(closed: bool) -> None:
+    """Undone crop by crop, they are the samples of the axis that goes on from its last one with the first."""
+    rng = np.random.default_rng(5)
+    for length in [*range(1, 75), 120, 121]:
+        step = axis_step(length, closed)
+        rule = (16, 0) if length % 2 else (22, -2)
+        whole = np.cumsum(rng.integers(-90, 90, (length, 2)), axis=0).astype(np.int32)
+        line = whole.copy()
+        forward_step(line, 0, step, rule)
+        nodes, details = line[: step.coarse], line[step.coarse :]
+        for start in range(0, length, 3):
+            for stop in range(start + 1, (start if closed else 0) + length + 1, 4):
+                found = crop_across_seam(step, start, stop)
+                taken, made = [], []
+                for crop in found.crops:
+                    own = np.arange(crop.first, crop.first + crop.step.coarse)
+                    taken += own.tolist()
+                    beside = np.arange(crop.first, crop.first + crop.step.midpoints)
+                    # Only where an axis wraps a crop goes on beyond its last nodes.
+                    assert step.wraps or own[-1] < step.coarse
+                    part = [np.take(nodes, own, 0, mode="wrap")]
+                    part += [np.take(details, beside, 0, mode="wrap")] if beside.size else []
+                    samples = np.concatenate(part)
+                    assert len(samples) == crop.step.length
+                    inverse_step(samples, 0, crop.step, rule)
+                    made.append(samples)
+                assert np.array_equal(np.array(taken) % step.coarse, np.arange(*found.nodes) % step.coarse)
+                assert 0 <= found.nodes[0] < step.coarse
+                assert found.nodes[1] - found.nodes[0] <= step.coarse
+                every = np.concatenate(made)
+                wanted = np.concatenate([every[slice(*span)] for span in found.wanted])
+                assert np.array_equal(wanted, np.take(whole, np.arange(start, stop), 0, mode="wrap"))
+                assert len(every) <= stop - start + 120
 
 
 @settings(max_examples=60, deadline=None)

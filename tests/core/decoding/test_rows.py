@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lodestream.decoding.reconstruction import reconstruct_channel
@@ -41,17 +41,27 @@ def _span(ends: list[float], length: int) -> tuple[int, int]:
 @settings(deadline=None)
 @given(
     st.tuples(lengths, lengths),
-    st.booleans(),
+    st.tuples(st.booleans(), st.booleans()),
     st.tuples(st.integers(1, 4), st.integers(1, 4)),
     st.lists(st.floats(0, 1), min_size=4, max_size=4),
     st.integers(0, 12),
     st.integers(0, 2**32 - 1),
 )
+@example((250, 9), (True, True), (2, 2), [0.0, 0.1, 0.0, 1.0], 0, 0)
+@example((251, 9), (True, True), (2, 2), [0.9, 1.0, 0.0, 1.0], 0, 0)
+@example((298, 9), (True, False), (2, 2), [0.0, 0.03, 0.2, 0.7], 2, 1)
+@example((284, 9), (True, False), (2, 2), [0.97, 1.0, 0.2, 0.7], 0, 2)
+@example((160, 9), (True, False), (2, 2), [0.0, 1.0, 0.0, 1.0], 0, 3)
 def test_windows_are_those_of_the_whole(
-    shape: tuple[int, int], closed: bool, tile: tuple[int, int], ends: list[float], core: int, seed: int
+    shape: tuple[int, int],
+    closed: tuple[bool, bool],
+    tile: tuple[int, int],
+    ends: list[float],
+    core: int,
+    seed: int,
 ) -> None:
     rng = np.random.default_rng(seed)
-    layout = Layout.single(shape, (False, closed), tile)
+    layout = Layout.single(shape, closed, tile)
     tiles = Tiles(TileTable.of(layout))
     tiles.known[:] = rng.integers(0, 2**12, tiles.known.size)
     tiles.sign[:] = np.where(tiles.known, rng.choice([-1, 1], tiles.sign.size), 0)
@@ -83,9 +93,20 @@ def test_windows_are_those_of_the_whole(
             assert reconstructor.is_shown(known)
 
 
-def test_rows_that_wrap_are_refused() -> None:
-    grid = Grid((9, 9), (True, False))
-    with pytest.raises(ValueError, match="do not wrap"):
-        RowsGeometry(Layout([grid], (3, 3)), (0, 3), 0)
-    with pytest.raises(ValueError, match="one grid"):
+def test_several_grids_are_refused() -> None:
+    with pytest.raises(ValueError, match="one grid, got 2"):
         RowsGeometry(Layout([Grid((9, 9)), Grid((9, 9))], (3, 3)), (0, 3), 0)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("length", [4000, 4001, 4002, 4004, 4006, 8010, 1 << 12])
+def test_some_rows_need_some_more_of_each_level(length: int, closed: bool) -> None:
+    layout = Layout.single((length, 9), (closed, False), (2, 2))
+    for start in (0, 1, 1000, length - 150):
+        stop = min(start + 200, length)
+        geometry = RowsGeometry(layout, (start, stop), 3)
+        for step, tiles in zip(geometry.steps, geometry.levels[1:], strict=True):
+            wanted = (stop - start) / 2 ** (layout.levels - step.level)
+            assert step.shape[0] <= min(wanted + 120, layout.shape(0, step.level)[0])
+            # Nodes and details of tiles of four rows, which the rows may begin and end within.
+            assert sum(map(len, tiles)) <= 2 * (step.shape[0] // 8 + 6)

@@ -50,6 +50,18 @@ def test_valid_points_stay_and_holes_lie_within_their_range(
         assert got.max() <= (valid.max() if valid.size else 0)
 
 
+@pytest.mark.parametrize("dtype", ["int64", "uint64"])
+def test_holes_beside_the_largest_integers_are_such(dtype: str) -> None:
+    """Which are no float64: the next one is beyond the range of the type."""
+    largest = np.iinfo(dtype).max
+    values, mask = np.full((20, 30), largest, dtype), np.ones((20, 30), np.bool_)
+    values[0, 0], mask[5:9, 7:20] = largest - 10_000, False
+    values[~mask] = 3
+    filled = fill_holes(values, mask, (False, False))
+    assert (filled[~mask] >= largest - 10_000).all()
+    assert (filled[5:9, 12:20] == largest).any()
+
+
 def beside(place: int, step: int, length: int, wraps: bool) -> int:
     return (place + step) % length if wraps else min(max(place + step, 0), length - 1)
 
