@@ -110,8 +110,8 @@ int64_t lode_lift_slopes(const int64_t *ends, int64_t ends_count, const int64_t 
                          int64_t first, int64_t last, double *slopes, int64_t slopes_count) {
     if (parents_count != ends_count || first < 0 || last > ends_count)
         return LODE_REFUSED;
-    for (int64_t number = last - 1; number >= first; number--) {
-        int64_t parent = parents[number];
+    for (int64_t number = last; number > first;) {
+        int64_t parent = parents[--number];
         if (parent >= number || !fits(ends, number, slopes_count))
             return LODE_REFUSED;
         if (parent < 0)

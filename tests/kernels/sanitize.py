@@ -115,7 +115,9 @@ def _tests(compiler: str, every_line: bool) -> bool:
     for old in library.parent.glob("*.gcda"):
         old.unlink()
     chosen = [*TESTS, *(MORE_TESTS if every_line else ())]
-    wrong = run_tests(compiler, library, ["-n", "2", "--dist", "loadfile", *chosen], FAULTS)
+    # What a fault ends is not started again: pytest-xdist may then wait for ever.
+    shared = ["-n", "2", "--dist", "loadfile", "--max-worker-restart", "0"]
+    wrong = run_tests(compiler, library, [*shared, *chosen], FAULTS)
     print("\n".join(wrong))
     if counts:
         lines = lines_run(library.parent, KERNELS)
