@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable
 from concurrent.futures import Executor
 from copy import copy
@@ -180,6 +181,8 @@ class Made:
             try:
                 with replacing(path) as unfinished, unfinished.open("wb") as file:
                     Building(build, execution, self._progress).write(file)
+                    file.flush()
+                    os.fsync(file.fileno())  # it is taken for whole wherever it is, also after a power failure
             except FileNotFoundError as error:
                 if self._executor is None:
                     raise

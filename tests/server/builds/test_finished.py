@@ -203,9 +203,11 @@ def test_limits_of_builds_hold(tmp_path: Path, exact: bytes) -> None:
 
 
 def promising(rows: int, columns: int) -> bytes:
-    """A container of a few hundred bytes whose header promises so many points, all of them alike, on a torus."""
-    known = index_of(ls.encode(np.zeros((9, 9)))).header
-    header = replace(known, blocks=(((rows, columns), (True, True)),), exact=False, corrected=False)
+    """A container of a few hundred bytes whose header promises so many points of a plane, with rules of x and y."""
+    across = np.stack([*np.indices((9, 9))[::-1], np.zeros((9, 9))], axis=-1)
+    known = index_of(ls.encode(across)).header
+    assert known.plane is not None
+    header = replace(known, blocks=(((rows, columns), (False, False)),), exact=False, corrected=False)
     header = replace(header, predictors=default_predictors(header.layout)[np.newaxis])
     header = replace(header, empty=((2 << header.levels) - 1,))
     nothing = Errors(0.0, 0.0)

@@ -80,7 +80,10 @@ def test_an_uploaded_container_is_checked_by_bands(tmp_path: Path, monkeypatch: 
     assert isinstance(worker.build(job), worker.Built)
     assert job.container.read_bytes() == data
     torus = _job(_new(tmp_path, "torus"), ls.encode(ls.Surface(terrain((300, 310)), (True, True))))
-    refused = worker.build(torus)
+    assert isinstance(worker.build(torus), worker.Built)
+    rows, columns = np.indices((300, 310))
+    ruled = ls.encode(np.stack([columns, rows, terrain((300, 310))], axis=-1))
+    refused = worker.build(_job(_new(tmp_path, "ruled"), ruled))
     assert isinstance(refused, worker.Refused)
     assert "heights.npy: expected a surface that takes at most 1 MiB to check" in refused.reason
     assert not refused.final
