@@ -135,9 +135,14 @@ def until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> 
 
 @contextmanager
 def command(*arguments: object, before: str = "import sys") -> Iterator[subprocess.Popen[bytes]]:
-    """The command in a process of its own, which does not outlive the block."""
+    """The command in a process of its own, which does not outlive the block.
+
+    One that computes all the time is not traced: coverage takes locks wherever an interrupt may come.
+    """
     program = [sys.executable, "-c", f"{before}\n{MAIN}", *map(str, arguments)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    if "while True" in before:
+        environment = {name: value for name, value in environment.items() if not name.startswith("COVERAGE_")}
     process = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
     try:
         yield process
