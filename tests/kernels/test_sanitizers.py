@@ -38,7 +38,7 @@ def fuzzed(sources: Sources, masks: Path, seconds: float, cases: int = 2**62) ->
 def test_the_fuzzer_finds_what_is_planted(sources: Sources, masks: Path, fault: str) -> None:
     file, right, wrong, words = FAULTS[fault]
     sources.plant(file, right, wrong)
-    found = fuzzed(sources, masks, 60).fault or ""
+    found = fuzzed(sources, masks, 240).fault or ""
     assert words in found
     assert "made again by" in found
 

@@ -89,7 +89,7 @@ def test_the_error_on_the_screen_falls_to_what_the_server_promised(tabs: Tabs, s
     tab = tabs(shelf.address("terrain"))
     prices = httpx.get(shelf.description("terrain").url, trust_env=False).json()["layers"]
     seen = []
-    tab.view.get_by_label("Stop when below a pixel").uncheck()
+    tab.go_on_below_a_pixel()
 
     def exact() -> bool:
         seen.append((tab.rms.inner_text(), tab.max.inner_text()))
@@ -178,7 +178,7 @@ def test_status_and_errors_are_of_one_moment_while_detail_is_blended_in(tabs: Ta
 def test_a_target_may_be_the_error_of_an_attribute(tabs: Tabs, shelf: Shelf) -> None:
     tab = tabs(shelf.address("attribute"))
     tab.shown("Below a pixel: paused", "Complete: exact")
-    tab.view.get_by_label("Stop when below a pixel").uncheck()
+    tab.go_on_below_a_pixel()
     row = tab.view.get_by_label("Error of", exact=True)
     assert not row.is_visible()
     tab.choose("Target", "RMS error")
@@ -192,7 +192,7 @@ def test_a_target_may_be_the_error_of_an_attribute(tabs: Tabs, shelf: Shelf) -> 
 
 def test_a_target_is_met_and_the_values_are_within_its_error(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(rate=5_000.0)) as (tab, _):
-        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.go_on_below_a_pixel()
         tab.until(lambda: tab.moments)
         tab.choose("Target", "RMS error")
         tab.view.get_by_label("Target value").fill("0.005")
@@ -234,7 +234,7 @@ def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> N
     frames: list[Frames] = []
     slow = Fault(delay=0.05, rate=20_000.0)
     with over_a_link(tabs, shelf, slow, watch=lambda tab: frames.append(Frames(tab))) as (tab, _):
-        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.go_on_below_a_pixel()
         (messages,) = frames
         tab.until(lambda: messages.data > 20_000)
         tab.button("Stop").click()
@@ -256,7 +256,7 @@ def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> N
 
 def test_stop_and_on_by_one_key(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(rate=20_000.0)) as (tab, _):
-        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.go_on_below_a_pixel()
         tab.until(lambda: tab.moments)
         tab.press("s")
         tab.shown("Stopped")
@@ -284,7 +284,7 @@ def test_a_lost_link_is_told_and_the_surface_goes_on(tabs: Tabs, shelf: Shelf, h
 
 def test_a_link_without_a_word_is_told(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(cut_down=30_000, vanish=True)) as (tab, _):
-        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.go_on_below_a_pixel()
         tab.shown("Waiting: no data for")
         assert tab.moments
         assert tab.rms.inner_text().endswith(" m")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -79,14 +80,14 @@ def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, h
         ls.decode(bytes(data))
     with ranged(host) as server:
         tab = tabs(f"{server.url}/index.html")
-        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.go_on_below_a_pixel()
         tab.shown("Failed")
         expect(tab.notice).not_to_be_empty()
         assert not any(moment["complete"] for moment in tab.moments)
         if where > 0.5:
             tab.until(lambda: bool(tab.moments))  # they wait for the description, for three seconds at most
             assert all(moment["bytes"] <= place for moment in tab.moments)
-            assert tab.rms.inner_text().endswith(" m")
+            expect(tab.rms).to_have_text(re.compile(" m$"), timeout=WAIT)
             assert tab.point(0.5, 0.55)["row"]
 
 
@@ -98,7 +99,7 @@ def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tab
     with ranged(host) as server:
         server.tags = tags
         tab = tabs(f"{server.url}/index.html")
-        tab.view.get_by_label("Stop when below a pixel").uncheck()
+        tab.go_on_below_a_pixel()
         tab.shown("Failed")
         expect(tab.notice).to_contain_text("the file was cut short")
         expect(tab.notice).to_contain_text(str(len(whole) - 5000))

@@ -183,7 +183,12 @@ class _Connection(H11Protocol):
         self._leave_request()
         self._rest = len(self._held)
         self._held.clear()
-        self._socket.write_eof()
+        try:
+            self._socket.write_eof()
+        except OSError:
+            # The client has reset the connection, and the loop has not heard of it yet.
+            self._socket.abort()
+            return
         if self._rest <= MOST_REST:
             self._socket.resume_reading()
         self._rest_timer = self.loop.call_later(_REST_SECONDS, self._rest_is_over)

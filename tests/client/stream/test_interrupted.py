@@ -41,7 +41,8 @@ Terrain = NDArray[np.float32]
 # What a pull says and asks beside the container: handshakes, headers, the surface's description, layers' figures.
 TALK = 12_000
 
-RATE = "1mbit"
+# Slow enough that a machine which stands still for a second or two changes nothing.
+RATE = "400kbit"
 
 # Bytes that are let come before it is ended; more than what is read at once, so that some of it has been decoded.
 CAME = 100_000

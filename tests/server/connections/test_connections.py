@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import json
 import re
@@ -15,6 +16,9 @@ from urllib.parse import urlsplit
 
 import httpx
 import pytest
+import uvicorn
+from starlette.types import Receive, Scope, Send
+from uvicorn.server import ServerState
 
 import lodestream as ls
 from lodestream.protocol.connection import State
@@ -22,6 +26,10 @@ from lodestream.protocol.messages import CODES, Credit, End, Error, Event, Open,
 from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.connections import connections
+from lodestream_server.connections.cuts import Cuts
+from lodestream_server.operation.metrics import Metrics
+from lodestream_server.operation.pace import Pace
+from lodestream_server.operation.settings import Settings
 from tests.server.helpers import PATIENCE, closed, eventually, hills, listed, npy, push, raw_stream
 
 SECONDS = 1.5
@@ -266,6 +274,41 @@ def test_ten_thousand_ranges_cost_no_more_than_the_file(impatient: tuple[str, di
     # Whether the server's buffer for heads holds it depends on how the network cuts it.
     assert status_of(answer) in (200, 400)
     assert len(answer) <= made["bytes"] + 2000
+
+
+def test_a_reset_while_an_answer_ends_is_no_error_of_the_server(tmp_path: Path) -> None:
+    ended = list[BaseException | None]()
+
+    async def answered() -> None:
+        loop, client = asyncio.get_running_loop(), socket.socket()
+
+        async def app(scope: Scope, receive: Receive, send: Send) -> None:
+            await receive()
+            try:
+                await send({"type": "http.response.start", "status": 413, "headers": [(b"content-length", b"1")]})
+                await send({"type": "http.response.body", "body": b"x", "more_body": True})
+                # With an answer that nobody has read this is a reset, of which the loop has not heard at the next line.
+                client.close()
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+            except Exception as error:
+                ended.append(error)
+            else:
+                ended.append(None)
+
+        kind = connections.connections(Settings(data=tmp_path, workers=1), Cuts(Metrics()), Pace())
+        config = uvicorn.Config(app, http=kind, lifespan="off", log_config=None)
+        config.load()
+        listening = await loop.create_server(lambda: kind(config, ServerState(), {}), "127.0.0.1", 0)
+        async with listening:
+            client.setblocking(False)
+            await loop.sock_connect(client, listening.sockets[0].getsockname())
+            await loop.sock_sendall(client, b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n\r\n1")
+            async with asyncio.timeout(PATIENCE):
+                while not ended:
+                    await asyncio.sleep(0.01)
+
+    asyncio.run(answered())
+    assert ended == [None]
 
 
 def test_a_connection_too_many_is_told_to_come_back(tmp_path: Path) -> None:
