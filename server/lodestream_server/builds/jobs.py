@@ -90,6 +90,8 @@ class _Running:
 
 _T = TypeVar("_T")
 
+_CONFINED = "landlock+seccomp"
+
 
 class _LaterError(Exception):
     """The system has no room, or nothing else that a build needs, now."""
@@ -314,7 +316,7 @@ class Builder:
             _log.error("the process that builds are forked from could not be started: %s", error)
             return
         held = self.confinement
-        if held == "landlock+seccomp":
+        if held == _CONFINED:
             _log.info("builds are confined by landlock and seccomp")
         else:
             _log.warning(
@@ -396,13 +398,20 @@ class Builder:
                 raise _LaterError(f"disk space of its owner: {error}") from None
 
     async def _attempt(self, record: Record) -> State | None:
-        """What a build makes of a surface; None where its upload was put into its place again meanwhile."""
+        """What a build makes of a surface; None where it is to be tried again from nothing."""
         folder = self._storage.work_folder(record.id)
         job = self._job(record, folder)
         begun = await asyncio.to_thread(_identities, job.files)
         allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory, self._threads)
-        # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
-        begin = partial(self._storage.new_work, record.id, folder)
+        continued = False
+
+        def begin() -> None:
+            # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
+            nonlocal continued
+            # Who builds by Dask is not confined, and a confined process may have been taken over.
+            may_continue = self.confinement == _CONFINED and not job.shared
+            continued = self._storage.new_work(record.id, folder, may_continue)
+
         call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
         self._running[record.id] = _Running(folder, call)
         try:
@@ -418,6 +427,10 @@ class Builder:
             # A build may read the files that were there when it began: not those of the same bytes that somebody has
             # uploaded after the last owner of the first had deleted them.
             if await asyncio.to_thread(_identities, job.files) != begun:
+                return None
+            if continued:
+                # What it continued from may have been at fault, and is gone now.
+                _log.warning("the build of %s begins anew, since continued it ended so: %s", record.id, result.reason)
                 return None
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
         finally:

@@ -4,6 +4,8 @@ A build by bands works in a folder of its own inside its job's folder, confined 
 ends meanwhile, that folder is moved aside, and moved into the folder of the next attempt before its process begins. The
 server itself reads nothing in it: a stranger's file may have taken over the process that wrote it, and some of the
 files are pickles. Only the next process reads them, which is confined in the same way and to the same surface.
+
+The files are not synchronised to disk. So they are used only as long as the system has not been started again.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from pathlib import Path
 from .durable import discard, make_folder, remove
 from .folders import Folders
 
-__all__ = ["BANDS", "SCRATCH", "clean", "forget", "keep", "put_back"]
+__all__ = ["BANDS", "SCRATCH", "clean", "forget", "keep", "put_back", "same_boot"]
 
 _log = logging.getLogger(__name__)
 
@@ -25,6 +27,25 @@ _log = logging.getLogger(__name__)
 SCRATCH, BANDS = "scratch", "bands"
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+
+
+def same_boot(at: Folders) -> bool:
+    """Whether the last server of a folder ran since the system was started; notes down that this one does.
+
+    Where the system does not tell one start from another, or the note is not there whole, it is False.
+    """
+    try:
+        now = _BOOT.read_bytes()
+        same = at.boot.exists() and at.boot.read_bytes() == now
+        if not same:
+            at.boot.touch(0o600)
+            at.boot.write_bytes(now)
+    except OSError:
+        return False
+    return same
 
 
 def keep(at: Folders, surface: str, work: Path) -> None:

@@ -14,8 +14,8 @@ a record without its container                the container is built again from 
 a container of another format version         it is built again from the upload, and kept until then; without the
                                               upload the surface waits
 a record without its container and upload     the surface is missing, until they are back or it is deleted
-what builds by bands of queued surfaces had   it is kept for the next attempt (`interrupted`)
-made
+what builds by bands of queued surfaces had   it is kept for the next attempt, unless the system was started again
+made                                          meanwhile (`interrupted`)
 uploads and builds in progress, files half    removed: they were not acknowledged, or can be made again
 written, level files
 ============================================  ==========================================================================
@@ -66,10 +66,13 @@ def recover(at: Folders) -> list[Record]:
     found = {surface: present(at, record) for surface, record in records.items()}
     _set_strays_aside(at, found)
     queued = {surface for surface, record in found.items() if record.state == "queued"}
-    for path in at.work.iterdir():
-        if (surface := path.name.partition(".")[0]) in queued:
-            interrupted.keep(at, surface, path)
-    interrupted.clean(at, queued)
+    if not interrupted.same_boot(at):
+        interrupted.clean(at, set())
+    else:
+        for path in at.work.iterdir():
+            if (surface := path.name.partition(".")[0]) in queued:
+                interrupted.keep(at, surface, path)
+        interrupted.clean(at, queued)
     for folder in (at.incoming, at.work):
         for path in folder.iterdir():
             remove(path)

@@ -125,11 +125,19 @@ class Storage:
         """Keep what an interrupted build by bands has made in its folder, see `interrupted.keep`."""
         interrupted.keep(self._at, surface, work)
 
-    def new_work(self, surface: str, work: Path) -> None:
-        """Create the folder of a build, with what an interrupted attempt had made."""
+    def new_work(self, surface: str, work: Path, may_continue: bool) -> bool:
+        """Create the folder of a build; returns whether what an interrupted attempt had made is in it.
+
+        Where the build may not continue, that is removed.
+        """
         make_folder(work)
-        if interrupted.put_back(self._at, surface, work):
+        if not may_continue:
+            interrupted.forget(self._at, surface)
+            return False
+        continued = interrupted.put_back(self._at, surface, work)
+        if continued:
             _log.info("the build of %s continues from what an interrupted attempt had made", surface)
+        return continued
 
     def forget_interrupted(self, surface: str) -> None:
         """Remove what an interrupted attempt had made."""

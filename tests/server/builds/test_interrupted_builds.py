@@ -15,6 +15,7 @@ import pytest
 import lodestream as ls
 from lodestream_server.storage import interrupted
 from lodestream_server.storage.folders import Folders
+from lodestream_server.storage.storage import Storage
 from tests.core.surfaces import terrain
 from tests.server.helpers import eventually, settled
 from tests.server.programs import Server, server
@@ -166,6 +167,56 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
             os.truncate(path, path.stat().st_size // 2)
     with server(data, build_memory=MEMORY) as second, second.client() as http:
         assert _container(http, location) == container
+
+
+@pytest.mark.parametrize("upload", ["npy"], indirect=True)
+def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
+    tmp_path: Path, upload: tuple[str, bytes, bytes]
+) -> None:
+    name, content, container = upload
+    data = tmp_path / "data"
+    first, location = _begin(data, name, content)
+    first.kill()
+    (exact,) = (data / "work").glob("**/exact")
+    shutil.rmtree(exact)
+    exact.touch()
+    with server(data, build_memory=MEMORY) as second, second.client() as http:
+        assert _container(http, location) == container
+        text = second.log.read_text()
+    assert text.count("continues from what an interrupted attempt had made") == 1
+    assert text.count("begins anew, since continued it ended so: the build failed with an internal error") == 1
+
+
+@pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.parametrize("end", [Server.kill, Server.stop])
+def test_after_a_restart_of_the_machine_the_build_begins_anew(
+    tmp_path: Path, upload: tuple[str, bytes, bytes], end: Callable[[Server], object]
+) -> None:
+    name, content, container = upload
+    data = tmp_path / "data"
+    first, location = _begin(data, name, content)
+    end(first)
+    now = (data / "boot-id").read_bytes()
+    (data / "boot-id").write_bytes(now[::-1])
+    with server(data, build_memory=MEMORY) as second, second.client() as http:
+        assert (data / "boot-id").read_bytes() == now
+        assert _container(http, location) == container
+        assert "continues" not in second.log.read_text()
+    assert not (data / "interrupted").exists() or not list((data / "interrupted").iterdir())
+
+
+def test_where_a_build_may_not_continue_what_was_kept_is_removed(tmp_path: Path) -> None:
+    at = Folders(tmp_path)
+    storage = Storage(tmp_path)
+    try:
+        work = _work(at)
+        (work / interrupted.SCRATCH / interrupted.BANDS).mkdir()
+        interrupted.keep(at, "ab", work)
+        assert not storage.new_work("ab", at.work / "ab.1", may_continue=False)
+        assert list((at.work / "ab.1").iterdir()) == []
+        assert list(at.interrupted.iterdir()) == []
+    finally:
+        storage.close()
 
 
 def _work(at: Folders) -> Path:
