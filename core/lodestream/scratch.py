@@ -228,7 +228,8 @@ class Room:
             return np.empty(shape, dtype)
         self._count += 1
         made = self._scratch().empty(f"arrays/{self._count}", shape, dtype)
-        vars(made)[_MADE] = True
+        if isinstance(made, np.memmap):  # an empty array is in no file
+            vars(made)[_MADE] = True
         return made
 
 

@@ -70,12 +70,12 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
         capacity = Capacity(options.max_vertices)
         try:
             index = read_index(read, size, capacity)
+            header, level = index.header, options.target.level
+            if level is not None and level > header.levels:
+                return False  # decoding in one piece tells so
+            decoder = RowsDecoder(read, index, level)
         except (CorruptStreamError, TruncatedStreamError, TooLargeError):
             return False  # decoding in one piece tells what is wrong with it, and what is left
-        header, level = index.header, options.target.level
-        if level is not None and level > header.levels:
-            return False  # likewise
-        decoder = RowsDecoder(read, index, level)
         check_grid(options.out, header)
         needs = _Needs(decoder, options)
         try:

@@ -94,10 +94,17 @@ _CONFINED = "landlock+seccomp"
 
 
 class _LaterError(Exception):
-    """The system has no room, or nothing else that a build needs, now."""
+    """The system has no room, or nothing else that a build needs, now.
 
-    def __init__(self, what: str) -> None:
+    Attributes
+    ----------
+    held : bool
+        Something is held by another process, as the folder of a build by one of the server before.
+    """
+
+    def __init__(self, what: str, held: bool = False) -> None:
         super().__init__(f"waits for {what}")
+        self.held = held
 
     @classmethod
     def of(cls, number: int | None) -> _LaterError:
@@ -105,7 +112,8 @@ class _LaterError(Exception):
         return cls(
             "space on the server's disk"
             if number in worker.NO_ROOM
-            else f"the server's system ({os.strerror(number or 0)})"
+            else f"the server's system ({os.strerror(number or 0)})",
+            held=number == errno.EAGAIN,
         )
 
 
@@ -403,7 +411,7 @@ class Builder:
         job = self._job(record, folder)
         begun = await asyncio.to_thread(_identities, job.files)
         allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory, self._threads)
-        continued = False
+        continued = held = False
 
         def begin() -> None:
             # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
@@ -433,10 +441,14 @@ class Builder:
                 _log.warning("the build of %s begins anew, since continued it ended so: %s", record.id, result.reason)
                 return None
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
+        except _LaterError as error:
+            held = error.held
+            raise
         finally:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
-            await _removed(folder, partial(self._storage.keep_interrupted, record.id) if self._closing else None)
+            keep = partial(self._storage.keep_interrupted, record.id) if self._closing or held else None
+            await _removed(folder, keep)
 
     async def _run(self, work: Awaitable[_T]) -> _T | worker.Refused:
         try:

@@ -124,6 +124,12 @@ def test_small_arrays_make_no_folder(tmp_path: Path) -> None:
     assert not (tmp_path / "room").exists()
 
 
+def test_an_empty_array_is_in_no_file(tmp_path: Path) -> None:
+    made = Room(lambda: Scratch(tmp_path / "room"), 0).empty((0, 3), np.float64)
+    assert (made.shape, made.dtype) == ((0, 3), np.float64)
+    assert not scratch.is_made(made)
+
+
 def test_there_is_no_limit_of_vertices_where_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "surface.npy"
     _write(path, "npy")

@@ -147,11 +147,15 @@ def test_a_process_of_the_server_before_is_waited_for(tmp_path: Path, upload: tu
     first, location = _begin(data, name, content)
     first.stop()
     (mark,) = (data / "interrupted").glob("*/.lodestream-build")
+    left = _made(data)
     with mark.open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with server(data, build_memory=MEMORY) as second, second.client() as http:
             eventually(lambda: "waits for the server's system" in second.log.read_text(), "a build that waits")
             assert http.get(location).json()["state"] in ("queued", "building")
+            eventually(
+                lambda: left in (_made(data / "interrupted"), _made(data / "work")), "what was made, still there"
+            )
             held.close()
             assert _container(http, location) == container
 
