@@ -16,12 +16,14 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "is_made", "rows_at_once"]
+__all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "boot_id", "is_made", "rows_at_once"]
 
 _SUFFIX = ".npy"
 _UNFINISHED = ".part"
 #: Attribute of the maps of files that a `Room` has made.
 _MADE = "_lodestream_made"
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 #: Headers are parsed by one thread at a time: Python 3.11 raises SystemError now and then where several parse at once.
 _parsing = Lock()
@@ -33,6 +35,17 @@ def _parse_anew() -> None:
 
 
 os.register_at_fork(after_in_child=_parse_anew)  # another thread may have been parsing when the process forked
+
+
+def boot_id() -> str | None:
+    """What tells this start of the system from others; None where it is not told.
+
+    Files of a build are not synchronised to disk: after a power failure one may have its length and not its contents.
+    """
+    try:
+        return _BOOT_ID.read_text().strip()
+    except OSError:
+        return None
 
 
 class DamagedError(ValueError):

@@ -22,7 +22,7 @@ from ..encoding.prepared import Prepared, prepare
 from ..errors import InputError
 from ..parallel import threads
 from ..quality import Quality
-from ..scratch import DamagedError, Room, Scratch, is_made
+from ..scratch import DamagedError, Room, Scratch, boot_id, is_made
 from ..surface import Surface
 from .build import Build
 from .building import Building, OutOfRangeError
@@ -199,6 +199,7 @@ class Made:
         block = self._surface.blocks[0]
         said = {
             "version": __version__,
+            "boot": boot_id(),
             "quality": repr(self._quality),
             "closed": block.closed,
             "attributes": list(block.attributes),

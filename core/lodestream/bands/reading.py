@@ -10,7 +10,7 @@ from typing import Any
 from .. import __version__
 from ..errors import InputError
 from ..formats import read
-from ..scratch import Scratch
+from ..scratch import Scratch, boot_id
 from ..surface import Surface
 from .front import default_memory
 from .memory import WHOLE
@@ -56,6 +56,7 @@ def read_into(
     key = json.dumps(
         [
             __version__,
+            boot_id(),
             [[str(path.resolve()), *state] for path, state in zip(paths, states, strict=True)],
             sorted((name, repr(value)) for name, value in options.items()),
         ]

@@ -16,6 +16,8 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
+from lodestream.scratch import boot_id
+
 from .durable import discard, make_folder, remove
 from .folders import Folders
 
@@ -29,21 +31,20 @@ SCRATCH, BANDS = "scratch", "bands"
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
-_BOOT = Path("/proc/sys/kernel/random/boot_id")
-
-
 def same_boot(at: Folders) -> bool:
     """Whether the last server of a folder ran since the system was started; notes down that this one does.
 
     Where the system does not tell one start from another, or the note is not there whole, it is False.
     """
+    now = boot_id()
+    if now is None:
+        return False
     try:
-        now = _BOOT.read_bytes()
-        same = at.boot.exists() and at.boot.read_bytes() == now
+        same = at.boot.exists() and at.boot.read_text() == now
         if not same:
             at.boot.touch(0o600)
-            at.boot.write_bytes(now)
-    except OSError:
+            at.boot.write_text(now)
+    except (OSError, UnicodeDecodeError):
         return False
     return same
 

@@ -223,6 +223,23 @@ def test_a_source_goes_on_if_its_values_are_the_same(
     assert {path.name for path in tmp_path.iterdir()} == {"a.lode"}
 
 
+def test_after_a_restart_of_the_machine_a_build_begins_anew(
+    tmp_path: Path, cut: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface, scratch = _heights(), tmp_path / "scratch"
+    cut(2)
+    with pytest.raises(KeyboardInterrupt):
+        ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
+    monkeypatch.undo()
+    # As a power failure leaves what was not on disk yet.
+    for path in scratch.glob("tasks/*/exact/**/*.npy"):
+        content = path.read_bytes()
+        path.write_bytes(content[:128] + bytes(len(content) - 128))
+    monkeypatch.setattr(made, "boot_id", lambda: "another")
+    ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
+    assert (tmp_path / "a.lode").read_bytes() == ls.encode(surface)
+
+
 @pytest.mark.parametrize("name", ["surface", "exact/coefficients"])
 @pytest.mark.parametrize("length", [0, 60, 200])
 def test_files_that_a_failure_of_the_machine_cut_are_made_again(

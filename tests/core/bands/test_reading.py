@@ -67,6 +67,16 @@ def test_a_file_that_is_written_to_while_it_is_read_is_refused(tmp_path: Path, m
     assert np.array_equal(_read(tmp_path).points, _values())
 
 
+def test_after_a_restart_of_the_machine_a_file_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    _write(tmp_path / "a.tif", _values())
+    _read(tmp_path)
+    path = tmp_path / "files" / "arrays" / "1.npy"
+    content = path.read_bytes()
+    path.write_bytes(content[:128] + bytes(len(content) - 128))
+    monkeypatch.setattr(reading, "boot_id", lambda: "another")
+    assert np.array_equal(_read(tmp_path).points, _values())
+
+
 @pytest.mark.parametrize("name", ["arrays/1.npy", "surface.msgpack", "files.json"])
 @pytest.mark.parametrize("length", [0, 30])
 def test_files_that_a_failure_of_the_machine_cut_are_read_again(tmp_path: Path, name: str, length: int) -> None:
