@@ -366,7 +366,6 @@ class Builder:
     async def _insist(self, record: Record) -> State:
         """Try until it is ready or refused."""
         if record.attempts >= _CRASHES:
-            await asyncio.to_thread(self._storage.forget_interrupted, record.id)
             return await self._postpone(record, f"the server ended {record.attempts} times while this was being built")
         deaths = endings = 0
         while True:
@@ -393,6 +392,7 @@ class Builder:
         """What becomes of a surface whose upload is not there, or not what was acknowledged; None where it is."""
         if not await asyncio.to_thread(self._storage.has_upload, record):
             await asyncio.to_thread(self._storage.lose, record.id)
+            await asyncio.to_thread(self._storage.forget_interrupted, record.id)
             return "missing"
         problem = await self._damage(record)
         return None if problem is None else await self._postpone(record, problem)
@@ -521,6 +521,7 @@ class Builder:
     async def _postpone(self, record: Record, reason: str) -> State:
         _log.warning("%s waits for a retry: %s", record.id, reason)
         await asyncio.to_thread(self._storage.postpone, record.id, reason)
+        await asyncio.to_thread(self._storage.forget_interrupted, record.id)  # a retry begins with the upload
         return "waiting"
 
     def _out_of_memory(self) -> str:

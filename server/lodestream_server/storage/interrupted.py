@@ -93,10 +93,10 @@ def put_back(at: Folders, surface: str, work: Path) -> bool:
 
 
 def forget(at: Folders, surface: str) -> None:
-    """Remove what was kept for a surface."""
+    """Remove what was kept for a surface; what cannot be removed stays for the next start."""
     kept = at.interrupted / surface
     if os.path.lexists(kept):
-        remove(kept)
+        discard(kept)
 
 
 def clean(at: Folders, queued: set[str]) -> None:

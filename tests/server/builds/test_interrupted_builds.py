@@ -277,3 +277,19 @@ def test_where_it_cannot_be_put_back_the_build_begins_anew(tmp_path: Path) -> No
     (work / interrupted.SCRATCH / interrupted.BANDS / "in the way").mkdir(parents=True)
     assert not interrupted.put_back(at, "ab", work)
     assert list(at.interrupted.iterdir()) == []
+
+
+@pytest.mark.parametrize("upload", ["npy"], indirect=True)
+def test_nothing_is_kept_for_a_surface_whose_upload_is_damaged(
+    tmp_path: Path, upload: tuple[str, bytes, bytes]
+) -> None:
+    name, content, _ = upload
+    data = tmp_path / "data"
+    first, location = _begin(data, name, content)
+    first.stop()
+    (file,) = (data / "uploads").glob("*/0")
+    with file.open("r+b") as damaged:
+        damaged.write(b"\0")
+    with server(data, build_memory=MEMORY) as second, second.client() as http:
+        assert settled(http, location)["state"] == "waiting"
+        eventually(lambda: not list((data / "interrupted").iterdir()), "an empty folder")
