@@ -84,6 +84,13 @@ def _begin(data: Path, name: str, content: bytes) -> tuple[Server, str]:
     return running, location
 
 
+def _end(data: Path, location: str, container: bytes, memory: int = MEMORY) -> str:
+    """What the next server writes to its log until it has built this container."""
+    with server(data, build_memory=memory) as second, second.client() as http:
+        assert _container(http, location) == container
+        return second.log.read_text()
+
+
 @pytest.mark.parametrize(("upload", "end"), [("npy", Server.kill), ("tif", Server.stop)], indirect=["upload"])
 def test_a_build_continues_after_its_server_has_ended(
     tmp_path: Path, upload: tuple[str, bytes, bytes], end: Callable[[Server], object]
@@ -136,8 +143,7 @@ def test_a_build_with_other_memory_begins_anew(tmp_path: Path, upload: tuple[str
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.kill()
-    with server(data, build_memory=MEMORY + (40 << 20)) as second, second.client() as http:
-        assert _container(http, location) == container
+    _end(data, location, container, MEMORY + (40 << 20))
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
@@ -169,8 +175,7 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
     for number, path in enumerate(sorted((data / "work").glob(f"**/{interrupted.BANDS}/tasks/**/*.npy"))):
         if number % 5 == 0:
             os.truncate(path, path.stat().st_size // 2)
-    with server(data, build_memory=MEMORY) as second, second.client() as http:
-        assert _container(http, location) == container
+    _end(data, location, container)
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
@@ -184,9 +189,7 @@ def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
     (exact,) = (data / "work").glob("**/exact")
     shutil.rmtree(exact)
     exact.touch()
-    with server(data, build_memory=MEMORY) as second, second.client() as http:
-        assert _container(http, location) == container
-        text = second.log.read_text()
+    text = _end(data, location, container)
     assert text.count("continues from what an interrupted attempt had made") == 1
     assert text.count("begins anew, since continued it ended so: the build failed with an internal error") == 1
 
@@ -202,10 +205,8 @@ def test_after_a_restart_of_the_machine_the_build_begins_anew(
     end(first)
     now = (data / "boot-id").read_bytes()
     (data / "boot-id").write_bytes(now[::-1])
-    with server(data, build_memory=MEMORY) as second, second.client() as http:
-        assert (data / "boot-id").read_bytes() == now
-        assert _container(http, location) == container
-        assert "continues" not in second.log.read_text()
+    assert "continues" not in _end(data, location, container)
+    assert (data / "boot-id").read_bytes() == now
     assert not (data / "interrupted").exists() or not list((data / "interrupted").iterdir())
 
 
