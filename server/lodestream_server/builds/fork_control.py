@@ -94,7 +94,8 @@ class ForkServer:
     @property
     def confinement(self) -> tuple[str, ...] | None:
         """How the kernel confines the processes of calls, see `lodestream.confinement`; None before it is known."""
-        return None if self._started is None else self._started.confinement
+        started = self._started  # another thread may end it meanwhile
+        return None if started is None else started.confinement
 
     def wait(self, given_up: Callable[[], bool] = lambda: False) -> str | None:
         """Start it, and wait until it is ready, or until `given_up` returns True.

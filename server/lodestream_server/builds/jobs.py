@@ -92,6 +92,9 @@ _T = TypeVar("_T")
 
 _CONFINED = "landlock+seccomp"
 
+# For so long what was made for a build is kept while another process holds it.
+_HELD_SECONDS = 600.0
+
 
 class _LaterError(Exception):
     """The system has no room, or nothing else that a build needs, now.
@@ -159,6 +162,8 @@ class Builder:
         self._check_owner: Callable[[str | None], Awaitable[None]] | None = None
         self._pending: Counter[str] = Counter()
         self._running: dict[str, _Running] = {}
+        #: Since when the folder of a surface's build is held by another process.
+        self._held: dict[str, float] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._preloading: asyncio.Task[None] | None = None
         self._room = asyncio.Event()
@@ -223,6 +228,7 @@ class Builder:
 
     def _ended(self, surface: str) -> None:
         self._tasks.pop(surface, None)
+        self._held.pop(surface, None)
         caller = self._callers.pop(surface)
         self._pending[caller] -= 1
         if not self._pending[caller]:
@@ -411,13 +417,16 @@ class Builder:
         job = self._job(record, folder)
         begun = await asyncio.to_thread(_identities, job.files)
         allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory, self._threads)
-        continued = held = False
+        continued = held = ended = False
 
         def begin() -> None:
             # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
             nonlocal continued
+            confinement = self.confinement
+            if confinement is None:  # the process that others are forked from has died, and is started again
+                raise BlockingIOError(errno.EAGAIN, "it is not known yet how builds are confined")
             # Who builds by Dask is not confined, and a confined process may have been taken over.
-            may_continue = self.confinement == _CONFINED and not job.shared
+            may_continue = confinement == _CONFINED and not job.shared
             continued = self._storage.new_work(record.id, folder, may_continue)
 
         call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
@@ -431,6 +440,7 @@ class Builder:
                 result = await self._keep(record, job, result)
             if result is None:
                 return "ready"
+            ended = True
             await asyncio.to_thread(discard, folder)  # whoever sees that it has failed sees nothing of it
             # A build may read the files that were there when it began: not those of the same bytes that somebody has
             # uploaded after the last owner of the first had deleted them.
@@ -442,13 +452,23 @@ class Builder:
                 return None
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
         except _LaterError as error:
-            held = error.held
+            held = error.held and self._is_held_shortly(record.id)
             raise
+        except (MemoryError, ProcessDiedError) as error:
+            if not continued or self._closing:
+                raise
+            _log.warning("the build of %s begins anew, since continued it ended so: %s", record.id, error)
+            return None
         finally:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
-            keep = partial(self._storage.keep_interrupted, record.id) if self._closing or held else None
+            keeps = held or (self._closing and not ended)
+            keep = partial(self._storage.keep_interrupted, record.id) if keeps else None
             await _removed(folder, keep)
+
+    def _is_held_shortly(self, surface: str) -> bool:
+        """Whether what holds the folder of a build may let go of it yet, as a process that is ending does."""
+        return time.monotonic() - self._held.setdefault(surface, time.monotonic()) < _HELD_SECONDS
 
     async def _run(self, work: Awaitable[_T]) -> _T | worker.Refused:
         try:

@@ -9,10 +9,9 @@
     DATA/containers/{sha256}.lode     never changed, named by their SHA-256, shared likewise
     DATA/incoming/                    uploads in progress
     DATA/work/                        builds in progress
-    DATA/interrupted/{id}/            what a build by bands had made when it was interrupted
+    DATA/interrupted/{id}.{start}/    what a build by bands had made when it was interrupted
     DATA/levels/                      level files made on request, removed at each start
     DATA/damaged/                     files moved away by a start or by ``lodestream fsck --repair``
-    DATA/boot-id                      of the system when the last server started, see `interrupted`
     DATA/lock                         locked by the one process that uses the folder
 
 Records, uploads and containers are always complete: they are written elsewhere, synchronised, and renamed. Each of the
@@ -87,15 +86,10 @@ class Folders:
         return self.root / "damaged"
 
     @property
-    def boot(self) -> Path:
-        """Which start of the system the last server ran in."""
-        return self.root / "boot-id"
-
-    @property
     def known(self) -> Collection[str]:
         """Names of everything that may be in the data folder."""
         # A disk of its own has lost+found.
-        files = ("lock", self.boot.name, "marking", "tokens.json", "lost+found")
+        files = ("lock", "marking", "tokens.json", "lost+found")
         return {*files, self.damaged.name, *(folder.name for folder in self.written)}
 
     @property

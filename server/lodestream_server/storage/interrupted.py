@@ -5,7 +5,8 @@ ends meanwhile, that folder is moved aside, and moved into the folder of the nex
 server itself reads nothing in it: a stranger's file may have taken over the process that wrote it, and some of the
 files are pickles. Only the next process reads them, which is confined in the same way and to the same surface.
 
-The files are not synchronised to disk. So they are used only as long as the system has not been started again.
+The files are not synchronised to disk, and are not to be used after a power failure. So the names of both folders end
+with what tells this start of the system from others, and what has another name is never used.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lodestream.scratch import boot_id
 from .durable import discard, make_folder, remove
 from .folders import Folders
 
-__all__ = ["BANDS", "SCRATCH", "clean", "forget", "keep", "put_back", "same_boot"]
+__all__ = ["BANDS", "SCRATCH", "clean", "forget", "keep", "put_back", "work_name"]
 
 _log = logging.getLogger(__name__)
 
@@ -31,22 +32,15 @@ SCRATCH, BANDS = "scratch", "bands"
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
-def same_boot(at: Folders) -> bool:
-    """Whether the last server of a folder ran since the system was started; notes down that this one does.
+def work_name(surface: str, token: str) -> str:
+    """The name of a job's folder."""
+    return f"{surface}.{token}.{boot_id()}"
 
-    Where the system does not tell one start from another, or the note is not there whole, it is False.
-    """
-    now = boot_id()
-    if now is None:
-        return False
-    try:
-        same = at.boot.exists() and at.boot.read_text() == now
-        if not same:
-            at.boot.touch(0o600)
-            at.boot.write_text(now)
-    except (OSError, UnicodeDecodeError):
-        return False
-    return same
+
+def _kept(at: Folders, surface: str) -> Path | None:
+    """Where what was made since the system was started is kept; None where the system does not tell its starts."""
+    boot = boot_id()
+    return None if boot is None else at.interrupted / f"{surface}.{boot}"
 
 
 def keep(at: Folders, surface: str, work: Path) -> None:
@@ -54,6 +48,9 @@ def keep(at: Folders, surface: str, work: Path) -> None:
 
     No process may be at work there any more. Where it is not possible, nothing is kept.
     """
+    kept = _kept(at, surface)
+    if kept is None or kept.suffix != work.suffix:
+        return
     try:
         handle = os.open(work, _FOLDER)
     except OSError:
@@ -66,7 +63,7 @@ def keep(at: Folders, surface: str, work: Path) -> None:
                 return
             at.interrupted.mkdir(exist_ok=True)
             forget(at, surface)
-            os.rename(BANDS, at.interrupted / surface, src_dir_fd=inner)
+            os.rename(BANDS, kept, src_dir_fd=inner)
         finally:
             os.close(inner)
     except FileNotFoundError:
@@ -79,8 +76,8 @@ def keep(at: Folders, surface: str, work: Path) -> None:
 
 def put_back(at: Folders, surface: str, work: Path) -> bool:
     """Move what was kept into the folder of a job, which is new; returns whether there was any, and it could be."""
-    kept = at.interrupted / surface
-    if not kept.is_dir():
+    kept = _kept(at, surface)
+    if kept is None or not kept.is_dir():
         return False
     try:
         make_folder(work / SCRATCH)
@@ -94,14 +91,14 @@ def put_back(at: Folders, surface: str, work: Path) -> bool:
 
 def forget(at: Folders, surface: str) -> None:
     """Remove what was kept for a surface; what cannot be removed stays for the next start."""
-    kept = at.interrupted / surface
-    if os.path.lexists(kept):
-        discard(kept)
+    for path in at.interrupted.glob(f"{surface}.*"):
+        discard(path)
 
 
 def clean(at: Folders, queued: set[str]) -> None:
-    """Remove what was kept for surfaces that do not wait for a build."""
+    """Remove what was kept for surfaces that do not wait for a build, or before the system was started."""
+    wanted = {_kept(at, surface) for surface in queued}
     with suppress(FileNotFoundError):
         for path in list(at.interrupted.iterdir()):
-            if path.name not in queued:
+            if path not in wanted:
                 remove(path)

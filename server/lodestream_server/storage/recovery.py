@@ -66,13 +66,10 @@ def recover(at: Folders) -> list[Record]:
     found = {surface: present(at, record) for surface, record in records.items()}
     _set_strays_aside(at, found)
     queued = {surface for surface, record in found.items() if record.state == "queued"}
-    if not interrupted.same_boot(at):
-        interrupted.clean(at, set())
-    else:
-        for path in at.work.iterdir():
-            if (surface := path.name.partition(".")[0]) in queued:
-                interrupted.keep(at, surface, path)
-        interrupted.clean(at, queued)
+    for path in at.work.iterdir():
+        if (surface := path.name.partition(".")[0]) in queued:
+            interrupted.keep(at, surface, path)
+    interrupted.clean(at, queued)
     for folder in (at.incoming, at.work):
         for path in folder.iterdir():
             remove(path)

@@ -119,7 +119,7 @@ class Storage:
 
         A folder that still exists at the next start shows that the server ended during the build.
         """
-        return self._at.work / f"{surface}.{secrets.token_hex(8)}"
+        return self._at.work / interrupted.work_name(surface, secrets.token_hex(8))
 
     def keep_interrupted(self, surface: str, work: Path) -> None:
         """Keep what an interrupted build by bands has made in its folder, see `interrupted.keep`."""

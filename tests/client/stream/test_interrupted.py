@@ -211,8 +211,10 @@ def test_for_people_there_is_a_line_of_figures(relief_surface: str, folder: Path
         code, stdout, stderr = end(process)
     assert (code, stdout) == (130, "")
     # Somebody who interrupts is not kept waiting: on a busy machine the name may not come in time, and that is told.
-    late = "lodestream: written without metadata such as name and position, which could not be fetched: "
-    first, figures, last = [line for line in stderr.splitlines() if not line.startswith(late)]
+    late = "lodestream: written without metadata such as name and position, which "
+    lines = [line for line in stderr.splitlines() if line.startswith("lodestream: ") and not line.startswith(late)]
+    assert len(lines) == 3, stderr
+    first, figures, last = lines
     assert first == "lodestream: interrupted"
     assert figures.startswith("lodestream: stopped: level ")
     assert "maximum" in figures

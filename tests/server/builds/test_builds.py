@@ -252,7 +252,6 @@ def test_what_a_dead_server_left_half_done_is_swept_away(tmp_path: Path) -> None
     files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file() and path.name != MARKER)
     # What was whole, and nobody speaks of, is not removed.
     assert files == [
-        "boot-id",
         f"containers/{surface['container']}.lode",
         f"damaged/containers/{'0' * 64}.lode",
         "damaged/uploads/0123456789abcdef0123/0",

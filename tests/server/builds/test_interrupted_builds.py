@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.scratch import boot_id
 from lodestream_server.storage import interrupted
 from lodestream_server.storage.folders import Folders
 from lodestream_server.storage.storage import Storage
@@ -127,7 +128,7 @@ def test_what_is_kept_of_a_surface_that_waits_for_no_build_is_removed(
     first, location = _begin(data, name, content)
     first.stop()
     surface = location.rpartition("/")[2]
-    assert [path.name for path in (data / "interrupted").iterdir()] == [surface]
+    assert [path.name for path in (data / "interrupted").iterdir()] == [f"{surface}.{boot_id()}"]
     for kept in ("0123456789abcdef0123", "other"):
         (data / "interrupted" / kept / "deep").mkdir(parents=True)
     with server(data, build_memory=MEMORY) as second, second.client() as http:
@@ -203,10 +204,9 @@ def test_after_a_restart_of_the_machine_the_build_begins_anew(
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     end(first)
-    now = (data / "boot-id").read_bytes()
-    (data / "boot-id").write_bytes(now[::-1])
+    (left,) = [*(data / "work").iterdir(), *(data / "interrupted").glob("*")]
+    left.rename(left.with_suffix(f".{(boot_id() or '')[::-1]}"))
     assert "continues" not in _end(data, location, container)
-    assert (data / "boot-id").read_bytes() == now
     assert not (data / "interrupted").exists() or not list((data / "interrupted").iterdir())
 
 
@@ -225,7 +225,7 @@ def test_where_a_build_may_not_continue_what_was_kept_is_removed(tmp_path: Path)
 
 
 def _work(at: Folders) -> Path:
-    work = at.work / "ab.0"
+    work = at.work / interrupted.work_name("ab", "0")
     (work / interrupted.SCRATCH).mkdir(parents=True)
     return work
 
