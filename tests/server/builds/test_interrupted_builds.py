@@ -18,6 +18,7 @@ from lodestream_server.storage import interrupted
 from lodestream_server.storage.folders import Folders
 from lodestream_server.storage.storage import Storage
 from tests.core.surfaces import terrain
+from tests.server.builds.test_confinement import needs_landlock
 from tests.server.helpers import eventually, settled
 from tests.server.programs import Server, server
 
@@ -92,6 +93,7 @@ def _end(data: Path, location: str, container: bytes, memory: int = MEMORY) -> s
         return second.log.read_text()
 
 
+@needs_landlock  # what is not confined does not continue
 @pytest.mark.parametrize(("upload", "end"), [("npy", Server.kill), ("tif", Server.stop)], indirect=["upload"])
 def test_a_build_continues_after_its_server_has_ended(
     tmp_path: Path, upload: tuple[str, bytes, bytes], end: Callable[[Server], object]
@@ -147,6 +149,7 @@ def test_a_build_with_other_memory_begins_anew(tmp_path: Path, upload: tuple[str
     _end(data, location, container, MEMORY + (40 << 20))
 
 
+@needs_landlock
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
 def test_a_process_of_the_server_before_is_waited_for(tmp_path: Path, upload: tuple[str, bytes, bytes]) -> None:
     name, content, container = upload
@@ -179,6 +182,7 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
     _end(data, location, container)
 
 
+@needs_landlock
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
 def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
     tmp_path: Path, upload: tuple[str, bytes, bytes]
