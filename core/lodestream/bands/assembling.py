@@ -130,7 +130,7 @@ def coded_layers(
     large : int
         The coarsest level whose units are large.
     """
-    first = build.table.tiles_from(large) if large else len(tops[0])
+    first = build.prepared.layout.tiles_from(large) if large else len(tops[0])
     starts = np.array([tiles.start for _, _, tiles in pieces])
     stored: dict[tuple[int, int], _Piece] = {}
     for channel, own in enumerate(tops):

@@ -1,4 +1,4 @@
-"""What every task of a build knows: the prepared surface, its lattices, its bands. Each worker opens it from files."""
+"""What every task of a build knows: the prepared surface, its lattices, its pieces. Workers open it from files."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ..encoding.prepared import Prepared
 from ..entropy.tiles import TileTable
 from ..scratch import Scratch
 from .geometry import CORE_POINTS, Bands
+from .grid_runs import GridRuns
 from .references import dump, load
 
 __all__ = ["Build"]
@@ -33,20 +34,20 @@ class _Facts:
 
 
 class Build:
-    """One stream of a surface of one grid, built by bands in a folder.
+    """One stream of a surface, built by pieces in a folder.
 
     Parameters
     ----------
     scratch : Scratch
         Of this stream alone.
     prepared : Prepared
-        Of a surface of one grid, with no `rms`; what is large in it is memory-mapped.
+        With no `rms`; what is large in it is memory-mapped.
     lattices : Lattices
         With no `fineness`.
     points : int
-        Of a band, about. It decides about memory, not about bytes.
+        Of a piece, about. It decides about memory, not about bytes.
     core_points : int
-        See `Bands`.
+        See `Bands` and `GridRuns`.
     """
 
     def __init__(
@@ -56,14 +57,14 @@ class Build:
         self.points, self._core_points = points, core_points
 
     @cached_property
-    def bands(self) -> Bands:
-        """Which tiles and rows each band has."""
-        return Bands(self.prepared.layout, self.points, self._core_points)
+    def pieces(self) -> Bands | GridRuns:
+        """What is worked on together: rows of the one grid, or some of several grids."""
+        kind = Bands if self.prepared.arrangement is None else GridRuns
+        return kind(self.prepared.layout, self.points, self._core_points)
 
-    @property
-    def table(self) -> TileTable:
-        """Of all tiles; the same for all channels, since no side is shared."""
-        return TileTable.of(self.prepared.layout)
+    def table(self, channel: int) -> TileTable:
+        """Of all tiles of a channel: points of interfaces are coordinates."""
+        return TileTable.of(self.prepared.layout, channel < self.prepared.geometric)
 
     @property
     def channels(self) -> int:

@@ -24,23 +24,20 @@ from ..encoding.residual_encoder import chunk_sample, chunk_size
 from ..encoding.transformed import band_weights
 from ..encoding.written import window_section_of
 from ..planning.window_errors import KIND as WINDOW_ERRORS
-from ..transform.predictors import COEFFICIENT_BITS, default_predictors
-from . import tasks
+from . import grid_tasks, tasks
 from .assembling import Chunks, coded_layers, returned_digest
 from .build import Build
 from .coding import parents_of, sizes_of_unit
 from .executing import Execution, Task
-from .forward import fit_columns, fit_rows
+from .grid_measuring import blocks_of_run
 from .measuring import Figures, ValuesOfRows, errors_of, kinds_of, measured_rows
-from .stored import PLAIN, kind_of, name_of, pieces_of, read_tiles, transformed
+from .stored import name_of, pieces_of, read_tiles, transformed
+from .transforming import planes_of_channel, transforming
 
 __all__ = ["Building", "OutOfRangeError"]
 
 #: Fractions of the time that the phases take, about: transform, coding, measuring, writing.
 _SHARES = 0.3, 0.3, 0.3, 0.1
-
-#: What the transform of a channel leaves.
-_TRANSFORMED = "samples", "columns", "halves", "nodes", "details", "coefficients", "planes", "rules", "core-rules"
 
 
 class OutOfRangeError(Exception):
@@ -79,105 +76,27 @@ class Building:
         self._measure()
         return self._assemble(out)
 
-    def _carry_out(self, share: float, phase: list[Task]) -> None:
+    def _carry_out(self, share: float, phase: Sequence[Task]) -> None:
         start = self._done
         self._execution.carry_out(phase, lambda fraction: self._progress(start + share * fraction))
         self._done = start + share
 
-    # Transform: level by level, from the finest one down.
+    # Transform.
 
     def _transform(self) -> None:
-        plain = [self._is_plain(channel) for channel in range(self._build.channels)]
-        if not self._scratch.has(PLAIN):
-            self._scratch.write(PLAIN, np.array(plain))
-        if not self._scratch.has("predictors"):
-            predictors = np.stack([self._predictors(channel) for channel in range(self._build.channels)])
-            self._scratch.write("predictors", predictors)
+        transforming(self._build, self._carry_out).carry_out(_SHARES[0])
         for channel, lattice in enumerate(self._build.lattices.channels):
             if not self._scratch.has(f"weights/{channel}"):
-                own = self._read("predictors")[channel]
-                weights = band_weights(self._build.prepared, channel, lattice, self._build.table, own)
+                own, table = self._read("predictors")[channel], self._build.table(channel)
+                weights = band_weights(self._build.prepared, channel, lattice, table, own)
                 self._scratch.write(f"weights/{channel}", weights)
-
-    def _is_plain(self, channel: int) -> bool:
-        """Transform a channel; whether it has the default predictors."""
-        overflow, share = f"overflow/{channel}", _SHARES[0] / self._build.channels
-        if not self._scratch.has(overflow):
-            self._transform_channel(channel, share, fit=True)
-            share = 0.0
-            if not self._fits(channel):
-                self._scratch.write(overflow, np.zeros(0))
-        plain = self._scratch.has(overflow)
-        if plain:
-            # Fitted predictors let coefficients grow beyond what a container holds; the default ones never do.
-            for kind in _TRANSFORMED:
-                self._scratch.remove(f"{kind}/{channel}")
-            self._transform_channel(channel, share, fit=False)
-        self._scratch.remove(f"{kind_of('samples', not plain)}/{channel}")
-        return plain
-
-    def _transform_channel(self, channel: int, share: float, fit: bool) -> None:
-        bands, finest = self._build.bands, self._layout.levels
-        done = f"{kind_of('core-rules', fit)}/{channel}"
-        if self._scratch.has(done):
-            self._done += share
-            return
-
-        def names(kind: str, level: int, pieces: Sequence[int]) -> list[str]:
-            return [name_of(kind_of(kind, fit), channel, level, k) for k in pieces]
-
-        def phase(names: list[str], function: Callable[..., None], *arguments: int) -> list[Task]:
-            return [Task(name, function, (channel, int(fit), *arguments, k)) for k, name in enumerate(names)]
-
-        count = len(tasks.sample_pieces(self._build, finest))
-        self._carry_out(share / 4, phase(names("columns", finest, range(count)), tasks.coordinates))
-        for level in reversed(bands.levels):
-            own = range(len(bands.of(level)))
-            part = share * 3 / 4 * self._layout.points(level) / (self._layout.points(finest) * 4 / 3)
-            sampled = names("columns", level, range(len(tasks.sample_pieces(self._build, level))))
-            self._fit(channel, level, 0, fit, sampled)
-            self._carry_out(part / 2, phase(names("details", level, own), tasks.first_step, level))
-            self._scratch.remove(f"{kind_of('samples', fit)}/{channel}/{level}")
-            self._fit(channel, level, 1, fit, names("nodes", level, own) + names("details", level, own))
-            self._carry_out(part / 2, phase(names("columns", level - 1, own), tasks.second_step, level))
-            # Not by the task: one whose worker dies when it has done this could not be done again.
-            self._scratch.remove(f"{kind_of('halves', fit)}/{channel}/{level}")
-        self._carry_out(0.0, [Task(done, tasks.core, (channel, int(fit)))])
-
-    def _fit(self, channel: int, level: int, axis: int, fit: bool, names: list[str]) -> None:
-        """Fit the predictor of an axis to what the pieces of a level have sampled, or let it be the default one."""
-        name = f"{kind_of('rules', fit)}/{channel}/{level}/{axis}"
-        if self._scratch.has(name):
-            return
-        rule = None
-        if fit:
-            fitted = fit_rows if axis == 0 else fit_columns
-            rule = fitted([self._read(sampled) for sampled in names], self._layout, level)
-        self._scratch.write(name, np.array(rule or (0, 0), np.int8))
-
-    def _fits(self, channel: int) -> bool:
-        return max(int(self._planes("planes", channel).max()), 0) <= COEFFICIENT_BITS
-
-    def _planes(self, kind: str, channel: int) -> NDArray[np.int8]:
-        """Bit-planes of all tiles of a channel, int8, shape (tile,)."""
-        return np.concatenate([self._read(name_of(kind, channel, level, k)) for level, k, _ in self._pieces])
-
-    def _predictors(self, channel: int) -> NDArray[np.int8]:
-        predictors = default_predictors(self._layout)
-        core, rules = (transformed(self._build, kind, channel) for kind in ("core-rules", "rules"))
-        coarsest = self._build.bands.core
-        predictors[:coarsest] = self._read(f"{core}/{channel}")[:coarsest]
-        for level in self._build.bands.levels:
-            for axis in range(2):
-                predictors[level - 1, axis] = self._read(f"{rules}/{channel}/{level}/{axis}")
-        return predictors
 
     # Coding.
 
     @cached_property
     def _tops(self) -> list[NDArray[np.int8]]:
-        channels = range(self._build.channels)
-        return [self._planes(transformed(self._build, "planes", channel), channel) for channel in channels]
+        build, channels = self._build, range(self._build.channels)
+        return [planes_of_channel(build, transformed(build, "planes", channel), channel) for channel in channels]
 
     def _code(self) -> None:
         if not self._scratch.has("large"):
@@ -195,11 +114,12 @@ class Building:
             for channel, tops in enumerate(self._tops):
                 if not tops[tile]:
                     continue
-                parents = parents_of(self._build.table, range(tile, tile + 1))
+                table = self._build.table(channel)
+                parents = parents_of(table, range(tile, tile + 1))
                 kind = transformed(self._build, "coefficients", channel)
                 above = read_tiles(self._build, kind, channel, parents) if parents else np.zeros(0, np.int32)
                 true = read_tiles(self._build, kind, channel, range(tile, tile + 1))
-                sizes.append(sizes_of_unit(self._build.table, tile, true, above, int(tops[tile]), level))
+                sizes.append(sizes_of_unit(table, tile, true, above, int(tops[tile]), level))
         return level if worth([large for large, _ in sizes], [small for _, small in sizes]) else 0
 
     @property
@@ -247,16 +167,23 @@ class Building:
 
     # Errors and residual.
 
+    @property
+    def _is_one_grid(self) -> bool:
+        return self._build.prepared.arrangement is None
+
     def _measure(self) -> None:
         if not self._scratch.has("chunk"):
             self._scratch.write("chunk", np.array(self._chunk()))
         rows, columns = (int(exponent) for exponent in self._read("chunk"))
         self._build.save_header(replace(self._header, chunk=(rows, columns)))
-        self._carry_out(_SHARES[2], [Task(f"exact/{k}", tasks.measure, (k,)) for k in range(self._runs)])
+        measure = tasks.measure if self._is_one_grid else grid_tasks.measure
+        self._carry_out(_SHARES[2], [Task(f"exact/{k}", measure, (k,)) for k in range(self._runs)])
 
     @property
     def _runs(self) -> int:
-        """How many runs of rows are measured."""
+        """How many runs of rows, or of blocks, are measured."""
+        if not self._is_one_grid:
+            return len(blocks_of_run(self._build.prepared, self._build.points))
         rows, columns = (int(exponent) for exponent in self._read("chunk"))
         return len(measured_rows(self._build.prepared, (rows, columns), self._build.points))
 
@@ -328,7 +255,7 @@ class Building:
         return writer.end(levels)
 
     def _has_small(self, tiles: range) -> bool:
-        return tiles.start < self._build.table.tiles_from(self._large)
+        return tiles.start < self._layout.tiles_from(self._large)
 
     def _read(self, name: str) -> NDArray[Any]:
         return self._scratch.read(name)

@@ -1,17 +1,31 @@
-"""What tasks leave for each other: pieces of a channel's flat arrays, by the tiles that they hold."""
+"""What tasks leave for each other: names of files, and pieces of a channel's flat arrays by the tiles they hold."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..entropy.part_table import flat_span
+from ..transform.predictors import default_predictors
 from .build import Build
+from .measuring import Figures
 
-__all__ = ["PLAIN", "kind_of", "name_of", "pieces_of", "read_tiles", "stored_tiles", "transformed"]
+__all__ = [
+    "CORE",
+    "PLAIN",
+    "kind_of",
+    "name_of",
+    "name_of_fit",
+    "pieces_of",
+    "read_tiles",
+    "rules_of",
+    "stored_tiles",
+    "transformed",
+    "write_measured",
+]
 
 #: The file that says which channels are transformed with the default predictors, bool, shape (channel,).
 PLAIN = "plain"
@@ -23,6 +37,11 @@ CORE = 0
 def name_of(kind: str, channel: int, level: int, band: int) -> str:
     """The name of a file."""
     return f"{kind}/{channel}/{level}/{band}"
+
+
+def name_of_fit(kind: str, channel: int, fit: int, *place: int) -> str:
+    """The name of a file of a channel's transform, see `kind_of`, or of a folder: level, piece and so on follow."""
+    return "/".join([kind_of(kind, bool(fit)), *map(str, (channel, *place))])
 
 
 def kind_of(kind: str, fit: bool) -> str:
@@ -40,9 +59,9 @@ def transformed(build: Build, kind: str, channel: int) -> str:
 
 def pieces_of(build: Build) -> list[tuple[int, int, range]]:
     """All pieces: level, band and tiles of each, parents before children. The core stands under its finest level."""
-    bands = build.bands
-    pieces = [(bands.core, CORE, bands.core_tiles)]
-    return pieces + [(level, band.number, band.tiles) for level in bands.levels for band in bands.of(level)]
+    pieces = build.pieces
+    core = (pieces.core, CORE, pieces.core_tiles)
+    return [core, *((level, piece.number, piece.tiles) for level in pieces.levels for piece in pieces.of(level))]
 
 
 def stored_tiles(build: Build, kind: str, channel: int, tiles: range) -> Iterator[tuple[slice, NDArray[Any]]]:
@@ -50,11 +69,11 @@ def stored_tiles(build: Build, kind: str, channel: int, tiles: range) -> Iterato
 
     Yields where a piece goes among that of these tiles, and what it has, shape (number,), not to be changed.
     """
-    table, bands = build.table, build.bands
+    table, core = build.table(channel), build.pieces.core
     level = build.prepared.layout.level_of(tiles.start)
     wanted = flat_span(table, tiles)
     for at, number, own in pieces_of(build):
-        if at != max(level, bands.core) or own.stop <= tiles.start or own.start >= tiles.stop:
+        if at != max(level, core) or own.stop <= tiles.start or own.start >= tiles.stop:
             continue
         piece, place = build.scratch.read(name_of(kind, channel, at, number)), flat_span(table, own)
         low, high = max(place.start, wanted.start), min(place.stop, wanted.stop)
@@ -63,7 +82,7 @@ def stored_tiles(build: Build, kind: str, channel: int, tiles: range) -> Iterato
 
 def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[Any]:
     """The same in one array, shape (number,). There is at least one tile."""
-    span = flat_span(build.table, tiles)
+    span = flat_span(build.table(channel), tiles)
     found: NDArray[Any] | None = None
     for place, piece in stored_tiles(build, kind, channel, tiles):
         if found is None:
@@ -71,3 +90,25 @@ def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[A
         found[place] = piece
     assert found is not None  # every tile is in a piece
     return found
+
+
+def rules_of(build: Build, channel: int, fit: int, level: int, rules: Sequence[int]) -> NDArray[np.int8]:
+    """Predictors that tell some rules of a level alone, axes or `INTERFACES`; int8, shape (level, rule, 2)."""
+    predictors = default_predictors(build.prepared.layout)
+    for rule in rules:
+        predictors[level - 1, rule] = build.scratch.read(name_of_fit("rules", channel, fit, level, rule))
+    return predictors
+
+
+def write_measured(
+    build: Build, number: int, figures: Figures, chunks: Sequence[bytes], kept: Sequence[bytes], exact: Sequence[bool]
+) -> None:
+    """Write what the run of this number tells of errors; its chunks, and those of holes that are kept."""
+    scratch = build.scratch
+    scratch.write(f"squares/{number}", figures.squares)
+    scratch.write(f"equal/{number}", figures.equal)
+    scratch.write(f"counts/{number}", figures.counts)
+    for kind, own in (("chunks", chunks), ("kept-chunks", kept)):
+        scratch.write(f"{kind}/{number}", np.frombuffer(b"".join(own), np.uint8))
+        scratch.write(f"{kind}-lengths/{number}", np.array([len(chunk) for chunk in own], np.int64))
+    scratch.write(f"exact/{number}", np.array(exact))

@@ -8,20 +8,28 @@ from __future__ import annotations
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..decoding.rows import RowsGeometry
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
 from ..entropy.part_table import part_of
 from ..entropy.tiles import Tiles
 from ..scratch import Room, Scratch
-from ..transform.predictors import default_predictors
 from ..transform.pyramid import empty
 from . import forward
 from .build import Build
 from .coding import Units, code_segments, code_units, parents_of
+from .geometry import Bands
 from .measuring import RowsMeasurer, chunks_of_rows, kinds_of, measured_rows
-from .stored import CORE, kind_of, name_of, read_tiles, stored_tiles, transformed
+from .stored import (
+    CORE,
+    name_of,
+    name_of_fit,
+    read_tiles,
+    rules_of,
+    stored_tiles,
+    transformed,
+    write_measured,
+)
 from .windows import RowsGiven, window_core
 
 __all__ = [
@@ -45,7 +53,7 @@ def sample_pieces(build: Build, level: int) -> list[tuple[int, int]]:
     """The rows of each piece of a level's samples."""
     if level == build.prepared.layout.levels and build.prepared.surface.blocks[0].mask is not None:
         return strips(build.prepared)
-    return build.bands.samples(level)
+    return _bands(build).samples(level)
 
 
 def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
@@ -60,8 +68,10 @@ def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
     try:
         samples = room.empty(shape, np.int32) if own.folder.exists() else empty(shape)
         coordinates_of_strip(build.prepared, channel, build.lattices.channels[channel], rows, samples, room)
-        build.scratch.write(_name("samples", channel, fit, layout.levels, piece), samples)
-        build.scratch.write(_name("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples))
+        build.scratch.write(name_of_fit("samples", channel, fit, layout.levels, piece), samples)
+        build.scratch.write(
+            name_of_fit("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples)
+        )
     finally:
         own.clear()
 
@@ -69,14 +79,14 @@ def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
 def first_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:
     """The step along the rows' axis of a band; ``fit`` as in `core`."""
     build = Build.open(folder)
-    layout, own = build.prepared.layout, build.bands.of(level)[band]
-    predictors = _rules(build, channel, fit, level, 0)
-    name = f"{kind_of('samples', bool(fit))}/{channel}/{level}"
+    layout, own = build.prepared.layout, _bands(build).of(level)[band]
+    predictors = rules_of(build, channel, fit, level, [0])
+    name = name_of_fit("samples", channel, fit, level)
     stepped = forward.first_step(build.scratch, name, sample_pieces(build, level), layout, own, predictors)
     nodes, details = forward.sampled_rows(stepped, layout, own)
-    build.scratch.write(_name("halves", channel, fit, level, band), stepped)
-    build.scratch.write(_name("nodes", channel, fit, level, band), nodes)
-    build.scratch.write(_name("details", channel, fit, level, band), details)
+    build.scratch.write(name_of_fit("halves", channel, fit, level, band), stepped)
+    build.scratch.write(name_of_fit("nodes", channel, fit, level, band), nodes)
+    build.scratch.write(name_of_fit("details", channel, fit, level, band), details)
 
 
 def second_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:
@@ -85,28 +95,28 @@ def second_step(folder: str, channel: int, fit: int, level: int, band: int) -> N
     ``fit`` as in `core`.
     """
     build = Build.open(folder)
-    layout, own = build.prepared.layout, build.bands.of(level)[band]
-    stepped = np.array(build.scratch.read(_name("halves", channel, fit, level, band)))
-    predictors = _rules(build, channel, fit, level, 1)
-    nodes, flat, planes = forward.second_step(stepped, layout, own, predictors, build.table)
-    build.scratch.write(_name("samples", channel, fit, level - 1, band), nodes)
-    build.scratch.write(_name("coefficients", channel, fit, level, band), flat)
-    build.scratch.write(_name("planes", channel, fit, level, band), planes)
-    build.scratch.write(_name("columns", channel, fit, level - 1, band), forward.sampled_columns(nodes))
+    layout, own = build.prepared.layout, _bands(build).of(level)[band]
+    stepped = np.array(build.scratch.read(name_of_fit("halves", channel, fit, level, band)))
+    predictors = rules_of(build, channel, fit, level, [1])
+    nodes, flat, planes = forward.second_step(stepped, layout, own, predictors, build.table(channel))
+    build.scratch.write(name_of_fit("samples", channel, fit, level - 1, band), nodes)
+    build.scratch.write(name_of_fit("coefficients", channel, fit, level, band), flat)
+    build.scratch.write(name_of_fit("planes", channel, fit, level, band), planes)
+    build.scratch.write(name_of_fit("columns", channel, fit, level - 1, band), forward.sampled_columns(nodes))
 
 
 def core(folder: str, channel: int, fit: int) -> None:
     """The levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
     build = Build.open(folder)
-    bands, layout = build.bands, build.prepared.layout
+    bands, layout = _bands(build), build.prepared.layout
     samples = empty(layout.shape(0, bands.core))
     pieces = sample_pieces(build, bands.core)
-    name = f"{kind_of('samples', bool(fit))}/{channel}/{bands.core}"
+    name = name_of_fit("samples", channel, fit, bands.core)
     forward.read_rows(build.scratch, name, pieces, (0, len(samples)), samples)
-    predictors, flat, planes = forward.core_transform(samples, bands, build.table, bool(fit))
-    build.scratch.write(_name("coefficients", channel, fit, bands.core, CORE), flat)
-    build.scratch.write(_name("planes", channel, fit, bands.core, CORE), planes)
-    build.scratch.write(f"{kind_of('core-rules', bool(fit))}/{channel}", predictors)
+    predictors, flat, planes = forward.core_transform(samples, bands, build.table(channel), bool(fit))
+    build.scratch.write(name_of_fit("coefficients", channel, fit, bands.core, CORE), flat)
+    build.scratch.write(name_of_fit("planes", channel, fit, bands.core, CORE), planes)
+    build.scratch.write(name_of_fit("core-rules", channel, fit), predictors)
 
 
 def code(folder: str, channel: int, level: int, band: int) -> None:
@@ -138,20 +148,14 @@ def measure(folder: str, number: int) -> None:
     figures = measurer.figures(list(np.array(build.scratch.read("states"))))
     last = np.array(build.scratch.read("last-state"))
     chunks, kept, exact = chunks_of_rows(build.prepared, header, measurer.values(last, kinds_of(build.prepared)), rows)
-    build.scratch.write(f"squares/{number}", figures.squares)
-    build.scratch.write(f"equal/{number}", figures.equal)
-    build.scratch.write(f"counts/{number}", figures.counts)
-    for kind, own in (("chunks", chunks), ("kept-chunks", kept)):
-        build.scratch.write(f"{kind}/{number}", np.frombuffer(b"".join(own), np.uint8))
-        build.scratch.write(f"{kind}-lengths/{number}", np.array([len(chunk) for chunk in own], np.int64))
-    build.scratch.write(f"exact/{number}", np.array(exact))
+    write_measured(build, number, figures, chunks, kept, exact)
 
 
 def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
     """What measures these rows."""
     layout, predictors = build.prepared.layout, build.scratch.read("predictors")
-    geometry = RowsGeometry(layout, rows, min(build.bands.core, window_core(layout)))
-    part = part_of(build.table, geometry.tiles)
+    geometry = RowsGeometry(layout, rows, min(_bands(build).core, window_core(layout)))
+    part = part_of(build.table(0), geometry.tiles)
     channels = []
     for channel in range(build.channels):
         coefficients = transformed(build, "coefficients", channel)
@@ -169,25 +173,19 @@ def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
     return RowsMeasurer(given, lattices, prepared.geometric, np.array(predictors), geometry, channels)
 
 
-def _name(kind: str, channel: int, fit: int, level: int, piece: int) -> str:
-    return name_of(kind_of(kind, bool(fit)), channel, level, piece)
-
-
-def _rules(build: Build, channel: int, fit: int, level: int, axis: int) -> NDArray[np.int8]:
-    """Predictors that tell what one axis of a level has; int8, shape (level, axis, 2)."""
-    predictors = default_predictors(build.prepared.layout)
-    predictors[level - 1, axis] = build.scratch.read(f"{kind_of('rules', bool(fit))}/{channel}/{level}/{axis}")
-    return predictors
+def _bands(build: Build) -> Bands:
+    assert isinstance(build.pieces, Bands)
+    return build.pieces
 
 
 def _units(build: Build, channel: int, level: int, band: int) -> Units:
     """The units of a piece, ready to be coded."""
-    bands = build.bands
-    tiles = bands.core_tiles if level == bands.core else bands.of(level)[band].tiles
-    parents = parents_of(build.table, tiles) if tiles.start else range(0)
+    pieces, table = build.pieces, build.table(channel)
+    tiles = pieces.core_tiles if level == pieces.core else pieces.of(level)[band].tiles
+    parents = parents_of(table, tiles) if tiles.start else range(0)
     coefficients, planes = (transformed(build, kind, channel) for kind in ("coefficients", "planes"))
     above = read_tiles(build, coefficients, channel, parents) if parents else np.zeros(0, np.int32)
     true = np.array(build.scratch.read(name_of(coefficients, channel, level, band)))
     tops = np.array(build.scratch.read(name_of(planes, channel, level, band)))
     weights, large = build.scratch.read(f"weights/{channel}"), int(build.scratch.read("large"))
-    return Units(build.table, tiles, true, above, weights, tops, large)
+    return Units(table, tiles, true, above, weights, tops, large)

@@ -16,7 +16,7 @@ from ..grid.layout import Layout
 from ..quantization.distortion import Original, distance_figures, other_originals, store_values
 from ..quantization.lattice import Lattice
 
-__all__ = ["RowsGiven", "WindowMeasurer", "window_core"]
+__all__ = ["RowsGiven", "WindowMeasurer", "compared", "window_core"]
 
 #: Rows or columns, half-open.
 Span = tuple[int, int]
@@ -136,23 +136,24 @@ class WindowMeasurer:
         frames = [self._channels[channel].frame for channel in channels]
         canvas = frames[0][None] if len(frames) == 1 else np.stack(frames)
         lattices = self._lattices[channels.start : channels.stop]
-        found = self._compare(original, lattices, canvas, fractions, first)
+        found = compared(original, lattices, canvas, fractions, first)
         self._before[number] = found
         return found
 
-    @staticmethod
-    def _compare(
-        original: Original, lattices: Sequence[Any], canvas: NDArray[np.int32], fractions: Sequence[int], channel: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        squares = distance_figures(original, lattices, canvas, fractions, channel)
-        equal = np.zeros(squares.shape[2], np.bool_)
-        if original.points.dtype.kind == "f" and original.points.dtype.itemsize == 8 and not squares[..., 1].any():
-            # Squares of the smallest differences vanish: only a look at the values tells that there are none.
-            columns = original.points.shape[1]
-            same = np.empty((*original.points.shape[:2], len(lattices)), original.points.dtype)
-            for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
-                store_values(lattice, (canvas[number, :, :columns], fraction), same, number)
-            wanted = original.points[..., channel : channel + len(lattices)]
-            chosen = slice(None) if original.counted is None else original.counted
-            equal[:] = np.array_equal(wanted[chosen], same[chosen])
-        return squares, equal
+
+def compared(
+    original: Original, lattices: Sequence[Lattice], canvas: NDArray[np.int32], fractions: Sequence[int], channel: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """`distance_figures`, and of each kind whether all values are equal: known where the squares are all 0."""
+    squares = distance_figures(original, lattices, canvas, fractions, channel)
+    equal = np.zeros(squares.shape[2], np.bool_)
+    if original.points.dtype.kind == "f" and original.points.dtype.itemsize == 8 and not squares[..., 1].any():
+        # Squares of the smallest differences vanish: only a look at the values tells that there are none.
+        columns = original.points.shape[1]
+        same = np.empty((*original.points.shape[:2], len(lattices)), original.points.dtype)
+        for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
+            store_values(lattice, (canvas[number, :, :columns], fraction), same, number)
+        wanted = original.points[..., channel : channel + len(lattices)]
+        chosen = slice(None) if original.counted is None else original.counted
+        equal[:] = np.array_equal(wanted[chosen], same[chosen])
+    return squares, equal

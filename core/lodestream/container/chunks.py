@@ -20,14 +20,18 @@ class ChunkPlace(NamedTuple):
     kept: bool = False
 
 
-def chunk_places(header: Header, within: tuple[int, int] | None = None) -> Iterator[ChunkPlace]:
+def chunk_places(
+    header: Header, within: tuple[int, int] | None = None, blocks: range | None = None
+) -> Iterator[ChunkPlace]:
     """All chunks in the order of the file: block by block, row by row of places, channel by channel.
 
     A block of which holes are kept has as many chunks again, in the same order, of these. With ``within``, those alone
-    that begin in these rows, half-open, of which the first begins chunks.
+    that begin in these rows, half-open, of which the first begins chunks; with
+    ``blocks`` those of these.
     """
     height, width = (1 << exponent for exponent in header.chunk)
-    for block, ((rows, columns), _) in enumerate(header.blocks):
+    for block in range(len(header.blocks)) if blocks is None else blocks:
+        rows, columns = header.blocks[block][0]
         for kept in (False, True) if header.kept and header.kept[block] else (False,):
             for top in range(*((0, rows) if within is None else within), height):
                 for left in range(0, columns, width):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..grid.connectivity import Arrangement, Interface, LatticeBlock, Patch, Side, arrange, stored, whole_patch
 from ..quantization.lattice import Lattice
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Block
 
 __all__ = ["arranged", "lines", "may_share", "unshared"]
@@ -44,7 +45,7 @@ def unshared(blocks: Sequence[Block]) -> Arrangement:
 
 
 def arranged(
-    blocks: Sequence[Block], points: Sequence[NDArray[Any]], lattices: Sequence[Lattice]
+    blocks: Sequence[Block], points: Sequence[NDArray[Any]], lattices: Sequence[Lattice], room: Room = IN_MEMORY
 ) -> Arrangement | None:
     """The patches and interfaces of blocks; None of one block that is one patch without interfaces.
 
@@ -54,13 +55,17 @@ def arranged(
     points : for each block, finite, shape (row, column, channel)
         Holes filled.
     lattices : of each coordinate
+    room : Room
+        Where large arrays go.
     """
     sources = []
     for block, array in zip(blocks, points, strict=True):
-        channels = [lattice.coordinates(array[..., k]) for k, lattice in enumerate(lattices)]
-        coordinates = np.stack(channels, axis=2)
-        if block.mask is not None:
-            coordinates[~block.mask] = 0  # whatever stands under holes agrees
+        coordinates = room.empty((*block.shape, len(lattices)), np.int32)
+        for rows in rows_at_once(coordinates.shape):
+            for k, lattice in enumerate(lattices):
+                coordinates[rows, :, k] = lattice.coordinates(array[rows, :, k])
+            if block.mask is not None:
+                coordinates[rows][~block.mask[rows]] = 0  # whatever stands under holes agrees
         sources.append(LatticeBlock(coordinates, block.closed, block.mask))
     found = arrange(sources, len(lattices))
     patches, interfaces = [], list(found.interfaces)

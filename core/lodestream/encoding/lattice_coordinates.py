@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grid.connectivity import stored
+from ..grid.connectivity import stored, stored_side
 from ..grid.layout import Layout
 from ..quantization.lattice import Lattice, find_lattice, offset_lattice, precision_lattice, short_lattice
 from ..quantization.lattice_choice import attribute_lattices, channel_of, choose_lattices
@@ -21,6 +23,8 @@ from .prepared import Prepared
 
 __all__ = [
     "Lattices",
+    "coordinates_of_interfaces",
+    "coordinates_of_patch",
     "coordinates_of_strip",
     "exact_lattices",
     "fine_lattices",
@@ -50,7 +54,7 @@ class Lattices:
     fineness: int = 0
 
 
-def exact_lattices(prepared: Prepared, bits: int | None = None) -> Lattices:
+def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_MEMORY) -> Lattices:
     """A lattice for each channel: its own, or one as fine as its precision asks for, or as costs least.
 
     Parameters
@@ -58,6 +62,8 @@ def exact_lattices(prepared: Prepared, bits: int | None = None) -> Lattices:
     prepared : Prepared
     bits : int, optional
         Keep no more of any channel than so many bits of its range; what they leave out is stored.
+    room : Room
+        Where large arrays go.
 
     Raises
     ------
@@ -75,11 +81,22 @@ def exact_lattices(prepared: Prepared, bits: int | None = None) -> Lattices:
         if offset is not None and find_lattice(prepared.valid) is None:
             found[0] = offset
     for number, kind in enumerate(prepared.kinds, 1):
-        values = np.concatenate([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays])
+        values = _joined([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays], room)
         own = {part: named[first + part] for part in range(kind.channels) if first + part in named}
         found += attribute_lattices(values, prepared.attribute_precisions.get(kind.name), bits, own)
         first += kind.channels
     return Lattices(tuple(found))
+
+
+def _joined(arrays: list[NDArray[Any]], room: Room) -> NDArray[Any]:
+    """Arrays of shape (point, component) one below the other."""
+    if len(arrays) == 1:
+        return arrays[0]
+    found, done = room.empty((sum(map(len, arrays)), arrays[0].shape[1]), arrays[0].dtype), 0
+    for array in arrays:
+        found[done : done + len(array)] = array
+        done += len(array)
+    return found
 
 
 def fine_lattices(prepared: Prepared) -> Lattices | None:
@@ -176,33 +193,54 @@ def coordinates_of_strip(
 
 
 def _of_patches(prepared: Prepared, channel: int, lattice: Lattice, arrays: list[NDArray[np.int32]]) -> None:
-    interfaces = prepared.interfaces
+    interfaces = coordinates_of_interfaces(prepared, channel, lattice)
+    for array, points in zip(arrays, interfaces, strict=False):
+        array[:, 0] = points
+    for number, array in enumerate(arrays[len(interfaces) :]):
+        coordinates_of_patch(prepared, number, channel, lattice, interfaces, array)
+
+
+def coordinates_of_interfaces(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
+    """Coordinates of a channel on all interfaces, int32, shape (point,): those of the first patch that has each.
+
+    All 0 for attributes, which are not shared: blocks may disagree about them.
+    """
+    grids = prepared.layout.grids[: prepared.interfaces]
+    found = [np.zeros(grid.shape[0], np.int32) for grid in grids]
+    if channel >= prepared.geometric:
+        return found
     known: set[int] = set()
-    for number, patch in enumerate(prepared.patches):
-        values = stored(patch, prepared.channel(patch.block, channel))
-        arrays[interfaces + number][...] = lattice.coordinates(values)
-        if channel >= prepared.geometric:
-            continue  # attributes are not shared: blocks may disagree about them
-        for side, line in zip(patch.sides, lines(arrays[interfaces + number]), strict=True):
-            if side is None:
-                continue
-            interface = arrays[side.interface][:, 0]
-            if side.interface not in known:
-                interface[:] = (line[::-1] if side.reversed else line)[: interface.size]
+    for patch in prepared.patches:
+        for place, side in enumerate(patch.sides):
+            if side is not None and side.interface not in known:
+                line = lattice.coordinates(stored_side(patch, prepared.channel(patch.block, channel), place))
+                points = found[side.interface]
+                points[:] = (line[::-1] if side.reversed else line)[: points.size]
                 known.add(side.interface)
-    if channel < prepared.geometric:
-        _agree(prepared, arrays)
-
-
-def _agree(prepared: Prepared, arrays: list[NDArray[np.int32]]) -> None:
-    """Sides take their points from their interfaces: under holes, and on coarser lattices, these may differ."""
-    interfaces = prepared.interfaces
-    for number, grid in enumerate(prepared.layout.grids[:interfaces]):
+    for number, grid in enumerate(grids):
         for end, source in enumerate(grid.sources[:2]):
             if source is not None:
-                arrays[number][-end, 0] = arrays[source.grid][-1 if source.reversed else 0, 0]
-    for number, patch in enumerate(prepared.patches):
-        for side, line in zip(patch.sides, lines(arrays[interfaces + number]), strict=True):
+                found[number][-end] = found[source.grid][-1 if source.reversed else 0]
+    return found
+
+
+def coordinates_of_patch(
+    prepared: Prepared,
+    number: int,
+    channel: int,
+    lattice: Lattice,
+    interfaces: Sequence[NDArray[np.int32]],
+    out: NDArray[np.int32],
+) -> None:
+    """Put coordinates of a channel of a patch into ``out``, int32, shape (row, column).
+
+    Sides take their points from their interfaces, see `coordinates_of_interfaces`: under holes, and on coarser
+    lattices, these may differ.
+    """
+    patch = prepared.patches[number]
+    out[...] = lattice.coordinates(stored(patch, prepared.channel(patch.block, channel)))
+    if channel < prepared.geometric:
+        for side, line in zip(patch.sides, lines(out), strict=True):
             if side is not None:
-                interface = arrays[side.interface][:, 0]
-                line[:] = interface[::-1] if side.reversed else interface
+                points = interfaces[side.interface]
+                line[:] = points[::-1] if side.reversed else points

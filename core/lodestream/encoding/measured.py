@@ -15,11 +15,9 @@ from ..decoding.reconstruction import Coordinates, initial_state, reconstruct_ch
 from ..entropy.tile_coder import Strings
 from ..parallel import spread, threads
 from ..planning.window_errors import is_divided, layer_codes, no_errors
-from ..quantization.distortion import Original, coordinate_distances, other_originals
+from ..quantization.distortion import coordinate_distances
 from ..transform.pyramid import PADDING
 from .allocated import Allocated, State
-from .holes import given_arrays
-from .prepared import Prepared
 from .quantized import Quantized
 from .states import StateReconstructor
 
@@ -116,7 +114,7 @@ class _Measuring:
         quantized = allocated.quantized
         self._header, self._tiles = allocated.header, allocated.tiles
         self._prepared, self._lattices = quantized.prepared, quantized.lattices.channels
-        self._others = _others(quantized.prepared) if len(self._lattices) > 1 else []
+        self._others = quantized.prepared.others_of(None) if len(self._lattices) > 1 else []
         self._own = self._reconstructor()
 
     def _reconstructor(self) -> StateReconstructor:
@@ -181,13 +179,6 @@ class _Measuring:
             for number in range(shared, channels)
         ]
         return tuple(known)
-
-
-def _others(prepared: Prepared) -> list[tuple[list[Original], int]]:
-    """What the channels that are no coordinates are compared with."""
-    blocks = prepared.surface.blocks
-    arrays = [given_arrays(block) for block in blocks]
-    return other_originals(prepared.arrangement, arrays, [block.mask for block in blocks], prepared.geometric)
 
 
 def shown_states(header: Header, states: Sequence[State], passes: State) -> list[State]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from ..grid.multiblock import grids_of, shared_points
 from ..joints import Groups
 from ..mesh.joining import change_of
 from ..quality import Quality
-from ..quantization.distortion import Original, originals_of
+from ..quantization.distortion import Original, originals_of, other_originals
 from ..quantization.lattice import find_lattice
 from ..quantization.lattice_choice import DEFAULT_DIVISIONS, choose_lattices
 from ..quantization.lattice_depth import default_divisions
@@ -28,7 +29,7 @@ from ..surface import Block, Surface
 from ..target import Tolerance
 from ..transform.pyramid import PADDING
 from .arranging import arranged, may_share, unshared
-from .holes import Arrays, filled, valid_points
+from .holes import Arrays, filled, given_arrays, valid_points
 from .named_precisions import named_errors
 from .tiling import SMALL, SMALL_TILE, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE, chunk_exponents, square, tile_exponents
 
@@ -74,7 +75,6 @@ class Prepared:
     layout : Layout
     chunks : tuple of (int, int)
         Exponents of two: what may be the rows and columns of a chunk of residual, the smallest first.
-    originals : tuple of Original, one for each patch
     joint_changes : JointChanges or None
         See `Header`.
     """
@@ -97,8 +97,26 @@ class Prepared:
     patches: tuple[Patch, ...]
     layout: Layout
     chunks: tuple[tuple[int, int], ...]
-    originals: tuple[Original, ...]
     joint_changes: JointChanges | None
+
+    @cached_property
+    def originals(self) -> tuple[Original, ...]:
+        """What the coordinates of each patch are compared with."""
+        return tuple(self.originals_of(None))
+
+    def originals_of(self, chosen: range | None) -> list[Original]:
+        """The same of some patches, by their numbers; None: of all."""
+        masks = [block.mask for block in self.surface.blocks]
+        return originals_of(self.arrangement, [own[0] for own in self.arrays], masks, chosen)
+
+    def others_of(self, chosen: range | None) -> list[tuple[list[Original], int]]:
+        """What the channels that are no coordinates are compared with, of some patches; None: of all.
+
+        Of each channel what `other_originals` says of it.
+        """
+        blocks = self.surface.blocks
+        arrays = [given_arrays(block) for block in blocks]
+        return other_originals(self.arrangement, arrays, [block.mask for block in blocks], self.geometric, chosen)
 
     @property
     def kept(self) -> list[NDArray[np.bool_] | None]:
@@ -174,7 +192,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
         if geometric > 1:  # sides are shared by points, not by heights
             own = {channel: error for channel, error in named.items() if channel < point_channels}
             lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions, named=own)
-            arrangement = arranged(blocks, points, lattices[:geometric])
+            arrangement = arranged(blocks, points, lattices[:geometric], room)
     if arrangement is None:
         small = absolute is None and rms is None and _takes_small_tiles(surface, valid)
         layout, chunks = _of_one_grid(first, geometric, small)
@@ -202,7 +220,6 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
         patches=(whole_patch(0, first.shape, first.closed),) if arrangement is None else arrangement.patches,
         layout=layout,
         chunks=tuple(chunks),
-        originals=tuple(originals_of(arrangement, points, [block.mask for block in blocks])),
         joint_changes=_joint_changes(given, arrangement),
     )
 

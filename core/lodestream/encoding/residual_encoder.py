@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -101,7 +101,9 @@ def chunk_sample(prepared: Prepared, shape: tuple[int, int]) -> tuple[tuple[int,
 class ChunkCoder:
     """Makes chunks, see `encode_chunks`."""
 
-    def __init__(self, prepared: Prepared, header: Header, restored: Sequence[Restored]) -> None:
+    def __init__(
+        self, prepared: Prepared, header: Header, restored: Sequence[Restored] | Mapping[int, Restored]
+    ) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
         self._rough = prepared.rough
 

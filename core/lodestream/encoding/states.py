@@ -52,20 +52,26 @@ class StateReconstructor:
     header : Header
     tiles : sequence of Tiles, one for each channel
         All that a reader knows in the end.
+    patches : range, optional
+        Of these patches alone, by their numbers, and of the interfaces that they need: ``tiles`` have their tiles.
 
     Attributes
     ----------
     canvases : Canvases
-        What was reconstructed last.
+        What was reconstructed last, of each grid: of chosen patches interfaces first.
     """
 
-    def __init__(self, header: Header, tiles: Sequence[Tiles]) -> None:
+    def __init__(self, header: Header, tiles: Sequence[Tiles], patches: range | None = None) -> None:
         layout = header.layout
+        self._places: Sequence[int] = range(len(layout.grids))
+        if patches is not None:
+            first = len(layout.grids) - len(header.patches)
+            layout, self._places = layout.part(range(first + patches.start, first + patches.stop))
         shapes = [grid.shape for grid in layout.grids]
         self.canvases: Canvases = [
             np.empty((header.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes
         ]
-        self._header, self._tiles = header, tiles
+        self._header, self._tiles, self._layout = header, tiles, layout
         most = layout.points(layout.levels) // _KEPT
         self._levels = [level for level in range(layout.levels) if _WORTH <= layout.points(level) <= most]
         self._kept: dict[int, _Kept] = {}
@@ -79,22 +85,26 @@ class StateReconstructor:
             The coordinate.
         channel : int
         state : int8, shape (tile,)
-            Passes that remain of each tile.
+            Passes that remain of each tile of the surface.
         """
-        header, layout = self._header, self._header.layout
+        header, layout, tiles = self._header, self._layout, self._tiles[channel]
         arrays = [canvas[place, :, :-PADDING] for canvas in self.canvases]
-        whole, bare = known_levels(layout, state, layout.levels)
+        whole, bare = known_levels(header.layout, state, layout.levels)
         kept = self._kept.get(channel)
         shared = 0
         if kept is not None:
-            changed = _first_changed(layout, kept.state, state)
+            changed = _first_changed(header.layout, kept.state, state)
             shared = min(bisect_left(self._levels, changed), len(kept.grids))
         self._kept[channel] = kept = _Kept(state.copy(), [] if kept is None else kept.grids[:shared])
         start = self._levels[shared - 1] if shared else None
         if start is not None:
             for array, grid in zip(arrays, kept.grids[-1], strict=True):
                 array[: grid.shape[0], : grid.shape[1]] = grid
-        self._tiles[channel].spread_levels(layout.levels, state, arrays, whole, start, bare)
+        every: list[NDArray[np.int32] | None] = [None] * len(header.layout.grids)
+        for number, array in zip(self._places, arrays, strict=True):
+            every[number] = array
+        own = state if layout is header.layout else state[np.asarray(tiles.table.members)]
+        tiles.spread_levels(layout.levels, own, every, whole, start, bare)
         rules, coordinate = header.predictors[channel], channel < header.geometric
         for level in self._levels[shared:]:
             inverse(arrays, layout, rules, level, whole, coordinate, start, bare)

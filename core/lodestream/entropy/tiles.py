@@ -178,6 +178,8 @@ class TileTable:
             order = np.argsort(numbers, kind="stable")
             found = order[np.minimum(np.searchsorted(numbers, above, sorter=order), len(order) - 1)]
             above = np.where(numbers[found] == above, found, -1)
+        if not len(arrays.tile):
+            return *np.zeros((2, 0), np.int64), *arrays.halved.T
         # The parent of a band has its grid and its kind, and bands stand by tile, grid and kind.
         keys, own = (arrays.tile * grids + arrays.grid) * 4 + arrays.kind, above[arrays.tile]
         wanted = keys + 4 * grids * (own - arrays.tile)
@@ -299,7 +301,7 @@ class Tiles:
         self,
         level: int,
         state: NDArray[np.int8],
-        coefficients: Sequence[NDArray[np.int32]],
+        coefficients: Sequence[NDArray[np.int32] | None],
         whole: int,
         start: int | None = None,
         bare: Collection[int] = (),
@@ -311,7 +313,7 @@ class Tiles:
         level : int
         state : int8, shape (tile,)
             Passes that remain of each tile.
-        coefficients : int32 arrays, shape (row, column), one for each grid
+        coefficients : int32 arrays, shape (row, column), one for each grid; None of grids that are passed over
             What they hold at the places of these tiles does not matter.
         whole : int
             Coefficients of levels above this one are multiplied by 2**`FRACTION_BITS`.
@@ -320,11 +322,13 @@ class Tiles:
         bare : collection of int
             So are these.
         """
-        table, tiles_of = self.table, self.table.layout.tiles_of
-        finer, state = tiles_of(whole).stop, np.ascontiguousarray(state)
+        table, state = self.table, np.ascontiguousarray(state)
+        finer = table.tiles_from(whole + 1)
         for lowest, highest in _runs(0 if start is None else start + 1, level, bare):
-            span = table.first[tiles_of(lowest).start], table.first[tiles_of(highest).stop]
+            span = table.first[[table.tiles_from(lowest) if lowest else 0, table.tiles_from(highest + 1)]]
             for array, numbers in zip(coefficients, table.of_grid, strict=True):
+                if array is None:
+                    continue
                 own = np.arange(*span) if len(coefficients) == 1 else numbers[slice(*np.searchsorted(numbers, span))]
                 self._spread(own, state, array, finer)
 

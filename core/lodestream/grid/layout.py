@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import NamedTuple, overload
 
@@ -149,14 +149,16 @@ class Layout:
         Interfaces first. A surface of one block that shares no side is one grid.
     tile : (int, int)
         Exponents of two of a tile's rows and columns, in coefficients of one band.
+    levels : int, optional
+        The finest level, at least as many as the grids have; by default just as many.
     """
 
-    def __init__(self, grids: Sequence[Grid], tile: tuple[int, int]) -> None:
+    def __init__(self, grids: Sequence[Grid], tile: tuple[int, int], levels: int | None = None) -> None:
         for grid in grids:
             if min(grid.shape) < 1:
                 raise InputError(f"expected at least one row and column, got {grid.shape[0]} x {grid.shape[1]}")
         self.grids, self.tile = tuple(grids), tile
-        self.levels = max(len(axis) for grid in grids for axis in grid.lengths) - 1
+        self.levels = max(len(axis) for grid in grids for axis in grid.lengths) - 1 if levels is None else levels
         self.shared = any(any(grid.taken) for grid in grids)
         above = range(self.levels, -1, -1)
         self._shapes = [[grid.shape_at(level) for level in above] for grid in grids]
@@ -173,6 +175,28 @@ class Layout:
     def of(grids: tuple[Grid, ...], tile: tuple[int, int]) -> Layout:
         """The layout of some grids."""
         return Layout(grids, tile)
+
+    def part(self, patches: range) -> tuple[Layout, list[int]]:
+        """The layout of some patches and of the interfaces that they need, and the numbers that its grids have here.
+
+        ``patches`` are numbers of grids. Levels are those of this layout, tiles are not.
+        """
+        needed: set[int] = set()
+        waiting = list(patches)
+        while waiting:
+            new = {source.grid for source in self.grids[waiting.pop()].sources if source is not None} - needed
+            needed |= new
+            waiting += new
+        chosen = [*sorted(needed), *patches]
+        own = {number: place for place, number in enumerate(chosen)}
+        grids = []
+        for number in chosen:
+            first, last, left, right = (
+                None if source is None else source._replace(grid=own[source.grid])
+                for source in self.grids[number].sources
+            )
+            grids.append(replace(self.grids[number], sources=(first, last, left, right)))
+        return Layout(grids, self.tile, self.levels), chosen
 
     def shape(self, grid: int, level: int) -> tuple[int, int]:
         """Rows and columns of a grid at a level."""

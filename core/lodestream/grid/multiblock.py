@@ -113,6 +113,17 @@ class VertexCounter:
             counted[place] &= still
         self._known.update(held)
 
+    def pass_over(self, patch: Patch) -> None:
+        """Leave to a patch what is its own, as `count` does, without counting it."""
+        for side in patch.sides:
+            if side is None:
+                continue
+            interface = self._interfaces[side.interface]
+            if interface.length > 1:
+                self._used.add(side.interface)
+            ends = (0,) if interface.length == 1 else () if interface.closed else (0, 1)
+            self._known.update(self._owners.get((side.interface, end), (side.interface, end)) for end in ends)
+
 
 def shared_points(arrangement: Arrangement, shapes: Sequence[tuple[int, int]]) -> Groups:
     """The points of blocks of these shapes that are one, since they are the same point of an interface.

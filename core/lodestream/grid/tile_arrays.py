@@ -109,6 +109,16 @@ class TileArrays:
         """The level of each tile, int64, shape (tile,)."""
         return self.starts.searchsorted(tiles, side="right") - 1
 
+    def groups(self, level: int) -> tuple[Ints, Ints]:
+        """The grids and tiles of a level in groups of grids whose tiles are common, int64, shape (group + 1,) each.
+
+        The first grid and the first tile of each group, then how many grids there are and where the next level begins.
+        """
+        first, last = self._group[[level * self._grids, (level + 1) * self._grids - 1]]
+        groups = np.arange(first, last + 1)
+        grids = self._leader[groups] - level * self._grids
+        return np.append(grids, self._grids), np.append(self._first[groups], self.starts[level + 1])
+
     def places(self, tiles: Ints) -> Ints:
         """Row and column of each tile among those of its level and grid, int64, shape (tile, axis)."""
         return self._located(tiles)[1]

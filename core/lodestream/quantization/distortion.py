@@ -79,7 +79,10 @@ class Original:
 
 
 def originals_of(
-    arrangement: Arrangement | None, points: Sequence[NDArray[Any]], masks: Sequence[NDArray[np.bool_] | None]
+    arrangement: Arrangement | None,
+    points: Sequence[NDArray[Any]],
+    masks: Sequence[NDArray[np.bool_] | None],
+    chosen: range | None = None,
 ) -> list[Original]:
     """What the values of each patch are compared with; each vertex of several patches is counted in one of them.
 
@@ -90,12 +93,16 @@ def originals_of(
     points : C-contiguous arrays, shape (row, column, channel), one for each block
     masks : bool, shape (row, column), or None, one for each block
         True where a point is valid.
+    chosen : range, optional
+        Of these patches alone, by their numbers.
     """
     if arrangement is None:
         return [Original(points[0], masks[0])]
     originals = []
-    counter = VertexCounter(arrangement)
-    for patch in arrangement.patches:
+    counter, chosen = VertexCounter(arrangement), chosen or range(len(arrangement.patches))
+    for patch in arrangement.patches[: chosen.start]:
+        counter.pass_over(patch)
+    for patch in arrangement.patches[chosen.start : chosen.stop]:
         mask = masks[patch.block]
         counted = np.ones(patch.shape, np.bool_) if mask is None else stored(patch, mask)
         counter.count(patch, counted)
@@ -108,6 +115,7 @@ def other_originals(
     arrays: Sequence[Sequence[NDArray[Any]]],
     masks: Sequence[NDArray[np.bool_] | None],
     geometric: int,
+    chosen: range | None = None,
 ) -> list[tuple[list[Original], int]]:
     """What the reconstructions of each channel that is no coordinate are compared with, and its number in those arrays.
 
@@ -123,8 +131,12 @@ def other_originals(
         True where a point is valid.
     geometric : int
         The first so many channels of the points are coordinates.
+    chosen : range, optional
+        Of these patches alone, by their numbers.
     """
     patches = None if arrangement is None else arrangement.patches
+    if patches is not None and chosen is not None:
+        patches = patches[chosen.start : chosen.stop]
     if patches is None:
         valid = [masks[0]]
     else:

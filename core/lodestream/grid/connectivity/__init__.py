@@ -13,6 +13,17 @@ interface must be the whole side of every patch that uses it, and be coarsened t
 from __future__ import annotations
 
 from .arrange import arrange
-from .model import Arrangement, Interface, LatticeBlock, Patch, Side, assemble, stored, whole_patch
+from .model import Arrangement, Interface, LatticeBlock, Patch, Side, assemble, stored, stored_side, whole_patch
 
-__all__ = ["Arrangement", "Interface", "LatticeBlock", "Patch", "Side", "arrange", "assemble", "stored", "whole_patch"]
+__all__ = [
+    "Arrangement",
+    "Interface",
+    "LatticeBlock",
+    "Patch",
+    "Side",
+    "arrange",
+    "assemble",
+    "stored",
+    "stored_side",
+    "whole_patch",
+]

@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Arrangement", "Interface", "LatticeBlock", "Patch", "Side", "assemble", "stored", "whole_patch"]
+__all__ = [
+    "Arrangement",
+    "Interface",
+    "LatticeBlock",
+    "Patch",
+    "Side",
+    "assemble",
+    "stored",
+    "stored_side",
+    "whole_patch",
+]
 
 
 @dataclass(frozen=True)
@@ -137,11 +147,24 @@ def stored(patch: Patch, values: NDArray[Any]) -> NDArray[Any]:
     array, shape (rows, columns, ...)
         A copy.
     """
+    return values[np.ix_(*_places(patch, values))]
+
+
+def stored_side(patch: Patch, values: NDArray[Any], side: int) -> NDArray[Any]:
+    """One side of what `stored` gives, shape (point, ...): of the first row, last row, first column or last column."""
+    places = list(_places(patch, values))
+    places[side // 2] = places[side // 2][[-(side % 2)]]
+    line: NDArray[Any] = values[np.ix_(*places)]
+    return line[0] if side < 2 else line[:, 0]
+
+
+def _places(patch: Patch, values: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The rows and columns of the source block, shape (H, W, ...), in the order in which a patch has them."""
     rows, columns = (
-        np.arange(*(window[::-1] if flipped else window), -1 if flipped else 1) - flipped
-        for window, flipped in zip((patch.rows, patch.columns), patch.flipped, strict=True)
+        (np.arange(*(window[::-1] if flipped else window), -1 if flipped else 1) - flipped) % length
+        for window, flipped, length in zip((patch.rows, patch.columns), patch.flipped, values.shape[:2], strict=True)
     )
-    return values[np.ix_(rows % values.shape[0], columns % values.shape[1])]
+    return rows, columns
 
 
 def assemble(
