@@ -6,7 +6,7 @@ import errno
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
@@ -75,6 +75,19 @@ class Scratch:
         """Keep an array of any shape and dtype under a name; one that is there already is replaced."""
         with self.writing(name) as path, path.open("wb") as file:
             np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
+
+    def write_joined(self, name: str, arrays: Sequence[NDArray[Any]]) -> None:
+        """Keep the values of arrays of one dtype, shape (row, ...) each, one after another as a flat array."""
+        head = {
+            "descr": np.lib.format.dtype_to_descr(arrays[0].dtype),
+            "fortran_order": False,
+            "shape": (sum(array.size for array in arrays),),
+        }
+        with self.writing(name) as path, path.open("wb") as file:
+            np.lib.format.write_array_header_1_0(file, head)
+            for array in arrays:
+                for rows in rows_at_once(array.shape):
+                    file.write(np.ascontiguousarray(array[rows]).data)
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
@@ -223,21 +236,24 @@ class Room:
     scratch : callable or None
         Gives the folder, a `Scratch`. None: all arrays are in memory.
     least : int
-        Arrays of fewer bytes are in memory.
+        Arrays of fewer bytes are in memory, up to so many bytes in all.
     memory : int, optional
         Bytes that may be taken for what cannot go into files, where somebody has said so.
     """
 
     def __init__(self, scratch: Callable[[], Scratch] | None = None, least: int = 0, memory: int | None = None) -> None:
-        self._scratch, self._least, self.memory, self._count = scratch, least, memory, 0
+        self._scratch, self._least, self.memory = scratch, least, memory
+        self._count = self._small = 0
 
     def takes(self, size: int) -> bool:
-        """Whether an array of so many bytes is large."""
-        return self._scratch is not None and size >= self._least
+        """Whether an array of so many bytes goes into a file: it is large, or there are many small ones already."""
+        return self._scratch is not None and self._small + size >= self._least
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         """A new array of this shape, (row, ...), whatever it holds."""
-        if self._scratch is None or not self.takes(math.prod(shape) * np.dtype(dtype).itemsize):
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if self._scratch is None or not self.takes(size):
+            self._small += size
             return np.empty(shape, dtype)
         self._count += 1
         made = self._scratch().empty(f"arrays/{self._count}", shape, dtype)

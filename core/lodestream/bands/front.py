@@ -118,8 +118,9 @@ def encode(
     memory : int or str, optional
         Bytes to work in, a MiB or more, or text such as ``"512MiB"``, beside arrays that are memory-mapped: what takes
         more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
-        for each value of such a row are taken in any case, and 6 for each point of a surface with
-        holes. By default a quarter of the machine's memory, and where there is no ``out`` one piece.
+        for each value of such a row are taken in any case, and 6 for each point of a surface with holes. A surface of
+        several blocks is built block by block: the largest one is in place of such a row. By default a quarter of the
+        machine's memory, and where there is no ``out`` one piece.
     scratch : str or path-like, optional
         A folder for the files of a build by bands, about 12 bytes a value; empty, or of a build that was cut. What is
         made there is kept when the build is interrupted, or fails, and the same call goes on from there; after success
@@ -274,6 +275,4 @@ def _in_one_piece(surface: Surface, quality: Quality) -> str | None:
     """Why a surface cannot be built by bands; None: it can."""
     if quality.rms is not None:
         return "a stream for one error (rms) is made of all values together"
-    if len(surface.blocks) > 1:
-        return f"it has {len(surface.blocks)} blocks"
     return None

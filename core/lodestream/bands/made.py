@@ -29,7 +29,7 @@ from .building import Building, OutOfRangeError
 from .executing import Execution
 from .folders import TASKS, remove, replacing
 from .geometry import CORE_POINTS
-from .memory import BESIDE, OF_BAND, masks_memory
+from .memory import BESIDE, OF_BAND, largest_block, masks_memory
 from .references import file_state, root_of
 from .room import FOR_A_VALUE, check_room
 
@@ -70,22 +70,20 @@ class Made:
     ) -> None:
         self._surface, self._quality, self._progress, self._executor = surface, quality, progress, executor
         own = threads()
-        points = surface.blocks[0].shape[0] * surface.blocks[0].shape[1]
+        points = sum(block.shape[0] * block.shape[1] for block in surface.blocks)
         channels = max(1, sum(a.size for a in self._arrays()) // points)
         room = max(memory - BESIDE - masks_memory(surface), 0) // (OF_BAND * channels)
         self._threads = 1 if executor is not None else max(1, min(own, room // _FEWEST))
         self._points = min(max(room // self._threads, _FEWEST), _MOST)
         self._core = min(CORE_POINTS, max(self._points // 2, 1 << 12))
-        self._values = points * channels
+        self._room, self._channels, self._values = room, channels, points * channels
         self._copied = copied
 
     def _arrays(self) -> list[NDArray[Any]]:
-        block = self._surface.blocks[0]
-        return [block.points, *block.attributes.values()]
+        return [array for block in self._surface.blocks for array in (block.points, *block.attributes.values())]
 
     def _all(self) -> list[NDArray[Any]]:
-        mask = self._surface.blocks[0].mask
-        return [*self._arrays(), *([] if mask is None else [mask])]
+        return [*self._arrays(), *(block.mask for block in self._surface.blocks if block.mask is not None)]
 
     def container(self, folder: Path) -> Path | None:
         """The file of the container, in the folder; None: the surface must be encoded in one piece.
@@ -131,13 +129,14 @@ class Made:
         prepared_files = scratch.folder / "prepared" / uuid4().hex
         room = Room(lambda: Scratch(prepared_files), 0 if self._executor is not None else _IN_A_FILE)
         prepared = prepare(self._surface, self._quality, room)
-        if prepared.arrangement is not None:
-            return None
+        if prepared.arrangement is not None and self._executor is None:
+            # No patch is divided.
+            self._threads = max(1, min(self._threads, self._room * self._channels // largest_block(self._surface)))
         raw = sum(array.nbytes for array in self._arrays())
         best: Path | None = None
         for bits in (None, *encoder.COARSER):
             try:
-                found = self._stream(scratch, prepared, bits)
+                found = self._stream(scratch, prepared, bits, room)
             except OutOfRangeError:
                 return None
             if best is None or found.stat().st_size < best.stat().st_size:
@@ -151,31 +150,30 @@ class Made:
     def _in_files(self, files: Scratch) -> Surface:
         """The surface with all arrays in files, which tasks open: what is in memory would go to each of them."""
 
-        def kept(name: str, array: NDArray[Any]) -> NDArray[Any]:
-            if root_of(array) is not None:
-                return array
-            if not files.has(name):
-                files.write(name, array)
-            return files.read(name)
-
         # Copied, not made anew: that would look at all values, and put another mask into memory.
-        block = copy(self._surface.blocks[0])
-        block.points = kept("points", block.points)
-        block.mask = None if block.mask is None else kept("mask", block.mask)
-        block.attributes = {
-            name: kept(f"attributes/{number}", array) for number, (name, array) in enumerate(block.attributes.items())
-        }
+        blocks = [copy(block) for block in self._surface.blocks]
+        for block, points in zip(blocks, _kept(files, "points", [block.points for block in blocks]), strict=True):
+            block.points, block.attributes = points, dict(block.attributes)
+        masked = [block for block in blocks if block.mask is not None]
+        for block, mask in zip(
+            masked, _kept(files, "masks", [b.mask for b in masked if b.mask is not None]), strict=True
+        ):
+            block.mask = mask
+        for number, name in enumerate(blocks[0].attributes):
+            given = [block.attributes[name] for block in blocks]
+            for block, array in zip(blocks, _kept(files, f"attributes/{number}", given), strict=True):
+                block.attributes[name] = array
         surface = copy(self._surface)
-        surface.blocks = (block,)
+        surface.blocks = tuple(blocks)
         surface.joints = None  # the values say again which points are one
         return surface
 
-    def _stream(self, scratch: Scratch, prepared: Prepared, bits: int | None) -> Path:
+    def _stream(self, scratch: Scratch, prepared: Prepared, bits: int | None, room: Room) -> Path:
         name = "exact" if bits is None else f"bits-{bits}"
         path = scratch.folder / f"{name}.lode"
         if not path.exists():
             own = Scratch(scratch.folder / name)
-            build = Build(own, prepared, exact_lattices(prepared, bits), self._points, self._core)
+            build = Build(own, prepared, exact_lattices(prepared, bits, room), self._points, self._core)
             build.save()
             execution = Execution(own, self._executor, self._threads)
             try:
@@ -196,18 +194,33 @@ class Made:
 
     def _key(self) -> str:
         """What tells this build from others: one that was cut goes on only if nothing of it has changed."""
-        block = self._surface.blocks[0]
+        blocks = self._surface.blocks
         said = {
             "version": __version__,
             "boot": boot_id(),
             "quality": repr(self._quality),
-            "closed": block.closed,
-            "attributes": list(block.attributes),
+            "blocks": [[block.closed, list(block.attributes), block.mask is None] for block in blocks],
             "metadata": hashlib.sha256(repr(self._surface.metadata).encode()).hexdigest(),
             "arrays": [_identity(array, self._copied) for array in self._all()],
             "points": [self._points, self._core],
         }
         return json.dumps(said)
+
+
+def _kept(files: Scratch, name: str, arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Arrays of one dtype and any shapes, those in memory as parts of one file: a process may have so many maps."""
+    left = [array for array in arrays if root_of(array) is None]
+    if left and not files.has(name):
+        files.write_joined(name, left)
+    whole: NDArray[Any] = files.read(name) if left else np.zeros(0)
+    found, done = [], 0
+    for array in arrays:
+        if root_of(array) is None:
+            found.append(whole[done : done + array.size].reshape(array.shape))
+            done += array.size
+        else:
+            found.append(array)
+    return found
 
 
 def _identity(array: NDArray[Any], copied: bool) -> list[Any]:

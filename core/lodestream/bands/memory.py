@@ -16,6 +16,7 @@ __all__ = [
     "WHOLE",
     "checked_memory",
     "default_memory",
+    "largest_block",
     "least_memory",
     "masks_memory",
     "whole_memory",
@@ -63,13 +64,22 @@ def whole_memory(surface: Surface) -> int:
 
 
 def least_memory(surface: Surface) -> int:
-    """About the least that encoding a surface by bands takes, in bytes: the program, and a row of tiles."""
-    block = surface.blocks[0]
-    values = sum(array.size for array in (block.points, *block.attributes.values()))
-    return BESIDE + masks_memory(surface) + OF_BAND * values * _ROWS // max(block.shape[0], _ROWS)
+    """About the least that encoding a surface by bands takes, in bytes: the program, and a row of tiles.
+
+    Of several blocks the largest one in place of a row.
+    """
+    values = largest_block(surface)
+    if len(surface.blocks) == 1:
+        values = values * _ROWS // max(surface.blocks[0].shape[0], _ROWS)
+    return BESIDE + masks_memory(surface) + OF_BAND * values
+
+
+def largest_block(surface: Surface) -> int:
+    """Values of the largest block, attributes included."""
+    blocks = surface.blocks
+    return max(sum(array.size for array in (block.points, *block.attributes.values())) for block in blocks)
 
 
 def masks_memory(surface: Surface) -> int:
     """About what masks take where a surface is encoded by bands, in bytes: which points are holes is known of all."""
-    block = surface.blocks[0]
-    return 0 if block.mask is None else _MASKS * block.shape[0] * block.shape[1]
+    return _MASKS * sum(block.mask.size for block in surface.blocks if block.mask is not None)

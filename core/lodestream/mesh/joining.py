@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +41,8 @@ SIDES: dict[str, tuple[slice | int, slice | int]] = {
     "first_column": (slice(None), 0),
     "last_column": (slice(None), -1),
 }
+#: The two sides at the ends of axis 0, and of axis 1.
+_SIDES_ACROSS = ("first_row", "last_row"), ("first_column", "last_column")
 
 
 class Pole(NamedTuple):
@@ -50,40 +53,68 @@ class Pole(NamedTuple):
     kind: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class NumberedBlock:
-    """A block, its points as numbers among those of all blocks, what is said of its faces, and which cells have one."""
+    """A block whose points have numbers among those of all blocks, and what is said of its faces.
+
+    Attributes
+    ----------
+    block : Block
+    start : int
+        The number of its first point.
+    faces : mapping
+    joins : bool
+        Whether its border is joined to others at the same place.
+    """
 
     block: Block
-    points: NDArray[np.int64]
+    start: int
     faces: Mapping[str, Any]
-    cells: NDArray[np.bool_]
-    joins: bool  # its border, to others at the same place
+    joins: bool
 
     @staticmethod
     def of(block: Block, start: int, faces: Mapping[str, Any], blocks: int) -> NumberedBlock:
         """A block of so many, whose points are numbered from `start`."""
-        height, width = block.shape
-        valid = np.ones(block.shape, np.bool_) if block.mask is None else block.mask
-        cells = valid.copy()
+        return NumberedBlock(block, start, faces, bool(faces.get("joined", blocks > 1)))
+
+    @cached_property
+    def points(self) -> NDArray[np.int64]:
+        """The numbers of its points, shape (row, column)."""
+        height, width = self.block.shape
+        return self.start + np.arange(height * width).reshape(height, width)
+
+    @cached_property
+    def cells(self) -> NDArray[np.bool_]:
+        """Which cells have a face, shape (row of cells, column of cells)."""
+        block = self.block
+        cells = np.ones(block.shape, np.bool_) if block.mask is None else np.array(block.mask)
         for axis in (0, 1):
             cells &= np.roll(cells, -1, axis)
             if not wraps(block, axis):
                 cells = cells[:-1] if axis == 0 else cells[:, :-1]
-        left_out = unpack_cells(faces.get("left_out"), cells.shape)
+        left_out = unpack_cells(self.faces.get("left_out"), cells.shape)
         if left_out is not None:
             cells &= ~left_out
-        points = start + np.arange(height * width).reshape(height, width)
-        return NumberedBlock(block, points, faces, cells, bool(faces.get("joined", blocks > 1)))
+        return cells
+
+    def side(self, name: str) -> NDArray[np.int64]:
+        """The numbers of the points of one of the `SIDES`, shape (point,)."""
+        rows, columns = (np.arange(n)[k] for n, k in zip(self.block.shape, SIDES[name], strict=True))
+        return self.start + np.atleast_1d(rows * self.block.shape[1] + columns)
 
     def border(self) -> NDArray[np.int64]:
         """The points that may lie at the place of others, shape (point,): valid ones with fewer than four faces."""
-        if not self.joins or self.block.points.ndim != 3:
-            return self.points[:0, 0]
-        border = on_border(self.cells, self.block.shape)
-        if self.block.mask is not None:
-            border &= self.block.mask
-        return self.points[border]
+        block = self.block
+        if not self.joins or block.points.ndim != 3:
+            return np.empty(0, np.int64)
+        if block.mask is None and self.faces.get("left_out") is None:
+            # All cells have a face: those points are the sides of open axes, and nothing of all points is needed.
+            names = [name for axis, pair in enumerate(_SIDES_ACROSS) if not wraps(block, axis) for name in pair]
+            return np.unique(np.concatenate([np.empty(0, np.int64), *map(self.side, names)]))
+        border = on_border(self.cells, block.shape)
+        if block.mask is not None:
+            border &= block.mask
+        return self.start + np.flatnonzero(border)
 
 
 def wraps(block: Block, axis: int) -> bool:
@@ -131,7 +162,7 @@ def numbered_blocks(surface: Surface) -> list[NumberedBlock]:
     for number, block in enumerate(surface.blocks):
         faces = _face_map(surface.metadata, number, len(surface.blocks))
         numbered.append(NumberedBlock.of(block, start, faces, len(surface.blocks)))
-        start += numbered[-1].points.size
+        start += block.shape[0] * block.shape[1]
     return numbered
 
 
@@ -187,7 +218,7 @@ def join_points(
         joined[index] = index[_first_equal([place[index]])]
     there = []
     for pole in poles:
-        line = numbered[pole.block].points[SIDES[pole.side]]
+        line = numbered[pole.block].side(pole.side)
         if (place[line] == place[line[0]]).all():
             there.append(pole)
             if not numbered[pole.block].joins:
@@ -232,7 +263,7 @@ def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
 
 def _that_count(numbered: Sequence[NumberedBlock], poles: Sequence[Pole]) -> NDArray[np.int64]:
     """The points that may be joined with others, increasing."""
-    sides = [numbered[pole.block].points[SIDES[pole.side]] for pole in poles]
+    sides = [numbered[pole.block].side(pole.side) for pole in poles]
     return np.unique(np.concatenate([*(own.border() for own in numbered), *sides]))
 
 

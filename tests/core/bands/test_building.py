@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lodestream.bands import build, building
+from lodestream.bands import build, transforming
 from lodestream.bands.build import Build
 from lodestream.bands.building import Building
 from lodestream.bands.executing import Execution
@@ -102,7 +102,7 @@ def test_bands_give_the_bytes_of_one_piece(name: str, points: int, core_points: 
 
 def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
     heights = _heights((310, 270))
-    monkeypatch.setattr(building, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
+    monkeypatch.setattr(transforming, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
     expected = built(Surface(heights), 30_000, 600)
     code, late = Building._code, list[Path]()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands import tasks
+from lodestream.bands import grid_tasks, tasks
 from lodestream.bands.cluster import executor_of
 from tests.clusters import local_cluster
 
@@ -37,28 +38,30 @@ def _surface(kind: str) -> ls.Surface:
     if kind == "closed columns":
         return ls.Surface(heights, (False, True))
     if kind == "blocks":
-        return ls.Surface(blocks=[ls.Block(heights[:, :300]), ls.Block(heights[:, 299:])])
+        columns, rows = np.meshgrid(np.arange(640.0), np.arange(700.0))
+        points = np.stack([columns + np.sin(rows / 50), rows, heights / 100], axis=-1).astype(np.float32)
+        return ls.Surface(blocks=[ls.Block(points[a : a + 141]) for a in range(0, 561, 140)])
     return ls.Surface(heights)
 
 
 def _die_in(name: str, dask_worker: Any) -> None:
     """On a worker: die in the first task of this name, when its files are written and nobody knows it."""
-    task = getattr(tasks, name)
+    for module in (tasks, grid_tasks):
+        if (task := getattr(module, name, None)) is not None:
+            setattr(module, name, partial(_dying, task))
 
-    def dying(*arguments: Any) -> None:
-        task(*arguments)
-        os.kill(os.getpid(), signal.SIGKILL)
 
-    setattr(tasks, name, dying)
+def _dying(task: Any, *arguments: Any) -> None:
+    task(*arguments)
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.parametrize("cluster", [2], indirect=True)
 @pytest.mark.parametrize("kind", ["holes", "closed columns", "blocks"])
 def test_a_cluster_builds_the_same_bytes(cluster: Any, kind: str, tmp_path: Path) -> None:
     surface = _surface(kind)
-    memory = 1 << 20 if len(surface.blocks) == 1 else None  # several blocks are built here, in one piece
     with cluster.get_executor(pure=False, retries=3) as executor:
-        ls.encode(surface, out=tmp_path / "a.lode", executor=executor, memory=memory)
+        ls.encode(surface, out=tmp_path / "a.lode", executor=executor, memory=1 << 20)
     assert (tmp_path / "a.lode").read_bytes() == ls.encode(surface)
     assert [path.name for path in tmp_path.iterdir()] == ["a.lode"]
 
@@ -72,6 +75,8 @@ def test_a_cluster_builds_the_same_bytes(cluster: Any, kind: str, tmp_path: Path
         ("coordinates", "closed columns"),
         ("code", "holes"),
         ("measure", "closed columns"),
+        ("second_step", "blocks"),
+        ("measure", "blocks"),
     ],
 )
 def test_a_worker_that_dies_costs_its_task(cluster: Any, task: str, kind: str, tmp_path: Path) -> None:
