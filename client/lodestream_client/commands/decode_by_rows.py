@@ -16,6 +16,7 @@ from .inputs import named
 from .outcome import Outcome, check_grid
 
 if TYPE_CHECKING:
+    from lodestream.decoding.by_blocks import BlocksDecoder
     from lodestream.decoding.by_rows import RowsDecoder
     from lodestream.planning.byte_ranges import RangeSet
 
@@ -54,7 +55,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
     from lodestream.bands.front import default_memory
     from lodestream.container.capacity import Capacity
     from lodestream.container.reader import read_index
-    from lodestream.decoding.by_rows import RowsDecoder
+    from lodestream.decoding.by_bands import decoder_by_bands
     from lodestream.planning.byte_ranges import RangeSet
 
     memory = default_memory() if options.memory is None else options.memory
@@ -73,7 +74,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
             header, level = index.header, options.target.level
             if level is not None and level > header.levels:
                 return False  # decoding in one piece tells so
-            decoder = RowsDecoder(read, index, level)
+            decoder = decoder_by_bands(read, index, level)
         except (CorruptStreamError, TruncatedStreamError, TooLargeError):
             return False  # decoding in one piece tells what is wrong with it, and what is left
         check_grid(options.out, header)
@@ -106,8 +107,8 @@ class _Needs:
         Why it is not done by bands; None: it can be.
     """
 
-    def __init__(self, decoder: RowsDecoder, options: DecodeOptions) -> None:
-        from lodestream.decoding.by_rows import why_not_by_rows
+    def __init__(self, decoder: RowsDecoder | BlocksDecoder, options: DecodeOptions) -> None:
+        from lodestream.decoding.by_bands import why_not_by_bands
         from lodestream.formats import for_writing, written
         from lodestream.planning.selection import selection_of
 
@@ -127,7 +128,7 @@ class _Needs:
         elif options.partial or replace(options.target, level=None) != Target():
             self.reason = "only the whole surface or a level is, without --partial, limits and --attributes"
         else:
-            self.reason = why_not_by_rows(header)
+            self.reason = why_not_by_bands(header)
 
     def check(self, memory: int) -> None:
         """Refuse what takes more than was given or, if nothing was, than there is.
@@ -156,7 +157,7 @@ class _Needs:
 
 
 def _decode(
-    decoder: RowsDecoder,
+    decoder: RowsDecoder | BlocksDecoder,
     out: Path,
     memory: int,
     options: DecodeOptions,

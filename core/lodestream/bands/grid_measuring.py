@@ -18,9 +18,8 @@ from ..decoding.reconstruction import Values
 from ..encoding.prepared import Prepared
 from ..encoding.residual_encoder import ChunkCoder
 from ..encoding.states import StateReconstructor
-from ..entropy.part_table import consecutive, part_of
+from ..entropy.part_table import part_of, tiles_of_grids
 from ..entropy.tiles import Tiles
-from ..grid.layout import Layout
 from ..grid.patches import assemble
 from ..parallel import spread
 from ..quantization.distortion import Original, store_values
@@ -30,7 +29,7 @@ from .measuring import BANDS_TOGETHER, Figures
 from .stored import stored_tiles, transformed
 from .windows import compared
 
-__all__ = ["blocks_of_run", "measured", "tiles_of_patches"]
+__all__ = ["BlocksMeasurer", "blocks_of_run", "measured"]
 
 
 def blocks_of_run(prepared: Prepared, points: int) -> list[range]:
@@ -48,20 +47,6 @@ def blocks_of_run(prepared: Prepared, points: int) -> list[range]:
     return [*found, range(first, len(sizes))]
 
 
-def tiles_of_patches(layout: Layout, interfaces: int, patches: range) -> list[range]:
-    """The tiles that some patches have at any level, and those of all interfaces, in runs of one level each.
-
-    Patches are counted from the first of them, before which the layout has so many ``interfaces``.
-    """
-    wanted = [*range(interfaces), *range(interfaces + patches.start, interfaces + patches.stop)]
-    found: list[range] = []
-    for level in range(layout.levels + 1):
-        grids, tiles = layout.tile_arrays.groups(level)
-        groups = np.unique(np.searchsorted(grids, wanted, side="right") - 1).tolist()
-        found += consecutive(np.concatenate([np.arange(tiles[group], tiles[group + 1]) for group in groups]))
-    return found
-
-
 def measured(build: Build, header: Header, blocks: range) -> tuple[Figures, list[bytes], list[bool]]:
     """Measure some blocks in all states, and code their residual.
 
@@ -74,10 +59,15 @@ def measured(build: Build, header: Header, blocks: range) -> tuple[Figures, list
     list of bool
         Of each channel whether it is exact with them.
     """
-    measurer = _Measurer(build, header, blocks)
-    figures = measurer.figures(list(np.array(build.scratch.read("states"))))
+    prepared = build.prepared
+    patches = [number for number, patch in enumerate(prepared.patches) if patch.block in blocks]
+    others = prepared.others_of(patches) if header.channels > 1 else []
+    tiles = [_known(build, channel, patches) for channel in range(header.channels)]
+    measurer = BlocksMeasurer(header, tiles, blocks, patches)
+    states = list(np.array(build.scratch.read("states")))
+    figures = measurer.figures(states, prepared.originals_of(patches), others)
     values = measurer.values(np.array(build.scratch.read("last-state")))
-    coder = ChunkCoder(build.prepared, header, values)
+    coder = ChunkCoder(prepared, header, values)
     places = list(chunk_places(header, blocks=blocks))
     chunks, exact = [], [True] * header.channels
     for place, (data, whole) in zip(places, spread(coder.code, places), strict=True):
@@ -86,42 +76,59 @@ def measured(build: Build, header: Header, blocks: range) -> tuple[Figures, list
     return figures, chunks, exact
 
 
-class _Measurer:
-    """Measures the patches of some blocks in one state after another."""
+def _known(build: Build, channel: int, patches: Sequence[int]) -> Tiles:
+    """All that a reader knows of a channel of some patches in the end."""
+    layout, interfaces = build.prepared.layout, build.prepared.interfaces
+    grids = [*range(interfaces), *(interfaces + patch for patch in patches)]
+    part = part_of(build.table(channel), tiles_of_grids(layout, grids, layout.levels))
+    tiles, coefficients = Tiles(part.table), transformed(build, "coefficients", channel)
+    for run, span in part.spans:
+        known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
+        for place, true in stored_tiles(build, coefficients, channel, run):
+            np.abs(true, out=known[place])
+            np.sign(true, out=sign[place], casting="unsafe")
+        for place, passes in stored_tiles(build, "early", channel, run):
+            early[place] = passes
+    return tiles
 
-    def __init__(self, build: Build, header: Header, blocks: range) -> None:
-        prepared = build.prepared
-        self._prepared, self._header, self._blocks = prepared, header, blocks
-        own = [number for number, patch in enumerate(prepared.patches) if patch.block in blocks]
-        self._patches = range(own[0], own[-1] + 1)  # patches go block by block
-        self._lattices = build.lattices.channels
-        self._tiles = [self._known(build, channel) for channel in range(build.channels)]
-        self._reconstructor = StateReconstructor(header, self._tiles, self._patches)
 
-    def _known(self, build: Build, channel: int) -> Tiles:
-        """All that a reader knows of a channel of these patches in the end."""
-        part = part_of(
-            build.table(channel), tiles_of_patches(self._prepared.layout, self._prepared.interfaces, self._patches)
-        )
-        tiles, coefficients = Tiles(part.table), transformed(build, "coefficients", channel)
-        for run, span in part.spans:
-            known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
-            for place, true in stored_tiles(build, coefficients, channel, run):
-                np.abs(true, out=known[place])
-                np.sign(true, out=sign[place], casting="unsafe")
-            for place, passes in stored_tiles(build, "early", channel, run):
-                early[place] = passes
-        return tiles
+class BlocksMeasurer:
+    """Measures the patches of some blocks in one state after another.
 
-    def figures(self, states: Sequence[NDArray[np.int8]]) -> Figures:
-        """What the patches tell of the errors of states, int8, shape (tile, channel) each."""
-        prepared, geometric = self._prepared, self._prepared.geometric
-        comparisons = [(prepared.originals_of(self._patches), range(geometric), 0)]
-        if len(self._lattices) > 1:
-            comparisons += [
-                (originals, range(number, number + 1), component)
-                for number, (originals, component) in enumerate(prepared.others_of(self._patches), geometric)
-            ]
+    Parameters
+    ----------
+    header : Header
+        Of a surface of several grids.
+    tiles : sequence of Tiles, one for each channel
+        All that a reader knows in the end of the tiles of these patches, and of all interfaces.
+    blocks : range
+    patches : sequence of int
+        Those of the blocks, by their numbers.
+    """
+
+    def __init__(self, header: Header, tiles: Sequence[Tiles], blocks: range, patches: Sequence[int]) -> None:
+        self._header, self._blocks, self._patches = header, blocks, patches
+        self._reconstructor = StateReconstructor(header, tiles, patches)
+
+    def figures(
+        self,
+        states: Sequence[NDArray[np.int8]],
+        coordinates: Sequence[Original],
+        others: Sequence[tuple[Sequence[Original], int]],
+    ) -> Figures:
+        """What the patches tell of the errors of states, each of them a cell of its own.
+
+        Parameters
+        ----------
+        states : sequence of int8 arrays, shape (tile, channel)
+        coordinates : sequence of Original, one for each patch
+        others : sequence
+            Of each channel that is no coordinate, as `other_originals` tells it of these patches.
+        """
+        geometric = self._header.geometric
+        comparisons = [(coordinates, range(geometric), 0)]
+        for number, (originals, component) in enumerate(others, geometric):
+            comparisons.append((originals, range(number, number + 1), component))
         counts = [sum(original.count for original in originals) for originals, _, _ in comparisons]
         squares, equal = [], []
         for state in states:
@@ -139,7 +146,7 @@ class _Measurer:
         Sums and largest of the squared distances, shape (patch, kind, 2); and of each kind whether all is equal.
         """
         fractions = [self._reconstruct(place, channel, state) for place, channel in enumerate(channels)]
-        lattices = self._lattices[channels.start : channels.stop]
+        lattices = self._header.lattices[channels.start : channels.stop]
         found, same = [], []
         for original, canvas in zip(originals, self._canvases, strict=True):
             squares, equal = compared(original, lattices, canvas[: len(channels)], fractions, first)
@@ -158,22 +165,20 @@ class _Measurer:
 
     def values(self, state: NDArray[np.int8]) -> dict[int, Values]:
         """Values of the blocks in a state, int8, shape (tile, channel), by their numbers in the surface."""
-        prepared, header = self._prepared, self._header
-        arrays: dict[int, list[NDArray[Any]]] = {block: [] for block in self._blocks}
-        channel = 0
-        for given in prepared.arrays[self._blocks.start]:
-            shapes = [(*prepared.patches[number].shape, given.shape[2]) for number in self._patches]
-            grids = [np.empty(shape, given.dtype) for shape in shapes]
-            for component in range(given.shape[2]):
+        header, channel = self._header, 0
+        found: dict[int, Values] = {block: Values([]) for block in self._blocks}
+        for count in (header.point_channels, *(kind.channels for kind in header.attributes)):
+            grids: list[NDArray[Any]] = [np.empty((0, 0, count))] * len(header.patches)
+            for number in self._patches:
+                grids[number] = np.empty((*header.patches[number].shape, count), header.dtypes[channel])
+            for component in range(count):
                 fraction = self._reconstruct(0, channel, state)
-                for values, canvas in zip(grids, self._canvases, strict=True):
+                for number, canvas in zip(self._patches, self._canvases, strict=True):
                     coordinates = canvas[0, :, :-PADDING], fraction
-                    store_values(self._lattices[channel], coordinates, values, component)
+                    store_values(header.lattices[channel], coordinates, grids[number], component)
                 channel += 1
-            every: list[NDArray[Any]] = [np.empty((0, 0, 0))] * len(prepared.patches)
-            every[self._patches.start : self._patches.stop] = grids
-            for block, own in arrays.items():
-                shape = header.blocks[block][0]
-                whole = assemble(header.block_patches[block], header.layout, header.layout.levels, shape, every)
-                own.append(np.ascontiguousarray(whole))
-        return {block: Values(own) for block, own in arrays.items()}
+            for block, values in found.items():
+                own, shape = header.block_patches[block], header.blocks[block][0]
+                whole = assemble(own, header.layout, header.layout.levels, shape, grids)
+                values.arrays.append(np.ascontiguousarray(whole))
+        return found

@@ -1,4 +1,4 @@
-"""Checking a container from an untrusted source that does not fit into memory: values and errors by bands of rows."""
+"""Checking a container from an untrusted source that does not fit into memory: values and errors by bands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from ..container.digest import little_endian
 from ..container.model import Header
-from ..decoding.by_rows import RowsDecoder, why_not_by_rows
+from ..decoding.by_bands import decoder_by_bands, why_not_by_bands
+from ..decoding.by_blocks import BlocksDecoder
+from ..decoding.by_rows import RowsDecoder
 from ..decoding.inspected_sections import Walked, walk
 from ..decoding.inspection import (
     READ,
@@ -26,9 +28,12 @@ from ..decoding.inspection import (
     states_of,
 )
 from ..errors import CorruptStreamError, TooLargeError
+from ..grid.patches import level_shapes
 from ..library import require
 from ..parallel import spread
+from ..quantization.distortion import originals_of, other_originals
 from ..surface import Block, Surface
+from .grid_measuring import BlocksMeasurer
 from .measuring import Figures, RowsMeasurer, distances_of
 from .windows import RowsGiven
 
@@ -87,7 +92,7 @@ def inspect(
     header = walked.index.header
     if _fits(header, memory):
         return inspect_whole(walked, progress)
-    if (reason := why_not_by_rows(header)) is not None:
+    if (reason := why_not_by_bands(header)) is not None:
         raise TooLargeError(
             f"expected a surface that takes at most {memory >> 20:,} MiB to check, got one that takes about "
             f"{_values(header) * _WHOLE >> 20:,} MiB and cannot be decoded by bands: {reason}"
@@ -103,16 +108,45 @@ def _fits(header: Header, memory: int) -> bool:
     return _values(header) * _WHOLE <= memory
 
 
+@dataclass(frozen=True)
+class _Found:
+    """What decoding by bands tells: the SHA-256 of all values, the corners of their parts, and figures if any are."""
+
+    digest: str
+    corners: list[NDArray[Any]]
+    figures: list[Figures]
+
+
 def _by_bands(file: BinaryIO, walked: Walked, memory: int, progress: Callable[[float], None]) -> Inspection:
     def read(offset: int, length: int) -> bytes:
         file.seek(offset)
         return file.read(length)
 
     index, header = walked.index, walked.index.header
-    decoder = RowsDecoder(read, index)
     states = list(states_of(walked)) if header.exact else []
     check_levels(index, lambda level: _level(header, index.metadata_values, level), _MOST_POINTS)
-    groups, passes = decoder.groups(memory), 1 + (len(header.attributes) if index.digest is not None else 0)
+    decoder = decoder_by_bands(read, index)
+    if isinstance(decoder, RowsDecoder):
+        found = _of_rows(decoder, states, memory, progress)
+    else:
+        found = _of_blocks(decoder, states, memory, progress)
+    holes = tuple(0 if mask is None else int(np.count_nonzero(~mask)) for mask in header.masks)
+    check_values(index, holes, found.corners)
+    if index.digest is not None and found.digest != index.digest:
+        problem = f"expected values with the SHA-256 {index.digest}, got {found.digest}"
+        raise CorruptStreamError(problem, header.length)
+    if header.exact:
+        check_errors(walked, _errors(header, found.figures, len(states)), lambda part: None)
+    progress(1.0)
+    return Inspection(index, header.exact)
+
+
+def _of_rows(
+    decoder: RowsDecoder, states: Sequence[NDArray[np.int8]], memory: int, progress: Callable[[float], None]
+) -> _Found:
+    """Decode and measure the rows of the one grid, some at a time."""
+    header, hashed = decoder.header, decoder.index.digest is not None
+    groups, passes = decoder.groups(memory), 1 + (len(header.attributes) if hashed else 0)
     digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
     for number, group in enumerate(groups, 1):
         for band in spread(lambda rows: _band(decoder, rows, states), group):
@@ -120,21 +154,13 @@ def _by_bands(file: BinaryIO, walked: Walked, memory: int, progress: Callable[[f
             corners += band.corners
             figures += band.figures
         progress(READ + (_MEASURED - READ) * number / len(groups) / passes)
-    check_values(index, (0 if header.masks[0] is None else int(np.count_nonzero(~header.masks[0])),), corners)
-    if index.digest is not None:
-        # An array is hashed whole before the next one, so each attribute takes another pass.
-        for attribute in range(1, passes):
-            for group in groups:
-                for values in spread(decoder.rows, group):
-                    digest.update(little_endian(values.arrays[attribute]))
-            progress(READ + (_MEASURED - READ) * (attribute + 1) / passes)
-        if digest.hexdigest() != index.digest:
-            problem = f"expected values with the SHA-256 {index.digest}, got {digest.hexdigest()}"
-            raise CorruptStreamError(problem, header.length)
-    if header.exact:
-        check_errors(walked, _errors(header, figures, len(states)), lambda part: None)
-    progress(1.0)
-    return Inspection(index, header.exact)
+    # An array is hashed whole before the next one, so each attribute takes another pass.
+    for attribute in range(1, passes):
+        for group in groups:
+            for values in spread(decoder.rows, group):
+                digest.update(little_endian(values.arrays[attribute]))
+        progress(READ + (_MEASURED - READ) * (attribute + 1) / passes)
+    return _Found(digest.hexdigest(), corners, figures)
 
 
 @dataclass(frozen=True)
@@ -160,21 +186,47 @@ def _band(decoder: RowsDecoder, rows: tuple[int, int], states: Sequence[NDArray[
     return _Band(arrays[0], corners_of(arrays[0], mask), figures)
 
 
+def _of_blocks(
+    decoder: BlocksDecoder, states: Sequence[NDArray[np.int8]], memory: int, progress: Callable[[float], None]
+) -> _Found:
+    """Decode and measure some blocks at a time."""
+    header, masks = decoder.header, decoder.header.masks
+    digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
+    for blocks in decoder.groups(memory):
+        tiles, patches = decoder.tiles(blocks), decoder.patches(blocks)
+        values = decoder.values(blocks, tiles)
+        for block, own in values.items():
+            for array in own.arrays:
+                digest.update(little_endian(array))
+            corners += corners_of(own.arrays[0], masks[block])
+        if states:
+            points = {block: own.arrays[0] for block, own in values.items()}
+            arrays = {block: own.arrays for block, own in values.items()}
+            coordinates = originals_of(header.arrangement, points, masks, patches)
+            others = other_originals(header.arrangement, arrays, masks, header.geometric, patches)
+            measurer = BlocksMeasurer(header, tiles, blocks, patches)
+            figures.append(measurer.figures(states, coordinates, others))
+        progress(READ + (_MEASURED - READ) * blocks.stop / len(header.blocks))
+    return _Found(digest.hexdigest(), corners, figures)
+
+
 def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
     """A surface of a level's shape whose values are 0: as much as its metadata are about."""
-    shape, masked = header.layout.shape(0, level), header.masks[0] is not None
+    shapes = level_shapes(header.patches, header.layout, level, [shape for shape, _ in header.blocks])
     counts = (header.point_channels, *(kind.channels for kind in header.attributes))
     first = [sum(counts[:number]) for number in range(len(counts))]
-    points, *others = (
-        np.zeros((*shape, count), header.dtypes[channel]) for count, channel in zip(counts, first, strict=True)
-    )
-    attributes = {
-        kind.name: array if kind.components else array[..., 0]
-        for kind, array in zip(header.attributes, others, strict=True)
-    }
-    mask = np.ones(shape, np.bool_) if masked else None
-    block = Block(points[..., 0] if header.flat else points, header.closed, mask=mask, attributes=attributes)
-    return Surface(blocks=[block], metadata=dict(metadata))
+    blocks = []
+    for shape, (_, closed), mask in zip(shapes, header.blocks, header.masks, strict=True):
+        points, *others = (
+            np.zeros((*shape, count), header.dtypes[channel]) for count, channel in zip(counts, first, strict=True)
+        )
+        attributes = {
+            kind.name: array if kind.components else array[..., 0]
+            for kind, array in zip(header.attributes, others, strict=True)
+        }
+        valid = None if mask is None else np.ones(shape, np.bool_)
+        blocks.append(Block(points[..., 0] if header.flat else points, closed, mask=valid, attributes=attributes))
+    return Surface(blocks=blocks, metadata=dict(metadata))
 
 
 def _errors(header: Header, figures: list[Figures], states: int) -> list[Measured]:

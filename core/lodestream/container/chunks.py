@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from .model import Header
 
-__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel"]
+__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel", "first_chunks"]
 
 
 class ChunkPlace(NamedTuple):
@@ -40,6 +40,16 @@ def chunk_places(
                         yield ChunkPlace(channel, block, down, across, kept)
 
 
+def first_chunks(header: Header) -> list[int]:
+    """The number of the first chunk of each block, and how many chunks there are."""
+    height, width = (1 << exponent for exponent in header.chunk)
+    ends = [0]
+    for block, ((rows, columns), _) in enumerate(header.blocks):
+        kinds = 2 if header.kept and header.kept[block] else 1
+        ends.append(ends[-1] + kinds * -(-rows // height) * -(-columns // width) * header.channels)
+    return ends
+
+
 def chunks_of_a_channel(header: Header) -> int:
     """How many chunks each channel has; those of kept holes count for themselves."""
-    return sum(1 for _ in chunk_places(header)) // header.channels
+    return first_chunks(header)[-1] // header.channels

@@ -6,19 +6,14 @@ decoded twice.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from itertools import pairwise
-from threading import Lock
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..container.chunks import chunk_places
 from ..container.digest import values_digest
-from ..container.model import Chunk, Header, Index, Segment
-from ..container.sections import check_of
-from ..entropy.bitplanes import pass_count
+from ..container.model import Index
 from ..entropy.part_table import consecutive, part_of
 from ..entropy.tiles import Tiles, TileTable
 from ..errors import CorruptStreamError
@@ -27,15 +22,14 @@ from ..grid.patches import level_masks
 from ..kernels import PART_ROWS
 from ..parallel import spread, threads
 from ..quantization.distortion import store_values
-from ..residual import chunk_coder
 from ..scratch import Room
 from ..surface import Block, Surface
-from .batches import Coded, batch_length, rounds_of
 from .level_grids import positioned
 from .reconstruction import Values
 from .rows import RowsGeometry, RowsReconstructor, known_state
+from .stored_segments import StoredSegments
 
-__all__ = ["RowsDecoder", "why_not_by_rows"]
+__all__ = ["RowsDecoder"]
 
 #: Levels of at most so many points are decoded whole for each band.
 _CORE_POINTS = 1 << 18
@@ -44,15 +38,6 @@ _BYTES = 40
 
 #: Rows, half-open.
 Span = tuple[int, int]
-
-
-def why_not_by_rows(header: Header) -> str | None:
-    """Why a container cannot be decoded by bands of rows; None: it can."""
-    if len(header.layout.grids) > 1:
-        return "blocks share sides, or there are several"
-    if header.plane is not None:
-        return "x and y are made of rules"
-    return None
 
 
 class RowsDecoder:
@@ -75,8 +60,7 @@ class RowsDecoder:
     """
 
     def __init__(self, read: Callable[[int, int], bytes], index: Index, level: int | None = None) -> None:
-        self._read, self.index, self.header = read, index, index.header
-        self._reading = Lock()
+        self.index, self.header = index, index.header
         layout = self.header.layout
         self.level = layout.levels if level is None else level
         self.shape = layout.shape(0, self.level)
@@ -86,9 +70,7 @@ class RowsDecoder:
         mask = level_masks(self.header.patches, layout, self.level, self.header.masks)[0]
         #: No node of so coarse a level is valid: it shows what stands under the holes.
         self._mask = mask if mask is None or self._finest or mask.any() else None
-        self._segments: dict[int, list[Segment]] = defaultdict(list)
-        for segment in self.index.segments:
-            self._segments[segment.tile].append(segment)
+        self._stored = StoredSegments(read, index)
         # Once the stream is complete a tile that no layer has announced is known to have nothing but zeros.
         self._state = np.zeros((len(layout.tiles), self.header.channels), np.int8)
 
@@ -107,8 +89,6 @@ class RowsDecoder:
         ------
         CorruptStreamError
             If a segment or a chunk is damaged, or the SHA-256 of the values is wrong.
-        ValueError
-            If this cannot be decoded by rows, see `why_not_by_rows`.
         """
         header, shape = self.header, self.shape
         counts = (header.point_channels, *(kind.channels for kind in header.attributes))
@@ -163,8 +143,6 @@ class RowsDecoder:
         ------
         CorruptStreamError
             If a segment or a chunk is damaged.
-        ValueError
-            If this cannot be decoded by rows.
         """
         return self.values(*self.tiles(rows))
 
@@ -203,8 +181,6 @@ class RowsDecoder:
         ------
         CorruptStreamError
             If a segment is damaged.
-        ValueError
-            If this cannot be decoded by rows.
         """
         header = self.header
         geometry = RowsGeometry(header.layout, rows, self._core, level=self.level)
@@ -214,34 +190,8 @@ class RowsDecoder:
             Tiles(part.table, header.quantiser if channel < header.geometric else None, header.large)
             for channel in range(header.channels)
         ]
-        self._decode(channels, part.tiles)
+        self._stored.decode(channels, part.tiles)
         return geometry, channels
-
-    def _decode(self, channels: list[Tiles], numbers: NDArray[np.int64]) -> None:
-        """Decode all segments of some tiles, by their numbers in the surface."""
-        coded: list[Coded] = []
-        for tile in numbers.tolist():
-            left: dict[int, int] = {}
-            for segment in self._segments[tile]:
-                first = left.get(segment.channel, pass_count(segment.top))
-                left[segment.channel] = first - segment.passes
-                data = self._checked(segment, "segment")
-                coded.append(Coded(tile, segment.channel, first - 1, segment.passes, data, segment.range.offset))
-        coded.sort(key=lambda one: one.offset)
-        local = {int(tile): place for place, tile in enumerate(numbers)}
-        while coded:
-            count = batch_length(self.header.layout, coded)
-            for readings in rounds_of(channels, [one._replace(tile=local[one.tile]) for one in coded[:count]]):
-                spread(lambda reading: reading.run(), readings)
-            coded = coded[count:]
-
-    def _checked(self, part: Segment | Chunk, what: str) -> bytes:
-        """The bytes of a segment or a chunk."""
-        with self._reading:
-            data = self._read(part.range.offset, part.range.length)
-        if len(data) != part.range.length or check_of(data) != part.check:
-            raise CorruptStreamError(f"expected a {what} with the checksum that the index tells", part.range.offset)
-        return data
 
     def _correct(self, values: Values, rows: Span) -> None:
         header, chunks = self.header, self.index.chunks
@@ -252,16 +202,8 @@ class RowsDecoder:
         first = (rows[0] >> header.chunk[0]) * across
         numbers = {False: first, True: each + first}
         for place in chunk_places(header, rows):
-            number = numbers[place.kept]
+            self._stored.correct(values, numbers[place.kept], place, rows[0])
             numbers[place.kept] += 1
-            if not chunks[number].range.length:
-                continue
-            data, own = self._checked(chunks[number], "chunk"), values.window(place, rows[0])
-            mask = (header.kept_masks if place.kept else header.masks)[0]
-            chosen = slice(None) if mask is None else mask[slice(*place.rows), slice(*place.columns)]
-            known = own[chosen]
-            restored = chunk_coder.decode_chunk(known.ravel(), data, chunks[number].range.offset)
-            own[chosen] = restored.reshape(known.shape)
 
 
 def _with_parents(layout: Layout, levels: list[list[range]]) -> list[range]:

@@ -27,7 +27,7 @@ from ..transform.pyramid import PADDING, grids, inverse, refine
 from .crop import AxisCrop, crop_axis
 from .levels import known_levels
 
-__all__ = ["Coordinates", "has_bands", "reconstruct_channel", "values_of_grid"]
+__all__ = ["Coordinates", "has_bands", "reconstruct_channel", "reconstruct_patches", "values_of_grid"]
 
 #: Lattice coordinates of each grid, over two to the power of the second.
 Coordinates = tuple[list[NDArray[np.int32]], int]
@@ -70,6 +70,33 @@ def reconstruct_channel(
     coordinate = channel < header.geometric
     inverse(coefficients, layout, header.predictors[channel], level, whole, coordinate, bare=bare)
     return coefficients, FRACTION_BITS if whole < level else 0
+
+
+def reconstruct_patches(
+    header: Header, channel: int, tiles: Tiles, patches: Sequence[int], level: int
+) -> list[NDArray[np.int32]]:
+    """One channel of some patches when all segments are known, at a level: int32, shape (row, column) each.
+
+    Parameters
+    ----------
+    header : Header
+        Of a surface of several grids.
+    channel : int
+    tiles : Tiles
+        Of the tiles that these patches have up to the level, and all interfaces.
+    patches : sequence of int
+        By their numbers.
+    level : int
+    """
+    interfaces = len(header.layout.grids) - len(header.patches)
+    layout, places = header.layout.part([interfaces + patch for patch in patches])
+    arrays = grids(layout, level)
+    every: list[NDArray[np.int32] | None] = [None] * len(header.layout.grids)
+    for place, array in zip(places, arrays, strict=True):
+        every[place] = array
+    tiles.spread_levels(level, np.zeros(len(tiles.table.members), np.int8), every, level)
+    inverse(arrays, layout, header.predictors[channel], level, level, channel < header.geometric)
+    return arrays[-len(patches) :]
 
 
 def has_bands(header: Header, level: int) -> bool:

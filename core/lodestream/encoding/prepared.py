@@ -104,12 +104,12 @@ class Prepared:
         """What the coordinates of each patch are compared with."""
         return tuple(self.originals_of(None))
 
-    def originals_of(self, chosen: range | None) -> list[Original]:
+    def originals_of(self, chosen: Sequence[int] | None) -> list[Original]:
         """The same of some patches, by their numbers; None: of all."""
         masks = [block.mask for block in self.surface.blocks]
         return originals_of(self.arrangement, [own[0] for own in self.arrays], masks, chosen)
 
-    def others_of(self, chosen: range | None) -> list[tuple[list[Original], int]]:
+    def others_of(self, chosen: Sequence[int] | None) -> list[tuple[list[Original], int]]:
         """What the channels that are no coordinates are compared with, of some patches; None: of all.
 
         Of each channel what `other_originals` says of it.

@@ -52,7 +52,7 @@ class StateReconstructor:
     header : Header
     tiles : sequence of Tiles, one for each channel
         All that a reader knows in the end.
-    patches : range, optional
+    patches : sequence of int, optional
         Of these patches alone, by their numbers, and of the interfaces that they need: ``tiles`` have their tiles.
 
     Attributes
@@ -61,12 +61,12 @@ class StateReconstructor:
         What was reconstructed last, of each grid: of chosen patches interfaces first.
     """
 
-    def __init__(self, header: Header, tiles: Sequence[Tiles], patches: range | None = None) -> None:
+    def __init__(self, header: Header, tiles: Sequence[Tiles], patches: Sequence[int] | None = None) -> None:
         layout = header.layout
         self._places: Sequence[int] = range(len(layout.grids))
         if patches is not None:
             first = len(layout.grids) - len(header.patches)
-            layout, self._places = layout.part(range(first + patches.start, first + patches.stop))
+            layout, self._places = layout.part([first + patch for patch in patches])
         shapes = [grid.shape for grid in layout.grids]
         self.canvases: Canvases = [
             np.empty((header.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..grid.layout import Layout
 from .tiles import TileTable
 
-__all__ = ["Part", "consecutive", "flat_span", "part_of"]
+__all__ = ["Part", "consecutive", "flat_span", "part_of", "tiles_of_grids"]
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,19 @@ def consecutive(numbers: NDArray[np.int64]) -> list[range]:
     every = np.unique(numbers)
     starts = np.flatnonzero(np.diff(every, prepend=-2) > 1).tolist()
     return [range(int(every[a]), int(every[b - 1]) + 1) for a, b in pairwise([*starts, len(every)])]
+
+
+def tiles_of_grids(layout: Layout, grids: Sequence[int], level: int) -> list[range]:
+    """The tiles that some grids have at the levels up to one, in runs of neighbours of one level each.
+
+    Tiles that they have in common with other grids are among them.
+    """
+    found: list[range] = []
+    for own in range(level + 1):
+        starts, tiles = layout.tile_arrays.groups(own)
+        groups = np.unique(np.searchsorted(starts, grids, side="right") - 1).tolist()
+        found += consecutive(np.concatenate([np.arange(tiles[group], tiles[group + 1]) for group in groups]))
+    return found
 
 
 def flat_span(table: TileTable, tiles: range) -> slice:

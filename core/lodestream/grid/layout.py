@@ -176,10 +176,10 @@ class Layout:
         """The layout of some grids."""
         return Layout(grids, tile)
 
-    def part(self, patches: range) -> tuple[Layout, list[int]]:
+    def part(self, patches: Sequence[int]) -> tuple[Layout, list[int]]:
         """The layout of some patches and of the interfaces that they need, and the numbers that its grids have here.
 
-        ``patches`` are numbers of grids. Levels are those of this layout, tiles are not.
+        ``patches`` are numbers of grids, and come last. Levels are those of this layout, tiles are not.
         """
         needed: set[int] = set()
         waiting = list(patches)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ __all__ = [
 ]
 
 Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
+
+T = TypeVar("T")
+#: Of each block, or of those alone that are asked for.
+ByBlock = Sequence[T] | Mapping[int, T]
 
 #: Points in one call of a kernel, and cells of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
 _AT_ONCE = 1 << 20
@@ -80,9 +84,9 @@ class Original:
 
 def originals_of(
     arrangement: Arrangement | None,
-    points: Sequence[NDArray[Any]],
-    masks: Sequence[NDArray[np.bool_] | None],
-    chosen: range | None = None,
+    points: ByBlock[NDArray[Any]],
+    masks: ByBlock[NDArray[np.bool_] | None],
+    chosen: Sequence[int] | None = None,
 ) -> list[Original]:
     """What the values of each patch are compared with; each vertex of several patches is counted in one of them.
 
@@ -90,19 +94,20 @@ def originals_of(
     ----------
     arrangement : Arrangement or None
         None: there is one block, which is one patch.
-    points : C-contiguous arrays, shape (row, column, channel), one for each block
+    points : C-contiguous arrays, shape (row, column, channel), one for each block that is asked for
     masks : bool, shape (row, column), or None, one for each block
         True where a point is valid.
-    chosen : range, optional
-        Of these patches alone, by their numbers.
+    chosen : sequence of int, optional
+        Of these patches alone, by their numbers, increasing.
     """
     if arrangement is None:
         return [Original(points[0], masks[0])]
     originals = []
-    counter, chosen = VertexCounter(arrangement), chosen or range(len(arrangement.patches))
-    for patch in arrangement.patches[: chosen.start]:
-        counter.pass_over(patch)
-    for patch in arrangement.patches[chosen.start : chosen.stop]:
+    counter, wanted = VertexCounter(arrangement), None if chosen is None else set(chosen)
+    for number, patch in enumerate(arrangement.patches):
+        if wanted is not None and number not in wanted:
+            counter.pass_over(patch)
+            continue
         mask = masks[patch.block]
         counted = np.ones(patch.shape, np.bool_) if mask is None else stored(patch, mask)
         counter.count(patch, counted)
@@ -112,10 +117,10 @@ def originals_of(
 
 def other_originals(
     arrangement: Arrangement | None,
-    arrays: Sequence[Sequence[NDArray[Any]]],
-    masks: Sequence[NDArray[np.bool_] | None],
+    arrays: ByBlock[Sequence[NDArray[Any]]],
+    masks: ByBlock[NDArray[np.bool_] | None],
     geometric: int,
-    chosen: range | None = None,
+    chosen: Sequence[int] | None = None,
 ) -> list[tuple[list[Original], int]]:
     """What the reconstructions of each channel that is no coordinate are compared with, and its number in those arrays.
 
@@ -131,19 +136,19 @@ def other_originals(
         True where a point is valid.
     geometric : int
         The first so many channels of the points are coordinates.
-    chosen : range, optional
-        Of these patches alone, by their numbers.
+    chosen : sequence of int, optional
+        Of these patches alone, by their numbers, increasing.
     """
     patches = None if arrangement is None else arrangement.patches
     if patches is not None and chosen is not None:
-        patches = patches[chosen.start : chosen.stop]
+        patches = tuple(patches[number] for number in chosen)
     if patches is None:
         valid = [masks[0]]
     else:
         own = [(patch, masks[patch.block]) for patch in patches]
         valid = [None if mask is None else stored(patch, mask) for patch, mask in own]
     found = []
-    for number, array in enumerate(arrays[0]):
+    for number, array in enumerate(arrays[patches[0].block if patches else 0]):
         first = 0 if number else geometric
         if first == array.shape[2]:
             continue

@@ -169,7 +169,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     """
     from lodestream import Decoder, Target
     from lodestream.container import read_index
-    from lodestream.decoding.by_rows import RowsDecoder
+    from lodestream.decoding.by_bands import decoder_by_bands
     from lodestream.planning.planner import plan
     from lodestream.scratch import Room, Scratch
 
@@ -185,7 +185,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
             if aside >= job.most_bytes:
                 raise FileTooLongError(os.strerror(errno.EFBIG))
             room = Room(lambda: Scratch(job.folder / "values"))
-            rows = RowsDecoder(read, index, job.level)
+            rows = decoder_by_bands(read, index, job.level)
             return rows.surface(room, job.memory // _BAND, lambda fraction: None), aside
         chosen = plan(index, Target(level=job.level))
         decoder = Decoder(level=job.level)
@@ -196,10 +196,10 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
 
 def _goes_by_bands(header: Header, job: LevelJob) -> bool:
     """Whether a level is decoded by bands, and written so: it takes much memory in one piece, and can be."""
-    from lodestream.decoding.by_rows import why_not_by_rows
+    from lodestream.decoding.by_bands import why_not_by_bands
     from lodestream.formats import written
 
-    if job.level > header.levels or written(job.format_name).memory or why_not_by_rows(header) is not None:
+    if job.level > header.levels or written(job.format_name).memory or why_not_by_bands(header) is not None:
         return False
     return header.layout.points(job.level) * header.channels * _WHOLE > job.memory // 2
 

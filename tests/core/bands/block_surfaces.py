@@ -117,7 +117,7 @@ def block_surface(
     blocks = []
     for points, closed in _blocks(kind, shape, count, rng):
         values = np.round(points * 1000).astype(dtype) if dtype[0] != "f" else points.astype(dtype)
-        mask, attributes = None, {}
+        mask, attributes = None, dict[str, NDArray[Any]]()
         if "holes" in more and rng.random() < 0.7:
             mask = rng.random(points.shape[:2]) < 0.9
             mask[rng.integers(len(mask)) :, : rng.integers(mask.shape[1]) // 2] = False

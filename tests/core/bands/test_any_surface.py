@@ -18,7 +18,7 @@ from lodestream.bands import made
 from lodestream.bands.front import goes_by_bands
 from lodestream.bands.inspecting import inspect
 from lodestream.container.reader import read_index
-from lodestream.decoding.by_rows import RowsDecoder, why_not_by_rows
+from lodestream.decoding.by_bands import decoder_by_bands, why_not_by_bands
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.scratch import IN_MEMORY
@@ -124,8 +124,8 @@ def _is_known_by_bands(container: bytes, rng: np.random.Generator) -> None:
         return container[offset : offset + length]
 
     expected = ls.decode(container)
-    decoder = RowsDecoder(read, read_index(read, len(container)))
-    if why_not_by_rows(decoder.header) is not None:
+    decoder = decoder_by_bands(read, read_index(read, len(container)))
+    if why_not_by_bands(decoder.header) is not None:
         return
     found = decoder.surface(IN_MEMORY, 1, lambda fraction: None)
     assert found.closed == expected.closed

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -12,20 +14,32 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.bands import made
+from lodestream.bands import grid_tasks, made, transforming
+from lodestream.bands.grid_measuring import blocks_of_run
+from lodestream.bands.grid_runs import GridRuns
+from lodestream.bands.inspecting import inspect
+from lodestream.container.reader import read_index
+from lodestream.decoding.by_bands import decoder_by_bands, why_not_by_bands
+from lodestream.decoding.by_blocks import BlocksDecoder
+from lodestream.decoding.by_rows import RowsDecoder
+from lodestream.encoding import transformed
+from lodestream.encoding.encoder import encode
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
+from lodestream.scratch import IN_MEMORY
+from lodestream.surface import Surface
 
+from ..container.forgery import with_layer_errors
 from .block_surfaces import KINDS, block_surface
 from .test_building import built
 
 #: What a container does not keep is another matter, see test_losses.
 pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
 
-lengths = st.integers(4, 20) | st.integers(4, 150)
+lengths = st.integers(4, 20) | st.integers(4, 90)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     kind=st.sampled_from(KINDS),
     shape=st.tuples(lengths, lengths),
@@ -70,3 +84,113 @@ def test_any_blocks(
         container = built(surface, points, core, threads, precision=precision)
         # Of noise the shortest of several streams is kept, and this is the first.
         assert container == whole or (len(container) > len(whole) and precision is None)
+    _is_known_by_blocks(whole, seed)
+
+
+def _decoder(container: bytes, level: int | None = None) -> BlocksDecoder | RowsDecoder:
+    def read(offset: int, length: int) -> bytes:
+        return container[offset : offset + length]
+
+    return decoder_by_bands(read, read_index(read, len(container)), level)
+
+
+def _is_known_by_blocks(container: bytes, seed: int) -> None:
+    """Decoding by blocks, of a level and of the whole, and an inspection say of a container what decoding in memory does."""
+    whole = ls.Decoder()
+    whole.feed(container)
+    assert whole.header is not None
+    for level in (seed % (whole.header.levels + 1), None):
+        decoder = _decoder(container, level)
+        if why_not_by_bands(decoder.header) is not None:
+            return
+        found, expected = decoder.surface(IN_MEMORY, 1, lambda fraction: None), whole.surface(level)
+        assert found.metadata == expected.metadata
+        assert repr(found.joints) == repr(expected.joints)
+        for own, other in zip(found.blocks, expected.blocks, strict=True):
+            assert own.closed == other.closed
+            assert own.points.tobytes() == other.points.tobytes()
+            assert (own.mask is None) == (other.mask is None)
+            if own.mask is not None and other.mask is not None:
+                assert own.mask.tobytes() == other.mask.tobytes()
+            assert list(own.attributes) == list(other.attributes)
+            for name, values in own.attributes.items():
+                assert values.tobytes() == other.attributes[name].tobytes()
+    inspect(io.BytesIO(container), max_vertices=1 << 20, memory=1)
+
+
+def _plates(dtype: str = "float32", more: str = "") -> Surface:
+    return block_surface("plates", (260, 240), 2, dtype, more, np.random.default_rng(7))
+
+
+@pytest.mark.parametrize("more", ["", "holes", "attributes"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_wrong_errors_are_found(more: str, place: int) -> None:
+    data = ls.encode(_plates(more=more))
+    with pytest.raises(ls.CorruptStreamError, match="RMS and maximum error of layer 0"):
+        inspect(io.BytesIO(with_layer_errors(data, 0, 0.999, place)), max_vertices=1 << 20, memory=1)
+
+
+def test_a_flipped_bit_is_found() -> None:
+    data = bytearray(ls.encode(_plates()))
+    for place in range(20, len(data), len(data) // 40):
+        data[place] ^= 4
+        with pytest.raises(ls.LodestreamError):
+            inspect(io.BytesIO(bytes(data)), max_vertices=1 << 20, memory=1)
+        data[place] ^= 4
+
+
+def test_damage_is_found_where_it_is_decoded() -> None:
+    container = bytearray(ls.encode(_plates()))
+    segment = _decoder(bytes(container)).index.segments[-1]
+    container[segment.range.offset] ^= 1
+    with pytest.raises(ls.CorruptStreamError, match="checksum"):
+        _decoder(bytes(container)).surface(IN_MEMORY, 1, lambda fraction: None)
+
+
+def test_coefficients_that_are_too_large_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    surface = _plates()
+    monkeypatch.setattr(transforming, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
+    plain = built(surface, 1, 600)
+    monkeypatch.setattr(transformed, "COEFFICIENT_BITS", 0)
+    assert plain == encode(surface)
+    assert ls.decode(plain).blocks[0].points.tobytes() == surface.blocks[0].points.tobytes()
+
+
+def test_many_small_blocks_go_together() -> None:
+    surface = _plates()
+    prepared = prepare(surface, Quality())
+    points = sum(block.shape[0] * block.shape[1] for block in surface.blocks)
+    assert blocks_of_run(prepared, points) == [range(len(surface.blocks))]
+    assert blocks_of_run(prepared, 1) == [range(k, k + 1) for k in range(len(surface.blocks))]
+    runs, together = (GridRuns(prepared.layout, size, 600) for size in (1, 2 * points))
+    for level in runs.levels:
+        assert [run.tiles.start for run in runs.of(level)[1:]] == [run.tiles.stop for run in runs.of(level)[:-1]]
+        assert sum(len(run.tiles) for run in runs.of(level)) == len(prepared.layout.tiles_of(level))
+        assert len(together.of(level)) == 1
+    assert len(runs.of(prepared.layout.levels)) > 1
+
+
+def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    surface = _plates()
+    expected, calls = ls.encode(surface), [0]
+    step, measure = grid_tasks.second_step, grid_tasks.measure
+
+    def counted(*arguments: Any) -> None:
+        calls[0] += 1
+        step(*arguments)
+
+    def cut(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(grid_tasks, "second_step", counted)
+    monkeypatch.setattr(grid_tasks, "measure", cut)
+    monkeypatch.setattr(made, "_FEWEST", 1)
+    with pytest.raises(KeyboardInterrupt):
+        ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, scratch=tmp_path / "scratch")
+    before = calls[0]
+    assert before > 0
+    monkeypatch.setattr(grid_tasks, "measure", measure)
+    ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, scratch=tmp_path / "scratch")
+    assert calls[0] == before, "what was transformed is not transformed again"
+    assert (tmp_path / "a.lode").read_bytes() == expected
+    assert not (tmp_path / "scratch").exists()
