@@ -120,6 +120,7 @@ def block_surface(
         mask, attributes = None, dict[str, NDArray[Any]]()
         if "holes" in more and rng.random() < 0.7:
             mask = rng.random(points.shape[:2]) < 0.9
+            mask[[0, -1]] = mask[:, [0, -1]] = True  # each hole in a side would make one more patch
             mask[rng.integers(len(mask)) :, : rng.integers(mask.shape[1]) // 2] = False
             mask[0, 0] = True
         if "attributes" in more:
