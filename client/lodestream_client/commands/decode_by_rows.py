@@ -1,4 +1,4 @@
-"""``lodestream decode`` of surfaces that do not fit into memory: by bands of rows, by way of a file."""
+"""``lodestream decode`` of surfaces that do not fit into memory: by bands of rows or by blocks, by way of a file."""
 
 from __future__ import annotations
 
@@ -115,9 +115,9 @@ class _Needs:
         self._format = written("npy") if options.out == "-" else for_writing(options.out)
         self._given = options.memory is not None
         header = decoder.header
-        self.points = header.layout.points(decoder.level)
-        if decoder.level == header.levels:
-            self.points = sum(rows * columns for (rows, columns), _ in header.blocks)
+        shapes = decoder.shapes
+        self.points = sum(rows * columns for rows, columns in shapes)
+        self._together = max(rows * columns for rows, columns in shapes) if self._format.by_block else self.points
         channels = selection_of(options.target).channels(header)
         self.decoding = self.points * int(channels.sum()) * _WHOLE
         self._values = self.points * sum(
@@ -142,12 +142,14 @@ class _Needs:
 
         limit = memory if self._given else memory_limit()
         whole = self.decoding <= memory or self.reason is not None
-        writing = self._format.memory * self.points + (self._values if whole else 0)
+        writing = self._format.memory * self._together + (self._values if whole else 0)
         if self._format.memory and writing > limit:
             by_bands = [it.name for it in formats() if (it.write or it.write_beside) and not it.memory]
+            by_block = [it.name for it in formats() if it.by_block]
             raise TooLargeError(
                 f"expected a surface that takes at most {limit >> 20:,} MiB to write as {self._format.name}, got one "
-                f"that takes about {writing >> 20:,} MiB; {', '.join(by_bands)} are written by bands of rows"
+                f"that takes about {writing >> 20:,} MiB; {', '.join(by_bands)} are written by bands of rows, and "
+                f"{', '.join(by_block)} block by block"
             )
         if self.reason is not None and self.decoding > limit:
             raise TooLargeError(

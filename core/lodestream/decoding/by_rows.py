@@ -57,6 +57,8 @@ class RowsDecoder:
     level : int
     shape : (int, int)
         Rows and columns of the level.
+    shapes : list of (int, int)
+        The same of each block: of the only one.
     """
 
     def __init__(self, read: Callable[[int, int], bytes], index: Index, level: int | None = None) -> None:
@@ -64,6 +66,7 @@ class RowsDecoder:
         layout = self.header.layout
         self.level = layout.levels if level is None else level
         self.shape = layout.shape(0, self.level)
+        self.shapes = [self.shape]
         self._finest = self.level == layout.levels
         small = (own for own in range(self.level + 1) if layout.points(own) <= _CORE_POINTS)
         self._core = max(small, default=0)

@@ -71,6 +71,8 @@ class Format:
     memory : int
         Bytes that writing takes for each point, beside the surface, about; 0 where it takes some rows at a time, of a
         surface that is in files.
+    by_block : bool
+        Whether writing takes one block at a time: then its memory is that for the points of the largest one.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Format:
     write_beside: Callable[[Surface, Path], None] | None = None
     folder: Callable[[Path], bool] | None = None
     memory: int = 0
+    by_block: bool = False
 
     @property
     def suffixes_out(self) -> tuple[str, ...]:
@@ -223,6 +226,7 @@ FORMATS = (
         sniff=multiblock.sniff,
         write=multiblock.write,
         memory=48,
+        by_block=True,
         write_beside=multiblock.write_beside,
         blocks=True,
         media_type=multiblock.MEDIA_TYPE,
@@ -252,6 +256,7 @@ FORMATS = (
         read=plot3d.read,
         write=plot3d_writer.write,
         memory=48,
+        by_block=True,
         blocks=True,
         write_suffixes=plot3d_writer.SUFFIXES,
         options=plot3d.READ_OPTIONS,

@@ -199,7 +199,9 @@ def _goes_by_bands(header: Header, job: LevelJob) -> bool:
     from lodestream.decoding.by_bands import why_not_by_bands
     from lodestream.formats import written
 
-    if job.level > header.levels or written(job.format_name).memory or why_not_by_bands(header) is not None:
+    if job.level > header.levels or why_not_by_bands(header) is not None:
+        return False
+    if (format_ := written(job.format_name)).memory and not format_.by_block:
         return False
     return header.layout.points(job.level) * header.channels * _WHOLE > job.memory // 2
 

@@ -12,6 +12,7 @@ import lodestream as ls
 from lodestream.container import capacity
 from lodestream_client.commands import decode_by_rows
 from lodestream_client.commands.outcome import Outcome
+from tests.core.bands.block_surfaces import block_surface
 from tests.core.surfaces import terrain
 
 from ..conftest import Run
@@ -102,6 +103,36 @@ def test_a_torus_is_decoded_by_bands(run: Run, container: Path) -> None:
     container.write_bytes(ls.encode(ls.Surface(HEIGHTS, (True, True))))
     assert run("decode", container, container.with_name("a.npy"), *LITTLE)[0] == 0
     assert np.array_equal(np.load(container.with_name("a.npy")), HEIGHTS)
+
+
+@pytest.mark.parametrize("out", ["a.vtm", "a.p3d"])
+def test_blocks_are_decoded_and_written_one_after_another(
+    run: Run, container: Path, out: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface = block_surface("plates", (180, 170), 3, "float32", "holes", np.random.default_rng(1))
+    container.write_bytes(ls.encode(surface))
+    whole, little = container.with_name("whole") / out, container.with_name("little") / out
+    for path in (whole, little):
+        path.parent.mkdir()
+    assert run("decode", container, whole, "--memory", "1GiB")[0] == 0
+    monkeypatch.setattr(ls.Decoder, "surface", None)  # in one piece
+    code, _, stderr = run("decode", container, little, *LITTLE)
+    assert code == 0, stderr
+    made = sorted(path.relative_to(little.parent) for path in little.parent.rglob("*") if path.is_file())
+    assert made == sorted(path.relative_to(whole.parent) for path in whole.parent.rglob("*") if path.is_file())
+    assert len(made) == (1 if out == "a.p3d" else 1 + len(surface.blocks))
+    for name in made:
+        assert (little.parent / name).read_bytes() == (whole.parent / name).read_bytes()
+
+
+def test_a_surface_that_touches_itself_is_decoded_by_bands(
+    run: Run, container: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    surface = block_surface("sphere", (200, 190), 1, "float32", "", np.random.default_rng(1))
+    container.write_bytes(ls.encode(surface))
+    monkeypatch.setattr(ls.Decoder, "surface", None)
+    assert run("decode", container, container.with_name("a.npy"), *LITTLE)[0] == 0
+    assert np.array_equal(np.load(container.with_name("a.npy")), surface.points)
 
 
 def test_without_the_option_the_machine_is_the_limit(

@@ -36,34 +36,36 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
     i runs along the columns, j along the rows. Numbers are double where any is not held by single. Holes have IBLANK 0
     and the place of a point that is valid; an attribute ``iblank`` that agrees with them is written as it is.
-    A closed axis repeats its first points at the end. Planar points make a grid of two dimensions.
+    A closed axis repeats its first points at the end. Planar points make a grid of two dimensions. One block after the
+    other is looked at, then written.
 
     Raises
     ------
     FormatError
         If integers need more than a double, or a block more bytes than a record may have.
     """
-    blocks = [_arrays(surface, block) for block in surface.blocks]
-    dtype = np.result_type(np.float32, *(channel for channels in blocks for channel in channels))
-    code = "<f8" if dtype == np.float64 else "<f4"
-    given = [_given(block) for block in surface.blocks]
-    as_given = all(values is not None for values in given)
-    blanks = _blanks(surface, [values for values in given if values is not None] if as_given else None)
+    dtypes, shapes, dimensions = [np.dtype(np.float32)], [], 0
+    for block in surface.blocks:
+        channels = _arrays(surface, block)
+        dtypes += [channel.dtype for channel in channels]
+        shapes.append(channels[0].shape)
+        dimensions = len(channels)
+    code = "<f8" if np.result_type(*dtypes) == np.float64 else "<f4"
+    as_given = all(_given(block) is not None for block in surface.blocks)
+    blanked = as_given or any(block.holes for block in surface.blocks)
     _warn_left_out(surface, as_given)
-    dimensions = len(blocks[0])
-    shapes = [channels[0].shape for channels in blocks]
     sizes = [(columns, rows, 1)[:dimensions] for rows, columns in shapes]
-    lengths = [4, 4 * dimensions * len(blocks)]
+    lengths = [4, 4 * dimensions * len(shapes)]
     for rows, columns in shapes:
-        lengths.append(rows * columns * (dimensions * int(code[-1]) + 4 * (blanks is not None)))
+        lengths.append(rows * columns * (dimensions * int(code[-1]) + 4 * blanked))
     if max(lengths) > _LONGEST:
         raise FormatError(f"expected blocks of at most {number(_LONGEST)} bytes for PLOT3D, got {number(max(lengths))}")
-    _write_record(file, lengths[0], np.array([len(blocks)], "<i4"))
+    _write_record(file, lengths[0], np.array([len(shapes)], "<i4"))
     _write_record(file, lengths[1], np.array(sizes, "<i4"))
-    for place, (channels, length) in enumerate(zip(blocks, lengths[2:], strict=True)):
-        arrays = [channel.astype(code) for channel in channels]
-        if blanks is not None:
-            arrays.append(blanks[place].astype("<i4"))
+    for block, length in zip(surface.blocks, lengths[2:], strict=True):
+        arrays = [channel.astype(code) for channel in _arrays(surface, block)]
+        if blanked:
+            arrays.append(_blanks(block, as_given).astype("<i4"))
         _write_record(file, length, *arrays)
 
 
@@ -91,15 +93,12 @@ def _arrays(surface: Surface, block: Block) -> list[NDArray[Any]]:
     return found
 
 
-def _blanks(surface: Surface, given: list[NDArray[Any]] | None) -> list[NDArray[Any]] | None:
-    """IBLANK of each block; None where no point is a hole and no attribute says anything else."""
-    if given is None and not any(block.holes for block in surface.blocks):
-        return None
-    values = given or [
-        np.ones(block.shape, np.int32) if block.mask is None else block.mask.astype(np.int32)
-        for block in surface.blocks
-    ]
-    return [wrapped_ends(of_block, block) for of_block, block in zip(values, surface.blocks, strict=True)]
+def _blanks(block: Block, as_given: bool) -> NDArray[Any]:
+    """IBLANK of a block: what its attribute says, or where there are holes."""
+    values = _given(block) if as_given else None
+    if values is None:
+        values = np.ones(block.shape, np.int32) if block.mask is None else block.mask.astype(np.int32)
+    return wrapped_ends(values, block)
 
 
 def _given(block: Block) -> NDArray[Any] | None:
