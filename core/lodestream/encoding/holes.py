@@ -103,15 +103,12 @@ def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]], room: 
     if len(blocks) == 1 and blocks[0].mask is None:
         valid = points[0]
     else:
-        masks = [
-            np.ones(array.shape[:2], np.bool_) if b.mask is None else b.mask
-            for b, array in zip(blocks, points, strict=True)
-        ]
-        count = sum(int(np.count_nonzero(mask)) for mask in masks)
+        count = sum(array.shape[0] * array.shape[1] - b.holes for b, array in zip(blocks, points, strict=True))
         valid, done = room.empty((count, 1, points[0].shape[2]), points[0].dtype), 0
-        for array, mask in zip(points, masks, strict=True):
+        for block, array in zip(blocks, points, strict=True):
             for rows in rows_at_once(array.shape):
-                chosen = array[rows][mask[rows]]
+                own = array[rows]
+                chosen = own.reshape(-1, own.shape[2]) if block.mask is None else own[block.mask[rows]]
                 valid[done : done + len(chosen), 0] = chosen
                 done += len(chosen)
     return valid[..., 0] if flat else valid

@@ -126,7 +126,7 @@ def find_lattice(values: NDArray[Any]) -> Lattice | None:
     (rounded correctly, or computed as ``origin + step * k``), each fewer than 2**24 steps between least and largest
     value. What is returned restores every value bit for bit, except that -0.0 is taken for 0.0.
     """
-    flat = values.ravel()
+    flat = values.reshape(-1)  # a view of a channel too, where there is one; ravel would copy it
     low, high = flat.min(), flat.max()
     if values.dtype.kind in "iu":
         return _integer_lattice(flat, int(low), int(high))

@@ -15,11 +15,13 @@ import pytest
 
 import lodestream as ls
 from lodestream.bands import cluster as clusters
+from lodestream.formats import write_stream
 from lodestream_client.__main__ import main
 from lodestream_server import create_app, running_server
 from lodestream_server.builds import cluster_build, worker
 from lodestream_server.operation.settings import Settings
 from tests.clusters import local_cluster
+from tests.core.bands.block_surfaces import block_surface
 from tests.core.surfaces import terrain
 from tests.server.helpers import push
 
@@ -43,26 +45,38 @@ def _npy(side: int) -> bytes:
     return out.getvalue()
 
 
-def _job(folder: Path, data: bytes, **changes: Any) -> worker.Job:
+def _blocks() -> ls.Surface:
+    return block_surface("plates", (300, 280), 3, "float32", "", np.random.default_rng(5))
+
+
+def _plot3d() -> bytes:
+    out = io.BytesIO()
+    write_stream(_blocks(), "plot3d", out)
+    return out.getvalue()
+
+
+def _job(folder: Path, data: bytes, name: str = "heights.npy", **changes: Any) -> worker.Job:
     upload = folder / "0"
     upload.write_bytes(data)
     (folder / "work").mkdir()
     given: dict[str, Any] = {"options": {}, "max_vertices": 1 << 20, "folder": folder / "work"}
-    return worker.Job((upload,), "heights.npy", None, "auto", **(given | changes))
+    return worker.Job((upload,), name, None, "auto", **(given | changes))
 
 
 def _without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "memory_limit", lambda: 2 << 20)
 
 
-@pytest.mark.parametrize("options", [{}, {"precision": "0.5"}])
+@pytest.mark.parametrize(
+    ("options", "name"), [({}, "heights.npy"), ({"precision": "0.5"}, "heights.npy"), ({}, "blocks.p3d")]
+)
 def test_a_build_by_bands_has_the_same_bytes(
-    options: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: dict[str, str], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "whole").mkdir()
     (tmp_path / "bands").mkdir()
-    data = _npy(300)
-    whole, bands = (_job(tmp_path / name, data, options=options) for name in ("whole", "bands"))
+    data = _plot3d() if name == "blocks.p3d" else _npy(300)
+    whole, bands = (_job(tmp_path / folder, data, name, options=options) for folder in ("whole", "bands"))
     built = worker.build(whole)
     assert isinstance(built, worker.Built)
     assert not whole.scratch.exists()
@@ -81,6 +95,8 @@ def test_an_uploaded_container_is_checked_by_bands(tmp_path: Path, monkeypatch: 
     assert job.container.read_bytes() == data
     torus = _job(_new(tmp_path, "torus"), ls.encode(ls.Surface(terrain((300, 310)), (True, True))))
     assert isinstance(worker.build(torus), worker.Built)
+    blocks = _job(_new(tmp_path, "blocks"), ls.encode(_blocks()))
+    assert isinstance(worker.build(blocks), worker.Built)
     rows, columns = np.indices((300, 310))
     ruled = ls.encode(np.stack([columns, rows, terrain((300, 310))], axis=-1))
     refused = worker.build(_job(_new(tmp_path, "ruled"), ruled))
@@ -113,13 +129,16 @@ def test_a_cluster_builds_what_is_large(cluster: Any, tmp_path: Path) -> None:
     assert not any((tmp_path / "data" / "work").iterdir())
 
 
+@pytest.mark.parametrize("name", ["heights.npy", "blocks.p3d"])
 def test_a_surface_is_parsed_where_it_is_confined_and_built_elsewhere(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cluster: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = _npy(300)
-    job, whole = _job(_new(tmp_path, "a"), data, shared=True), _job(_new(tmp_path, "b"), data)
+    data, points = _npy(300), 300 * 300
+    if name == "blocks.p3d":
+        data, points = _plot3d(), sum(block.shape[0] * block.shape[1] for block in _blocks().blocks)
+    job, whole = _job(_new(tmp_path, "a"), data, name, shared=True), _job(_new(tmp_path, "b"), data, name)
     _without_memory(monkeypatch)
-    assert worker.build(job) == worker.Parsed(300 * 300)
+    assert worker.build(job) == worker.Parsed(points)
     assert not job.container.exists()
     task = cluster_build.ClusterJob(job, cluster.scheduler_address, 1 << 20)
     assert cluster_build.build(task) == worker.build(whole)
