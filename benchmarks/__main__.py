@@ -26,8 +26,8 @@ SECTIONS = (
     "stream",
 )
 
-#: Sections that take most of an hour: only when they are named.
-LONG = ("scale",)
+#: Sections that take long: only when they are named.
+LONG = ("scale", "scale_blocks")
 
 # Before numpy is loaded: every figure is of one core, but where another number of threads is named.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LODESTREAM_THREADS"):

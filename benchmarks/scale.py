@@ -12,8 +12,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
@@ -21,6 +19,7 @@ import psutil
 from . import tasks
 from .measure import gate, note, table
 from .terrain import write_terrain
+from .watched import Run, all_cores, anonymous, command, row
 
 #: Points along a side of what is only encoded, and of the surface that goes all the way.
 SIDES = (317, 1001, 3163, 10_000)
@@ -59,14 +58,6 @@ rasterio.shutil.copy(sys.argv[1], sys.argv[2], driver="COG", **options)
 """
 
 
-@dataclass(frozen=True)
-class _Run:
-    """A command that has ended: seconds by the clock, and the largest anonymous memory of any of its processes."""
-
-    seconds: float
-    memory: int
-
-
 def main() -> None:
     """Print both tables."""
     with tempfile.TemporaryDirectory() as name:
@@ -84,7 +75,7 @@ def _costs(folder: Path) -> dict[int, float]:
         write_terrain(source, side)
         run = _encoded(source, out)
         found[side**2] = run.seconds / side**2 * 1e6
-        rows.append(_row(f"{side} x {side}", run, out, side**2))
+        rows.append(row(f"{side} x {side}", run, out, side**2))
     table("Encoding by size", ["heights, int16", "s", "µs a sample", "container", "anonymous memory"], rows)
     note(
         f"`lodestream.encode(heights, out=, memory={_MEMORY_BYTES})` of a memory-mapped array, all cores, in a process "
@@ -98,33 +89,33 @@ def _all_the_way(folder: Path, costs: dict[int, float]) -> None:
     write_terrain(source, LARGE)
     rows, most = [], 0
 
-    def step(name: str, run: _Run, made: Path) -> None:
+    def step(name: str, run: Run, made: Path) -> None:
         nonlocal most
         most = max(most, run.memory)
-        rows.append(_row(name, run, made, LARGE**2))
+        rows.append(row(name, run, made, LARGE**2))
 
-    run = _command([*_LODESTREAM, "encode", str(source), str(out), "--memory", MEMORY])
+    run = command([*_LODESTREAM, "encode", str(source), str(out), "--memory", MEMORY])
     step(f"`encode --memory {MEMORY}`", run, out)
     costs[LARGE**2] = run.seconds / LARGE**2 * 1e6
     with _Server(folder / "data") as server:
         said = folder / "address"
-        run = _command([*_LODESTREAM, "push", str(out), server.url], said)
+        run = command([*_LODESTREAM, "push", str(out), server.url], said)
         step("`push`, checked by the server", run, out)
         address = said.read_text().strip()
         middle = f"{LARGE // 2}:{LARGE // 2 + WINDOW}"
         window = folder / "window.npy"
-        run = _command([*_LODESTREAM, "pull", address, str(window), "--roi", f"{middle},{middle}"])
+        run = command([*_LODESTREAM, "pull", address, str(window), "--roi", f"{middle},{middle}"])
         step(f"`pull --roi`, {WINDOW} x {WINDOW} exactly", run, window)
         most = max(most, server.most)
         rows.append(["`serve`, all the while", "", "", "", f"{server.most / 2**20:.0f} MiB"])
     cog = folder / "ours.cog.tif"
-    step("`decode` to COG", _command([*_LODESTREAM, "decode", str(out), str(cog), "--memory", MEMORY]), cog)
+    step("`decode` to COG", command([*_LODESTREAM, "decode", str(out), str(cog), "--memory", MEMORY]), cog)
     plain, theirs = folder / "plain.tif", folder / "theirs.cog.tif"
     subprocess.run([sys.executable, "-c", _TRANSLATE, str(source), str(plain)], check=True)
     rows.append(
-        _row(
+        row(
             "GDAL's COG, deflate, all cores",
-            _command([sys.executable, "-c", _COG, str(plain), str(theirs)]),
+            command([sys.executable, "-c", _COG, str(plain), str(theirs)]),
             theirs,
             LARGE**2,
         )
@@ -135,54 +126,11 @@ def _all_the_way(folder: Path, costs: dict[int, float]) -> None:
     gate("22. anonymous memory of any process, MiB", most / 2**20, at_most=MOST_MEMORY / 2**20)
 
 
-def _row(name: str, run: _Run, made: Path, samples: int) -> list[str]:
-    size = made.stat().st_size
-    return [
-        name,
-        f"{run.seconds:.1f}",
-        f"{run.seconds / samples * 1e6:.2f}",
-        f"{size:,}",
-        f"{run.memory / 2**20:.0f} MiB",
-    ]
-
-
-def _encoded(source: Path, out: Path) -> _Run:
+def _encoded(source: Path, out: Path) -> Run:
     """Encode a file in a process that has encoded a small one before."""
     told = out.with_suffix(".json")
-    run = _command([sys.executable, "-c", _ENCODE, str(source), str(out), str(_MEMORY_BYTES)], told)
-    return _Run(json.loads(told.read_text())["seconds"], run.memory)
-
-
-def _command(words: list[str], said: Path | None = None) -> _Run:
-    """Run a command to its end; `CalledProcessError` is raised if it fails. What it says goes into a file."""
-    started = time.monotonic()
-    with open(said or os.devnull, "wb") as told:
-        process = psutil.Popen(words, env=_all_cores(), stdout=told, stderr=subprocess.DEVNULL)
-    most = 0
-    while process.poll() is None:
-        most = max(most, _anonymous(process))
-        time.sleep(0.05)
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, words)
-    return _Run(time.monotonic() - started, most)
-
-
-def _all_cores() -> dict[str, str]:
-    """The environment without what keeps the other benchmarks on one core."""
-    return {key: value for key, value in os.environ.items() if not key.endswith("_THREADS")}
-
-
-def _anonymous(process: psutil.Process) -> int:
-    """The largest anonymous memory of a process and of those that it has started, bytes."""
-    found = 0
-    try:
-        for one in (process, *process.children(recursive=True)):
-            with open(f"/proc/{one.pid}/status") as lines:
-                own = next((line for line in lines if line.startswith("RssAnon")), "RssAnon: 0 kB")
-            found = max(found, int(own.split()[1]) << 10)
-    except (psutil.NoSuchProcess, OSError):
-        pass
-    return found
+    run = command([sys.executable, "-c", _ENCODE, str(source), str(out), str(_MEMORY_BYTES)], told)
+    return Run(json.loads(told.read_text())["seconds"], run.memory)
 
 
 class _Server:
@@ -192,7 +140,7 @@ class _Server:
         command = [*_LODESTREAM, "serve", "--port", "0", "--data", str(folder), "--max-vertices", str(LARGE**2)]
         command += ["--memory", "1GiB"]  # of which a build takes half
         piped = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-        self._process = psutil.Popen(command, env=_all_cores(), **piped)
+        self._process = psutil.Popen(command, env=all_cores(), **piped)
         self.url = next(
             word for line in self._process.stdout for word in line.split() if word.startswith("http://127.0.0.1")
         )
@@ -203,7 +151,7 @@ class _Server:
 
     def _watch(self) -> None:
         while not self._stopped.wait(0.05):
-            self.most = max(self.most, _anonymous(self._process))
+            self.most = max(self.most, anonymous(self._process))
 
     def __enter__(self) -> _Server:
         self._watcher.start()

@@ -27,10 +27,11 @@ from ..decoding.inspection import (
     inspect_whole,
     states_of,
 )
+from ..decoding.reconstruction import Values
 from ..errors import CorruptStreamError, TooLargeError
 from ..grid.patches import level_shapes
 from ..library import require
-from ..parallel import spread
+from ..parallel import spread, threads
 from ..quantization.distortion import originals_of, other_originals
 from ..surface import Block, Surface
 from .grid_measuring import BlocksMeasurer
@@ -189,25 +190,34 @@ def _band(decoder: RowsDecoder, rows: tuple[int, int], states: Sequence[NDArray[
 def _of_blocks(
     decoder: BlocksDecoder, states: Sequence[NDArray[np.int8]], memory: int, progress: Callable[[float], None]
 ) -> _Found:
-    """Decode and measure some blocks at a time."""
-    header, masks = decoder.header, decoder.header.masks
+    """Decode and measure some blocks at a time, as many runs of them together as there are threads."""
+    groups, count = decoder.groups(memory // threads()), threads()
     digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
-    for blocks in decoder.groups(memory):
-        tiles, patches = decoder.tiles(blocks), decoder.patches(blocks)
-        values = decoder.values(blocks, tiles)
-        for block, own in values.items():
-            for array in own.arrays:
-                digest.update(little_endian(array))
-            corners += corners_of(own.arrays[0], masks[block])
-        if states:
-            points = {block: own.arrays[0] for block, own in values.items()}
-            arrays = {block: own.arrays for block, own in values.items()}
-            coordinates = originals_of(header.arrangement, points, masks, patches)
-            others = other_originals(header.arrangement, arrays, masks, header.geometric, patches)
-            measurer = BlocksMeasurer(header, tiles, blocks, patches)
-            figures.append(measurer.figures(states, coordinates, others))
-        progress(READ + (_MEASURED - READ) * blocks.stop / len(header.blocks))
+    for first in range(0, len(groups), count):
+        together = groups[first : first + count]
+        for values, own in spread(lambda blocks: _measured(decoder, blocks, states), together):
+            for block, found in values.items():
+                for array in found.arrays:
+                    digest.update(little_endian(array))
+                corners += corners_of(found.arrays[0], decoder.header.masks[block])
+            figures += own
+        progress(READ + (_MEASURED - READ) * together[-1].stop / len(decoder.header.blocks))
     return _Found(digest.hexdigest(), corners, figures)
+
+
+def _measured(
+    decoder: BlocksDecoder, blocks: range, states: Sequence[NDArray[np.int8]]
+) -> tuple[dict[int, Values], list[Figures]]:
+    """Decode some blocks, and measure them in these states."""
+    header, tiles, patches = decoder.header, decoder.tiles(blocks), decoder.patches(blocks)
+    values = decoder.values(blocks, tiles)
+    if not states:
+        return values, []
+    points = {block: own.arrays[0] for block, own in values.items()}
+    arrays = {block: own.arrays for block, own in values.items()}
+    coordinates = originals_of(header.arrangement, points, header.masks, patches)
+    others = other_originals(header.arrangement, arrays, header.masks, header.geometric, patches)
+    return values, [BlocksMeasurer(header, tiles, blocks, patches).figures(states, coordinates, others)]
 
 
 def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
