@@ -136,7 +136,10 @@ def step(
 
 
 def details_of(array: NDArray[np.int32], coarse: tuple[int, int]) -> list[NDArray[np.int32]]:
-    """What a step of both axes leaves beside the nodes, which are the first rows and columns; views."""
+    """What a step of both axes leaves beside the nodes; views, shape (row, column).
+
+    ``array`` is the grid's, shape (row, column), of which the first rows and columns are the nodes, ``coarse`` of them.
+    """
     return [array[coarse[0] :], array[: coarse[0], coarse[1] :]]
 
 

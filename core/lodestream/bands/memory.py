@@ -5,6 +5,7 @@ from __future__ import annotations
 from operator import index
 
 from ..container.capacity import memory_limit
+from ..encoding.arranging import may_share
 from ..errors import OptionError
 from ..sizes import parse_size
 from ..surface import Surface
@@ -66,10 +67,11 @@ def whole_memory(surface: Surface) -> int:
 def least_memory(surface: Surface) -> int:
     """About the least that encoding a surface by bands takes, in bytes: the program, and a row of tiles.
 
-    Of several blocks the largest one in place of a row.
+    Of several blocks, and of one that touches itself, the largest one in place of a row.
     """
-    values = largest_block(surface)
-    if len(surface.blocks) == 1:
+    values, first = largest_block(surface), surface.blocks[0]
+    in_space = first.points.ndim == 3 and first.points.shape[2] > 1
+    if len(surface.blocks) == 1 and not (in_space and first.mask is None and may_share(first, first.points)):
         values = values * _ROWS // max(surface.blocks[0].shape[0], _ROWS)
     return BESIDE + masks_memory(surface) + OF_BAND * values
 

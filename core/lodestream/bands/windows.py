@@ -144,7 +144,14 @@ class WindowMeasurer:
 def compared(
     original: Original, lattices: Sequence[Lattice], canvas: NDArray[np.int32], fractions: Sequence[int], channel: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """`distance_figures`, and of each kind whether all values are equal: known where the squares are all 0."""
+    """`distance_figures`, and of each kind whether all values are equal: known where the squares are all 0.
+
+    Parameters are those of `distance_figures`; ``canvas`` are its coordinates, int32, shape (channel, row, column).
+
+    Returns
+    -------
+    float64, shape (row of cells, column of cells, kind, 2), and bool, shape (kind,)
+    """
     squares = distance_figures(original, lattices, canvas, fractions, channel)
     equal = np.zeros(squares.shape[2], np.bool_)
     if original.points.dtype.kind == "f" and original.points.dtype.itemsize == 8 and not squares[..., 1].any():

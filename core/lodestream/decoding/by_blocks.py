@@ -66,7 +66,12 @@ class BlocksDecoder:
     def surface(self, room: Room, memory: int, progress: Callable[[float], None]) -> Surface:
         """The whole surface, or its level, some blocks at a time into arrays that go where there is room.
 
-        Parameters and errors are those of `RowsDecoder.surface`.
+        Parameters are those of `RowsDecoder.surface`.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment or a chunk is damaged, no point is finite, or the SHA-256 of the values is wrong.
         """
         header, blocks = self.header, list[Block]()
         for group in self.groups(memory):

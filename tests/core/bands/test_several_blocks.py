@@ -18,6 +18,7 @@ from lodestream.bands import grid_tasks, made, transforming
 from lodestream.bands.grid_measuring import blocks_of_run
 from lodestream.bands.grid_runs import GridRuns
 from lodestream.bands.inspecting import inspect
+from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.container.reader import read_index
 from lodestream.decoding.by_bands import decoder_by_bands, why_not_by_bands
 from lodestream.decoding.by_blocks import BlocksDecoder
@@ -154,6 +155,17 @@ def test_coefficients_that_are_too_large_are_noticed(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(transformed, "COEFFICIENT_BITS", 0)
     assert plain == encode(surface)
     assert ls.decode(plain).blocks[0].points.tobytes() == surface.blocks[0].points.tobytes()
+
+
+def test_a_surface_that_is_not_divided_takes_more_memory_at_least() -> None:
+    plates, sphere = _plates(), block_surface("sphere", (400, 300), 1, "float32", "", np.random.default_rng(1))
+    largest = max(block.points.size for block in plates.blocks)
+    assert least_memory(plates) == BESIDE + OF_BAND * largest
+    assert least_memory(sphere) == BESIDE + OF_BAND * sphere.points.size
+    plane = Surface(sphere.points[50:80, 10:20])
+    assert least_memory(plane) == BESIDE + OF_BAND * plane.points.size
+    tall = Surface(np.concatenate([sphere.points[50:80, 10:20] + k for k in np.arange(20, dtype=np.float32)]))
+    assert least_memory(tall) < BESIDE + OF_BAND * tall.points.size // 8
 
 
 def test_many_small_blocks_go_together() -> None:

@@ -6,6 +6,7 @@ import fcntl
 import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -64,12 +65,10 @@ def _container(http: httpx.Client, location: str) -> bytes:
 def _made(folder: Path) -> Inodes:
     """The finished files of builds by bands below a folder, by their name there."""
     found: Inodes = {}
-    for path in folder.glob("**/tasks/**/*.npy"):
-        name = str(path).partition("/tasks/")[2]
-        try:
-            found[name] = path.stat().st_ino
-        except FileNotFoundError:
-            continue
+    for above, _, names in os.walk(folder):  # which passes over folders that vanish meanwhile
+        for path in (Path(above) / name for name in names if "/tasks/" in f"{above}/" and name.endswith(".npy")):
+            with suppress(FileNotFoundError):
+                found[str(path).partition("/tasks/")[2]] = path.stat().st_ino
     return {name: number for name, number in found.items() if "/prepared/" not in name and "/surface/" not in name}
 
 
