@@ -55,8 +55,8 @@ What all commands have in common:
   components (`wind`) the error is that of the distance; `info` shows the names and errors of all channels. A limit of
   an attribute that `--attributes` leaves out is refused. Errors of single channels are stored in two bytes, rounded up
   by at most 1/32, so the error shown for one channel may be slightly above that of all channels together.
-- `decode --memory` writes NPY, GeoTIFF, COG, NetCDF and Zarr by bands within this memory. If another output needs more,
-  it is refused, with the memory that it needs ([large.md](large.md)).
+- `decode --memory` writes NPY, GeoTIFF, COG, NetCDF and Zarr by bands within this memory, VTM and PLOT3D block by
+  block. If another output needs more, it is refused, with the memory that it needs ([large.md](large.md)).
 - `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
   combined with each other and with the limits. `--roi` cannot be combined with `--level`, nor with errors of channels
