@@ -228,6 +228,11 @@ def _take(path: Path) -> None:
             # Some file systems cannot.
 
 
+#: Arrays of a `Room` that have a file each. Those that come after share files, unless they are large: each file is one
+#: of those that a process may have open. A common one has a part of the bytes that there are, at least and at most.
+_FILES, _SHARE, _LEAST_COMMON, _MOST_COMMON, _ALIGNED = 16, 4, 1 << 22, 1 << 28, 64
+
+
 class Room:
     """Where arrays go: large ones into files of a scratch folder, which is made when the first one comes.
 
@@ -236,14 +241,15 @@ class Room:
     scratch : callable or None
         Gives the folder, a `Scratch`. None: all arrays are in memory.
     least : int
-        Arrays of fewer bytes are in memory, up to so many bytes in all.
+        Arrays of fewer bytes are in memory, up to so many bytes in all, those included that are gone meanwhile.
     memory : int, optional
         Bytes that may be taken for what cannot go into files, where somebody has said so.
     """
 
     def __init__(self, scratch: Callable[[], Scratch] | None = None, least: int = 0, memory: int | None = None) -> None:
         self._scratch, self._least, self.memory = scratch, least, memory
-        self._count = self._small = 0
+        self._count = self._small = self._filed = 0
+        self._common: tuple[NDArray[np.uint8], int] = np.zeros(0, np.uint8), 0  # a file, and how much of it is taken
 
     def takes(self, size: int) -> bool:
         """Whether an array of so many bytes goes into a file: it is large, or there are many small ones already."""
@@ -255,6 +261,18 @@ class Room:
         if self._scratch is None or not self.takes(size):
             self._small += size
             return np.empty(shape, dtype)
+        self._filed += size
+        common = min(max(self._filed // _SHARE, _LEAST_COMMON), _MOST_COMMON)
+        if self._count < _FILES or size >= common:
+            return self._file(shape, dtype)
+        whole, taken = self._common
+        if taken + size > whole.size:
+            whole, taken = self._file((common,), np.uint8), 0
+        self._common = whole, taken + -(-size // _ALIGNED) * _ALIGNED
+        return whole[taken : taken + size].view(np.dtype(dtype)).reshape(shape)
+
+    def _file(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        assert self._scratch is not None
         self._count += 1
         made = self._scratch().empty(f"arrays/{self._count}", shape, dtype)
         if isinstance(made, np.memmap):  # an empty array is in no file

@@ -26,6 +26,8 @@ __all__ = ["by_rows"]
 
 #: Bytes for each value that decoding in one piece takes.
 _WHOLE = 12
+#: And for each value of a block that is decoded by itself, from the file.
+_BLOCK = 24
 #: The part of the memory that an array in memory may take.
 _PART = 16
 #: In the folder on the way to the file: arrays, and the file with what its writer makes beside it.
@@ -78,7 +80,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
         except (CorruptStreamError, TruncatedStreamError, TooLargeError):
             return False  # decoding in one piece tells what is wrong with it, and what is left
         check_grid(options.out, header)
-        needs = _Needs(decoder, options)
+        needs = _Needs(decoder, options, memory)
         try:
             needs.check(memory)
             if needs.decoding <= memory or needs.reason is not None:
@@ -107,7 +109,7 @@ class _Needs:
         Why it is not done by bands; None: it can be.
     """
 
-    def __init__(self, decoder: RowsDecoder | BlocksDecoder, options: DecodeOptions) -> None:
+    def __init__(self, decoder: RowsDecoder | BlocksDecoder, options: DecodeOptions, memory: int) -> None:
         from lodestream.decoding.by_bands import why_not_by_bands
         from lodestream.formats import for_writing, written
         from lodestream.planning.selection import selection_of
@@ -128,7 +130,7 @@ class _Needs:
         elif options.partial or replace(options.target, level=None) != Target():
             self.reason = "only the whole surface or a level is, without --partial, limits and --attributes"
         else:
-            self.reason = why_not_by_bands(header)
+            self.reason = why_not_by_bands(header, memory // _BLOCK, decoder.level)
 
     def check(self, memory: int) -> None:
         """Refuse what takes more than was given or, if nothing was, than there is.

@@ -7,6 +7,7 @@ each level takes two rounds of tasks as it does by bands of rows, see `forward`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,14 +81,21 @@ def sampled_lines(arrays: Sequence[NDArray[np.int32]], layout: Layout, level: in
 
 def _strides(layout: Layout, level: int, grids: range, axis: int) -> dict[int, int]:
     """Every how manieth line along an axis is looked at, of those grids whose predictor is fitted."""
-    lines = [0, 0]  # of patches, and of interfaces: as many as all of them have together
-    for number, grid in enumerate(layout.grids):
-        lines[grid.interface] += layout.shape(number, level)[1 - axis]
+    lines = _lines(layout, level, axis)
     return {
         grid: sample_stride(layout.shape(grid, level)[1 - axis], lines[layout.grids[grid].interface])
         for grid in grids
         if is_fitted(layout.steps(grid, level)[axis])
     }
+
+
+@lru_cache(maxsize=64)
+def _lines(layout: Layout, level: int, axis: int) -> tuple[int, int]:
+    """Lines along an axis that all patches have together at a level, and all interfaces."""
+    lines = [0, 0]
+    for number, grid in enumerate(layout.grids):
+        lines[grid.interface] += layout.shape(number, level)[1 - axis]
+    return lines[0], lines[1]
 
 
 def fit(
@@ -163,8 +171,6 @@ def coefficients_of(
         As of a `GridRun`.
     """
     part = part_of(table, [tiles])
-    every = [np.zeros((0, 0), np.int32)] * len(table.layout.grids)
-    every[grids.start : grids.stop] = arrays
-    flat = gather(part.table, every)
+    flat = gather(part.table, arrays, grids=grids)
     planes = np.array([planes_of(part.table, flat, tile) for tile in range(len(tiles))], np.int8)
     return flat[part.spans[0][1]].copy(), planes

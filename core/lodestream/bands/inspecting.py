@@ -93,7 +93,7 @@ def inspect(
     header = walked.index.header
     if _fits(header, memory):
         return inspect_whole(walked, progress)
-    if (reason := why_not_by_bands(header)) is not None:
+    if (reason := why_not_by_bands(header, memory // _WHOLE)) is not None:
         raise TooLargeError(
             f"expected a surface that takes at most {memory >> 20:,} MiB to check, got one that takes about "
             f"{_values(header) * _WHOLE >> 20:,} MiB and cannot be decoded by bands: {reason}"
@@ -111,9 +111,10 @@ def _fits(header: Header, memory: int) -> bool:
 
 @dataclass(frozen=True)
 class _Found:
-    """What decoding by bands tells: the SHA-256 of all values, the corners of their parts, and figures if any are."""
+    """What decoding by bands tells: the SHA-256 of all values, holes, corners of parts, and figures if any are."""
 
     digest: str
+    holes: tuple[int, ...]
     corners: list[NDArray[Any]]
     figures: list[Figures]
 
@@ -131,8 +132,7 @@ def _by_bands(file: BinaryIO, walked: Walked, memory: int, progress: Callable[[f
         found = _of_rows(decoder, states, memory, progress)
     else:
         found = _of_blocks(decoder, states, memory, progress)
-    holes = tuple(0 if mask is None else int(np.count_nonzero(~mask)) for mask in header.masks)
-    check_values(index, holes, found.corners)
+    check_values(index, found.holes, found.corners)
     if index.digest is not None and found.digest != index.digest:
         problem = f"expected values with the SHA-256 {index.digest}, got {found.digest}"
         raise CorruptStreamError(problem, header.length)
@@ -148,10 +148,12 @@ def _of_rows(
     """Decode and measure the rows of the one grid, some at a time."""
     header, hashed = decoder.header, decoder.index.digest is not None
     groups, passes = decoder.groups(memory), 1 + (len(header.attributes) if hashed else 0)
-    digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
+    digest, holes, corners, figures = hashlib.sha256(), 0, list[NDArray[Any]](), list[Figures]()
     for number, group in enumerate(groups, 1):
-        for band in spread(lambda rows: _band(decoder, rows, states), group):
+        for rows, band in zip(group, spread(lambda rows: _band(decoder, rows, states), group), strict=True):
             digest.update(little_endian(band.points))
+            mask = header.masks[0]
+            holes += _holes(band.points, None if mask is None else mask[slice(*rows)])
             corners += band.corners
             figures += band.figures
         progress(READ + (_MEASURED - READ) * number / len(groups) / passes)
@@ -161,7 +163,16 @@ def _of_rows(
             for values in spread(decoder.rows, group):
                 digest.update(little_endian(values.arrays[attribute]))
         progress(READ + (_MEASURED - READ) * (attribute + 1) / passes)
-    return _Found(digest.hexdigest(), corners, figures)
+    return _Found(digest.hexdigest(), (holes,), corners, figures)
+
+
+def _holes(points: NDArray[Any], mask: NDArray[np.bool_] | None) -> int:
+    """Points that are not valid, or not finite, of some of shape (row, column, component)."""
+    count = points.shape[0] * points.shape[1]
+    if points.dtype.kind != "f":
+        return 0 if mask is None else int(count - np.count_nonzero(mask))
+    valid = np.isfinite(points[..., :3]).all(axis=2)
+    return int(count - np.count_nonzero(valid if mask is None else valid & mask))
 
 
 @dataclass(frozen=True)
@@ -193,16 +204,18 @@ def _of_blocks(
     """Decode and measure some blocks at a time, as many runs of them together as there are threads."""
     groups, count = decoder.groups(memory // threads()), threads()
     digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
+    holes, masks = list[int](), decoder.header.masks
     for first in range(0, len(groups), count):
         together = groups[first : first + count]
         for values, own in spread(lambda blocks: _measured(decoder, blocks, states), together):
             for block, found in values.items():
                 for array in found.arrays:
                     digest.update(little_endian(array))
-                corners += corners_of(found.arrays[0], decoder.header.masks[block])
+                corners += corners_of(found.arrays[0], masks[block])
+                holes.append(_holes(found.arrays[0], masks[block]))
             figures += own
         progress(READ + (_MEASURED - READ) * together[-1].stop / len(decoder.header.blocks))
-    return _Found(digest.hexdigest(), corners, figures)
+    return _Found(digest.hexdigest(), tuple(holes), corners, figures)
 
 
 def _measured(

@@ -85,6 +85,14 @@ class Made:
     def _all(self) -> list[NDArray[Any]]:
         return [*self._arrays(), *(block.mask for block in self._surface.blocks if block.mask is not None)]
 
+    def _beside(self) -> int:
+        """About the bytes of what is prepared of several blocks, and of such with holes: copies, and lattice points."""
+        blocks = self._surface.blocks
+        if len(blocks) == 1:
+            return 0
+        points = sum(block.points.nbytes + 4 * block.points.size for block in blocks)
+        return points + sum(block.points.nbytes for block in blocks if block.mask is not None)
+
     def container(self, folder: Path) -> Path | None:
         """The file of the container, in the folder; None: the surface must be encoded in one piece.
 
@@ -98,7 +106,7 @@ class Made:
             If a worker has another version of this program.
         """
         in_memory = sum(array.nbytes for array in self._all() if root_of(array) is None)
-        check_room(folder, self._values * FOR_A_VALUE + in_memory)
+        check_room(folder, self._values * FOR_A_VALUE + in_memory + self._beside())
         files = [root_of(array) for array in self._all()]
         paths = sorted({str(Path(str(root.filename)).resolve()) for root in files if root is not None})
         states = [file_state(path) for path in paths]
@@ -208,18 +216,20 @@ class Made:
 
 
 def _kept(files: Scratch, name: str, arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
-    """Arrays of one dtype and any shapes, those in memory as parts of one file: a process may have so many maps."""
-    left = [array for array in arrays if root_of(array) is None]
-    if left and not files.has(name):
-        files.write_joined(name, left)
-    whole: NDArray[Any] = files.read(name) if left else np.zeros(0)
-    found, done = [], 0
-    for array in arrays:
-        if root_of(array) is None:
-            found.append(whole[done : done + array.size].reshape(array.shape))
-            done += array.size
-        else:
-            found.append(array)
+    """Arrays of one dtype and any shapes, those in memory as parts of one file: a process may have so many open."""
+    left = [number for number, array in enumerate(arrays) if root_of(array) is None]
+    if not left:
+        return arrays
+    # The key of a build does not tell where arrays lie: a file of other ones must not be taken for this.
+    told = json.dumps([(number, arrays[number].shape, arrays[number].dtype.str) for number in left])
+    name = f"{name}-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+    if not files.has(name):
+        files.write_joined(name, [arrays[number] for number in left])
+    whole, found, done = files.read(name), list(arrays), 0
+    for number in left:
+        array = arrays[number]
+        found[number] = whole[done : done + array.size].reshape(array.shape)
+        done += array.size
     return found
 
 

@@ -24,6 +24,8 @@ __all__ = ["dump", "file_state", "load", "root_of"]
 
 #: Attribute of a map: whether it is one of the files that had its name.
 _KNOWN = "_lodestream_files"
+#: Attribute of a map: the number of its file.
+_INODE = "_lodestream_inode"
 
 _HEAD = f"lodestream {__version__}\n".encode()
 
@@ -57,15 +59,44 @@ def load(path: Path) -> Any:
 class _Pickler(pickle.Pickler):
     """Puts the name of a file in place of arrays that are maps of it."""
 
+    def __init__(self, file: Any, protocol: int) -> None:
+        super().__init__(file, protocol)
+        self._files: dict[str, _File] = {}
+
     def reducer_override(self, value: object) -> Any:
         """As `pickle` wants it: how an object is made again."""
         if isinstance(value, np.ndarray) and value.size:
             root = root_of(value)
             if root is not None and root.filename is not None:
                 start = value.__array_interface__["data"][0] - root.__array_interface__["data"][0]
-                place = str(Path(root.filename).resolve()), root.offset + start
-                return _mapped, (*place, value.dtype, value.shape, value.strides)
+                path = str(Path(root.filename).resolve())
+                file = self._files.setdefault(path, _File(path))  # the same object for all of its arrays
+                return _part, (file, root.offset + start, value.dtype, value.shape, value.strides)
         return NotImplemented
+
+
+class _File:
+    """A file that is mapped once for all arrays in it: each map takes one of the files that a process may have open."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._raw: np.memmap[Any, Any] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_path": self._path, "_raw": None}
+
+    @property
+    def raw(self) -> np.memmap[Any, Any]:
+        """Its bytes, uint8, shape (byte,)."""
+        if self._raw is None:
+            self._raw = np.memmap(self._path, np.uint8, "r")
+        return self._raw
+
+
+def _part(
+    file: _File, offset: int, dtype: np.dtype[Any], shape: tuple[int, ...], strides: tuple[int, ...]
+) -> NDArray[Any]:
+    return np.ndarray(shape, dtype, file.raw, offset, strides)
 
 
 def file_state(path: str | os.PathLike[str]) -> list[int]:
@@ -117,7 +148,9 @@ def _is_of(root: np.memmap[Any, Any], state: os.stat_result) -> bool:
     Where the system does not tell, the values are compared, and the map remembers what was found: as long as it is
     there, no other file gets the number of its own.
     """
-    if _inode(root.__array_interface__["data"][0]) == state.st_ino:
+    if _INODE not in vars(root):
+        vars(root)[_INODE] = _inode(root.__array_interface__["data"][0])  # a map is of one file as long as it is there
+    if vars(root)[_INODE] == state.st_ino:
         return True
     known = vars(root).setdefault(_KNOWN, {})
     file = state.st_dev, state.st_ino

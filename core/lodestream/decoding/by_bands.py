@@ -5,15 +5,33 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ..container.model import Header, Index
+from ..grid.patches import level_shapes
 from .by_blocks import BlocksDecoder
 from .by_rows import RowsDecoder
 
 __all__ = ["decoder_by_bands", "why_not_by_bands"]
 
 
-def why_not_by_bands(header: Header) -> str | None:
-    """Why a container cannot be decoded by bands; None: it can."""
-    return "x and y are made of rules" if header.plane is not None else None
+def why_not_by_bands(header: Header, most: int, level: int | None = None) -> str | None:
+    """Why a container cannot be decoded by bands; None: it can.
+
+    Parameters
+    ----------
+    header : Header
+    most : int
+        Values that there is memory for. No block is divided where there are several, or where one touches itself.
+    level : int, optional
+        The finest if not given.
+    """
+    if header.plane is not None:
+        return "x and y are made of rules"
+    if header.arrangement is None:
+        return None
+    shapes = [shape for shape, _ in header.blocks]
+    if level is not None:
+        shapes = level_shapes(header.patches, header.layout, level, shapes)
+    largest = max(rows * columns for rows, columns in shapes) * header.channels
+    return None if largest <= most else f"its largest block has {largest:,} values, and there is memory for {most:,}"
 
 
 def decoder_by_bands(

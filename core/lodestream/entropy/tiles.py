@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from copy import copy
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -121,6 +122,13 @@ class TileTable:
         grids = self._arrays().grid
         ends = np.cumsum(np.bincount(grids, minlength=len(self.layout.grids)))
         return np.split(np.argsort(grids, kind="stable"), ends[:-1])
+
+    def of_grids(self, chosen: range) -> list[NDArray[np.int64]]:
+        """`of_grid` of neighbouring grids alone, which takes no longer the more others there are."""
+        grids = self._arrays().grid
+        order = np.argsort(grids, kind="stable")
+        ends = np.searchsorted(grids[order], np.arange(chosen.start, chosen.stop + 1))
+        return [order[first:last] for first, last in pairwise(ends.tolist())]
 
     def classes(self) -> tuple[list[BandClass], NDArray[np.int64]]:
         """All that differs between bands but their places and sizes, and which of them each band is, shape (band,)."""
@@ -386,15 +394,20 @@ def _runs(first: int, last: int, without: Collection[int]) -> Iterator[tuple[int
 
 
 def gather(
-    table: TileTable, coefficients: Sequence[NDArray[np.int32]], origins: NDArray[np.int64] | None = None
+    table: TileTable,
+    coefficients: Sequence[NDArray[np.int32]],
+    origins: NDArray[np.int64] | None = None,
+    grids: range | None = None,
 ) -> NDArray[np.int32]:
     """The signed coefficients of all tiles, shape (`TileTable.size`,), from those of the grids, (row, column).
 
-    ``origins`` are those of the table, unless the arrays have other rows.
+    ``origins`` are those of the table, unless the arrays have other rows; ``grids`` are all, unless the tiles have
+    bands of these alone.
     """
     flat, bands = np.zeros(table.size, np.int32), table.bands
     tops = (table.origins if origins is None else origins)[:, 1:]
-    for array, numbers in zip(coefficients, table.of_grid, strict=True):
+    of_grid = table.of_grid if grids is None else table.of_grids(grids)
+    for array, numbers in zip(coefficients, of_grid, strict=True):
         places = bands[numbers][:, [OFFSET, STRIDE, ROWS, COLUMNS]].tolist()
         for (place, stride, rows, columns), (top, left) in zip(places, tops[numbers].tolist(), strict=True):
             frame = flat[place : place + rows * stride].reshape(rows, stride)

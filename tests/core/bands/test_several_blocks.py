@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -12,27 +13,35 @@ import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import grid_tasks, made, transforming
+from lodestream.bands import grid_tasks, inspecting, made, tasks, transforming
 from lodestream.bands.grid_measuring import blocks_of_run
 from lodestream.bands.grid_runs import GridRuns
 from lodestream.bands.inspecting import inspect
 from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.container.reader import read_index
-from lodestream.decoding.by_bands import decoder_by_bands, why_not_by_bands
+from lodestream.decoding.by_bands import decoder_by_bands
 from lodestream.decoding.by_blocks import BlocksDecoder
 from lodestream.decoding.by_rows import RowsDecoder
+from lodestream.decoding.inspection import Inspection
 from lodestream.encoding import transformed
 from lodestream.encoding.encoder import encode
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
-from lodestream.scratch import IN_MEMORY
-from lodestream.surface import Surface
+from lodestream.residual import chunk_coder
+from lodestream.scratch import IN_MEMORY, Room, Scratch
+from lodestream.surface import Block, Surface
 
 from ..container.forgery import with_layer_errors
 from .block_surfaces import KINDS, block_surface
 from .test_building import built
+
+try:
+    import resource
+except ImportError:  # not on Windows
+    resource = None  # type: ignore[assignment]
 
 #: What a container does not keep is another matter, see test_losses.
 pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
@@ -102,7 +111,7 @@ def _is_known_by_blocks(container: bytes, seed: int) -> None:
     assert whole.header is not None
     for level in (seed % (whole.header.levels + 1), None):
         decoder = _decoder(container, level)
-        if why_not_by_bands(decoder.header) is not None:
+        if decoder.header.plane is not None:
             return
         found, expected = decoder.surface(IN_MEMORY, 1, lambda fraction: None), whole.surface(level)
         assert found.metadata == expected.metadata
@@ -116,7 +125,14 @@ def _is_known_by_blocks(container: bytes, seed: int) -> None:
             assert list(own.attributes) == list(other.attributes)
             for name, values in own.attributes.items():
                 assert values.tobytes() == other.attributes[name].tobytes()
-    inspect(io.BytesIO(container), max_vertices=1 << 20, memory=1)
+    with mock.patch.object(inspecting, "why_not_by_bands", return_value=None):
+        inspect(io.BytesIO(container), max_vertices=1 << 20, memory=1)
+
+
+def _checked(data: bytes, channels: int = 3) -> Inspection:
+    """Checked some blocks at a time: in memory for the largest of `_plates`, with so many channels."""
+    largest = max(block.shape[0] * block.shape[1] for block in _plates().blocks)
+    return inspect(io.BytesIO(data), max_vertices=1 << 20, memory=24 * largest * channels)
 
 
 def _plates(dtype: str = "float32", more: str = "") -> Surface:
@@ -128,7 +144,7 @@ def _plates(dtype: str = "float32", more: str = "") -> Surface:
 def test_wrong_errors_are_found(more: str, place: int) -> None:
     data = ls.encode(_plates(more=more))
     with pytest.raises(ls.CorruptStreamError, match="RMS and maximum error of layer 0"):
-        inspect(io.BytesIO(with_layer_errors(data, 0, 0.999, place)), max_vertices=1 << 20, memory=1)
+        _checked(with_layer_errors(data, 0, 0.999, place), 6 if more == "attributes" else 3)
 
 
 def test_a_flipped_bit_is_found() -> None:
@@ -136,8 +152,78 @@ def test_a_flipped_bit_is_found() -> None:
     for place in range(20, len(data), len(data) // 40):
         data[place] ^= 4
         with pytest.raises(ls.LodestreamError):
-            inspect(io.BytesIO(bytes(data)), max_vertices=1 << 20, memory=1)
+            _checked(bytes(data))
         data[place] ^= 4
+
+
+def test_blocks_that_are_too_large_are_refused() -> None:
+    data = ls.encode(_plates())
+    assert _checked(data).errors_checked
+    with pytest.raises(ls.TooLargeError, match=r"at most 1 MiB to check, .* its largest block has [\d,]+ values"):
+        inspect(io.BytesIO(data), max_vertices=1 << 20, memory=1 << 20)
+
+
+def test_values_that_are_not_finite_are_holes_whoever_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, decode = _plates().blocks[0].points, chunk_coder.decode_chunk
+
+    def forged(known: NDArray[Any], chunk: bytes, offset: int) -> NDArray[Any]:
+        values = decode(known, chunk, offset)
+        values[:1] = np.nan
+        return values
+
+    # Two channels are rough, so that the extent is not looked at; the third one has a residual.
+    data = ls.encode(Surface(blocks=[Block(points), Block(points + 99)]), attribute_precision={"x": 0.1, "y": 0.1})
+    monkeypatch.setattr(chunk_coder, "decode_chunk", forged)
+    for memory in (1 << 30, 24 * points.size):
+        with pytest.raises(ls.CorruptStreamError, match="holes"):
+            inspect(io.BytesIO(data), max_vertices=1 << 20, memory=memory)
+
+
+@pytest.mark.parametrize("first", [1 << 20, 1_258_291])
+def test_a_build_goes_on_though_other_arrays_are_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    xr = pytest.importorskip("xarray")
+    shapes = [(200, 175), *[(160, 125)] * 5]
+    values = [np.random.default_rng(k).integers(0, 300, shape).astype(np.int16) for k, shape in enumerate(shapes)]
+    tree = xr.DataTree.from_dict(
+        {f"block_{k}": xr.Dataset({"z": (("y", "x"), array)}) for k, array in enumerate(values)}
+    )
+    code = tasks.code
+
+    def cut(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tasks, "code", cut)
+    with pytest.raises(KeyboardInterrupt):
+        ls.encode(tree, out=tmp_path / "a.lode", memory=first, scratch=tmp_path / "scratch")
+    monkeypatch.setattr(tasks, "code", code)
+    ls.encode(tree, out=tmp_path / "a.lode", memory=(1 << 20) + 1_258_291 - first, scratch=tmp_path / "scratch")
+    for block, array in zip(ls.decode((tmp_path / "a.lode").read_bytes()).blocks, values, strict=True):
+        assert np.array_equal(block.points, array)
+
+
+@pytest.mark.skipif(resource is None, reason="the system does not limit files")
+def test_many_blocks_take_few_files(tmp_path: Path) -> None:
+    assert resource is not None
+    rng = np.random.default_rng(1)
+    blocks = []
+    for _ in range(150):
+        mask = rng.random((20, 20)) < 0.9
+        blocks.append(Block(rng.normal(size=(20, 20)), mask=mask, attributes={"a": rng.normal(size=(20, 20))}))
+    surface = Surface(blocks=blocks)
+    expected = encode(surface, stacklevel=0)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/dev/fd")) + 60, before[1]))
+    try:
+        with ThreadPoolExecutor(1) as executor:
+            ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, executor=executor)
+        found = _decoder(expected).surface(Room(lambda: Scratch(tmp_path / "room")), 1, lambda fraction: None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    assert (tmp_path / "a.lode").read_bytes() == expected
+    for own, other in zip(found.blocks, ls.decode(expected).blocks, strict=True):
+        assert own.points.tobytes() == other.points.tobytes()
 
 
 def test_damage_is_found_where_it_is_decoded() -> None:

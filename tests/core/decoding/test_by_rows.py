@@ -133,7 +133,13 @@ def test_what_cannot_be_decoded_by_rows_says_so() -> None:
     heights = SURFACES["integers"][0].points
     rows, columns = np.mgrid[:50, :60].astype(float)
     surface = ls.Surface(np.stack([columns, rows, np.hypot(rows, columns)], axis=-1))
-    reason = why_not_by_bands(_decoder(ls.encode(surface)).header)
+    reason = why_not_by_bands(_decoder(ls.encode(surface)).header, 1 << 30)
     assert reason is not None
     assert "rules" in reason
-    assert why_not_by_bands(_decoder(ls.encode(heights)).header) is None
+    assert why_not_by_bands(_decoder(ls.encode(heights)).header, 0) is None
+    header = _decoder(ls.encode(ls.Surface(blocks=[ls.Block(heights), ls.Block(heights[:90])]))).header
+    assert why_not_by_bands(header, heights.size) is None
+    assert why_not_by_bands(header, heights.size - 1) == (
+        f"its largest block has {heights.size:,} values, and there is memory for {heights.size - 1:,}"
+    )
+    assert why_not_by_bands(header, heights.size - 1, header.levels - 1) is None

@@ -40,6 +40,7 @@ __all__ = [
     "listed",
     "make_coarsest",
     "make_level_by_bands",
+    "make_level_by_blocks",
     "make_when_told",
     "miss_when_told",
     "nothing",
@@ -264,6 +265,14 @@ def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
 def make_level_by_bands(job: LevelJob) -> MadeLevel | RefusedLevel:
     """Make a level as one that takes more memory than there is, and say that values of it were in files."""
     made = make_level(replace(job, memory=1))
+    if not (job.folder / "values").is_dir():
+        raise AssertionError("expected values in files")
+    return made
+
+
+def make_level_by_blocks(job: LevelJob) -> MadeLevel | RefusedLevel:
+    """Make a level with the memory that blocks of 1,600 values take by themselves, and say that they were in files."""
+    made = make_level(replace(job, memory=2 * 24 * 1600))
     if not (job.folder / "values").is_dir():
         raise AssertionError("expected values in files")
     return made

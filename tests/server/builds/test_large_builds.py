@@ -95,7 +95,8 @@ def test_an_uploaded_container_is_checked_by_bands(tmp_path: Path, monkeypatch: 
     assert job.container.read_bytes() == data
     torus = _job(_new(tmp_path, "torus"), ls.encode(ls.Surface(terrain((300, 310)), (True, True))))
     assert isinstance(worker.build(torus), worker.Built)
-    blocks = _job(_new(tmp_path, "blocks"), ls.encode(_blocks()))
+    sides = [ls.Block(part) for part in np.array_split(terrain((300, 310)), 4)]
+    blocks = _job(_new(tmp_path, "blocks"), ls.encode(ls.Surface(blocks=sides)))
     assert isinstance(worker.build(blocks), worker.Built)
     rows, columns = np.indices((300, 310))
     ruled = ls.encode(np.stack([columns, rows, terrain((300, 310))], axis=-1))

@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lodestream import encode
+from lodestream import Block, Surface, encode
 from lodestream_server import running, running_server
 from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_queue, worker
 from lodestream_server.builds.level_files import Key, Lease, LevelFiles
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
-from tests.core.bands.block_surfaces import block_surface
 from tests.server.builds import slow
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.connections import hostile
@@ -562,16 +561,16 @@ def test_a_level_larger_than_memory_is_made_by_bands_to_the_same_file(
 def test_a_level_of_several_blocks_is_made_block_by_block_to_the_same_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format_name: str
 ) -> None:
-    surface = block_surface("plates", (120, 110), 2, "float32", "holes", np.random.default_rng(3))
+    heights = np.stack([*np.mgrid[0:96.0, 0:40.0], hills(96, 40)], axis=-1).astype(np.float32)
+    heights[..., 0] += np.sin(heights[..., 1])
+    blocks = [Block(heights[top : top + 13], mask=np.arange(13 * 40).reshape(13, 40) != 99) for top in range(0, 84, 12)]
     with running_server(tmp_path, workers=1) as url, client(url) as http:
-        told = push(http, encode(surface), filename="a.lode")
-        addresses = [f"{told['url']}/levels/{level}" for level in (3, len(told["levels"]) - 1)]
-        whole = [http.get(address, params={"format": format_name}).raise_for_status() for address in addresses]
-    monkeypatch.setattr(level_queue, "make_level", slow.make_level_by_bands)
+        told = push(http, encode(Surface(blocks=blocks)), filename="a.lode")
+        whole = http.get(finest(told), params={"format": format_name}).raise_for_status()
+    monkeypatch.setattr(level_queue, "make_level", slow.make_level_by_blocks)
     with running_server(tmp_path, workers=1) as url, client(url) as http:
-        for before, address in zip(whole, addresses, strict=True):
-            banded = http.get(str(httpx.URL(address).path), params={"format": format_name}).raise_for_status()
-            assert banded.content == before.content
+        banded = http.get(str(httpx.URL(finest(told)).path), params={"format": format_name}).raise_for_status()
+        assert banded.content == whole.content
 
 
 def test_values_in_files_count_for_the_room_of_a_level(tmp_path: Path) -> None:
