@@ -119,13 +119,14 @@ def encode(
         Bytes to work in, a MiB or more, or text such as ``"512MiB"``, beside arrays that are memory-mapped: what takes
         more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
         for each value of such a row are taken in any case, and 6 for each point of a surface with holes. A surface of
-        several blocks is built block by block: the largest one is in place of such a row. By default a quarter of the
-        machine's memory, and where there is no ``out`` one piece.
+        several blocks, or one that touches itself, is built block by block: the largest one is in place of such a row.
+        By default a quarter of the machine's memory, and where there is no ``out`` one piece.
     scratch : str or path-like, optional
-        A folder for the files of a build by bands, about 12 bytes a value; empty, or of a build that was cut. What is
-        made there is kept when the build is interrupted, or fails, and the same call goes on from there; after success
-        it is gone, with the folder if that was not there before. Only one build at a time has a folder. By default one
-        beside ``out`` that is gone afterwards; what a killed process left there is found again.
+        A folder for the files of a build by bands, about 12 bytes a value, up to 30 of several blocks; empty, or of a
+        build that was cut. What is made there is kept when the build is interrupted, or fails, and the same call goes
+        on from there; after success it is gone, with the folder if that was not there before. Only one build at a time
+        has a folder. By default one beside ``out`` that is gone afterwards; what a killed process left there is found
+        again.
     executor : concurrent.futures.Executor, optional
         Carries out the tasks of a build by bands: processes, or machines that all see ``scratch`` and the files of
         memory-mapped arrays, as ``distributed.Client(...).get_executor()``. By default threads of this process.
