@@ -124,7 +124,7 @@ class TileTable:
         return np.split(np.argsort(grids, kind="stable"), ends[:-1])
 
     def of_grids(self, chosen: range) -> list[NDArray[np.int64]]:
-        """`of_grid` of neighbouring grids alone, int64 of shape (band,): it takes no longer the more others there are."""
+        """`of_grid` of some neighbouring grids, int64 of shape (band,): the others cost nothing."""
         grids = self._arrays().grid
         order = np.argsort(grids, kind="stable")
         ends = np.searchsorted(grids[order], np.arange(chosen.start, chosen.stop + 1))
