@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..scratch import Scratch, rows_at_once
 from ..surface import DTYPES, Block, Surface
+from .references import root_of
 
 __all__ = ["load_surface", "save_surface"]
 
@@ -20,25 +22,40 @@ _FILE = "surface.msgpack"
 _MOST = 64 << 20
 
 
-def save_surface(surface: Surface, scratch: Scratch) -> None:
-    """Write a surface of any size into a folder; arrays that are whole files of the folder already stay there.
+#: Where an array lies: the name of a file, the first byte among its values, dtype and shape.
+_Place = tuple[str, int, str, tuple[int, ...]]
 
-    Which of its points are one (`Surface.joints`) is not kept.
+
+def save_surface(surface: Surface, scratch: Scratch) -> None:
+    """Write a surface of any size into a folder; arrays that lie in files of the folder already stay there.
+
+    The others share a file for each dtype, since a process may have only so many files open. Which points of the
+    surface are one (`Surface.joints`) is not kept.
     """
-    blocks = []
-    for number, block in enumerate(surface.blocks):
-        arrays = {"points": block.points}
+    every: list[dict[str, NDArray[Any]]] = []
+    for block in surface.blocks:
+        own = {"points": block.points}
         if block.mask is not None:
-            arrays["mask"] = block.mask
-        arrays.update({f"attribute {k}": array for k, array in enumerate(block.attributes.values())})
-        names = {}
-        for key, array in arrays.items():
-            name = _name_of(array, scratch)
-            if name is None:
-                name = f"surface/{number}/{key.replace(' ', '-')}"
-                scratch.write(name, array)
-            names[key] = name
-        blocks.append({"arrays": names, "closed": list(block.closed), "attributes": list(block.attributes)})
+            own["mask"] = block.mask
+        every.append(own | {f"attribute {k}": array for k, array in enumerate(block.attributes.values())})
+    places: list[dict[str, _Place | None]] = [
+        {key: _place_of(array, scratch) for key, array in own.items()} for own in every
+    ]
+    left: dict[str, list[tuple[int, str]]] = {}
+    for number, own in enumerate(every):
+        for key, array in own.items():
+            if places[number][key] is None:
+                left.setdefault(array.dtype.name, []).append((number, key))
+    for dtype, several in left.items():
+        name, done = f"surface/{dtype}", 0
+        scratch.write_joined(name, [every[number][key] for number, key in several])
+        for number, key in several:
+            places[number][key] = name, done, dtype, every[number][key].shape
+            done += every[number][key].nbytes
+    blocks = [
+        {"arrays": own, "closed": list(block.closed), "attributes": list(block.attributes)}
+        for own, block in zip(places, surface.blocks, strict=True)
+    ]
     described = msgpack.packb({"blocks": blocks, "metadata": surface.metadata})
     temporary = scratch.folder / f"{_FILE}.part"
     temporary.write_bytes(described)
@@ -63,7 +80,8 @@ def load_surface(scratch: Scratch) -> Surface | None:
         if len(described) > _MOST:
             raise ValueError("too long")
         found = msgpack.unpackb(described, strict_map_key=False)
-        blocks = [_block(entry, scratch) for entry in found["blocks"]]
+        files = _Files(scratch)
+        blocks = [_block(entry, files) for entry in found["blocks"]]
         metadata = found["metadata"]
         if not isinstance(metadata, dict):
             raise TypeError("no map")
@@ -74,37 +92,57 @@ def load_surface(scratch: Scratch) -> Surface | None:
     return Surface(blocks=blocks, metadata=metadata)
 
 
-def _block(entry: dict[str, Any], scratch: Scratch) -> Block:
-    arrays = {key: _read(name, scratch) for key, name in entry["arrays"].items()}
+class _Files:
+    """Files of a folder, each mapped once."""
+
+    def __init__(self, scratch: Scratch) -> None:
+        self._scratch = scratch
+        self._known: dict[str, NDArray[np.uint8]] = {}
+
+    def bytes_of(self, name: object) -> NDArray[np.uint8]:
+        """The values of a file as bytes, shape (byte,)."""
+        if not isinstance(name, str) or ".." in Path(name).parts or Path(name).is_absolute():
+            raise ValueError(f"a name within the folder was expected, not {str(name)[:80]!a}")
+        if name not in self._known:
+            array = self._scratch.read(name)
+            if not array.flags.c_contiguous:
+                raise ValueError("values in another order were not expected")
+            self._known[name] = np.ndarray((array.nbytes,), np.uint8, array)
+        return self._known[name]
+
+
+def _block(entry: dict[str, Any], files: _Files) -> Block:
+    arrays = {key: _read(place, files) for key, place in entry["arrays"].items()}
     attributes = {name: arrays[f"attribute {number}"] for number, name in enumerate(entry["attributes"])}
     rows, columns = entry["closed"]
     return Block(arrays["points"], (rows, columns), mask=arrays.get("mask"), attributes=attributes)
 
 
-def _read(name: object, scratch: Scratch) -> NDArray[Any]:
-    if not isinstance(name, str) or ".." in Path(name).parts or Path(name).is_absolute():
-        raise ValueError(f"a name within the folder was expected, not {str(name)[:80]!a}")
-    array = scratch.read(name)
-    if array.dtype.name not in [*DTYPES, "bool"]:
-        raise ValueError(f"no values of {array.dtype} are expected")
-    if array.dtype == bool and any((array[rows].view(np.uint8) > 1).any() for rows in rows_at_once(array.shape)):
+def _read(place: Any, files: _Files) -> NDArray[Any]:
+    name, start, kind, shape = place
+    if kind not in [*DTYPES, "bool"]:
+        raise ValueError(f"no values of {str(kind)[:80]!a} are expected")
+    dtype, raw = np.dtype(kind), files.bytes_of(name)
+    if not all(type(number) is int and number >= 0 for number in (start, *shape)) or start % dtype.itemsize:
+        raise ValueError("whole numbers were expected of a place")
+    if start + math.prod(shape) * dtype.itemsize > raw.size:
+        raise ValueError(f"values beyond the end of {str(name)[:80]!a} were not expected")
+    array: NDArray[Any] = np.ndarray(tuple(shape), dtype, raw, start)
+    if kind == "bool" and any((array[rows].view(np.uint8) > 1).any() for rows in rows_at_once(array.shape)):
         raise ValueError("bytes other than 0 and 1 in a mask were not expected")  # numpy counts them wrongly
     return array
 
 
-def _name_of(array: NDArray[Any], scratch: Scratch) -> str | None:
-    """The name of the file of which an array is the whole; None: there is none in this folder."""
-    root: Any = array
-    while isinstance(root, np.ndarray) and not isinstance(root, np.memmap):
-        root = root.base
-    if not isinstance(root, np.memmap) or root.filename is None:
+def _place_of(array: NDArray[Any], scratch: Scratch) -> _Place | None:
+    """Where an array lies in a file of this folder; None: in none, or in another order."""
+    root = root_of(array)
+    if root is None or not array.flags.c_contiguous:
         return None
-    path = Path(root.filename).resolve()
-    folder = scratch.folder.resolve()
+    path, folder = Path(str(root.filename)).resolve(), scratch.folder.resolve()
     if path.suffix != ".npy" or not path.is_relative_to(folder):
         return None
     name = str(path.relative_to(folder).with_suffix(""))
     stored = scratch.read(name)
-    same = stored.shape == array.shape and stored.dtype == array.dtype and stored.strides == array.strides
     start = array.__array_interface__["data"][0] - root.__array_interface__["data"][0]
-    return name if same and start == 0 else None
+    same = isinstance(stored, np.memmap) and stored.offset == root.offset and stored.flags.c_contiguous
+    return (name, start, array.dtype.name, array.shape) if same and start >= 0 else None

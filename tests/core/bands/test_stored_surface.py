@@ -10,7 +10,7 @@ import pytest
 
 from lodestream.bands.stored_surface import load_surface, save_surface
 from lodestream.errors import InputError
-from lodestream.scratch import Scratch
+from lodestream.scratch import Room, Scratch
 from lodestream.surface import Block, Surface
 
 
@@ -58,6 +58,33 @@ def test_files_of_the_folder_stay(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("surface/**/*.npy"))) == 1
 
 
+def test_many_arrays_take_few_files(tmp_path: Path) -> None:
+    rng, room = np.random.default_rng(2), Room(lambda: Scratch(tmp_path))
+    blocks = []
+    for number in range(60):
+        points = room.empty((4, 5), np.float32) if number % 2 else np.empty((4, 5), np.float32)
+        points[...] = rng.normal(size=(4, 5))
+        blocks.append(Block(points, attributes={"a": rng.integers(0, 9, (4, 5))}))
+    surface = Surface(blocks=blocks)
+    save_surface(surface, Scratch(tmp_path))
+    assert len(list(tmp_path.rglob("*.npy"))) < 24
+    again = load_surface(Scratch(tmp_path))
+    assert again is not None
+    _same(surface, again)
+    save_surface(again, Scratch(tmp_path))  # all of it lies there
+    assert len(list(tmp_path.rglob("*.npy"))) < 24
+    found = load_surface(Scratch(tmp_path))
+    assert found is not None
+    _same(surface, found)
+
+
+def _described(place: object, metadata: object = None) -> bytes:
+    """A surface of one block, as a file says where its points lie."""
+    block = {"arrays": {"points": place}, "closed": [0, 0], "attributes": []}
+    described: bytes = msgpack.packb({"blocks": [block], "metadata": {} if metadata is None else metadata})
+    return described
+
+
 @pytest.mark.parametrize(
     "described",
     [
@@ -66,10 +93,24 @@ def test_files_of_the_folder_stay(tmp_path: Path) -> None:
         msgpack.packb([]),
         msgpack.packb({"blocks": [], "metadata": {}}),
         msgpack.packb({"blocks": [{}], "metadata": {}}),
-        msgpack.packb({"blocks": [{"arrays": {"points": "../x"}, "closed": [0, 0], "attributes": []}], "metadata": {}}),
-        msgpack.packb({"blocks": [{"arrays": {"points": "text"}, "closed": [0, 0], "attributes": []}], "metadata": {}}),
-        msgpack.packb({"blocks": [{"arrays": {"points": "gone"}, "closed": [0, 0], "attributes": []}], "metadata": {}}),
-        msgpack.packb({"blocks": [{"arrays": {"points": "ok"}, "closed": [0, 0], "attributes": []}], "metadata": 5}),
+        _described(["../x", 0, "float64", [3, 3]]),
+        _described(["text", 0, "float64", [3, 3]]),
+        _described(["gone", 0, "float64", [3, 3]]),
+        _described(["ok", 0, "float64", [3, 3]], 5),
+        _described("ok"),
+        _described(["ok", 0, "float64", [3, 4]]),
+        _described(["ok", 8, "float64", [3, 3]]),
+        _described(["ok", -8, "float64", [3, 3]]),
+        _described(["ok", 4, "float64", [2, 2]]),
+        _described(["ok", 0, "float64", [-3, -3]]),
+        _described(["ok", 0, "float64", [2**62, 4]]),
+        _described(["ok", 0.0, "float64", [3, 3]]),
+        _described(["ok", True, "float64", [3, 3]]),
+        _described(["ok", 0, "complex128", [2, 2]]),
+        _described(["ok", 0, ["float64"], [3, 3]]),
+        _described(["ok", 0, "float64", [[3, 3]]]),
+        _described(["ok", 0, "float64", 9]),
+        _described(["turned", 0, "float64", [3, 2]]),
     ],
 )
 def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None:
@@ -77,6 +118,7 @@ def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None
     np.save(tmp_path / "x.npy", np.ones((3, 3)))
     scratch.write("text", np.array([["a", "b"], ["c", "d"]]))
     scratch.write("ok", np.ones((3, 3)))
+    scratch.write("turned", np.asfortranarray(np.ones((3, 2))))
     (scratch.folder / "surface.msgpack").write_bytes(described)
     with pytest.raises(InputError, match="expected"):
         load_surface(scratch)
@@ -85,7 +127,7 @@ def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None
 def test_masks_have_nothing_but_0_and_1(tmp_path: Path) -> None:
     scratch = Scratch(tmp_path)
     save_surface(Surface(np.zeros((4, 5)), mask=np.eye(4, 5) == 0), scratch)
-    path = next(tmp_path.rglob("mask.npy"))
+    path = next(tmp_path.rglob("bool.npy"))
     data = bytearray(path.read_bytes())
     data[-3] = 7
     path.write_bytes(data)
