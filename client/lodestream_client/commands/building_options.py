@@ -48,7 +48,8 @@ def add_building_options(parser: argparse.ArgumentParser) -> None:
         "--scratch",
         type=Path,
         metavar="FOLDER",
-        help="folder for the files of a build by bands, about 12 bytes a value, empty or of an interrupted build; "
+        help="folder for the files of a build by bands, about 12 bytes a value (up to 30 of several blocks), "
+        "empty or of an interrupted build; "
         "after an interruption it stays, and the same command continues from there (default: OUT.lode.build, which is "
         "removed after an interruption too)",
     )

@@ -118,6 +118,7 @@ class _Needs:
         self._given = options.memory is not None
         header = decoder.header
         shapes = decoder.shapes
+        self._several = len(shapes) > 1
         self.points = sum(rows * columns for rows, columns in shapes)
         self._together = max(rows * columns for rows, columns in shapes) if self._format.by_block else self.points
         channels = selection_of(options.target).channels(header)
@@ -144,19 +145,26 @@ class _Needs:
 
         limit = memory if self._given else memory_limit()
         whole = self.decoding <= memory or self.reason is not None
-        writing = self._format.memory * self._together + (self._values if whole else 0)
+        alone = self._format.memory * self._together
+        writing = alone + (self._values if whole else 0)
         if self._format.memory and writing > limit:
-            by_bands = [it.name for it in formats() if (it.write or it.write_beside) and not it.memory]
-            by_block = [it.name for it in formats() if it.by_block]
-            raise TooLargeError(
+            needed = (
                 f"expected a surface that takes at most {limit >> 20:,} MiB to write as {self._format.name}, got one "
-                f"that takes about {writing >> 20:,} MiB; {', '.join(by_bands)} are written by bands of rows, and "
-                f"{', '.join(by_block)} block by block"
             )
+            needed += f"that takes about {-(-writing >> 20):,} MiB"
+            if alone <= limit and self.reason is not None:
+                raise TooLargeError(f"{needed} and is not decoded by bands: {self.reason}; --memory takes more")
+            by_part = [
+                it.name
+                for it in formats()
+                if (it.write or it.write_beside) and (it.by_block if self._several else not it.memory)
+            ]
+            how = "block by block" if self._several else "by bands of rows"
+            raise TooLargeError(f"{needed}; {', '.join(by_part)} are written {how}, and --memory takes more")
         if self.reason is not None and self.decoding > limit:
             raise TooLargeError(
                 f"expected a surface that takes at most {limit >> 20:,} MiB to decode, got one that takes about "
-                f"{self.decoding >> 20:,} MiB and is not decoded by bands: {self.reason}"
+                f"{-(-self.decoding >> 20):,} MiB and is not decoded by bands: {self.reason}; --memory takes more"
             )
 
 

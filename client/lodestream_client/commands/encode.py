@@ -82,7 +82,8 @@ def run(args: argparse.Namespace) -> int:
     started = time.monotonic()
     with executor_of(options.building.dask) as executor, work_folder(options.building, options.out) as folder:
         surface = read_surface(options.files, options.surface, folder / "files", options.building.memory)
-        _note_memory(surface, options.building.memory)
+        if options.surface.quality.rms is None:  # a stream for one error is refused instead
+            _note_memory(surface, options.building.memory)
         made = _made(surface, options, folder, executor)
         size = len(made) if made is not None else Path(options.out).stat().st_size
         if made is not None:
@@ -156,7 +157,10 @@ def _note_memory(surface: Surface, memory: int | None) -> None:
 
     least = min(least_memory(surface), whole_memory(surface))
     if memory is not None and memory < least:
-        note(f"--memory {human_size(memory)} is exceeded: this surface takes about {human_size(least)} at least")
+        note(
+            f"--memory {human_size(memory)} is exceeded, and encoding goes on: "
+            f"this surface takes about {human_size(least)} at least"
+        )
 
 
 def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions) -> None:

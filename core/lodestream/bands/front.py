@@ -120,7 +120,7 @@ def encode(
         more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
         for each value of such a row are taken in any case, and 6 for each point of a surface with holes. A surface of
         several blocks, or one that touches itself, is built block by block: the largest one is in place of such a row.
-        By default a quarter of the machine's memory, and where there is no ``out`` one piece.
+        By default a quarter of the machine's memory, and one piece where there is neither ``out`` nor an executor.
     scratch : str or path-like, optional
         A folder for the files of a build by bands, about 12 bytes a value, up to 30 of several blocks; empty, or of a
         build that was cut. What is made there is kept when the build is interrupted, or fails, and the same call goes

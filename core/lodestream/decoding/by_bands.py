@@ -31,7 +31,9 @@ def why_not_by_bands(header: Header, most: int, level: int | None = None) -> str
     if level is not None:
         shapes = level_shapes(header.patches, header.layout, level, shapes)
     largest = max(rows * columns for rows, columns in shapes) * header.channels
-    return None if largest <= most else f"its largest block has {largest:,} values, and there is memory for {most:,}"
+    if largest <= most:
+        return None
+    return f"its largest block is decoded as a whole and has {largest:,} values, and there is memory for {most:,}"
 
 
 def decoder_by_bands(

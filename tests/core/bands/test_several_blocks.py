@@ -159,7 +159,10 @@ def test_a_flipped_bit_is_found() -> None:
 def test_blocks_that_are_too_large_are_refused() -> None:
     data = ls.encode(_plates())
     assert _checked(data).errors_checked
-    with pytest.raises(ls.TooLargeError, match=r"at most 1 MiB to check, .* its largest block has [\d,]+ values"):
+    with pytest.raises(
+        ls.TooLargeError,
+        match=r"at most 1 MiB to check, .* its largest block is decoded as a whole and has [\d,]+ values",
+    ):
         inspect(io.BytesIO(data), max_vertices=1 << 20, memory=1 << 20)
 
 

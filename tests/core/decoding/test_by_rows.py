@@ -140,6 +140,7 @@ def test_what_cannot_be_decoded_by_rows_says_so() -> None:
     header = _decoder(ls.encode(ls.Surface(blocks=[ls.Block(heights), ls.Block(heights[:90])]))).header
     assert why_not_by_bands(header, heights.size) is None
     assert why_not_by_bands(header, heights.size - 1) == (
-        f"its largest block has {heights.size:,} values, and there is memory for {heights.size - 1:,}"
+        f"its largest block is decoded as a whole and has {heights.size:,} values, "
+        f"and there is memory for {heights.size - 1:,}"
     )
     assert why_not_by_bands(header, heights.size - 1, header.levels - 1) is None

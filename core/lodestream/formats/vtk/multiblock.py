@@ -42,7 +42,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def write_beside(surface: Surface, path: Path) -> None:
-    """Write NAME.vtm, and the folder NAME beside it with NAME_0.vts and so on.
+    """Write NAME.vtm, and the folder NAME beside it with NAME_0.vts and so on, of eleven blocks NAME_00.vts.
 
     Both are written under temporary names and put in place by renaming, the folder first. A folder of that name is
     replaced if NAME.vtm is there and nothing but its blocks is in the folder, or if it is empty.
@@ -104,7 +104,8 @@ def _check_folder(folder: Path, path: Path) -> None:
 
 
 def _names(stem: str, count: int) -> list[str]:
-    return [f"{stem}_{number}.vts" for number in range(count)]
+    digits = len(str(count - 1))  # so that a shell has them in their order
+    return [f"{stem}_{number:0{digits}}.vts" for number in range(count)]
 
 
 def _index(folder: str, names: Sequence[str]) -> bytes:
