@@ -119,8 +119,12 @@ class Scratch:
                 read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
                 with _parsing:
                     shape, fortran, dtype = read(file)
-            except ValueError as error:
+            except OSError:
+                raise
+            except Exception as error:  # whatever a parser of Python's literals makes of it
                 raise DamagedError(f"expected an array in {path}, got something else ({error})") from None
+            if not dtype.itemsize or any(length < 0 for length in shape):
+                raise DamagedError(f"expected an array with values in {path}, got {dtype}")
             if dtype.hasobject:  # the file would say which addresses of memory they are at
                 raise DamagedError(f"expected an array of numbers in {path}, got {dtype} with objects of Python")
             start, size = file.tell(), os.fstat(file.fileno()).st_size

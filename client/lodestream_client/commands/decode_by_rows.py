@@ -26,8 +26,6 @@ __all__ = ["by_rows"]
 
 #: Bytes for each value that decoding in one piece takes.
 _WHOLE = 12
-#: And for each value of a block that is decoded by itself, from the file.
-_BLOCK = 24
 #: The part of the memory that an array in memory may take.
 _PART = 16
 #: In the folder on the way to the file: arrays, and the file with what its writer makes beside it.
@@ -83,7 +81,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
         needs = _Needs(decoder, options, memory)
         try:
             needs.check(memory)
-            if needs.decoding <= memory or needs.reason is not None:
+            if needs.whole(memory):
                 return False
             capacity.promise(needs.points, (), masked=0, tables=header.tables)
         except TooLargeError as error:
@@ -110,12 +108,13 @@ class _Needs:
     """
 
     def __init__(self, decoder: RowsDecoder | BlocksDecoder, options: DecodeOptions, memory: int) -> None:
+        from lodestream.container.capacity import memory_limit
         from lodestream.decoding.by_bands import why_not_by_bands
         from lodestream.formats import for_writing, written
         from lodestream.planning.selection import selection_of
 
         self._format = written("npy") if options.out == "-" else for_writing(options.out)
-        self._given = options.memory is not None
+        self._limit = memory if options.memory is not None else memory_limit()
         header = decoder.header
         shapes = decoder.shapes
         self._several = len(shapes) > 1
@@ -131,7 +130,12 @@ class _Needs:
         elif options.partial or replace(options.target, level=None) != Target():
             self.reason = "only the whole surface or a level is, without --partial, limits and --attributes"
         else:
-            self.reason = why_not_by_bands(header, memory // _BLOCK, decoder.level)
+            self.reason = why_not_by_bands(header, self._limit, decoder.level)
+
+    def whole(self, memory: int) -> bool:
+        """Whether it is decoded in one piece: it cannot be by bands, or there is room for it and for its writer."""
+        writing = self._format.memory * self._together + self._values
+        return self.reason is not None or (self.decoding <= memory and writing <= self._limit)
 
     def check(self, memory: int) -> None:
         """Refuse what takes more than was given or, if nothing was, than there is.
@@ -140,12 +144,10 @@ class _Needs:
         ------
         TooLargeError
         """
-        from lodestream.container.capacity import memory_limit
         from lodestream.formats import formats
 
-        limit = memory if self._given else memory_limit()
-        whole = self.decoding <= memory or self.reason is not None
-        alone = self._format.memory * self._together
+        limit, alone = self._limit, self._format.memory * self._together
+        whole = self.whole(memory)
         writing = alone + (self._values if whole else 0)
         if self._format.memory and writing > limit:
             needed = (
@@ -157,7 +159,9 @@ class _Needs:
             by_part = [
                 it.name
                 for it in formats()
-                if (it.write or it.write_beside) and (it.by_block if self._several else not it.memory)
+                if it is not self._format
+                and (it.write or it.write_beside)
+                and (it.by_block if self._several else not it.memory)
             ]
             how = "block by block" if self._several else "by bands of rows"
             raise TooLargeError(f"{needed}; {', '.join(by_part)} are written {how}, and --memory takes more")

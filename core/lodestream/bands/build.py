@@ -71,10 +71,10 @@ class Build:
         """Of the surface, attributes included."""
         return len(self.lattices.channels)
 
-    def save(self) -> None:
-        """Write what other processes need to open this."""
+    def save(self, flush: bool = False) -> None:
+        """Write what other processes need to open this; with ``flush``, also those of other machines."""
         facts = _Facts(self.prepared, self.lattices, self.points, self._core_points)
-        dump(facts, self.scratch.folder / _FILE)
+        dump(facts, self.scratch.folder / _FILE, flush)
 
     def save_header(self, header: Header) -> None:
         """Write the header, with the size of chunks, for the tasks that code the residual."""

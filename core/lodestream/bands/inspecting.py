@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..container.digest import little_endian
 from ..container.model import Header
 from ..decoding.by_bands import decoder_by_bands, why_not_by_bands
-from ..decoding.by_blocks import BlocksDecoder
+from ..decoding.by_blocks import BYTES, BlocksDecoder
 from ..decoding.by_rows import RowsDecoder
 from ..decoding.inspected_sections import Walked, walk
 from ..decoding.inspection import (
@@ -93,7 +93,7 @@ def inspect(
     header = walked.index.header
     if _fits(header, memory):
         return inspect_whole(walked, progress)
-    if (reason := why_not_by_bands(header, memory // _WHOLE)) is not None:
+    if (reason := why_not_by_bands(header, memory)) is not None:
         raise TooLargeError(
             f"expected a surface that takes at most {memory >> 20:,} MiB to check, got one that takes about "
             f"{_values(header) * _WHOLE >> 20:,} MiB and cannot be decoded by bands: {reason}"
@@ -201,12 +201,10 @@ def _band(decoder: RowsDecoder, rows: tuple[int, int], states: Sequence[NDArray[
 def _of_blocks(
     decoder: BlocksDecoder, states: Sequence[NDArray[np.int8]], memory: int, progress: Callable[[float], None]
 ) -> _Found:
-    """Decode and measure some blocks at a time, as many runs of them together as there are threads."""
-    groups, count = decoder.groups(memory // threads()), threads()
+    """Decode and measure some blocks at a time: runs of them by several threads, as far as there is memory for all."""
     digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
     holes, masks = list[int](), decoder.header.masks
-    for first in range(0, len(groups), count):
-        together = groups[first : first + count]
+    for together in _together(decoder, memory):
         for values, own in spread(lambda blocks: _measured(decoder, blocks, states), together):
             for block, found in values.items():
                 for array in found.arrays:
@@ -216,6 +214,21 @@ def _of_blocks(
             figures += own
         progress(READ + (_MEASURED - READ) * together[-1].stop / len(decoder.header.blocks))
     return _Found(digest.hexdigest(), tuple(holes), corners, figures)
+
+
+def _together(decoder: BlocksDecoder, memory: int) -> Iterator[list[range]]:
+    """Runs of blocks, as many at a time as there are threads and as fit into memory, but at least one."""
+    found: list[range] = []
+    taken = 0
+    for blocks in decoder.groups(memory // threads()):
+        points = sum(rows * columns for rows, columns in decoder.shapes[blocks.start : blocks.stop])
+        own = points * decoder.header.channels * BYTES
+        if found and (len(found) == threads() or taken + own > memory):
+            yield found
+            found, taken = [], 0
+        found.append(blocks)
+        taken += own
+    yield found
 
 
 def _measured(

@@ -182,7 +182,7 @@ class Made:
         if not path.exists():
             own = Scratch(scratch.folder / name)
             build = Build(own, prepared, exact_lattices(prepared, bits, room), self._points, self._core)
-            build.save()
+            build.save(flush=self._executor is not None)
             execution = Execution(own, self._executor, self._threads)
             try:
                 with replacing(path) as unfinished, unfinished.open("wb") as file:

@@ -30,12 +30,15 @@ _INODE = "_lodestream_inode"
 _HEAD = f"lodestream {__version__}\n".encode()
 
 
-def dump(value: object, path: Path) -> None:
-    """Write an object; what it holds of memory-mapped arrays stays in their files, which must stay where they are."""
+def dump(value: object, path: Path, flush: bool = False) -> None:
+    """Write an object; what it holds of memory-mapped arrays stays in their files, which must stay where they are.
+
+    With ``flush``, what was written to maps is in these files when it returns, for other machines to read.
+    """
     unfinished = path.with_name(f"{path.name}.part")
     with unfinished.open("wb") as file:
         file.write(_HEAD)
-        _Pickler(file, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+        _Pickler(file, pickle.HIGHEST_PROTOCOL, flush).dump(value)
     os.replace(unfinished, path)
 
 
@@ -59,9 +62,10 @@ def load(path: Path) -> Any:
 class _Pickler(pickle.Pickler):
     """Puts the name of a file in place of arrays that are maps of it."""
 
-    def __init__(self, file: Any, protocol: int) -> None:
+    def __init__(self, file: Any, protocol: int, flush: bool) -> None:
         super().__init__(file, protocol)
         self._files: dict[str, _File] = {}
+        self._flush = flush
 
     def reducer_override(self, value: object) -> Any:
         """As `pickle` wants it: how an object is made again."""
@@ -70,6 +74,8 @@ class _Pickler(pickle.Pickler):
             if root is not None and root.filename is not None:
                 start = value.__array_interface__["data"][0] - root.__array_interface__["data"][0]
                 path = str(Path(root.filename).resolve())
+                if path not in self._files and self._flush and root.mode != "r":
+                    root.flush()
                 file = self._files.setdefault(path, _File(path))  # the same object for all of its arrays
                 return _part, (file, root.offset + start, value.dtype, value.shape, value.strides)
         return NotImplemented

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import msgpack
 import numpy as np
@@ -21,6 +22,9 @@ _FILE = "surface.msgpack"
 #: The largest description of a surface that is read; metadata are limited to far less.
 _MOST = 64 << 20
 
+
+#: What unpacking and small changes of types may raise beside the usual.
+_OTHERS = RecursionError, OverflowError, msgpack.UnpackException
 
 #: Where an array lies: the name of a file, the first byte among its values, dtype and shape.
 _Place = tuple[str, int, str, tuple[int, ...]]
@@ -47,7 +51,7 @@ def save_surface(surface: Surface, scratch: Scratch) -> None:
             if places[number][key] is None:
                 left.setdefault(array.dtype.name, []).append((number, key))
     for dtype, several in left.items():
-        name, done = f"surface/{dtype}", 0
+        name, done = f"surface/{dtype}-{uuid4().hex}", 0  # arrays that stay may lie in a file of before
         scratch.write_joined(name, [every[number][key] for number, key in several])
         for number, key in several:
             places[number][key] = name, done, dtype, every[number][key].shape
@@ -87,7 +91,7 @@ def load_surface(scratch: Scratch) -> Surface | None:
             raise TypeError("no map")
     except InputError:
         raise
-    except (ValueError, TypeError, LookupError, AttributeError, OSError, msgpack.UnpackException) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, OSError, *_OTHERS) as error:
         raise InputError(f"expected a surface in {scratch.folder.name}, got something else ({error})") from None
     return Surface(blocks=blocks, metadata=metadata)
 
@@ -101,8 +105,10 @@ class _Files:
 
     def bytes_of(self, name: object) -> NDArray[np.uint8]:
         """The values of a file as bytes, shape (byte,)."""
-        if not isinstance(name, str) or ".." in Path(name).parts or Path(name).is_absolute():
-            raise ValueError(f"a name within the folder was expected, not {str(name)[:80]!a}")
+        if not isinstance(name, str):
+            raise TypeError(f"a name was expected, not {type(name).__name__}")
+        if ".." in Path(name).parts or Path(name).is_absolute():
+            raise ValueError(f"a name within the folder was expected, not {name[:80]!a}")
         if name not in self._known:
             array = self._scratch.read(name)
             if not array.flags.c_contiguous:
@@ -113,6 +119,8 @@ class _Files:
 
 def _block(entry: dict[str, Any], files: _Files) -> Block:
     arrays = {key: _read(place, files) for key, place in entry["arrays"].items()}
+    if not all(isinstance(name, str) for name in entry["attributes"]):
+        raise TypeError("names of attributes were expected")
     attributes = {name: arrays[f"attribute {number}"] for number, name in enumerate(entry["attributes"])}
     rows, columns = entry["closed"]
     return Block(arrays["points"], (rows, columns), mask=arrays.get("mask"), attributes=attributes)
@@ -120,14 +128,18 @@ def _block(entry: dict[str, Any], files: _Files) -> Block:
 
 def _read(place: Any, files: _Files) -> NDArray[Any]:
     name, start, kind, shape = place
-    if kind not in [*DTYPES, "bool"]:
-        raise ValueError(f"no values of {str(kind)[:80]!a} are expected")
-    dtype, raw = np.dtype(kind), files.bytes_of(name)
-    if not all(type(number) is int and number >= 0 for number in (start, *shape)) or start % dtype.itemsize:
+    if not isinstance(kind, str) or kind not in [*DTYPES, "bool"]:
+        raise ValueError("values of another type were not expected")
+    if not isinstance(shape, list) or not 2 <= len(shape) <= 3:
+        raise ValueError("two or three axes were expected")
+    if not all(type(number) is int and 0 <= number < 1 << 63 for number in (start, *shape)) or 0 in shape:
         raise ValueError("whole numbers were expected of a place")
+    dtype, raw = np.dtype(kind), files.bytes_of(name)
     if start + math.prod(shape) * dtype.itemsize > raw.size:
-        raise ValueError(f"values beyond the end of {str(name)[:80]!a} were not expected")
+        raise ValueError(f"values beyond the end of {name[:80]!a} were not expected")
     array: NDArray[Any] = np.ndarray(tuple(shape), dtype, raw, start)
+    if not array.flags.aligned:
+        raise ValueError("values between two places of memory were not expected")
     if kind == "bool" and any((array[rows].view(np.uint8) > 1).any() for rows in rows_at_once(array.shape)):
         raise ValueError("bytes other than 0 and 1 in a mask were not expected")  # numpy counts them wrongly
     return array

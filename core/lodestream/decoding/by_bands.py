@@ -6,20 +6,20 @@ from collections.abc import Callable
 
 from ..container.model import Header, Index
 from ..grid.patches import level_shapes
-from .by_blocks import BlocksDecoder
+from .by_blocks import BYTES, BlocksDecoder
 from .by_rows import RowsDecoder
 
 __all__ = ["decoder_by_bands", "why_not_by_bands"]
 
 
-def why_not_by_bands(header: Header, most: int, level: int | None = None) -> str | None:
+def why_not_by_bands(header: Header, memory: int, level: int | None = None) -> str | None:
     """Why a container cannot be decoded by bands; None: it can.
 
     Parameters
     ----------
     header : Header
-    most : int
-        Values that there is memory for. No block is divided where there are several, or where one touches itself.
+    memory : int
+        In bytes. No block is divided where there are several, or where one touches itself.
     level : int, optional
         The finest if not given.
     """
@@ -31,9 +31,9 @@ def why_not_by_bands(header: Header, most: int, level: int | None = None) -> str
     if level is not None:
         shapes = level_shapes(header.patches, header.layout, level, shapes)
     largest = max(rows * columns for rows, columns in shapes) * header.channels
-    if largest <= most:
+    if largest * BYTES <= memory:
         return None
-    return f"its largest block is decoded as a whole and has {largest:,} values, and there is memory for {most:,}"
+    return f"its largest block is decoded as a whole, in about {-(-largest * BYTES >> 20):,} MiB"
 
 
 def decoder_by_bands(

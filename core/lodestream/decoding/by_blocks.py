@@ -26,10 +26,10 @@ from .level_grids import level_nodes, positioned
 from .reconstruction import Values
 from .stored_segments import StoredSegments
 
-__all__ = ["BlocksDecoder"]
+__all__ = ["BYTES", "BlocksDecoder"]
 
 #: Bytes that decoding takes for each value of the blocks that are decoded together.
-_BYTES = 40
+BYTES = 40
 
 
 class BlocksDecoder:
@@ -111,7 +111,7 @@ class BlocksDecoder:
 
     def groups(self, memory: int) -> list[range]:
         """All blocks in runs that are decoded together, in so many bytes about: at least one block each."""
-        most = memory // (_BYTES * self.header.channels)
+        most = memory // (BYTES * self.header.channels)
         found, first, size = [], 0, 0
         for block, (rows, columns) in enumerate(self.shapes):
             if block > first and size + rows * columns > most:

@@ -147,6 +147,8 @@ def check_values(index: Index, holes: tuple[int, ...], corners: Sequence[NDArray
         )
     if holes != (header.holes or (0,) * len(holes)):
         raise CorruptStreamError(f"expected {header.holes} holes in the blocks, got {holes}", 0)
+    if any(own == rows * columns for own, ((rows, columns), _) in zip(holes, header.blocks, strict=True)):
+        raise CorruptStreamError("expected a valid point in each block, got none", 0)
     if header.exact:
         box = np.stack(corners)[:, np.newaxis]
         found = extent_of(box[..., 0] if box.shape[2] == 1 else box, min(box.shape[2], 3))

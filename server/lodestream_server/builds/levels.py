@@ -49,8 +49,8 @@ _LIBRARIES = ("h5netcdf", "h5py", "lodestream", "numpy", "rasterio", "scipy", "v
 MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}
 
 
-#: Bytes for each value that decoding in one piece takes, and of a block by itself; the part of the memory for a band.
-_WHOLE, _BLOCK, _BAND = 12, 24, 4
+#: Bytes for each value that decoding in one piece takes, and the part of the memory that a band may take.
+_WHOLE, _BAND = 12, 4
 
 
 class FileTooLongError(TooLargeError):
@@ -199,12 +199,14 @@ def _goes_by_bands(header: Header, job: LevelJob) -> bool:
     from lodestream.decoding.by_bands import why_not_by_bands
     from lodestream.formats import written
 
-    most = job.memory // 2
-    if job.level > header.levels or why_not_by_bands(header, most // _BLOCK, job.level) is not None:
+    if job.level > header.levels:
+        return False
+    most, whole = job.memory // 2, header.layout.points(job.level) * header.channels * _WHOLE
+    if why_not_by_bands(header, max(most, whole), job.level) is not None:
         return False
     if (format_ := written(job.format_name)).memory and not format_.by_block:
         return False
-    return header.layout.points(job.level) * header.channels * _WHOLE > most
+    return whole > most
 
 
 def _write(surface: Surface, job: LevelJob) -> Path:

@@ -56,7 +56,7 @@ def _dying(task: Any, *arguments: Any) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-@pytest.mark.parametrize("cluster", [2], indirect=True)
+@pytest.mark.parametrize("cluster", [2, 3], indirect=True)
 @pytest.mark.parametrize("kind", ["holes", "closed columns", "blocks"])
 def test_a_cluster_builds_the_same_bytes(cluster: Any, kind: str, tmp_path: Path) -> None:
     surface = _surface(kind)

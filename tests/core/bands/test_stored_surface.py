@@ -110,6 +110,11 @@ def _described(place: object, metadata: object = None) -> bytes:
         _described(["ok", 0, ["float64"], [3, 3]]),
         _described(["ok", 0, "float64", [[3, 3]]]),
         _described(["ok", 0, "float64", 9]),
+        _described(["ok", 0, "float64", [3, 0]]),
+        _described(["ok", 0, "bool", [2**60, 0]]),
+        _described(["ok", 0, "float64", [2**63] * 100_000]),
+        _described(["unfinished", 0, "float64", [3, 3]]),
+        _described([["ok"], 0, "float64", [3, 3]]),
         _described(["turned", 0, "float64", [3, 2]]),
     ],
 )
@@ -118,6 +123,9 @@ def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None
     np.save(tmp_path / "x.npy", np.ones((3, 3)))
     scratch.write("text", np.array([["a", "b"], ["c", "d"]]))
     scratch.write("ok", np.ones((3, 3)))
+    header = b"{'descr': ("
+    whole = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(72)
+    (scratch.folder / "unfinished.npy").write_bytes(whole)
     scratch.write("turned", np.asfortranarray(np.ones((3, 2))))
     (scratch.folder / "surface.msgpack").write_bytes(described)
     with pytest.raises(InputError, match="expected"):
@@ -127,7 +135,7 @@ def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None
 def test_masks_have_nothing_but_0_and_1(tmp_path: Path) -> None:
     scratch = Scratch(tmp_path)
     save_surface(Surface(np.zeros((4, 5)), mask=np.eye(4, 5) == 0), scratch)
-    path = next(tmp_path.rglob("bool.npy"))
+    path = next(tmp_path.rglob("bool-*.npy"))
     data = bytearray(path.read_bytes())
     data[-3] = 7
     path.write_bytes(data)

@@ -272,7 +272,7 @@ def make_level_by_bands(job: LevelJob) -> MadeLevel | RefusedLevel:
 
 def make_level_by_blocks(job: LevelJob) -> MadeLevel | RefusedLevel:
     """Make a level with the memory that blocks of 1,600 values take by themselves, and say that they were in files."""
-    made = make_level(replace(job, memory=2 * 24 * 1600))
+    made = make_level(replace(job, memory=2 * 40 * 1600))
     if not (job.folder / "values").is_dir():
         raise AssertionError("expected values in files")
     return made
