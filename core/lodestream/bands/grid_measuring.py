@@ -26,7 +26,7 @@ from ..quantization.distortion import Original, store_values
 from ..transform.pyramid import PADDING
 from .build import Build
 from .measuring import BANDS_TOGETHER, Figures
-from .stored import stored_tiles, transformed
+from .stored import known_tiles
 from .windows import compared
 
 __all__ = ["BlocksMeasurer", "blocks_of_run", "measured"]
@@ -80,16 +80,7 @@ def _known(build: Build, channel: int, patches: Sequence[int]) -> Tiles:
     """All that a reader knows of a channel of some patches in the end."""
     layout, interfaces = build.prepared.layout, build.prepared.interfaces
     grids = [*range(interfaces), *(interfaces + patch for patch in patches)]
-    part = part_of(build.table(channel), tiles_of_grids(layout, grids, layout.levels))
-    tiles, coefficients = Tiles(part.table), transformed(build, "coefficients", channel)
-    for run, span in part.spans:
-        known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
-        for place, true in stored_tiles(build, coefficients, channel, run):
-            np.abs(true, out=known[place])
-            np.sign(true, out=sign[place], casting="unsafe")
-        for place, passes in stored_tiles(build, "early", channel, run):
-            early[place] = passes
-    return tiles
+    return known_tiles(build, part_of(build.table(channel), tiles_of_grids(layout, grids, layout.levels)), channel)
 
 
 class BlocksMeasurer:

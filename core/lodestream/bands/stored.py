@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..entropy.part_table import flat_span
+from ..entropy.part_table import Part, flat_span
+from ..entropy.tiles import Tiles
 from ..transform.predictors import default_predictors
 from .build import Build
 from .measuring import Figures
@@ -17,6 +18,7 @@ __all__ = [
     "CORE",
     "PLAIN",
     "kind_of",
+    "known_tiles",
     "name_of",
     "name_of_fit",
     "pieces_of",
@@ -90,6 +92,19 @@ def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[A
         found[place] = piece
     assert found is not None  # every tile is in a piece
     return found
+
+
+def known_tiles(build: Build, part: Part, channel: int) -> Tiles:
+    """All that a reader knows in the end of a channel in some tiles, which have been coded."""
+    tiles, coefficients = Tiles(part.table), transformed(build, "coefficients", channel)
+    for run, span in part.spans:
+        known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
+        for place, true in stored_tiles(build, coefficients, channel, run):
+            np.abs(true, out=known[place])
+            np.sign(true, out=sign[place], casting="unsafe")
+        for place, passes in stored_tiles(build, "early", channel, run):
+            early[place] = passes
+    return tiles
 
 
 def rules_of(build: Build, channel: int, fit: int, level: int, rules: Sequence[int]) -> NDArray[np.int8]:

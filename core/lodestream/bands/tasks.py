@@ -12,7 +12,6 @@ import numpy as np
 from ..decoding.rows import RowsGeometry
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
 from ..entropy.part_table import part_of
-from ..entropy.tiles import Tiles
 from ..scratch import Room, Scratch
 from ..transform.pyramid import empty
 from . import forward
@@ -22,11 +21,11 @@ from .geometry import Bands
 from .measuring import RowsMeasurer, chunks_of_rows, kinds_of, measured_rows
 from .stored import (
     CORE,
+    known_tiles,
     name_of,
     name_of_fit,
     read_tiles,
     rules_of,
-    stored_tiles,
     transformed,
     write_measured,
 )
@@ -156,18 +155,7 @@ def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
     layout, predictors = build.prepared.layout, build.scratch.read("predictors")
     geometry = RowsGeometry(layout, rows, min(_bands(build).core, window_core(layout)))
     part = part_of(build.table(0), geometry.tiles)
-    channels = []
-    for channel in range(build.channels):
-        coefficients = transformed(build, "coefficients", channel)
-        tiles = Tiles(part.table)
-        for run, span in part.spans:
-            known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
-            for place, true in stored_tiles(build, coefficients, channel, run):
-                np.abs(true, out=known[place])
-                np.sign(true, out=sign[place], casting="unsafe")
-            for place, passes in stored_tiles(build, "early", channel, run):
-                early[place] = passes
-        channels.append(tiles)
+    channels = [known_tiles(build, part, channel) for channel in range(build.channels)]
     prepared = build.prepared
     given, lattices = RowsGiven.prepared(prepared, rows), build.lattices.channels
     return RowsMeasurer(given, lattices, prepared.geometric, np.array(predictors), geometry, channels)
