@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from ..surface import Surface
 from . import bezier, glb, npy, npz, npz_writer, off, text_arrays
@@ -19,7 +19,8 @@ from .plot3d import reader as plot3d
 from .plot3d import writer as plot3d_writer
 from .ply import reader as ply
 from .ply import writer as ply_writer
-from .raster import ascii_grid, ascii_writer, cog, geotiff, png, srtm_hgt, usgs_dem
+from .raster import ascii_writer, cog, geotiff, png
+from .raster.drivers import DRIVERS
 from .source import Source
 from .vtk import cgns, multiblock
 from .vtk import legacy as vtk_legacy
@@ -109,6 +110,20 @@ class Format:
         return self.name, *self.kinds
 
 
+def _raster(name: str, **more: Any) -> Format:
+    """The row of a raster that GDAL reads; `more` says how it is written."""
+    driver = DRIVERS[name]
+    return Format(
+        name=name,
+        suffixes=driver.suffixes,
+        sniff=driver.sniff,
+        read=driver.read,
+        options=driver.options,
+        named=driver.named,
+        **more,
+    )
+
+
 #: In the order in which they are tried: the first whose `Format.sniff` agrees reads the file.
 FORMATS = (
     Format(name="npy", suffixes=(".npy",), sniff=npy.sniff, read=npy.read, write=npy.write),
@@ -121,15 +136,7 @@ FORMATS = (
         options=npz.READ_OPTIONS,
         memory=32,
     ),
-    Format(
-        name="geotiff",
-        suffixes=(".tif", ".tiff"),
-        sniff=geotiff.sniff,
-        read=geotiff.read,
-        write=geotiff.write,
-        options=geotiff.READ_OPTIONS,
-        media_type="image/tiff",
-    ),
+    _raster("geotiff", write=geotiff.write, media_type="image/tiff"),
     Format(
         name="cog",
         suffixes=cog.SUFFIXES,
@@ -156,35 +163,10 @@ FORMATS = (
         options={key: text for key, text in netcdf.READ_OPTIONS.items() if key != "resolution"},
         write_beside=zarr_store.write_beside,
     ),
-    Format(
-        name="png",
-        suffixes=(".png",),
-        sniff=png.sniff,
-        read=png.read,
-        write=png.write,
-        options=png.READ_OPTIONS,
-        named=png.named,
-        memory=16,
-        media_type="image/png",
-    ),
-    Format(
-        name="esri-ascii",
-        suffixes=(".asc",),
-        sniff=ascii_grid.sniff,
-        read=ascii_grid.read,
-        write=ascii_writer.write,
-        memory=24,
-        media_type="text/plain",
-    ),
-    Format(name="usgs-dem", suffixes=(".dem",), sniff=usgs_dem.sniff, read=usgs_dem.read),
-    Format(
-        name="srtm-hgt",
-        suffixes=(".hgt",),
-        sniff=srtm_hgt.sniff,
-        read=srtm_hgt.read,
-        options=srtm_hgt.READ_OPTIONS,
-        named=srtm_hgt.named,
-    ),
+    _raster("png", write=png.write, memory=16, media_type="image/png"),
+    _raster("esri-ascii", write=ascii_writer.write, memory=24, media_type="text/plain"),
+    _raster("usgs-dem"),
+    _raster("srtm-hgt"),
     Format(
         name="ply", suffixes=(".ply",), sniff=ply.sniff, read=ply.read, write=ply_writer.write, blocks=True, memory=120
     ),

@@ -1,4 +1,4 @@
-"""GeoTIFF: bands of numbers with a place, a mask and a CRS, read and written by GDAL's GTiff driver."""
+"""GeoTIFF, written: bands of numbers with a place, a mask and a CRS, by GDAL's GTiff driver."""
 
 from __future__ import annotations
 
@@ -19,16 +19,12 @@ from ...surface import Surface
 from ..beside import folder_beside
 from ..holes import occurs
 from ..notes import listing, metadata_left_out, survives, warn, warn_left_out
-from ..source import Source
-from . import gdal, tiff_guard
+from . import gdal
 from .tags import describe, missing
 from .writing_heights import even_heights, geotransform, warn_off
 
-__all__ = ["READ_OPTIONS", "read", "sniff", "write", "write_tiff"]
+__all__ = ["write", "write_tiff"]
 
-READ_OPTIONS = {"band": "number of the band of heights, from 1 (default: 1); the others become attributes"}
-
-_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")  # both byte orders, classic and BigTIFF
 _TITLE = "GeoTIFF"
 
 #: Metadata that a GeoTIFF holds.
@@ -45,17 +41,6 @@ _AT_ONCE = 1 << 22
 _EXACT = 1 << 53
 #: A disk with fewer bytes is full.
 _FULL = 1 << 20
-
-
-def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like a TIFF."""
-    return head.startswith(_MAGICS)
-
-
-def read(source: Source) -> Surface:
-    """Read the first band, or the one that the option ``band`` names, as heights and the others as attributes."""
-    tiff_guard.check(source.path)
-    return gdal.read(source, "GTiff", "geotiff", _TITLE, "data.tif")
 
 
 def write(surface: Surface, file: BinaryIO) -> None:

@@ -1,13 +1,13 @@
 """PNG: heights as shades of grey, or as colours in one of the two codes that map tiles use.
 
-Pillow reads and writes the pixels; the header is read before, so that a size is refused before anything is expanded.
+GDAL reads the pixels (`drivers`), Pillow writes them. The header is read before, so that a size is refused before
+anything is expanded.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-import warnings
 import zlib
 from collections.abc import Mapping
 from io import BytesIO
@@ -23,7 +23,7 @@ from ..notes import listing, metadata_left_out, warn
 from ..source import Source, number
 from .writing_heights import even_heights
 
-__all__ = ["READ_OPTIONS", "named", "read", "sniff", "write"]
+__all__ = ["READ_OPTIONS", "check", "heights", "named", "sniff", "write"]
 
 READ_OPTIONS = {
     "encoding": "meaning of the pixels: grey, terrain-rgb or terrarium (default: grey for grey levels; for colours "
@@ -78,52 +78,47 @@ def require_pillow() -> Any:
     return PngImagePlugin
 
 
-def read(source: Source) -> Surface:
-    """Read heights: the shades themselves, or what the colours stand for; transparent pixels are holes.
+def heights(surface: Surface, source: Source) -> Surface:
+    """Take the bands of a PNG for heights: the shades themselves, or what the colours stand for.
+
+    Parameters
+    ----------
+    surface : Surface
+        As GDAL reads it: a band as points, shape (row, column), the others as attributes; transparent pixels are holes.
+    source : Source
 
     Raises
     ------
     FormatError
-        If the file is not whole, or Pillow cannot read it.
+        If it is not said what the colours stand for, or the rule in the file's text is none.
+    OptionError
+        If the option ``encoding`` does not fit the file.
     """
-    depth, kind = _header(source)
-    pillow = require_pillow()
-    _check_pixels(source)
-    try:
-        # The plugin itself: Image.open would try others, and has a limit of its own.
-        with warnings.catch_warnings(), source.path.open("rb") as file:
-            warnings.simplefilter("ignore")
-            image = pillow.PngImageFile(file)
-            image.load()
-            pixels = np.asarray(image)
-            text = _text(image.text.get(_TEXT))
-            clear = image.info.get("transparency")
-            words = [key for key in image.text if key not in _KNOWN_TEXTS]
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
-        raise FormatError(f"expected a whole PNG, got one that Pillow cannot read: {error}") from None
+    texts = dict(surface.metadata.get("tags", {}).get("", {}))
+    rule = _rule(texts.pop(_TEXT, None))
+    words = [key for key in texts if key not in _KNOWN_TEXTS]
     if words:
         warn(f"left out texts of the PNG: {listing(words)}")
-    _warn_of_transparency(pixels, kind)
-    encoding = _encoding(source, kind, text)
-    if encoding == "grey":
-        return _grey(source, pixels, depth, clear, text)
-    mask = pixels[..., 3] > 0 if kind == _RGBA else None
-    if mask is None and isinstance(clear, tuple):
-        mask = (pixels[..., :3] != np.array(clear)).any(axis=2)
-    code = np.zeros(pixels.shape[:2], np.float64)
-    for channel in range(3):
-        code = code * 256 + pixels[..., channel]
-    heights = (code / 256 - 32768).astype(np.float32) if encoding == "terrarium" else -10000 + 0.1 * code
-    return Surface(heights, mask=mask, metadata=source.metadata("png") | {"encoding": encoding})
+    metadata = source.metadata("png")
+    if not surface.attributes:
+        if _encoding(source, colours=False, text=rule) == "grey" and "dtype" in rule:
+            return Surface(_shaded(surface.points, rule), mask=surface.mask, metadata=metadata)
+        return Surface(surface.points, mask=surface.mask, metadata=metadata)
+    encoding = _encoding(source, colours=True, text=rule)
+    code = np.zeros(surface.shape, np.float64)
+    for band in (surface.points, *surface.attributes.values()):
+        code = code * 256 + band
+    values = (code / 256 - 32768).astype(np.float32) if encoding == "terrarium" else -10000 + 0.1 * code
+    return Surface(values, mask=surface.mask, metadata=metadata | {"encoding": encoding})
 
 
-def _warn_of_transparency(pixels: NDArray[Any], kind: int) -> None:
-    if kind in (_GREY_ALPHA, _RGBA) and not np.isin(pixels[..., -1], (0, 255)).all():
-        warn("left out partial transparency; only fully transparent points are holes")
+def check(source: Source) -> None:
+    """Refuse a PNG that is too large, of a kind of pixels that stands for no heights, or of fewer than it announces.
 
-
-def _header(source: Source) -> tuple[int, int]:
-    """Bits a channel and the kind of colour, after size and kind have been found to be allowed."""
+    Raises
+    ------
+    FormatError, TooLargeError
+    """
     with source.path.open("rb") as file:
         head = file.read(33)
     if len(head) < 33 or head[8:16] != b"\0\0\0\rIHDR":
@@ -131,14 +126,14 @@ def _header(source: Source) -> tuple[int, int]:
     width, height, depth, kind = struct.unpack(">IIBB", head[16:26])
     source.check_array((height, width), np.dtype(np.uint8))
     if kind not in _CHANNELS or (depth != 8 and (kind, depth) != (_GREY, 16)):
-        found = f"{_KINDS.get(kind, f'kind {kind}')} of {depth} bits"
-        raise FormatError(f"expected grey of 8 or 16 bits, or grey with alpha or colours of 8, got {found}")
+        got = f"{_KINDS.get(kind, f'kind {kind}')} of {depth} bits"
+        raise FormatError(f"expected grey of 8 or 16 bits, or grey with alpha or colours of 8, got {got}")
     source.check_expansion(height * width * depth // 8 * _CHANNELS[kind])
-    return depth, kind
+    _check_pixels(source)
 
 
 def _check_pixels(source: Source) -> None:
-    """Count what the pixels expand to, because Pillow takes those that are missing for black."""
+    """Count what the pixels expand to, because GDAL takes those that are missing for black."""
     with source.path.open("rb") as file:
         file.seek(16)
         width, height, depth, kind, _, _, interlaced = struct.unpack(">IIBBBBB", file.read(13))
@@ -166,12 +161,11 @@ def _check_pixels(source: Source) -> None:
         raise FormatError(f"expected a whole PNG of {number(wanted)} bytes of pixels, got {number(found)}")
 
 
-def _encoding(source: Source, kind: int, text: Mapping[str, Any]) -> str:
+def _encoding(source: Source, colours: bool, text: Mapping[str, Any]) -> str:
     chosen = source.options.get("encoding", text.get("encoding"))
     if chosen is not None and chosen not in _ENCODINGS:
         raise OptionError(f"expected encoding= one of {', '.join(_ENCODINGS)}, got {str(chosen)!r}")
-    grey = kind in (_GREY, _GREY_ALPHA)
-    if grey:
+    if not colours:
         if chosen not in (None, "grey") and "encoding" in source.options:
             raise OptionError(f"expected encoding=grey for grey levels, got {chosen!r}")
         return "grey"
@@ -184,26 +178,15 @@ def _encoding(source: Source, kind: int, text: Mapping[str, Any]) -> str:
     return str(chosen)
 
 
-def _grey(source: Source, pixels: NDArray[Any], depth: int, clear: Any, text: Mapping[str, Any]) -> Surface:
-    mask = None
-    if pixels.ndim == 3:
-        pixels, mask = pixels[..., 0], pixels[..., 1] > 0
-    elif isinstance(clear, int):
-        mask = pixels != clear
-    shades = pixels.astype(np.uint16 if depth == 16 else np.uint8)
-    heights = _heights(shades, text) if "dtype" in text else shades
-    return Surface(heights, mask=mask, metadata=source.metadata("png"))
-
-
-def _text(content: Any) -> dict[str, Any]:
+def _rule(content: Any) -> dict[str, Any]:
     try:
-        found = json.loads(str(content))
+        rule = json.loads(str(content))
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return rule if isinstance(rule, dict) else {}
 
 
-def _heights(shades: NDArray[Any], rule: Mapping[str, Any]) -> NDArray[Any]:
+def _shaded(shades: NDArray[Any], rule: Mapping[str, Any]) -> NDArray[Any]:
     """Heights of shades by the rule in the file's text."""
     try:
         first, origin, step, scale = (float(rule[key]) for key in ("first", "origin", "step", "scale"))
