@@ -10,10 +10,11 @@ from __future__ import annotations
 import json
 import re
 import secrets
+import socket
 import socketserver
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -23,12 +24,17 @@ from lodestream.page import HEADERS, INDEX, Asset
 
 from .sources import Source
 
-__all__ = ["PageServer", "byte_range", "serving"]
+__all__ = ["MOST_CONNECTIONS", "PageServer", "byte_range", "serving"]
+
+#: At once, each of which has a thread. A browser keeps six to one host, whatever its number of tabs.
+MOST_CONNECTIONS = 64
 
 _SURFACE = "surface.lode"
+_WORDS = "text/plain; charset=utf-8"
 _SECONDS = 30.0  # for which a connection may say nothing
 _AT_ONCE = 1 << 16  # bytes that have to be taken within these seconds: a page that shows a slow link takes them slowly
 _RANGE = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
+_ABSOLUTE = re.compile(r"https?://([^/?#]*)(.*)", re.IGNORECASE)  # RFC 9112, section 3.2.2
 
 
 def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
@@ -79,6 +85,7 @@ class PageServer(ThreadingHTTPServer):
     """
 
     daemon_threads = True
+    request_queue_size = MOST_CONNECTIONS  # those that come at once are not to try again after a second
 
     def __init__(self, pages: Mapping[str, Asset], name: str, port: int = 0) -> None:
         super().__init__(("127.0.0.1", port), _Handler)
@@ -90,6 +97,9 @@ class PageServer(ThreadingHTTPServer):
         self.source: Source | None = None
         self.progress = 0.0
         self.asked = threading.Event()
+        self._places = threading.Semaphore(MOST_CONNECTIONS)
+        self._lock = threading.Lock()
+        self._waiting: dict[socket.socket, None] = {}  # for a request; those that have waited longest are first
 
     def server_bind(self) -> None:
         """Bind, and do not ask for the name of this machine, for which some wait seconds."""
@@ -108,11 +118,69 @@ class PageServer(ThreadingHTTPServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing: browsers close connections whenever they like."""
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Give a connection a thread. If all are taken, the connection that has waited longest for a request ends.
+
+        So whoever opens connections and says nothing keeps nobody out. If all of them are being answered, this one is
+        refused.
+        """
+        if not self._places.acquire(blocking=False):
+            with self._lock:
+                longest = next(iter(self._waiting), None)
+                if longest is not None:
+                    del self._waiting[longest]
+                    with suppress(OSError):
+                        longest.shutdown(socket.SHUT_RDWR)  # its thread waits for a request, and hears the end
+            if longest is None:
+                _turn_away(request)
+                self.shutdown_request(request)
+                return
+            self._places.acquire()
+        self.wait_for_request(request)
+        try:
+            super().process_request(request, client_address)
+        except BaseException:
+            self._leave(request)  # no thread could be started
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer the requests of a connection, and make room for another one."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._leave(request)
+
+    def _leave(self, connection: socket.socket) -> None:
+        with self._lock:
+            self._waiting.pop(connection, None)
+        self._places.release()
+
+    def wait_for_request(self, connection: socket.socket) -> None:
+        """Note that a connection waits for a request, and may be ended to make room."""
+        with self._lock:
+            self._waiting[connection] = None
+
+    def begin_answer(self, connection: socket.socket) -> bool:
+        """Note that a request has arrived, which is to be answered; whether its connection was not ended before."""
+        with self._lock:
+            return self._waiting.pop(connection, self) is None
+
 
 class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
+    default_request_version = "HTTP/1.0"  # an answer to HTTP/0.9 would have no head
     timeout = _SECONDS
     server: PageServer
+
+    def handle_one_request(self) -> None:
+        self.server.wait_for_request(self.connection)
+        super().handle_one_request()
+
+    def parse_request(self) -> bool:
+        # The connection was ended to make room for another one: whatever it said last is not answered.
+        parsed = super().parse_request() and self.server.begin_answer(self.connection)
+        self.close_connection |= not parsed
+        return parsed
 
     def do_GET(self) -> None:
         self._answer(self._send)
@@ -126,11 +194,11 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, send: Callable[[Iterator[bytes]], None]) -> None:
         if "content-length" in self.headers or "transfer-encoding" in self.headers:
             self.close_connection = True  # a body is not read, and is not to pass for the next request
-        # Another page cannot read what it gets from here, unless its host's name was made to lead here.
-        if self.headers.get("host") not in self.server.hosts:
-            self._refuse(HTTPStatus.MISDIRECTED_REQUEST, send)
+        if (status := self._wrong_head()) is not None:
+            self.close_connection = True
+            self._refuse(status, send)
             return
-        path = self.path.partition("?")[0]
+        path = _addressed(self.path)[1].partition("?")[0]
         name = path.removeprefix(f"/{self.server.word}/") if path.startswith(f"/{self.server.word}/") else None
         asset = None if name is None else self.server.pages.get(name or INDEX)
         if asset is not None:
@@ -146,10 +214,30 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._refuse(HTTPStatus.NOT_FOUND, send)
 
+    def _wrong_head(self) -> HTTPStatus | None:
+        """Why a request is refused by its first lines alone; None: it is not."""
+        # Another page cannot read what it gets from here, unless its host's name was made to lead here.
+        hosts = [*self.headers.get_all("host", []), *filter(None, _addressed(self.path)[:1])]
+        if "host" not in self.headers or any(host.strip().lower() not in self.server.hosts for host in hosts):
+            return HTTPStatus.MISDIRECTED_REQUEST
+        # Behind a line that is no field the parser sees no further ones, such as a second Host.
+        hidden = self.headers.defects or self.headers.get_payload()
+        if hidden or len(self.headers.get_all("host", [])) > 1 or len(self.requestline.split()) != 3:
+            return HTTPStatus.BAD_REQUEST
+        return None
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Refuse what the standard library does not understand as everything else is refused."""
+        self.close_connection = True
+        self._refuse(HTTPStatus(code), (lambda _: None) if self.command == "HEAD" else self._send)
+
     def _head(self, status: HTTPStatus, headers: Mapping[str, str], length: int) -> None:
-        self.send_response(status)
+        self.send_response_only(status)  # `send_response` would name the standard library and its version
+        self.send_header("date", self.date_time_string())
         for key, value in {**HEADERS, **headers, "content-length": str(length)}.items():
             self.send_header(key, value)
+        if self.close_connection:
+            self.send_header("connection", "close")
         self.end_headers()
 
     def _send(self, body: Iterator[bytes]) -> None:
@@ -159,7 +247,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse(self, status: HTTPStatus, send: Callable[[Iterator[bytes]], None], words: str = "") -> None:
         body = f"{words or status.phrase}\n".encode()
-        self._head(status, {"content-type": "text/plain; charset=utf-8"}, len(body))
+        self._head(status, {"content-type": _WORDS}, len(body))
         send(iter((body,)))
 
     def _asset(self, asset: Asset, send: Callable[[Iterator[bytes]], None]) -> None:
@@ -196,6 +284,23 @@ class _Handler(BaseHTTPRequestHandler):
             send(_chained(begun, body))
         except (LodestreamError, OSError):
             self.close_connection = True  # cut short: the page asks again, and is told why
+
+
+def _addressed(target: str) -> tuple[str | None, str]:
+    """Host and port that the target of a request names, if it does, and its path and query."""
+    absolute = _ABSOLUTE.fullmatch(target)
+    return (None, target) if absolute is None else (absolute[1], absolute[2])
+
+
+def _turn_away(connection: socket.socket) -> None:
+    """Answer that all connections are taken, as far as that can be done without waiting."""
+    status = HTTPStatus.SERVICE_UNAVAILABLE
+    body = f"{status.phrase}\n"
+    fields = {**HEADERS, "content-type": _WORDS, "content-length": str(len(body)), "connection": "close"}
+    head = "".join(f"{key}: {value}\r\n" for key, value in fields.items())
+    with suppress(OSError):
+        connection.setblocking(False)
+        connection.send(f"HTTP/1.1 {status.value} {status.phrase}\r\n{head}\r\n{body}".encode())
 
 
 def _bytes(source: Source, first: int, stop: int) -> Iterator[bytes]:
