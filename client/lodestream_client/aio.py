@@ -77,6 +77,7 @@ async def upload(
     token: str | None = None,
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
     filename: str | None = None,
+    nodata: float | str | None = None,
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
@@ -88,7 +89,7 @@ async def upload(
     >>> asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy", precision=0.01)).state
     'ready'
     """
-    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename)
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
     parcel = await _prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:

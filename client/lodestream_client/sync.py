@@ -127,6 +127,7 @@ def upload(
     token: str | None = None,
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
     filename: str | None = None,
+    nodata: float | str | None = None,
 ) -> Description:
     """Upload a surface.
 
@@ -160,6 +161,8 @@ def upload(
     filename : str or None
         Name of the first file, whose suffix tells formats that content does not (``N37W122.hgt``); None: its own, or
         none of an open file and of bytes.
+    nodata : float, str or None
+        A value, or "nan", that marks holes though the file does not say so, see `lodestream.read`.
 
     Returns
     -------
@@ -188,7 +191,7 @@ def upload(
     >>> sync.upload("http://127.0.0.1:8000", surface, precision=0.01).details["shape"]
     [2, 2]
     """
-    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename)
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
     parcel = prepared(sources, asked, progress)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:

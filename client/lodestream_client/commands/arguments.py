@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,9 @@ __all__ = [
 ]
 
 
+_NEGATIVE_NUMBER = re.compile(r"-(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)$")
+
+
 def add_command(
     subparsers: Subparsers, name: str, run: Callable[[argparse.Namespace], int], summary: str, details: str = ""
 ) -> argparse.ArgumentParser:
@@ -38,6 +42,8 @@ def add_command(
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
+    # argparse has no public way to say that -3.4e+38 is a value (--nodata -3.4e+38) and no option.
+    parser._negative_number_matcher = _NEGATIVE_NUMBER
     parser.set_defaults(run=run, parser=parser)
     return parser
 

@@ -116,7 +116,7 @@ def read_surface(
     with option_hints(names), input_files(names) as files:
         format_options = _format_options(options.format_options)
         given: dict[str, Any] = {"closed": options.closed, "filename": files.filename}
-        given["format_name"] = options.format_name
+        given |= {"format_name": options.format_name, "nodata": options.nodata}
         if folder is None:
             first, *more = files.paths
             surface = ls.read(first, *more, **given, **format_options)

@@ -163,6 +163,7 @@ def _uploaded(options: PushOptions) -> Description:
             rms=wanted.quality.rms,
             attribute_precision=wanted.quality.attributes,
             closed=wanted.closed,
+            nodata=wanted.nodata,
             name=wanted.name,
             options=wanted.format_options,
             wait=options.wait,

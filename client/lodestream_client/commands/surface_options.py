@@ -39,6 +39,8 @@ class SurfaceOptions:
         The ``-o`` options.
     format_name : str or None
         The format that the file must have.
+    nodata : str or None
+        The value that marks holes.
     """
 
     quality: Quality
@@ -46,6 +48,7 @@ class SurfaceOptions:
     name: str | None
     format_options: Mapping[str, str]
     format_name: str | None = None
+    nodata: str | None = None
 
 
 def add_surface_options(parser: argparse.ArgumentParser) -> None:
@@ -82,6 +85,13 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
         help="closed axes of the grid; rows: the last row is connected to the first, as on a cylinder (default: auto, "
         "the file decides)",
     )
+    group.add_argument(
+        "--nodata",
+        metavar="VALUE",
+        help="value that marks holes though the file does not say so: a number, such as -9999, or nan; of points with "
+        "coordinates those that have it in all, such as the 0 0 0 of a depth camera, or else in z; a note says how "
+        "many",
+    )
     group.add_argument("--name", metavar="N", help="name of the surface")
     group.add_argument(
         "--format",
@@ -111,16 +121,14 @@ def surface_options(args: argparse.Namespace) -> SurfaceOptions:
 
 def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOptions:
     """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice."""
-    return SurfaceOptions(quality, args.closed, args.name, _format_options(args), args.format_name)
-
-
-def _format_options(args: argparse.Namespace) -> dict[str, str]:
-    options: dict[str, str] = {}
+    options: dict[str, str] = {} if args.nodata is None else {"nodata": args.nodata}
     for key, value in args.options:
         if key in options:
             args.parser.error(f"argument -o: {key} given twice")
         options[key] = value
-    return options
+    # Every format has this one, and the query of an upload has it among the options of the format.
+    nodata = options.pop("nodata", None)
+    return SurfaceOptions(quality, args.closed, args.name, options, args.format_name, nodata)
 
 
 def quality_of(args: argparse.Namespace) -> Quality:

@@ -170,10 +170,12 @@ def _parameters(asked: Asked) -> dict[str, str | list[str]]:
         parameters["rms"] = rms
     if asked.closed != "auto":
         parameters["closed"] = asked.closed
+    if asked.nodata is not None:
+        parameters["nodata"] = str(asked.nodata)
     if asked.name:
         parameters["name"] = asked.name
     for key, value in asked.options.items():
-        if key in ("precision", "rms", "closed", "name", "filename"):
+        if key in ("precision", "rms", "closed", "nodata", "name", "filename"):
             raise OptionError(f"{key} is not an option of a format")
         parameters[key] = value
     return parameters

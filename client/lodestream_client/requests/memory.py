@@ -42,6 +42,7 @@ class Asked:
     options: Mapping[str, str] = field(default_factory=dict)
     attribute_precision: Mapping[str, Tolerance | float | str] = field(default_factory=dict)
     filename: str | None = None
+    nodata: float | str | None = None
 
     @property
     def quality(self) -> Quality:
@@ -121,6 +122,8 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
 
 def _surface(source: Any, asked: Asked) -> Surface:
     """With the closure and the name that are asked for, whoever's the given one is."""
+    from lodestream.formats.nodata import checked, with_nodata
+    from lodestream.scratch import IN_MEMORY
     from lodestream.surface import Block, Surface
 
     if isinstance(source, Surface):
@@ -133,6 +136,8 @@ def _surface(source: Any, asked: Asked) -> Surface:
             raise
         except (TypeError, ValueError) as error:  # numpy's, of what is no array
             raise InputError(f"expected an array of points, got {type(source).__name__}: {error}") from None
+    if asked.nodata is not None:
+        surface = with_nodata(surface, checked(asked.nodata), IN_MEMORY)
     if asked.closed != "auto":
         if len(surface.blocks) > 1:
             raise OptionError(f"expected closed=auto for a surface of several blocks, got {len(surface.blocks)} blocks")

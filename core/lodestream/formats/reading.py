@@ -14,6 +14,7 @@ from ..errors import FormatError, InputError, OptionError
 from ..scratch import IN_MEMORY, Room
 from ..surface import Closed, Surface
 from . import notes
+from .nodata import checked, with_nodata
 from .source import DEFAULT_MAX_VERTICES, UNLIMITED_VERTICES, Source, check_allowed, with_name
 from .table import FORMATS, Format
 
@@ -67,6 +68,7 @@ def read(
     allowed: Collection[str] | None = None,
     format_name: str | None = None,
     room: Room | None = None,
+    nodata: float | str | None = None,
     **options: Any,
 ) -> Surface:
     """Read a surface from a file; the file's content decides its format.
@@ -94,6 +96,11 @@ def read(
     room : Room, optional
         Where large arrays go: NPY files are memory-mapped; rasters, NetCDF and Zarr are read window by window into
         files, and so are binary PLOT3D and raw .vts. Other formats are read into memory all the same.
+    nodata : float or str, optional
+        A value, or "nan", that marks holes though the file does not say so, in addition to those that it declares. A
+        height with this value becomes a hole, and a point whose coordinates all have it, such as 0, 0, 0 of a depth
+        camera; if no point of x, y, z has it in all, then those whose z has it, whose x and y stay. A `FormatWarning`
+        says how many points it was.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -140,6 +147,7 @@ def read(
             max_vertices = DEFAULT_MAX_VERTICES if room is None else UNLIMITED_VERTICES
         if not isinstance(max_vertices, int):  # as options of a command line would be, which are text
             raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
+        hole = None if nodata is None else checked(nodata)
         format_ = _sniff(path, name.suffix.lower(), format_name)
         if format_.read is None:
             raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
@@ -155,6 +163,8 @@ def read(
         size = path.stat().st_size
         source = Source(path, name.stem, size, max_vertices, options, others, chosen, allowed, room or IN_MEMORY)
         surface = format_.read(source)
+        if hole is not None:
+            surface = with_nodata(surface, hole, source.room)
         surface.metadata, dropped = metadata.fitted(surface.metadata)
         if dropped:
             words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)

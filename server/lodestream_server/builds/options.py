@@ -36,7 +36,8 @@ class SurfaceOptions:
         Name of the file, if the body has none.
     chosen : mapping of str to str
         The options that distinguish surfaces made from the same bytes: ``precision`` and ``rms`` in canonical spelling,
-        ``precision=NAME`` of attributes, ``closed`` unless it is auto, and options of the format as given.
+        ``precision=NAME`` of attributes, ``closed`` unless it is auto, ``nodata`` as a number, and options of the
+        format as given.
     """
 
     name: str | None
@@ -71,6 +72,10 @@ class SurfaceOptions:
             raise OptionError(f"expected closed to be one of {', '.join(CLOSED)}, got {closed[:80]!a}")
         if closed != "auto":
             values["closed"] = closed
+        if "nodata" in values:
+            from lodestream.formats.nodata import checked
+
+            values["nodata"] = str(checked(values["nodata"]))
         return cls(name, filename, values)
 
 
@@ -112,8 +117,8 @@ def check(
             raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
     _check_allowed(found[0].names, names[0], allowed)
     for key in options.chosen:
-        if key not in ("precision", "rms", "closed", *found[0].options) and not key.startswith(ATTRIBUTE):
-            known = ", ".join(("precision", "rms", "closed", "name", "filename", *found[0].options))
+        if key not in ("precision", "rms", "closed", "nodata", *found[0].options) and not key.startswith(ATTRIBUTE):
+            known = ", ".join(("precision", "rms", "closed", "nodata", "name", "filename", *found[0].options))
             raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
     return found[0]
 

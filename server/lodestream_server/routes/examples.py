@@ -84,6 +84,7 @@ UPLOAD: dict[str, Any] = {
                 "1e-3d",
             ),
             ("closed", "closed axes", ["auto", "none", "rows", "cols", "both"], None),
+            ("nodata", "value that marks holes though the file does not say so: a number or nan", None, "-9999"),
             ("name", "name of the surface", None, "Jacksboro"),
             ("filename", "name of the file of a raw body", None, "jacksboro.npy"),
             ("array", "NPZ: name of the array", None, None),
