@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from lodestream.confinement import landlock, places, seccomp
+from lodestream.confinement import landlock, missing, places, seccomp
 
 _LIBC = ctypes.CDLL(None)
 
@@ -30,8 +30,10 @@ has_seccomp = pytest.mark.skipif(
 _PROGRAM = """
 import json, os, socket, subprocess, sys, mmap, threading
 from pathlib import Path
-from lodestream.confinement import Rights, confine
+from lodestream.confinement import Rights, confine, landlock, missing
 asked = json.loads(sys.argv[1])
+if asked["without_landlock"]:
+    landlock.restrict = lambda *_: False
 paths = [tuple(map(Path, asked[name])) for name in ("read", "write")]
 held = confine(Rights(*paths, asked["processes"], asked["threads"]))
 found = []
@@ -46,7 +48,8 @@ print(json.dumps({"held": held, "found": found}))
 
 def confined(tried: list[str], **rights: Any) -> dict[str, Any]:
     """What comes of some expressions in a confined process."""
-    asked = {"read": [], "write": [], "processes": False, "threads": False, **rights, "tried": tried}
+    asked = {"read": [], "write": [], "processes": False, "threads": False, "without_landlock": False}
+    asked |= {**rights, "tried": tried}
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", _PROGRAM, json.dumps(asked)],
@@ -214,9 +217,46 @@ def test_processes_have_the_same_rights(tmp_path: Path) -> None:
     )
     assert "Permission denied" in told["found"][0]
     assert told["found"][1:3] == ["PermissionError 13", "PermissionError 1"]
-    # Before the sixth version of Landlock nobody tells those of the same rights from others.
-    assert told["found"][3] == ("PermissionError 1" if landlock.version(_LIBC) >= 6 else "None")
-    assert told["found"][4] == "PermissionError 1"
+    assert told["found"][3:] == ["PermissionError 1", "PermissionError 1"]
+
+
+@has_seccomp
+@pytest.mark.parametrize("without_landlock", [False, True])
+def test_who_starts_processes_signals_none_on_any_kernel(without_landlock: bool) -> None:
+    # Of the versions of Landlock only the sixth and later ones know of signals: what holds is not to depend on them.
+    nothing = "stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL"
+    child = f"subprocess.Popen([sys.executable, '-c', 'input()'], stdin=subprocess.PIPE, {nothing})"
+    targets = ["os.getppid()", "1", "0", "-1", "-os.getpgrp()", f"(child := {child}).pid"]
+    told = confined(
+        [
+            *(f"os.kill({target}, 0)" for target in targets),
+            "os.killpg(0, 0)",
+            "os.kill(os.getpid(), 0)",
+            "__import__('signal').pidfd_send_signal(os.open('/proc/self', os.O_RDONLY), 0)",
+            "__import__('ctypes').CDLL(None).syscall(434, os.getppid(), 0)",  # pidfd_open
+            "missing(held)",
+        ],
+        processes=True,
+        without_landlock=without_landlock,
+    )
+    refused = "PermissionError 1"
+    assert told["found"][:7] == 7 * [refused]
+    assert told["found"][7:10] == ["None", "OSError 38", "-1"]
+    lacks = "('landlock: a build may open every file that the server may open',)"
+    assert told["found"][10] == (lacks if without_landlock or not landlock.version(_LIBC) else "()")
+
+
+def test_what_is_missing_is_said_for_each_mechanism(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert missing(("landlock", "seccomp")) == ()
+    assert [sentence.partition(":")[0] for sentence in missing(())] == ["landlock", "seccomp"]
+    (files,) = missing(("seccomp",))
+    assert "every file" in files
+    for version, words, others in ((1, "sockets,", "signals"), (4, "than TCP", "signals"), (6, "than TCP", "limits")):
+        monkeypatch.setattr(landlock, "version", lambda _, version=version: version)
+        (calls,) = missing(("landlock",))
+        assert words in calls
+        assert others in calls
+        assert ("signals" in calls) is (version < 6)
 
 
 @pytest.mark.parametrize("machine", seccomp._MACHINES)
@@ -244,10 +284,10 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
     assert [verdict("clone", thread), verdict("clone", thread, threads=True)] == ["error 1", "allow"]
     assert [verdict("clone", 17, threads=True), verdict("execve", threads=True)] == ["error 1", "error 1"]
     assert [verdict("execve"), verdict("execve", processes=True)] == ["error 1", "allow"]
-    for name in ("kill", "tgkill", "tkill"):
+    for name in seccomp._SIGNALS:
         assert [verdict(name, 77), verdict(name, 78)] == ["allow", "error 1"]
-    assert verdict("kill", 78, processes=True) == "allow"
-    assert [verdict("tgkill", pid, processes=True) for pid in (77, 78)] == ["allow", "error 1"]
+    for name in seccomp._SIGNALS:
+        assert [verdict(name, pid, processes=True) for pid in (77, 78, 0)] == ["allow", "error 1", "error 1"]
     flags = [os.O_RDONLY, os.O_RDONLY | os.O_TRUNC, os.O_WRONLY | os.O_TRUNC, os.O_RDWR | os.O_TRUNC]
     assert [verdict("openat", 0, 0, flag) for flag in flags] == ["allow", "error 1", "allow", "allow"]
     assert [verdict("mmap", 0, 0, 0, flag) for flag in (0x01, 0x21, 0x23, 0x22)] == [

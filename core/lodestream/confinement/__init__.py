@@ -8,13 +8,14 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from . import landlock, seccomp
 from .places import library_places
 
-__all__ = ["Rights", "confine"]
+__all__ = ["Rights", "confine", "missing"]
 
 _NO_NEW_PRIVILEGES = 38  # PR_SET_NO_NEW_PRIVS
 _CAPABILITY_VERSION = 0x20080522  # _LINUX_CAPABILITY_VERSION_3
@@ -45,9 +46,9 @@ class Rights:
 def confine(rights: Rights) -> tuple[str, ...]:
     """Give up everything else, for this process and all that it starts.
 
-    No sockets are opened, no other process is looked into, sent a signal or given other limits, nothing is executed, no
-    mode, owner or time of a file is changed. What is open stays open. The process should have one thread: Landlock
-    holds the thread that calls this, and those that it starts.
+    No sockets are opened, no other process is looked into, sent a signal or given other limits, also none that this one
+    has started, nothing is executed, no mode, owner or time of a file is changed. What is open stays open. The process
+    should have one thread: Landlock holds the thread that calls this, and those that it starts.
 
     Returns
     -------
@@ -70,6 +71,31 @@ def confine(rights: Rights) -> tuple[str, ...]:
     if seccomp.restrict(libc, os.getpid(), processes=rights.processes, threads=rights.threads):
         held.append("seccomp")
     return tuple(held)
+
+
+def missing(held: Collection[str]) -> tuple[str, ...]:
+    """Say what a confined process may still do on this machine, a sentence for each mechanism that does not hold it.
+
+    Parameters
+    ----------
+    held : collection of str
+        What `confine` has returned.
+
+    Returns
+    -------
+    tuple of str
+        Each begins with "landlock" or "seccomp"; empty if both hold.
+    """
+    sentences = []
+    known = landlock.version(ctypes.CDLL(None, use_errno=True)) if "landlock" in held else 0
+    if "landlock" not in held:
+        sentences.append("landlock: a build may open every file that the server may open")
+    if "seccomp" not in held:
+        sockets = "sockets" if known < landlock.NETWORK else "sockets other than TCP"
+        signals = "send signals to other processes and change their limits"
+        others = signals if known < landlock.SCOPES else "change limits of other processes"
+        sentences.append(f"seccomp: a build may open {sockets}, {others}, and change modes and times of files")
+    return tuple(sentences)
 
 
 def _drop_capabilities(libc: ctypes.CDLL) -> None:

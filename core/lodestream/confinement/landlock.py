@@ -10,7 +10,10 @@ import struct
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["restrict", "version"]
+__all__ = ["NETWORK", "SCOPES", "restrict", "version"]
+
+#: The versions of the interface that know of TCP, and of signals and abstract sockets to processes outside.
+NETWORK, SCOPES = 4, 6
 
 # The same numbers on every architecture.
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
@@ -31,8 +34,8 @@ _READ = _READ_FILE | _READ_DIR
 #: No devices, pipes or sockets are made, and nothing is moved or linked from one folder to another.
 _WRITE = _READ | _WRITE_FILE | _TRUNCATE | _REMOVE_DIR | _REMOVE_FILE | _MAKE_DIR | _MAKE_REG | _MAKE_SYM
 
-_ALL_NETWORK = 0b11  # bind and connect by TCP, since version 4
-_ALL_SCOPES = 0b11  # abstract sockets and signals to processes outside, since version 6
+_ALL_NETWORK = 0b11  # bind and connect by TCP
+_ALL_SCOPES = 0b11  # abstract sockets and signals to processes outside
 
 
 def version(libc: ctypes.CDLL) -> int:
@@ -51,7 +54,7 @@ def restrict(libc: ctypes.CDLL, read: Iterable[Path], write: Iterable[Path], exe
     files = _KNOWN[min(known, len(_KNOWN)) - 1]
     attributes = struct.pack("=QQQ", files, _ALL_NETWORK, _ALL_SCOPES)
     # An older kernel knows only the beginning of it.
-    size = 24 if known >= 6 else 16 if known >= 4 else 8
+    size = 24 if known >= SCOPES else 16 if known >= NETWORK else 8
     ruleset = libc.syscall(_CREATE_RULESET, attributes, ctypes.c_size_t(size), 0)
     if ruleset < 0:
         return False

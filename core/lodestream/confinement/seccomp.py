@@ -128,7 +128,8 @@ def restrict(libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool 
     process : int
         The process that calls this, the only one to which it may send signals.
     processes : bool
-        Whether further processes may be started, and be sent signals.
+        Whether further processes may be started. They are sent no signals either, since no filter can tell them from
+        others: only Landlock can, from its sixth version on.
     threads : bool
         Whether further threads of this process may be started.
     """
@@ -161,7 +162,7 @@ def _program(
         if name in calls:
             yield _instruction(_EQUAL, calls[name], 0, 1)
             yield _instruction(_RETURN, _ERROR | errno.EPERM)
-    for name in _SIGNALS[processes:]:
+    for name in _SIGNALS:
         yield from _unless(calls[name], 0, (_EQUAL, process))
     for name in _LIMITS:
         yield from _unless(calls[name], 0, (_EQUAL, 0), (_EQUAL, process))

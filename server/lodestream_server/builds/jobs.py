@@ -41,6 +41,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from lodestream.confinement import missing
 from lodestream.errors import InputError, TooLargeError
 
 from ..access.access import key_of
@@ -320,6 +321,12 @@ class Builder:
         held = self.fork_server.confinement
         return None if held is None else "+".join(held) or "none"
 
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What the kernel does not keep builds from, a sentence for each mechanism; empty before it is known."""
+        held = self.fork_server.confinement
+        return () if held is None else missing(held)
+
     async def _preload(self) -> None:
         try:
             problem = await asyncio.to_thread(self.fork_server.wait)
@@ -334,9 +341,9 @@ class Builder:
             _log.info("builds are confined by landlock and seccomp")
         else:
             _log.warning(
-                "builds are not fully confined: of landlock and seccomp the kernel has %s; a file that exploits its "
-                "reader has all rights of this server",
+                "builds are not fully confined: of landlock and seccomp the kernel has %s. This is missing: %s",
                 "neither" if held == "none" else f"only {held}",
+                "; ".join(self.missing),
             )
         if problem is None:
             self.ready = True

@@ -89,20 +89,21 @@ async def healthz() -> Response:
     "/readyz",
     summary="Ready",
     responses={
-        200: examples.answer("Builds can begin", {"status": "ready", "confinement": "landlock+seccomp"}),
-        503: examples.answer("Not yet", {"status": "starting", "confinement": None}),
+        200: examples.answer("Builds can begin", {"status": "ready", "confinement": "landlock+seccomp", "missing": []}),
+        503: examples.answer("Not yet", {"status": "starting", "confinement": None, "missing": []}),
     },
 )
 @needs(None)
 async def readyz(parts: Parts) -> Response:
     """Whether the process that builds come from has loaded what they need. Before that uploads wait, all else works.
 
-    ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``.
+    ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``; ``missing``
+    says for each mechanism that this machine lacks what a build may do.
     """
-    confinement = parts.builder.confinement
+    confinement = {"confinement": parts.builder.confinement, "missing": parts.builder.missing}
     if parts.builder.ready:
-        return JSONResponse({"status": "ready", "confinement": confinement})
-    return JSONResponse({"status": "starting", "confinement": confinement}, 503, {"retry-after": "1"})
+        return JSONResponse({"status": "ready", **confinement})
+    return JSONResponse({"status": "starting", **confinement}, 503, {"retry-after": "1"})
 
 
 @readable(

@@ -7,6 +7,8 @@ import json
 import os
 import signal
 import struct
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -480,3 +482,48 @@ def test_cgns_on_adf_with_a_link_is_refused(tmp_path: Path) -> None:
     (tmp_path / "g.cgns").write_bytes(real.read_bytes()[:31000])
     with pytest.raises(FormatError, match="a CGNS file of at least 31,060 bytes by its header, got 31,000"):
         formats.read(tmp_path / "g.cgns")
+
+
+# Reads a file confined as a server's build is, perhaps by another script, and prints what came of it.
+_CONFINED = """
+import sys
+from pathlib import Path
+from lodestream import formats
+from lodestream.confinement import Rights, confine, landlock
+from lodestream.formats.vtk import grids
+path, script = map(Path, sys.argv[1:3])
+mine = (path,)
+if sys.argv[3] == "without":
+    landlock.restrict = lambda *_: False
+if script.name != "process.py":
+    grids._SCRIPT, grids._LAST_SECONDS = script, 0.1
+    mine += (script,)
+confine(Rights(read=mine, processes=True))
+try:
+    print(formats.read(path).points.shape)
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+def read_confined(path: Path, script: Path, landlock: str) -> str:
+    """What comes of reading a file in a process that may signal no other."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", _CONFINED, os.fspath(path), os.fspath(script), landlock]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux confines")
+@pytest.mark.parametrize("landlock", ["with", "without"])
+def test_who_reads_confined_needs_no_signal(tmp_path: Path, landlock: str) -> None:
+    grid = grid_of((4, 3, 1), points_of((4, 3, 1)))
+    path = tmp_path / "g.vtk"
+    write(vtkStructuredGridWriter(), grid, path)
+    assert read_confined(path, grids._SCRIPT, landlock) == "(3, 4, 3)"
+    # A reader that a file has taken over may stay as long as it likes: nobody waits for it.
+    stays = tmp_path / "stays.py"
+    stays.write_text(
+        "import ctypes, time\nctypes.CDLL(None).prctl(1, 9)\n"
+        'print(\'{"error": "stays"}\', flush=True)\ntime.sleep(36_000)\n'
+    )
+    assert read_confined(path, stays, landlock).endswith("that VTK reads, got stays")

@@ -253,14 +253,19 @@ def test_the_server_says_what_the_kernel_holds_builds_to(
         def confinement(self) -> tuple[str, ...]:
             return self.held
 
-    for held, words in (((), "has neither"), (("seccomp",), "has only seccomp")):
+    assert http.get("/readyz").json()["missing"] == [] or not WHOLE
+    lacks = (["landlock", "seccomp"], ["landlock"])
+    for held, words, names in (((), "has neither", lacks[0]), (("seccomp",), "has only seccomp", lacks[1])):
         monkeypatch.setattr(Loose, "held", held)
         monkeypatch.setattr(jobs, "ForkServer", lambda _: Loose())
         caplog.clear()
         with running(tmp_path / str(len(held))) as other:
             answer = eventually(partial(_ready, other), "the server to be ready")
+            missing = answer.pop("missing")
             assert answer == {"status": "ready", "confinement": "+".join(held) or "none"}
-        assert [record for record in caplog.records if words in record.getMessage()]
+            assert [sentence.partition(": a build may ")[0] for sentence in missing] == names
+        (warning,) = [record.getMessage() for record in caplog.records if words in record.getMessage()]
+        assert all(sentence in warning for sentence in missing)
 
 
 def _ready(http: httpx.Client) -> dict[str, Any] | None:

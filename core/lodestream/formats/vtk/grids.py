@@ -13,7 +13,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from math import prod
@@ -197,25 +197,37 @@ def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
     limits = [str(budget), str(seconds)]
     command = [sys.executable, "-P", os.fspath(_SCRIPT), file.kind, os.fspath(file.path.resolve()), *limits]
     environment = {**os.environ, "VTK_SMP_MAX_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(
+    process = subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
-    ) as process:
+    )
+    try:
+        assert process.stdout is not None  # it was asked for
+        line = process.stdout.readline()
+        if not line.endswith(b"\n"):
+            raise _ended(process, budget, seconds)
+        answer = json.loads(line)
+        if "error" in answer:
+            raise FormatError(f"expected structured grids that VTK reads, got {_printable(answer['error'])}")
+        if not answer["grids"]:
+            raise FormatError("expected structured grids that VTK reads, got none")
         try:
-            assert process.stdout is not None  # it was asked for
-            line = process.stdout.readline()
-            if not line.endswith(b"\n"):
-                raise _ended(process, budget, seconds)
-            answer = json.loads(line)
-            if "error" in answer:
-                raise FormatError(f"expected structured grids that VTK reads, got {_printable(answer['error'])}")
-            if not answer["grids"]:
-                raise FormatError("expected structured grids that VTK reads, got none")
-            try:
-                yield answer["grids"], process.stdout
-            except EOFError:
-                raise _ended(process, budget, seconds) from None
-        finally:
-            process.kill()
+            yield answer["grids"], process.stdout
+        except EOFError:
+            raise _ended(process, budget, seconds) from None
+    finally:
+        _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a reader whose answer is no longer wanted, and do not wait for one that cannot be ended."""
+    assert process.stdout is not None
+    process.stdout.close()  # who still writes gets an error
+    # A confined process may signal no other (`lodestream.confinement`). A reader that a file has taken over, and that
+    # stays, ends with this process.
+    with suppress(PermissionError):
+        process.kill()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_LAST_SECONDS)
 
 
 def _ended(process: subprocess.Popen[bytes], budget: int, seconds: int) -> UnavailableError:
