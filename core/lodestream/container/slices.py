@@ -21,10 +21,10 @@ __all__ = ["Slices", "State"]
 class State(NamedTuple):
     """What a view is made of; its errors are those that the whole surface has in this state.
 
-    ``all_planes`` says that nothing but residual is missing; ``whole_level`` is the level to which, counted from the
-    coarsest, everything is there where levels come one after another, else -1. ``whole_near`` says that nothing but
-    residual is missing in the region that comes first. ``channels`` are the errors of each channel, where these are
-    known.
+    ``all_layers`` says that no layer is missing: units that none names are known to have only zeros. ``whole_level`` is
+    the level to which, counted from the coarsest, everything is there where levels come one after another, else -1.
+    ``whole_near`` says that nothing but residual is missing in the region that comes first. ``channels`` are the errors
+    of each channel, where these are known.
     """
 
     number: int
@@ -33,7 +33,7 @@ class State(NamedTuple):
     rms: float
     max_error: float
     complete: bool
-    all_planes: bool
+    all_layers: bool
     whole_level: int = -1
     whole_near: bool = False
     channels: tuple[tuple[float, float], ...] = ()
@@ -190,9 +190,8 @@ class Slices:
                 return self._end(layer)
             size = record.end if self._in_file else self._bytes
             finest = self._layer_level[layer]
-            all_planes = last and finest == self._index.header.levels
             known = record.errors
-            return State(layer, finest, size, *known[:2], False, all_planes, channels=known.channels)
+            return State(layer, finest, size, *known[:2], False, last, channels=known.channels)
         level = self._by_level.whole(self._received)
         if level is not None and level < self._index.header.levels and not self._in_file:
             known = self._index.levels[level].errors

@@ -302,9 +302,8 @@ class Decoder:
         self._reconstruction.add(segments)
         last = number + 1 == header.layer_count
         complete = last and not header.corrected
-        whole = complete or (last and self._level == header.levels)
         figures = errors.rms, errors.maximum
-        self._show(State(number, self._level, frame.end, *figures, complete, whole, channels=errors.channels))
+        self._show(State(number, self._level, frame.end, *figures, complete, last, channels=errors.channels))
 
     def _take_residual(self, frame: Frame, header: Header) -> None:
         if len(self.layers) != header.layer_count or not header.corrected:
@@ -324,8 +323,7 @@ class Decoder:
     def _show(self, made: State) -> None:
         corrected = made.complete and self.header is not None and self.header.corrected
         window = self._window
-        all_planes = made.all_planes or (window is not None and window.is_last_layer(made))
-        length, state = self._reconstruction.length, self._progress.snapshot(all_planes)
+        length, state = self._reconstruction.length, self._progress.snapshot(made.all_layers)
         self.capacity.take(state.nbytes)
         if self.header is not None and made.whole_level >= 0:
             # The index says that there is nothing more of these levels.

@@ -203,10 +203,9 @@ def check_levels(index: Index, surface_at: Callable[[int], Surface], most: int |
 
 def states_of(walked: Walked) -> Iterator[NDArray[np.int8]]:
     """The states whose errors are told, int8, shape (tile, channel): of the layers, then of the levels but the last."""
-    header, last = walked.index.header, len(walked.index.layers) - 1
-    for record, view in zip(walked.index.layers, walked.decoder.layers, strict=False):
-        # What the last layer does not name has no coefficient but 0.
-        yield view._state if record.number < last else np.zeros_like(view._state)
+    header = walked.index.header
+    for _, view in zip(walked.index.layers, walked.decoder.layers, strict=False):
+        yield view._state
     for known in walked.index.levels[:-1]:
         state = initial_state(header)
         state[: header.layout.tiles_of(known.level).stop] = 0

@@ -73,11 +73,6 @@ class WindowState:
         rms, max_error = self._figures.within(made.rms, made.max_error, layer)
         return rms, max_error, not self._figures.whole and max_error != 0 and not math.isnan(rms)
 
-    def is_last_layer(self, made: State) -> bool:
-        """Whether nothing but residual is missing of the whole surface in this state."""
-        in_turn = made.whole_level < 0 and not math.isnan(made.rms)
-        return in_turn and made.number >= self._header.layer_count - 1
-
     def put_outside(self, made: State, state: NDArray[np.int8]) -> None:
         """Set what tiles outside the window tell of their levels; int8, shape (tile, channel); changed."""
         outside = self._outside

@@ -18,7 +18,7 @@ from lodestream.decoding import fallback
 
 from ..grid.layouts import layouts, tubes
 
-__all__ = ["agree_on", "assert_same", "surfaces", "without_kernels"]
+__all__ = ["agree_on", "assert_same", "assert_shown", "surfaces", "without_kernels"]
 
 WHY = "expected a library, got none, as this test wants it"
 
@@ -64,14 +64,14 @@ def agree_on(data: bytes, layer: int, level: int) -> None:
     other = reference.decode(container)
     assert (container.header.finest, len(container.layers)) == (decoder.header.levels, decoder.header.layer_count)
     layer, level = layer % len(container.layers), level % (container.header.finest + 1)
-    _shows(decoder.layers[layer].surface(), other.shown(layer + 1))
-    _shows(decoder.surface(), other.shown(residual=container.residual))
+    assert_shown(decoder.layers[layer].surface(), other.shown(layer + 1))
+    assert_shown(decoder.surface(), other.shown(residual=container.residual))
     if level < container.header.finest:
         # The page does not say what x and y of a coarser level of heights are.
-        _shows(decoder.surface(level), other.shown(level=level), heights=container.header.plane is not None)
+        assert_shown(decoder.surface(level), other.shown(level=level), heights=container.header.plane is not None)
 
 
-def _shows(surface: ls.Surface, blocks: list[reference.Shown], heights: bool = False) -> None:
+def assert_shown(surface: ls.Surface, blocks: list[reference.Shown], heights: bool = False) -> None:
     for found, wanted in zip(surface.blocks, blocks, strict=True):
         if not wanted.valid.any():
             continue  # so coarse a level shows what stands under its holes

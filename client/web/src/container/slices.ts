@@ -18,8 +18,8 @@ export interface State {
   /** Errors of each channel, where they are known. */
   readonly channels: ChannelErrors;
   readonly complete: boolean;
-  /** Nothing but the residual is missing. */
-  readonly allPlanes: boolean;
+  /** No layer is missing, so that units which none names are known to have only zeros. */
+  readonly allLayers: boolean;
   /** The level to which everything is there where levels come one after another, counted from the coarsest; else -1. */
   readonly wholeLevel: number;
   /** Nothing but the residual is missing in the region that comes first. */
@@ -215,7 +215,7 @@ export class Slices {
         maxError: record.errors.maximum,
         channels: record.errors.channels,
         complete: false,
-        allPlanes: last && level === header.levels,
+        allLayers: last,
         wholeLevel: -1,
         wholeNear: false,
       };
@@ -230,7 +230,7 @@ export class Slices {
         maxError: levels[level]!.errors.maximum,
         channels: levels[level]!.errors.channels,
         complete: false,
-        allPlanes: false,
+        allLayers: false,
         wholeLevel: level,
         wholeNear: false,
       };
@@ -245,7 +245,7 @@ export class Slices {
       maxError: Number.NaN,
       channels: [],
       complete: false,
-      allPlanes: false,
+      allLayers: false,
       wholeLevel: -1,
       wholeNear: this.#near[0]?.reached === layers.length - 1,
     };
@@ -290,7 +290,7 @@ export class Slices {
       maxError: last.errors.maximum,
       channels: last.errors.channels,
       complete: true,
-      allPlanes: true,
+      allLayers: true,
       wholeLevel: -1,
       wholeNear: false,
     };

@@ -273,7 +273,7 @@ export class Decoder {
       maxError: errors.maximum,
       channels: errors.channels,
       complete,
-      allPlanes: complete || (last && this.#level === header.levels),
+      allLayers: last,
       wholeLevel: -1,
       wholeNear: false,
     });
@@ -294,7 +294,7 @@ export class Decoder {
       maxError: errors.maximum,
       channels: errors.channels,
       complete: true,
-      allPlanes: true,
+      allLayers: true,
       wholeLevel: -1,
       wholeNear: false,
     });
@@ -309,7 +309,7 @@ export class Decoder {
   #show(begun: Begun, made: State): void {
     const { header, progress, shared, window } = begun;
     const { channels, layout } = header;
-    const state = progress.snapshot(made.allPlanes || (window?.isLastLayer(made) ?? false));
+    const state = progress.snapshot(made.allLayers);
     this.capacity.take(state.length);
     if (made.wholeLevel >= 0) {
       // The index says that there is nothing more of these levels.

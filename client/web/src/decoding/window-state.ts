@@ -59,11 +59,6 @@ export class WindowState {
     return { rms, maxError, bound: !this.#figures.whole && maxError !== 0 && !Number.isNaN(rms), channels: [] };
   }
 
-  /** Whether nothing but the residual is missing of the whole surface in this state. */
-  isLastLayer(made: State): boolean {
-    return made.wholeLevel < 0 && !Number.isNaN(made.rms) && made.number >= this.#header.layerCount - 1;
-  }
-
   /** Set what tiles outside the window tell of their levels in a state, (tile, channel). */
   putOutside(made: State, state: Int8Array): void {
     const header = this.#header;
