@@ -8,7 +8,7 @@ file needs them.
 format, write a module with ``sniff`` and ``read`` or ``write``, and give it a row.
 """
 
-from .reading import read, readable, sniff
+from .reading import read, sniff
 from .source import DEFAULT_MAX_VERTICES, check_allowed
 from .table import Format, formats
 from .writing import check_blocks, for_writing, write, write_stream, written
@@ -21,7 +21,6 @@ __all__ = [
     "for_writing",
     "formats",
     "read",
-    "readable",
     "sniff",
     "write",
     "write_stream",

@@ -18,7 +18,7 @@ from .nodata import checked, with_nodata
 from .source import DEFAULT_MAX_VERTICES, UNLIMITED_VERTICES, Source, check_allowed, with_name
 from .table import FORMATS, Format
 
-__all__ = ["read", "readable", "sniff"]
+__all__ = ["read", "sniff"]
 
 #: Bytes at the start of a file that decide about its format.
 _HEAD = 4096
@@ -190,12 +190,14 @@ def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
     with path.open("rb") as file:
         head = file.read(_HEAD)
     if wanted is not None:
-        format_ = readable(wanted)
-        suffix = suffix if suffix in format_.suffixes else format_.suffixes[0]
-        if not head or not format_.sniff(head, suffix):
-            got = _describe(head) if head else "an empty file"
-            raise FormatError(f"expected a file of format {format_.name}, got {got}")
-        return format_
+        called = f".{wanted.lower().removeprefix('.')}"
+        candidates = _readable_as(wanted)
+        for format_ in candidates:
+            known = next((it for it in (suffix, called) if it in format_.suffixes), format_.suffixes[0])
+            if head and format_.sniff(head, known):
+                return format_
+        names = " or ".join(format_.name for format_ in candidates)
+        raise FormatError(f"expected a file of format {names}, got {_describe(head) if head else 'an empty file'}")
     if is_container(head):
         raise FormatError(
             "expected a file of another format, got a container of Lodestream: lodestream.decode(bytes) gives its "
@@ -211,20 +213,22 @@ def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
     raise FormatError(f"expected {_readable()}, got {_describe(head)}")
 
 
-def readable(name: str) -> Format:
-    """The format that is read under this name, or whose files end so without the dot.
+def _readable_as(name: str) -> tuple[Format, ...]:
+    """The format that is read under this name, or those whose files end so without the dot, as .xyz of two.
 
     Raises
     ------
     OptionError
         If there is none; the message names those that exist.
     """
+    plain = name.lower().removeprefix(".")
     formats = {it.name: it for it in FORMATS if it.read}
-    by_suffix = {suffix[1:]: it for it in reversed(FORMATS) if it.read for suffix in it.suffixes}
-    found = (by_suffix | formats).get(name.lower().removeprefix("."))
-    if found is None:
+    if plain in formats:
+        return (formats[plain],)
+    by_suffix = tuple(it for it in formats.values() if f".{plain}" in it.suffixes)
+    if not by_suffix:
         raise OptionError(f"expected format to be one of {', '.join(formats)}, got {name[:80]!a}")
-    return found
+    return by_suffix
 
 
 def _check_regular(path: Path) -> None:
@@ -234,10 +238,9 @@ def _check_regular(path: Path) -> None:
 
 def _of_folder(path: Path, wanted: str | None) -> Format:
     found = next((it for it in FORMATS if it.folder and it.folder(path)), None)
-    if wanted is not None and (format_ := readable(wanted)) != found:
-        raise FormatError(
-            f"expected a file of format {format_.name}, got {'a folder' if found is None else found.name}"
-        )
+    if wanted is not None and found not in (candidates := _readable_as(wanted)):
+        names = " or ".join(format_.name for format_ in candidates)
+        raise FormatError(f"expected a file of format {names}, got {'a folder' if found is None else found.name}")
     if found is None:
         raise FormatError("expected a regular file or the folder of a Zarr store, got another folder")
     return found

@@ -229,6 +229,7 @@ FORMATS = (
         suffixes=text_arrays.SUFFIXES,
         sniff=text_arrays.sniff,
         read=text_arrays.read,
+        options=text_arrays.READ_OPTIONS,
         more=text_arrays.MORE,
     ),
     Format(

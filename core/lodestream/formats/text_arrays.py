@@ -1,10 +1,15 @@
-"""Arrays of numbers as plain text, a line for each row: heights in one file, or x, y and z in a file each."""
+"""Arrays as text: a surface in one file, its coordinates in a file each, or a line "x y z" for each node of a grid."""
 
 from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from math import prod
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,50 +17,132 @@ from numpy.typing import NDArray
 from ..coordinates.seams import merge
 from ..errors import FormatError, OptionError, TooLargeError
 from ..surface import Surface
+from . import gridded_points
 from .source import Source, number
 
-__all__ = ["MORE", "SUFFIXES", "read", "sniff"]
+__all__ = ["MORE", "READ_OPTIONS", "SUFFIXES", "read", "sniff"]
 
-SUFFIXES = (".dat", ".txt", ".csv")
+SUFFIXES = (".dat", ".txt", ".csv", ".xyz")
 MORE = "y, or y and z, each an array of the shape of the first, which is x then"
+READ_OPTIONS = {
+    "layout": "what a line of a single file is: heights (a row of them), or points (x, y, z and attributes of one "
+    "node; the default for three columns, for columns with names, and where the first two columns are a grid)"
+}
+
+#: The suffix of files of points, and of PLOT3D.
+_POINTS_SUFFIX = ".xyz"
 
 #: No two ways to match the same text, of which a line of many numbers would have as many as powers of two.
 _NUMBER = rb"[-+]?(?:(?:\d++(?:\.\d*+)?|\.\d++)(?:e[-+]?\d++)?|nan|inf)"
 _BETWEEN = rb"(?:[ \t]*+[,;][ \t]*+|[ \t]++)"
 _LINE = re.compile(rb"[ \t]*+" + _NUMBER + rb"(?:" + _BETWEEN + _NUMBER + rb")*+[ \t,;]*", re.IGNORECASE)
+_NAME = re.compile(r"[^\W\d][^,;\"]{0,60}")
+
 _HEAD = 4096  # bytes that are looked at to know a format
 _LONGEST_LINE = 64 << 20
 _MOST_FILES = 3
+_LINES_AT_ONCE = 1 << 16
+_MARK = b"\xef\xbb\xbf"  # that of UTF-8
+
+#: A line that begins so is a comment, and so is the rest of a line behind #.
+_COMMENT = (b"#", b"%", b"!", b"//")
+
+#: Lines of which the first two columns are looked at, so that a few heights are not taken for x and y.
+_FEWEST_POINTS = 16
+_MOST_COLUMNS = 64
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How the numbers of a file are written.
+
+    Attributes
+    ----------
+    delimiter : str or None
+        What stands between numbers; None: white space. With a semicolon a comma is a decimal point.
+    rows, columns : int
+        How many lines of numbers there are, and how many numbers the first has.
+    names : tuple of str
+        Names of the columns, from the line before the first numbers, or the comment before them; empty if it has none.
+    heading : bool
+        Whether the first line, comments aside, has the names.
+    """
+
+    delimiter: str | None
+    rows: int
+    columns: int
+    names: tuple[str, ...]
+    heading: bool
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file of such a suffix begins with a line of numbers, comments aside."""
+    """Whether a file of such a suffix begins with a line of numbers, comments and one line of names aside.
+
+    A .xyz has at least three columns, and does not begin with the dimensions of a PLOT3D file.
+    """
     if suffix not in SUFFIXES:
         return False
-    for line in head.splitlines():
-        if line.strip() and not line.lstrip().startswith(b"#"):
-            if len(head) >= _HEAD and head.endswith(line):  # cut, perhaps within a number
-                line = re.split(rb"[ \t,;](?=[^ \t,;]*$)", line)[0]
-            return _LINE.fullmatch(line) is not None
-    return False
+    lines = [line for line in map(_stripped, head.removeprefix(_MARK).splitlines(keepends=True)) if line]
+    if lines and len(head) >= _HEAD and not head.endswith((b"\n", b"\r")):
+        lines[-1] = re.split(rb"[ \t,;](?=[^ \t,;]*$)", lines[-1])[0]  # cut, perhaps within a number
+    if lines and _LINE.fullmatch(lines[0]) is None and len(lines) > 1:
+        names, numbers = (_words(line, _delimiter(lines[1])) for line in lines[:2])
+        if len(names) < 3 or len(names) != len(numbers) or not all(map(_NAME.fullmatch, names)):
+            return False
+        lines = lines[1:]
+    if not lines or _LINE.fullmatch(lines[0]) is None:
+        return False
+    return suffix != _POINTS_SUFFIX or _begins_with_points(lines, whole=len(head) < _HEAD)
+
+
+def _begins_with_points(lines: Sequence[bytes], whole: bool) -> bool:
+    """Whether the first lines of a .xyz are points, x, y, z and more, and not PLOT3D's dimensions and numbers."""
+    rows = [_words(line, _delimiter(line)) for line in (lines if whole else lines[:-1] or lines)]
+    if len(rows[0]) < 3 or any(len(row) != len(rows[0]) for row in rows):
+        return False
+    if not all(word.isdigit() for word in rows[0]) or len(rows[0]) > 3 or len(rows) < 2:
+        return True
+    # Three whole numbers: dimensions, if so many numbers follow and these are not the next node of a row or column.
+    nodes = prod(map(int, rows[0]))
+    count = sum(map(len, rows[1:]))
+    fits = count in (3 * nodes, 4 * nodes) if whole else count < 4 * nodes
+    return not fits or any(rows[0][axis] == rows[1][axis] for axis in (0, 1))
 
 
 def read(source: Source) -> Surface:
     """Read the array of one file as heights, of two as planar points, of three as x, y and z; always float64.
 
+    One file of points, a line "x y z" for each node of a grid, becomes heights over that grid, see `gridded_points`.
+
     Raises
     ------
     OptionError
-        If there are more than three files.
+        If there are more than three files, or the option ``layout`` does not fit them.
     FormatError
-        If they are of different shapes, or are no arrays.
+        If they are of different shapes, or are no arrays, or points are no grid.
     """
     paths = (source.path, *source.more)
     if len(paths) > _MOST_FILES:
         raise OptionError(f"expected one to three files of text, got {len(paths)}")
-    arrays = [_array(source, path) for path in paths]
-    if len(arrays) == 1:
-        return Surface(arrays[0], metadata=source.metadata("text"))
+    chosen = source.options.get("layout")
+    if chosen not in (None, "heights", "points"):
+        raise OptionError(f"expected layout=heights or layout=points, got {str(chosen)[:80]!r}")
+    if chosen == "points" and len(paths) > 1:
+        raise OptionError(f"expected layout=points for one file, got {len(paths)} files")
+    if len(paths) == 1:
+        layout = _layout(source.path)
+        points = chosen == "points" or (chosen is None and (layout.columns == 3 or bool(layout.names)))
+        shape = (layout.rows, 1, layout.columns) if points else (layout.rows, layout.columns)
+        source.check_array(shape, np.dtype(np.float64))
+        array = _array(source, source.path, layout)
+        if points or (chosen is None and _are_points(layout, array)):
+            return gridded_points.surface(source, array, layout.names)
+        return Surface(array, metadata=source.metadata("text"))
+    arrays = []
+    for path in paths:
+        layout = _layout(path)
+        source.check_array((layout.rows, layout.columns), np.dtype(np.float64))
+        arrays.append(_array(source, path, layout))
     for place, array in enumerate(arrays):
         if array.shape != arrays[0].shape:
             raise FormatError(
@@ -64,32 +151,98 @@ def read(source: Source) -> Surface:
     return merge(Surface(np.stack(arrays, axis=-1), metadata=source.metadata("text")), source.closed)
 
 
-def _array(source: Source, path: Path) -> NDArray[np.float64]:
-    delimiter, columns, rows = _layout(path)
-    source.check_array((rows, columns), np.dtype(np.float64))
+def _are_points(layout: _Layout, array: NDArray[np.float64]) -> bool:
+    """Whether lines of four numbers or more, whose columns have no names, are points: the first two are a grid."""
+    able = 3 < layout.columns <= _MOST_COLUMNS and layout.rows >= _FEWEST_POINTS
+    return able and gridded_points.is_whole_grid(array[:, 0], array[:, 1])
+
+
+def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
+    """All numbers of a file, shape (line, column); a large array lies where the source has room."""
+    rows, columns = layout.rows, layout.columns
+    array = source.empty((rows, columns), np.dtype(np.float64))
+    done = 0
     try:
-        # Opened here: numpy would take a name for an address, or for that of a compressed file.
-        with warnings.catch_warnings(), path.open(encoding="ascii") as file:
+        with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("error")
-            array = np.loadtxt(file, np.float64, delimiter=delimiter, ndmin=2)
+            lines = _numbers(file, layout)
+            while texts := [*islice(lines, _LINES_AT_ONCE)]:
+                # Lines and not the name: numpy would take one for an address, or for that of a compressed file.
+                part = np.loadtxt(texts, np.float64, comments=None, delimiter=layout.delimiter, ndmin=2)
+                array[done : done + len(part)] = part
+                done += len(part)
     except (ValueError, UserWarning) as error:
         reason = re.sub(r"\s+", " ", str(error))
         raise FormatError(f"expected {number(rows)} lines of {number(columns)} numbers, got others: {reason}") from None
     return array
 
 
-def _layout(path: Path) -> tuple[str | None, int, int]:
-    """What stands between numbers (None: white space), how many the first line has, and how many lines there are."""
-    rows, columns, delimiter = 0, 0, None
+def _numbers(file: IO[bytes], layout: _Layout) -> Iterator[str]:
+    """The lines of numbers of a file, without comments, and without the line of names."""
+    lines = (text for text in map(_stripped, _lines(file)) if text)
+    if layout.heading:
+        next(lines)
+    for text in lines:
+        yield text.decode("latin-1").replace(",", ".") if layout.delimiter == ";" else text.decode("latin-1")
+
+
+def _lines(file: IO[bytes]) -> Iterator[bytes]:
+    if file.read(len(_MARK)) != _MARK:
+        file.seek(0)
+    while line := file.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise TooLargeError(f"expected lines of fewer than {number(_LONGEST_LINE)} bytes, got a longer one")
+        yield line
+
+
+def _stripped(line: bytes) -> bytes:
+    """A line without comment and white space at its ends."""
+    text = line.strip()
+    return b"" if text.startswith(_COMMENT) else text.split(b"#")[0].rstrip()
+
+
+def _delimiter(line: bytes) -> str | None:
+    """What stands between numbers of a line; a comma between semicolons belongs to a number."""
+    return next((mark for mark in (";", ",") if mark.encode() in line), None)
+
+
+def _words(line: bytes, delimiter: str | None) -> list[str]:
+    text = line.decode("utf-8", "replace")
+    return [word.strip().strip('"') for word in text.split(delimiter)]
+
+
+def _layout(path: Path) -> _Layout:
+    """Go through a file for the layout of its numbers."""
+    rows, columns = 0, 0
+    delimiter: str | None = None
+    names: tuple[str, ...] = ()
+    heading, comment = b"", b""
     with path.open("rb") as file:
-        while line := file.readline(_LONGEST_LINE):
-            if len(line) == _LONGEST_LINE:
-                raise TooLargeError(f"expected lines of fewer than {number(_LONGEST_LINE)} bytes, got a longer one")
-            text = line.split(b"#")[0].strip()
+        for line in _lines(file):
+            text = _stripped(line)
+            if not rows and not text and line.strip():
+                comment = line.strip().lstrip(b"#%!/").strip()
             if not text:
                 continue
             if not rows:
-                delimiter = next((mark for mark in (",", ";") if mark.encode() in text), None)
+                if not heading and _LINE.fullmatch(text) is None:
+                    heading = text
+                    continue
+                delimiter = _delimiter(text)
                 columns = len(text.split(delimiter.encode() if delimiter else None))
+                names = _names(heading, comment, columns, delimiter)
             rows += 1
-    return delimiter, columns, rows
+    if heading and not names:
+        words = heading[:60].decode("utf-8", "replace")
+        raise FormatError(f"expected numbers in the first line, or a name for each column, got {words!r}")
+    return _Layout(delimiter, rows, columns, names, bool(heading))
+
+
+def _names(heading: bytes, comment: bytes, columns: int, delimiter: str | None) -> tuple[str, ...]:
+    """Names of columns in the line before the numbers; those in a comment only if they speak of x and y."""
+    for line, sure in ((heading, True), (comment, False)):
+        words = _words(line, delimiter if delimiter and delimiter.encode() in line else _delimiter(line))
+        fits = columns >= 3 and len(words) == columns and all(map(_NAME.fullmatch, words))
+        if fits and (sure or gridded_points.speaks_of_places(words)):
+            return tuple(words)
+    return ()

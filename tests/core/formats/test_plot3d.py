@@ -307,6 +307,34 @@ def test_a_file_padded_to_a_record_is_read(tmp_path: Path, record: int, precisio
             formats.read(tmp_path / "g.x", tmp_path / name)
 
 
+@pytest.mark.parametrize("endian", ["<", ">"])
+@pytest.mark.parametrize("blocks", [0, 1, 3])
+@pytest.mark.parametrize(("fields", "species"), [(5, 0), (6, 0), (9, 2)])
+def test_a_q_file_of_overflow_is_refused_with_what_to_do(
+    tmp_path: Path, endian: str, blocks: int, fields: int, species: int
+) -> None:
+    def record(*parts: Any) -> bytes:
+        arrays = [np.asarray(part) for part in parts]
+        content = b"".join(array.astype(f"{endian}{array.dtype.str[1:]}").tobytes() for array in arrays)
+        marker = struct.pack(f"{endian}i", len(content))
+        return marker + content + marker
+
+    dims = [(6, 4, 1), (5, 5, 5), (2, 3, 4)][: blocks or 1]
+    count = [record(np.int32(blocks))] if blocks else []
+    points = [record(np.ones((3, *size[::-1]))) for size in dims]
+    (tmp_path / "grid.x").write_bytes(b"".join([*count, record(np.array(dims, np.int32)), *points]))
+    q = [*count, record(np.array([*np.ravel(dims), fields, species], np.int32))]
+    for size in dims:
+        q += [record(np.ones(7), np.int32(0), np.ones(8 + species)), record(np.ones((fields, *size[::-1])))]
+    (tmp_path / "q.save").write_bytes(b"".join(q))
+    words = rf"got a Q file of OVERFLOW with {fields} fields and {species} species, which is not read: open it with"
+    with pytest.raises(FormatError, match=rf"q\.save: expected a PLOT3D grid file, {words}"):
+        formats.read(tmp_path / "q.save")
+    options = {"block": 1, "plane": "k0"} if blocks else {"plane": "k0"}
+    with pytest.raises(FormatError, match=rf"q\.save: expected a PLOT3D Q or function file, {words}"):
+        formats.read(tmp_path / "grid.x", tmp_path / "q.save", **options)
+
+
 @pytest.mark.parametrize("more", [0.0, 1.4])
 def test_reference_numbers_in_a_longer_record_are_read(tmp_path: Path, more: float) -> None:
     grid = Written(((4, 3, 1), (2, 3, 1)), multi=True, iblank=False, endian="<", records=True)

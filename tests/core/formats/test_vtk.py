@@ -144,6 +144,26 @@ def test_several_files_are_blocks(tmp_path: Path) -> None:
         formats.read(tmp_path / "0.vts", tmp_path / "1.vts")
 
 
+@pytest.mark.parametrize("kind", ["ImageData", "RectilinearGrid"])
+def test_images_and_rectilinear_grids_are_refused_with_what_to_do(tmp_path: Path, kind: str) -> None:
+    pyvista = pytest.importorskip("pyvista")
+    suffix = ".vti" if kind == "ImageData" else ".vtr"
+    path = tmp_path / f"a{suffix}"
+    if kind == "ImageData":
+        grid = pyvista.ImageData(dimensions=(4, 3, 1))
+    else:
+        grid = pyvista.RectilinearGrid(np.array([0.0, 1, 3]), np.array([0.0, 2]))
+    grid["heat"] = np.arange(grid.n_points)
+    grid.save(path)
+    with pytest.raises(FormatError, match=f"of type StructuredGrid, got {kind}: save it as .vts") as caught:
+        formats.read(path)
+    assert f"pyvista.read('a{suffix}').cast_to_structured_grid().save('a.vts')" in str(caught.value)
+    pyvista.read(path).cast_to_structured_grid().save(tmp_path / "a.vts")  # as the advice says
+    surface = formats.read(tmp_path / "a.vts")
+    assert surface.shape == (grid.dimensions[1], grid.dimensions[0])
+    assert list(surface.attributes) == ["heat"]
+
+
 @given(seed=st.integers(0, 2**32))
 @settings(max_examples=5)
 def test_what_is_blanked_is_a_hole(seed: int) -> None:

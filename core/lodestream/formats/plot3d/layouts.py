@@ -40,7 +40,7 @@ _VALUES: Mapping[str, tuple[object, ...]] = {
 _MAX_BLOCKS = 1 << 12
 _MAX_VARIABLES = 1 << 10
 _MAX_POINTS = 1 << 24
-_MARKER = 4
+_MARKER = _INTEGER = 4
 
 #: Reference numbers of a block in a Q file, and how many more its record may have behind them.
 REFERENCES = 4
@@ -259,6 +259,12 @@ def find_layout(
         return fitting[0]
     unit = "numbers" if numbers.text else "bytes"
     what = f"a PLOT3D {' or '.join(_KINDS[kind] for kind in kinds)} file"
+    if not fitting and (fields := _fields_of_overflow(numbers)):
+        raise FormatError(
+            f"expected {what}, got a Q file of OVERFLOW with {fields[0]} fields and {fields[1]} species, which is not "
+            "read: open it with its grid in ParaView or pyvista (MultiBlockPlot3DReader) and save .vts files, or write "
+            "its fields as a PLOT3D function file"
+        )
     if fitting:
         listed = "; or ".join(f"{layout.points()} ({layout.kind}, {layout.words()})" for layout in fitting)
         differ = len({layout.dimensions for layout in fitting}) > 1
@@ -279,6 +285,31 @@ def find_layout(
         f"expected {what} whose size fits its dimensions, got {number(numbers.size)} {unit} where the nearest layouts "
         f"take {nearest}"
     )
+
+
+def _fields_of_overflow(numbers: Numbers) -> tuple[int, int] | None:
+    """The numbers of fields and species, NQ and NQC, in the header of a Q file of OVERFLOW; None: it is no such file.
+
+    Their record follows that of the number of grids, or is the first of a single grid: three dimensions for each grid,
+    then NQ and NQC. Source: OVERFLOW User's Manual, section on file formats.
+    """
+    if numbers.text:
+        return None
+    for endian, multi in product("<>", (False, True)):
+        place, count = 0, 1
+        if multi:
+            head = numbers.integers(0, 3, endian)
+            if head is None or head[0] != _INTEGER or head[2] != _INTEGER or not 1 <= head[1] <= _MAX_BLOCKS:
+                continue
+            place, count = 2 * _MARKER + _INTEGER, head[1]
+        length = 3 * count + 2
+        record = numbers.integers(place, length + 2, endian)
+        if record is None or record[0] != record[-1] or record[0] != length * _INTEGER:
+            continue
+        *dims, fields, species = record[1:-1]
+        if min(dims) >= 1 and max(dims) <= _MAX_POINTS and 5 <= fields <= _MAX_VARIABLES and 0 <= species < fields:
+            return fields, species
+    return None
 
 
 def _plausible(numbers: Numbers, kinds: Sequence[str], wanted: Mapping[str, object]) -> Iterator[Layout]:

@@ -40,6 +40,16 @@ _TYPE, _LETTERS = re.compile(r"(U?Int|Float)(8|16|32|64)"), {"Int": "i", "UInt":
 _GHOSTS = "vtkGhostType"
 _SECTIONS = ("PointData", "CellData", "Points")
 
+#: What to do with grids of other types.
+_AS_STRUCTURED = ": save it as .vts, as by pyvista: pyvista.read({!r}).cast_to_structured_grid().save('a.vts')"
+_AS_MESH = ": save the surface as .ply or .obj, of which a grid is made if the mesh is one"
+_ADVICE = {
+    "ImageData": _AS_STRUCTURED.format("a.vti"),
+    "RectilinearGrid": _AS_STRUCTURED.format("a.vtr"),
+    "PolyData": _AS_MESH,
+    "UnstructuredGrid": _AS_MESH,
+}
+
 #: VTK looks through all attributes of an element to add one.
 _MOST_ATTRIBUTES = 100
 
@@ -126,7 +136,8 @@ def _checked(path: Path) -> tuple[Dims, int, Mapped | None]:
             "give its .vts files together, one for each block, as in lodestream.read('a/a_0.vts', 'a/a_1.vts')"
         )
     if kind != "StructuredGrid":
-        raise FormatError(f"expected a VTK file of type StructuredGrid, got {kind[:60]}")
+        advice = _ADVICE.get(kind, "")
+        raise FormatError(f"expected a VTK file of type StructuredGrid, got {kind[:60]}{advice}")
     if not found.whole or not found.pieces:
         raise FormatError("expected a StructuredGrid with a WholeExtent and a Piece, got none")
     promised = sum(array.promised() for array in found.arrays)
