@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
+from . import limits
 from .fields import FieldReader, FieldWriter
 from .model import Header
 
@@ -56,10 +57,12 @@ def parse_codecs(fields: FieldReader) -> tuple[int, ...]:
     UnsupportedVersionError
         When one of them is not known.
     CorruptStreamError
-        If they are not in rising order.
+        If they are not in rising order, or too many.
     """
     start = fields.at
-    needed = [fields.varint() for _ in range(fields.varint(len(fields.data)))]
+    count = fields.varint()
+    limits.check_count(count, limits.CODECS, "codecs", start)
+    needed = [fields.varint() for _ in range(count)]
     if any(later <= earlier for earlier, later in zip([0, *needed], needed, strict=False)):
         raise CorruptStreamError(f"expected the numbers of codecs, each above the one before, got {needed}", start)
     for codec in needed:

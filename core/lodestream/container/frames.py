@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import BinaryIO, NamedTuple
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
-from . import sections
+from . import limits, sections
 from .metadata import check_length
 
 __all__ = [
@@ -23,16 +23,19 @@ __all__ = [
 _START = len(sections.SIGNATURE)
 #: The kind and length of a section take at most so many bytes.
 _LONGEST_START = 10
-_KNOWN = {
-    sections.HEADER,
-    sections.LAYER,
-    sections.RESIDUAL,
-    sections.METADATA,
-    sections.INDEX,
-    sections.MASKS,
-    sections.KEPT_MASKS,
-    sections.PAGES,
-}
+_CRC = 4  # bytes at the end of a section
+_KNOWN = frozenset(
+    {
+        sections.HEADER,
+        sections.LAYER,
+        sections.RESIDUAL,
+        sections.METADATA,
+        sections.INDEX,
+        sections.MASKS,
+        sections.KEPT_MASKS,
+        sections.PAGES,
+    }
+)
 
 
 class Frame(NamedTuple):
@@ -45,24 +48,59 @@ class Frame(NamedTuple):
     end: int
 
 
+class _Passing:
+    """A section whose bytes are checked as they pass, and not kept.
+
+    Parameters
+    ----------
+    kind, offset : int
+        Of the section.
+    length : int
+        Bytes of all of it, the CRC included.
+    """
+
+    def __init__(self, kind: int, offset: int, length: int) -> None:
+        self.kind, self._offset, self.left = kind, offset, length
+        self._crc, self._end = 0, b""
+
+    def take(self, data: bytes | memoryview) -> None:
+        """Take the next bytes, at most as many as are left."""
+        checked = max(min(len(data), self.left - _CRC), 0)
+        self._crc = zlib.crc32(memoryview(data)[:checked], self._crc)
+        self._end += bytes(memoryview(data)[checked:])
+        self.left -= len(data)
+
+    def check(self) -> None:
+        """Refuse a section that does not match its CRC, or that is not known and must be; all bytes have passed."""
+        _check(self._crc == int.from_bytes(self._end, "little"), self.kind, self._offset)
+
+
 class FrameReader:
     """Sections in file order.
 
     Memory grows with what has arrived, never with what a length promises: a section that lies whole in the bytes of
-    one call is a window of these, others are put together. Metadata that are too long are refused as soon as they say
-    so.
+    one call is a window of these, others are put together. Sections that nobody asked for are not put together, but
+    checked as they pass. Metadata that are too long are refused as soon as they say so.
+
+    Parameters
+    ----------
+    keeps : collection of int
+        Kinds of the sections that are wanted; all others pass.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, keeps: Collection[int] = _KNOWN) -> None:
+        self._keeps = keeps
         self._data: bytes | bytearray = b""  # of one call; or, while a section waits for its rest, of several
         self._place = 0  # of what was not taken yet, in bytes of one call
         self._offset = 0  # of the same in the container
+        self._passing: _Passing | None = None
+        self._optional = 0  # sections so far
         self._started = False
         self.ended = False  # the index was read: nothing but the footer follows
 
     @property
     def position(self) -> int:
-        """Bytes of the container taken so far, partial sections not counted."""
+        """Bytes of the container taken so far, without those of a section that wait for the rest of it."""
         return self._offset
 
     @property
@@ -70,13 +108,19 @@ class FrameReader:
         """Bytes that wait for the rest of their section."""
         return len(self._data) - self._place
 
+    @property
+    def partial(self) -> bool:
+        """Whether a section has begun that is not whole."""
+        return self.pending > 0 or self._passing is not None
+
     def feed(self, data: bytes | memoryview) -> Iterator[Frame]:
         """Take bytes, yield the sections that are now complete.
 
         Raises
         ------
         CorruptStreamError
-            Where the bytes are no container, or a section fails its CRC.
+            Where the bytes are no container, a section fails its CRC, or there are more optional ones than a container
+            may have.
         UnsupportedVersionError
             Where the container is of another version, or a section that must be understood is not known.
         """
@@ -86,27 +130,54 @@ class FrameReader:
             self._data, self._place = bytearray(self._data[self._place :]) + data, 0
         else:
             self._data += data
-        while not self.ended and (frame := self._next()) is not None:
-            if frame.kind in _KNOWN:
+        while not self.ended and self._begin():
+            if self._passing is not None:
+                if not self._pass(self._passing):
+                    return
+            elif (frame := self._next()) is not None:
                 self.ended = frame.kind == sections.INDEX
                 yield frame
+            else:
+                return
 
     def rest(self) -> bytes:
         """Take the bytes after the index, once it was read."""
         rest, self._data, self._place = bytes(self._ahead()), b"", 0
         return rest
 
-    def _next(self) -> Frame | None:
+    def _begin(self) -> bool:
+        """Look at the start of the next section, unless one is passing; False: not enough of it has come."""
+        if self._passing is not None:
+            return True
         if not self._started and not self._start():
-            return None
+            return False
         first = self._ahead(_LONGEST_START)
         if self._offset == _START and first and first[0] != sections.HEADER:
             raise CorruptStreamError(f"expected the header section first, got kind {first[0]}", _START)
         extent = section_extent(first, self._offset)
+        if extent is None:
+            return False
+        if first[0] not in self._keeps:
+            self._optional += first[0] >= sections.OPTIONAL
+            limits.check_count(self._optional, limits.OPTIONAL, "optional sections", self._offset)
+            self._passing = _Passing(first[0], self._offset, extent[1])
+        return True
+
+    def _pass(self, passing: _Passing) -> bool:
+        """Let bytes of a section pass; False: there are more to come."""
+        passing.take(self._take(min(self.pending, passing.left)))
+        if passing.left:
+            return False
+        passing.check()
+        self._passing, self.ended = None, passing.kind == sections.INDEX
+        return True
+
+    def _next(self) -> Frame | None:
+        first, offset = self._ahead(_LONGEST_START), self._offset
+        extent = section_extent(first, offset)
         if extent is None or self.pending < extent[1]:
             return None
         start, length = extent
-        offset = self._offset
         return checked(self._take(length), first[0], offset, start)
 
     def _start(self) -> bool:
@@ -138,7 +209,7 @@ class FrameReader:
 def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
     """The kind of each section of a container in a file, and how many bytes of payload it announces.
 
-    Nothing else is read or checked; it ends where the bytes are no section any more.
+    Nothing else is read or checked; it ends with the root of the index, or where the bytes are no section any more.
     """
     place = _START
     while True:
@@ -152,6 +223,8 @@ def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
         else:
             return
         yield head[0], length
+        if head[0] == sections.INDEX:
+            return
         place += 1 + (number + 1) + length + 4
 
 
@@ -203,15 +276,20 @@ def index_sections(data: bytes, offset: int) -> tuple[Frame, Frame]:
 
 def checked(frame: bytes | memoryview, kind: int, offset: int, start: int) -> Frame:
     """A whole section, whose payload starts at ``start`` of it, after its CRC was checked."""
-    payload, crc = memoryview(frame)[start:-4], int.from_bytes(frame[-4:], "little")
-    if zlib.crc32(memoryview(frame)[:-4]) != crc:
+    payload, crc = memoryview(frame)[start:-_CRC], int.from_bytes(frame[-_CRC:], "little")
+    _check(zlib.crc32(memoryview(frame)[:-_CRC]) == crc, kind, offset)
+    return Frame(kind, offset, offset + start, payload, offset + len(frame))
+
+
+def _check(sound: bool, kind: int, offset: int) -> None:
+    """Refuse a section that is not sound, or that is not known and must be."""
+    if not sound:
         raise CorruptStreamError(f"expected a section of kind {kind} to match its CRC, got other bytes", offset)
     if kind not in _KNOWN and kind < sections.OPTIONAL:
         raise UnsupportedVersionError(
             f"expected sections of version {sections.VERSION}, got an unknown one of kind {kind} that must not be "
             "skipped"
         )
-    return Frame(kind, offset, offset + start, payload, offset + len(frame))
 
 
 def whole_section(data: bytes, offset: int, kind: int) -> Frame:

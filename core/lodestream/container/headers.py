@@ -14,7 +14,7 @@ from ..grid.multiblock import grids_of
 from ..quantization.band_steps import MOST_BASE, Quantiser
 from ..quantization.lattice import Lattice
 from ..transform.predictors import INTERFACES, default_predictors, fitted_steps
-from . import codecs
+from . import codecs, limits
 from .fields import LARGEST, FieldReader, FieldWriter
 from .frames import Frame
 from .model import Header, count_rectangles
@@ -134,7 +134,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     Raises
     ------
     CorruptStreamError
-        If a field has a value that no header has, or they do not fit together.
+        If a field has a value that no header has, they do not fit together, or one exceeds its limit (`limits`).
     TooLargeError
         If an axis is longer than this version reads.
     UnsupportedVersionError
@@ -145,7 +145,8 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     flags, code = fields.byte(), fields.byte()
     if code >= len(DTYPES):
         raise CorruptStreamError(f"expected a type below {len(DTYPES)}, got {code}", offset)
-    point_channels, layer_count = fields.varint(2**16), fields.varint()
+    point_channels, layer_count = fields.varint(), fields.varint()
+    limits.check_count(layer_count, limits.LAYERS, "layers", offset)
     tile, chunk, large = _exponents(fields.byte()), _exponents(fields.byte()), fields.byte()
     base = fields.varint(MOST_BASE)
     extent = fields.number()
@@ -158,6 +159,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     points = sum(rows * columns for (rows, columns), _ in blocks)
     extras = parse_extras(fields.take(fields.varint(len(payload))), offset, points) if flags & 128 else Extras()
     channels = point_channels + sum(kind.channels for kind in extras.attributes)
+    limits.check_count(channels, limits.CHANNELS, "channels", offset)
     few = point_channels == 0 or layer_count == 0 or (flags & 4 and point_channels != 1) or points < 2
     if few or points * channels > LARGEST:
         raise CorruptStreamError(
@@ -169,6 +171,7 @@ def parse_header(payload: memoryview, offset: int, length: int) -> Header:
     lattices = tuple(_parse_lattice(fields) for _ in range(channels))
     # What follows is counted in levels, so that the levels must be known to read on.
     layout = Layout.single(*blocks[0], tile) if arrangement is None else Layout.of(tuple(grids_of(arrangement)), tile)
+    limits.check_errors(channels, layer_count, layout.levels + 1, offset)
     empty = tuple(fields.varint((2 << layout.levels) - 1) for _ in range(channels))
     predictors = _parse_predictors(fields, layout, channels, min(point_channels, 3), offset)
     fields.end()

@@ -14,12 +14,21 @@ from typing import NamedTuple
 
 from ..errors import CorruptStreamError
 from ..transform.predictors import COEFFICIENT_BITS
+from . import limits
 from .chunks import chunks_of_a_channel
 from .fields import FieldReader, FieldWriter
 from .frames import Frame
 from .metadata import check_length
 from .model import ByteRange, Chunk, Errors, Header, Index, LayerRecord, LevelRecord, OptionalSection, Segment
-from .sections import FOOTER_LENGTH, OPTIONAL, read_errors, section_start, write_errors
+from .sections import (
+    FOOTER_LENGTH,
+    OPTIONAL,
+    WINDOW_ERRORS,
+    check_filled,
+    read_errors,
+    section_start,
+    write_errors,
+)
 
 __all__ = ["PAGE", "PagePlace", "Root", "parse_index", "parse_root", "serialize_index"]
 
@@ -149,37 +158,40 @@ def parse_root(frame: Frame, header: Header) -> Root:
     Raises
     ------
     CorruptStreamError
-        When it contradicts itself or the header.
+        When it contradicts itself or the header, or has too many optional sections.
     """
     fields = FieldReader(frame.payload, frame.payload_offset)
     channels = header.channels
-    layers = [(fields.varint(), read_errors(fields, channels)) for _ in range(fields.varint(len(frame.payload)))]
-    levels = [read_errors(fields, channels) for _ in range(fields.varint(len(frame.payload)))]
+    layers = [
+        (fields.varint(), read_errors(fields, channels)) for _ in range(_told(fields, header.layer_count, "layers"))
+    ]
+    levels = [read_errors(fields, channels) for _ in range(_told(fields, header.levels + 1, "levels"))]
     start, residual = fields.varint(), fields.varint()
     said = fields.at
     metadata = fields.varint()
     check_length(metadata, said, section=True)
-    optional = [_parse_optional(fields) for _ in range(fields.varint(len(frame.payload)))]
-    directories = [_parse_directory(fields) for _ in range(2)]
+    optional = _parse_optional(fields)
+    counts = (
+        _count_pages(len(header.layout.tiles)),
+        _count_pages(chunks_of_a_channel(header)) if residual else 0,
+    )
+    directories = [_parse_directory(fields, count) for count in counts]
     fields.end()
+    check_filled((length > _empty_layer(channels) for length, _ in layers), len(layers), frame.offset)
 
     places = _Places(start, optional)
     placed = tuple((places.next(length), errors) for length, errors in layers)
     exact = places.next(residual) if residual else None
     where = places.next(metadata)
     pages = places.end()
-    agree = len(layers) == header.layer_count and len(levels) == header.levels + 1
-    if start != header.length or not agree or (exact is not None) != header.corrected:
+    if start != header.length or (exact is not None) != header.corrected:
         raise CorruptStreamError("expected an index of the layers and levels of the header, got another", frame.offset)
     length = sum(size for directory in directories for size, _, _ in directory)
     first = pages + section_start(length)
     if places.left or first + length + _CRC != frame.offset:
         raise CorruptStreamError("expected sections that fill the container up to its index, got others", frame.offset)
-    counts = _count_pages(len(header.layout.tiles)), _count_pages(chunks_of_a_channel(header)) if exact else 0
     found = []
-    for directory, count in zip(directories, counts, strict=True):
-        if len(directory) != count:
-            raise CorruptStreamError(f"expected {count} pages of an index, got {len(directory)}", frame.offset)
+    for directory in directories:
         starts = accumulate((size for size, _, _ in directory), initial=first)
         own = [
             PagePlace(ByteRange(at, size), crc, told) for at, (size, crc, told) in zip(starts, directory, strict=False)
@@ -202,6 +214,7 @@ def parse_index(pages: Frame, root: Frame, header: Header) -> Index:
     if pages.offset != told.index.offset or pages.end != root.offset:
         raise CorruptStreamError("expected the pages of an index before its root, got others", pages.offset)
     segments = _parse_segments(_pages_of(pages, told.segment_pages), header, [place for place, _ in told.layers])
+    check_filled((bool(own) for own in segments), len(segments), pages.offset)
     finest, layers = 0, []
     for number, ((place, errors), own) in enumerate(zip(told.layers, segments, strict=True)):
         finest = max(finest, header.layout.level_of(max([0, *(segment.tile for segment in own)])))
@@ -244,18 +257,41 @@ class _Places:
         return place
 
 
-def _parse_optional(fields: FieldReader) -> OptionalSection:
-    start, kind = fields.at, fields.byte()
-    place = ByteRange(fields.varint(), fields.varint())
-    if kind < OPTIONAL or place.length < 6:
-        raise CorruptStreamError(f"expected an optional section, got kind {kind} of {place.length} bytes", start)
-    return OptionalSection(kind, place)
+def _told(fields: FieldReader, count: int, what: str) -> int:
+    """A count that is known already, so that nothing is read by another."""
+    start, told = fields.at, fields.varint()
+    if told != count:
+        raise CorruptStreamError(f"expected {count} {what} of an index, got {told}", start)
+    return told
 
 
-def _parse_directory(fields: FieldReader) -> list[tuple[int, int, int]]:
+def _empty_layer(channels: int) -> int:
+    """Bytes of the section of a layer that has no segments."""
+    out = FieldWriter()
+    write_errors(out, Errors(0.0, 0.0, ((0.0, 0.0),) * (channels if channels > 1 else 0)))
+    payload = len(out.data) + 1  # the number of segments
+    return section_start(payload) + payload + _CRC
+
+
+def _parse_optional(fields: FieldReader) -> list[OptionalSection]:
+    start, count = fields.at, fields.varint()
+    limits.check_count(count, limits.OPTIONAL, "optional sections", start)
+    found = []
+    for _ in range(count):
+        start, kind = fields.at, fields.byte()
+        place = ByteRange(fields.varint(), fields.varint())
+        if kind < OPTIONAL or place.length < 6:
+            raise CorruptStreamError(f"expected an optional section, got kind {kind} of {place.length} bytes", start)
+        found.append(OptionalSection(kind, place))
+    windows = sum(optional.kind == WINDOW_ERRORS for optional in found)
+    limits.check_count(windows, 1, "sections of errors of windows", start)
+    return found
+
+
+def _parse_directory(fields: FieldReader, count: int) -> list[tuple[int, int, int]]:
     """Length and CRC-32 of each page, and where that stands."""
     found = []
-    for _ in range(fields.varint(len(fields.data))):
+    for _ in range(_told(fields, count, "pages")):
         length, told = fields.varint(), fields.at
         (crc,) = fields.unpack("I")
         found.append((length, int(crc), told))

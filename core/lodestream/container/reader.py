@@ -19,7 +19,8 @@ __all__ = ["INDEX_GROWTH", "describe", "index_from", "index_of", "read_index", "
 #: How many times its bytes an index takes in memory.
 INDEX_GROWTH = 64
 
-_FIRST_READ = 512
+#: Bytes of a header that are read at once, at first and at most.
+_FIRST_READ, _MOST_AT_ONCE = 512, 1 << 22
 
 
 def read_index(read: Callable[[int, int], bytes], size: int, capacity: Capacity | None = None) -> Index:
@@ -84,7 +85,7 @@ def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacit
         if not data:
             break
         position += len(data)
-        wanted *= 2
+        wanted = min(2 * wanted, _MOST_AT_ONCE)
     raise TruncatedStreamError(f"expected a container with a whole header, got {size} bytes without")
 
 

@@ -29,7 +29,9 @@ __all__ = [
     "RESIDUAL",
     "SIGNATURE",
     "VERSION",
+    "WINDOW_ERRORS",
     "Entry",
+    "check_filled",
     "check_of",
     "check_signature",
     "is_container",
@@ -55,6 +57,8 @@ _EARLIER_MAGIC = b"\x89LODE\r\n"
 HEADER, LAYER, RESIDUAL, METADATA, INDEX, MASKS, KEPT_MASKS, PAGES = 1, 2, 3, 4, 5, 6, 7, 8
 #: Kinds from here on may be skipped by a reader that does not know them.
 OPTIONAL = 128
+#: Errors of windows, see `planning.window_errors`.
+WINDOW_ERRORS = 128
 FOOTER_LENGTH = 28
 _FOOTER_MAGIC = b"LODEEND\n"
 
@@ -105,6 +109,17 @@ def read_errors(fields: FieldReader, channels: int) -> Errors:
     return Errors(*distances, tuple(fields.rough_errors() for _ in range(channels)) if channels > 1 else ())
 
 
+def check_filled(filled: Iterable[bool], layers: int, offset: int) -> None:
+    """Refuse a layer without segments beside others; ``filled`` says of some of the layers whether they have any.
+
+    Raises
+    ------
+    CorruptStreamError
+    """
+    if layers > 1 and not all(filled):
+        raise CorruptStreamError(f"expected segments in each of {layers:,} layers, got a layer without", offset)
+
+
 def serialize_layer(errors: Errors, entries: Sequence[Entry], channels: int) -> bytes:
     """A layer's errors and table; the segments follow it in the section's payload."""
     out = FieldWriter()
@@ -133,13 +148,15 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Error
     Raises
     ------
     CorruptStreamError
-        If the table names units or planes that there are not, or the segments are of another length.
+        If the table names units or planes that there are not, the segments are of another length, or a layer that is
+        not the only one has none.
     """
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     channels, data = header.channels, bytes(payload)
     units = len(header.layout.tiles) * channels
     count = fields.varint(units)
+    check_filled([count > 0], header.layer_count, offset)
     entries, unit, place, total = [], 0, fields.place, 0
     # There are many entries: what a field nearly always is, one byte, is read without a call.
     try:

@@ -14,6 +14,7 @@ from ..grid.connectivity import Arrangement, Interface, Patch, Side
 from ..grid.multiblock import covers
 from ..joints import check_runs
 from ..surface import Closed
+from . import limits
 from .fields import LARGEST, FieldReader, FieldWriter
 from .model import AttributeKind, JointChanges
 
@@ -31,7 +32,6 @@ __all__ = [
 DTYPES = [np.dtype(name) for name in ["i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8"]]
 #: Most rows or columns of a block that kernels take. The format has no such limit.
 LONGEST_AXIS = 2**31 - 1
-_MOST_PATCHES = 1 << 16
 
 Blocks = tuple[tuple[tuple[int, int], Closed], ...]
 
@@ -72,12 +72,12 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
     Raises
     ------
     CorruptStreamError
-        If a block has no point, or patches and interfaces do not make up the blocks.
+        If a block has no point, patches and interfaces do not make up the blocks, or there are too many of them.
     """
     start = fields.at
     blocks = []
     points = 0
-    for _ in range(_count(fields)):
+    for _ in range(_count(fields, limits.BLOCKS, "blocks")):
         shape = fields.varint(), fields.varint()
         flags = fields.byte()
         points += shape[0] * shape[1]
@@ -85,10 +85,10 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
             raise CorruptStreamError(f"expected blocks of points, got {shape[0]} x {shape[1]}", start)
         blocks.append((shape, (bool(flags & 1), bool(flags & 2))))
     interfaces = []
-    for _ in range(_count(fields, 0)):
+    for _ in range(_count(fields, limits.INTERFACES, "interfaces", 0)):
         number = fields.varint()
         interfaces.append(Interface(number >> 2, bool(number & 1), bool(number & 2)))
-    patches = [_parse_patch(fields, blocks, interfaces) for _ in range(_count(fields))]
+    patches = [_parse_patch(fields, blocks, interfaces) for _ in range(_count(fields, limits.PATCHES, "patches"))]
     used = {side.interface for patch in patches for side in patch.sides if side is not None}
     if len(used) != len(interfaces):
         raise CorruptStreamError(
@@ -103,12 +103,13 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
     return tuple(blocks), Arrangement(tuple(patches), tuple(interfaces))
 
 
-def _count(fields: FieldReader, least: int = 1) -> int:
+def _count(fields: FieldReader, most: int, what: str, least: int = 1) -> int:
     start = fields.at
-    count = fields.varint(_MOST_PATCHES)
+    count = fields.varint()
+    limits.check_count(count, most, what, start)
     # Each takes a byte at least: nothing is made that was not sent.
     if not least <= count <= len(fields.data):
-        raise CorruptStreamError(f"expected {least} to {len(fields.data)} of them, got {count}", start)
+        raise CorruptStreamError(f"expected {least} to {len(fields.data)} {what}, got {count}", start)
     return count
 
 
@@ -134,7 +135,7 @@ def _parse_patch(
         if not ends & 16 << number:
             sides.append(None)
             continue
-        value = fields.varint(2 * _MOST_PATCHES)
+        value = fields.varint(2 * limits.INTERFACES)
         side, along = Side(value >> 1, bool(value & 1)), 1 - number // 2
         interface = interfaces[side.interface] if side.interface < len(interfaces) else None
         length = lengths[number // 2]
@@ -193,8 +194,9 @@ def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
     Raises
     ------
     CorruptStreamError
-        If they are no map of MessagePack, or say what cannot be of such a surface.
+        If they are no map of MessagePack, say what cannot be of such a surface, or are too long.
     """
+    limits.check_count(len(data), limits.EXTRAS, "bytes of extras", offset)
     try:
         values = msgpack.unpackb(data, raw=False, strict_map_key=True)
         kinds = tuple(
@@ -219,4 +221,5 @@ def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
         raise CorruptStreamError(
             f"expected attributes, a plane and joints in MessagePack, got {error}", offset
         ) from None
+    limits.check_names(((kind.name, kind.channels) for kind in kinds), offset)
     return Extras(kinds, plane, changes)

@@ -386,7 +386,7 @@ class Decoder:
             if self._window is not None:
                 self._window.follow(self.index)
             self._slices = Slices(self.index, chosen.segments, chosen.chunks, chosen.whole)
-            if self.layers or self._frames.pending:
+            if self.layers or self._frames.partial:
                 # The file was read in its own order so far, and is not any more.
                 self._slices.continue_file(self._frames.position)
                 self._follow_focus()

@@ -12,7 +12,7 @@ from ..container.frames import Frame, section_extent, whole_section
 from ..container.model import ByteRange, Chunk, Errors, Header, Index, LayerRecord, OptionalSection, Segment
 from ..errors import CorruptStreamError, TooLargeError, TruncatedStreamError
 from ..planning.window_errors import KIND as WINDOW_ERRORS
-from ..planning.window_errors import WindowErrors, parse_window_errors
+from ..planning.window_errors import MOST_SHARE, WindowErrors, parse_window_errors
 from .decoder import Decoder
 
 __all__ = ["Walked", "walk"]
@@ -21,6 +21,8 @@ __all__ = ["Walked", "walk"]
 _MOST_CHANNELS = 64
 #: The kind and length of a section take at most so many bytes.
 _FRAME_HEAD = 10
+#: Bytes of a section that nobody needs are read so many at a time.
+_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,17 @@ def walk(
     decoder, found = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()
     decoder.feed(_start(file, size))
     kept = True
-    for frame, data in _sections(file, size):
-        if frame.kind == sections.HEADER and decoder.header is None:
+    for kind, place in _sections(file, size):
+        if _passes(kind, place, size):
+            # The decoder checks it as it passes.
+            for start in range(place.offset, place.end, _AT_ONCE):
+                decoder.feed(_read(file, start, min(_AT_ONCE, place.end - start)))
+                progress(start / size)
+            found.optional.append(OptionalSection(kind, place))
+            continue
+        data = _read(file, place.offset, place.length)
+        frame = whole_section(data, place.offset, kind)
+        if kind == sections.HEADER and decoder.header is None:
             header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
             _check_size(header, max_vertices)
             kept = keeps(header)
@@ -98,7 +109,7 @@ def walk(
         _note(found, frame, decoder.header)
         if not kept and decoder.layers:
             decoder.layers[-1]._reconstruction.drop()
-        progress(frame.end / size)
+        progress(place.end / size)
     decoder.finish()
     assert decoder.index is not None  # the last section
     _take_footer(file, size, decoder)
@@ -119,8 +130,8 @@ def _start(file: BinaryIO, size: int) -> bytes:
     return start
 
 
-def _sections(file: BinaryIO, size: int) -> Iterator[tuple[Frame, bytes]]:
-    """Each section, its CRC checked, up to the index."""
+def _sections(file: BinaryIO, size: int) -> Iterator[tuple[int, ByteRange]]:
+    """Kind and place of each section, up to the index."""
     offset, kind = len(sections.SIGNATURE), -1
     while kind != sections.INDEX:
         head = _read(file, offset, _FRAME_HEAD)
@@ -130,9 +141,16 @@ def _sections(file: BinaryIO, size: int) -> Iterator[tuple[Frame, bytes]]:
             raise TruncatedStreamError(
                 f"expected {wanted}, got {size - offset} bytes: the container is cut short (at byte {offset})"
             )
-        data, kind = _read(file, offset, extent[1]), head[0]
-        yield whole_section(data, offset, kind), data
+        kind = head[0]
+        yield kind, ByteRange(offset, extent[1])
         offset += extent[1]
+
+
+def _passes(kind: int, place: ByteRange, size: int) -> bool:
+    """Whether a section of a file of so many bytes is one that no reader of this library uses."""
+    if kind == WINDOW_ERRORS:
+        return place.length > max(size // MOST_SHARE, _AT_ONCE)
+    return kind >= sections.OPTIONAL
 
 
 def _check_size(header: Header, most: int) -> None:

@@ -3,7 +3,8 @@
 Every tile of every channel is a list of coding passes, each with a cost in bits and a gain in squared error. Passes are
 grouped into *runs*: on the convex hull of each tile, so that a poor pass before a good one does not hide it, and so
 that a run is worth the segment that it takes. Runs are sorted by gain for each bit, parents never after their
-children; layers cut this order so that one is at most `_GROWTH` times as long as the one before.
+children; layers cut this order so that one is at most `_GROWTH` times as long as the one before. There are
+never more than a container may have.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..container.limits import most_layers
 from ..grid.layout import Layout
 from .curves import Curves, Worth
 
@@ -70,7 +72,7 @@ def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = Fal
     sizes = np.cumsum(curves.bits[order] / 8 + _ENTRY * last)
     gains = np.cumsum(curves.gains[order])
     states, state, start = [], top, 0
-    for end in _layer_ends(sizes, gains, last, few):
+    for end in _layer_ends(sizes, gains, last, few, most_layers(channels, layout.levels + 1)):
         state = state.copy()
         np.minimum.at(state.reshape(-1), unit[start:end], number[start:end])
         states.append(state)
@@ -86,9 +88,9 @@ def _worth(curves: Curves) -> Worth:
 
 
 def _layer_ends(
-    sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: bool
+    sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: bool, most: int
 ) -> list[int]:
-    """How many passes are known after each layer, from the bytes and the gains that the passes add up to.
+    """How many passes are known after each of at most so many layers, from bytes and gains that the passes add up to.
 
     Found from the end to the start, each within a range of bytes that the next one allows. It is the place after the
     `last` pass of a run, if there is one, where the error lies furthest below a line, in the logarithms of both, from
@@ -99,7 +101,7 @@ def _layer_ends(
     errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))
     lengths = np.log(np.maximum(sizes, 1.0))
     ends = [sizes.size - 1]
-    while True:
+    while len(ends) < most:
         end = ends[-1]
         low, high = _range_before(float(sizes[end]), float(sizes[-1]), few)
         if end == 0 or high < _FIRST_LAYER:

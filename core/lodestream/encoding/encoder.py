@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from numpy.typing import ArrayLike
 
-from ..container import metadata
+from ..container import limits, metadata
 from ..container.shape import LONGEST_AXIS
 from ..errors import FormatWarning, OptionError, TooLargeError
 from ..library import require
@@ -84,7 +84,8 @@ def check(surface: Surface, quality: Quality) -> None:
     Raises
     ------
     TooLargeError
-        If a block has more rows or columns than kernels can count.
+        If a block has more rows or columns than kernels can count, or there are more blocks or channels, or longer
+        names of attributes, than a container may have.
     InputError, OptionError
         If its metadata are too large, or there is no attribute or channel of a name that the quality has.
     """
@@ -92,7 +93,18 @@ def check(surface: Surface, quality: Quality) -> None:
     most = max(length for block in surface.blocks for length in block.shape)
     if most > LONGEST_AXIS:
         raise TooLargeError(f"expected at most {LONGEST_AXIS:,} rows and columns of a block, got {most:,}")
+    _check_counts(surface)
     check_names(surface, quality)
+
+
+def _check_counts(surface: Surface) -> None:
+    """Refuse more blocks, channels and names of attributes than a container may have."""
+    first = surface.blocks[0]
+    limits.check_count(len(surface.blocks), limits.BLOCKS, "blocks")
+    attributes = [(name, 1 if array.ndim == 2 else array.shape[2]) for name, array in first.attributes.items()]
+    channels = (1 if first.points.ndim == 2 else first.points.shape[2]) + sum(count for _, count in attributes)
+    limits.check_count(channels, limits.CHANNELS, "channels of points and attributes")
+    limits.check_names(attributes)
 
 
 def _stages(prepared: Prepared, lattices: Lattices, progress: _Progress) -> bytes:

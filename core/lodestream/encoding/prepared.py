@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..container import limits
 from ..container.model import AttributeKind, JointChanges
+from ..container.shape import serialize_extras
 from ..coordinates.height_fields import to_heights
 from ..grid.connectivity import Arrangement, Patch, whole_patch
 from ..grid.layout import Layout
@@ -199,7 +201,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
     else:
         # It is never read in windows: tiles and chunks may be as large as costs the fewest bytes.
         layout, chunks = Layout(grids_of(arrangement), square(WHOLE_TILE)), [square(WHOLE_CHUNK)]
-    return Prepared(
+    prepared = Prepared(
         given=given,
         surface=surface,
         plane=plane,
@@ -222,6 +224,24 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
         chunks=tuple(chunks),
         joint_changes=_joint_changes(given, arrangement),
     )
+    _check_counts(prepared)
+    return prepared
+
+
+def _check_counts(prepared: Prepared) -> None:
+    """Refuse what a container may not have, see `limits`.
+
+    Raises
+    ------
+    TooLargeError
+    """
+    channels = prepared.point_channels + sum(kind.channels for kind in prepared.kinds)
+    limits.check_errors(channels, 1, prepared.layout.levels + 1)
+    if prepared.arrangement is not None:
+        limits.check_count(len(prepared.patches), limits.PATCHES, "patches of blocks")
+        limits.check_count(prepared.interfaces, limits.INTERFACES, "sides that blocks share")
+    extras = serialize_extras(prepared.kinds, prepared.plane, prepared.joint_changes)
+    limits.check_count(len(extras), limits.EXTRAS, "bytes of names of attributes and of joints between blocks")
 
 
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:

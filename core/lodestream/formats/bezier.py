@@ -22,7 +22,7 @@ OPTIONS = {"density": "number of intervals along each side of a patch (default: 
 _DENSITY = 16
 _MAX_DENSITY = 1 << 14
 _MAX_DEGREE = 32
-_MAX_PATCHES = 1 << 16
+_MAX_PATCHES = 1 << 14
 
 Points = NDArray[np.float64]
 

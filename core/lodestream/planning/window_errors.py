@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..container.fields import FieldReader, FieldWriter
 from ..container.frames import whole_section
 from ..container.model import ByteRange, Header, Index
+from ..container.sections import WINDOW_ERRORS as KIND
 from ..container.sections import check_of
 from ..errors import CorruptStreamError, OptionError
 from ..grid.support import check_region
@@ -25,6 +26,7 @@ from ..target import Region
 __all__ = [
     "CELL",
     "KIND",
+    "MOST_SHARE",
     "WindowErrors",
     "WindowFigures",
     "is_divided",
@@ -36,16 +38,13 @@ __all__ = [
     "window_section",
 ]
 
-#: Kind of the section.
-KIND = 128
-
 #: Rows and columns of the cells that this program writes, as exponents of two.
 CELL = 8, 8
 # A code is a step of an eighth of an octave: 2**(-k / 8) over 2**16, rounded up.
 _STEPS = 65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734
 _LARGEST = 4.0  # times the extent: code 0
-# A section that is more of the container than this part of it costs a window more than it can save.
-_MOST_SHARE = 8
+#: A section that is more of the container than this part of it costs a window more than it can save.
+MOST_SHARE = 8
 _NOTHING = 255
 # Rounding of sums, quotients and roots is far below the steps of the codes; a bound stays one all the same.
 _UPWARDS = 1 + 2.0**-40
@@ -289,7 +288,7 @@ def _crc_table() -> NDArray[np.uint32]:
 def window_section(index: Index) -> ByteRange | None:
     """Where a container tells errors of windows; None where it does not, or at a length that is not worth it."""
     place = next((optional.range for optional in index.optional if optional.kind == KIND), None)
-    return place if place is not None and place.length <= index.size // _MOST_SHARE else None
+    return place if place is not None and place.length <= index.size // MOST_SHARE else None
 
 
 def read_window_errors(index: Index, read: Callable[[int, int], bytes]) -> WindowErrors | None:

@@ -5,7 +5,7 @@ tests can hold the compiled decoder to it; where that cannot be loaded, it decod
 `lodestream.decoding.fallback`. Sections of the page and modules: 1 `fields`; 2, 6 and 10 `container`; 3 to 3.2
 `header`; 3.3 and 7.5 `masks`; 4 `levels`; 5 `tiles`; 7 `bands`; 7.1 and 7.2 `range_coder`; 7.3 and 7.4 `small_units`;
 7.6 `large_units`; 8 `coefficients`, `lifting`, `reconstruction` and `decoder`; 9 to 9.2 `residual`; 9.3 `offsets`; 11
-and 12 `index`.
+and 12 `index`; 14 `limits`.
 """
 
 from .container import Container, Residual, Section, Segment, read_container, read_section

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from ..errors import CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
+from . import limits
 from .fields import Errors, Fields, crc, unpack_map
 from .header import Header, read_header
 from .masks import Masks, no_holes, read_masks
@@ -103,7 +104,9 @@ def read_layer(section: Section, header: Header, remaining: dict[int, int]) -> L
     errors = fields.errors(channels)
     entries: list[tuple[int, int, int | None, int]] = []
     unit = -1
-    for _ in range(fields.count(2)):
+    count = fields.count(2)
+    fields.require(count > 0 or header.layers == 1, "a layer without segments that is not the only one")
+    for _ in range(count):
         first = fields.u8()
         passes, skipped = (first & 7) + 1, first >> 4
         passes += fields.varint() if passes == 8 else 0
@@ -170,6 +173,7 @@ def read_container(data: bytes) -> Container:
             kind = section.kind
             if kind >= OPTIONAL:
                 optional.append((kind, section.payload))
+                check_optional([known for known, _ in optional], section.offset)
             elif kind == LAYER and len(layers) < header.layers:
                 layers.append(read_layer(section, header, remaining))
             elif kind == RESIDUAL and len(layers) == header.layers and header.has_residual and residual is None:
@@ -183,6 +187,12 @@ def read_container(data: bytes) -> Container:
     except (CorruptStreamError, TruncatedStreamError):
         pass  # what came before stays
     return Container(header, masks, layers, residual, metadata, optional)
+
+
+def check_optional(kinds: list[int], offset: int) -> None:
+    """Refuse more optional sections than a container has; `kinds` are those so far."""
+    if len(kinds) > limits.OPTIONAL or kinds.count(limits.WINDOW_ERRORS) > 1:
+        raise CorruptStreamError("more optional sections than a container has", offset)
 
 
 def windows_of(header: Header, masks: Masks) -> list[tuple[int, slice, slice, bool]]:

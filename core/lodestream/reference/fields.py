@@ -72,9 +72,10 @@ class Fields:
                 return value
         raise self.damaged("a number has more than nine bytes")
 
-    def count(self, each: int = 1) -> int:
-        """Read a varint that counts things of at least `each` bytes, which must be there."""
+    def count(self, each: int = 1, most: int | None = None) -> int:
+        """Read a varint that counts things of at least `each` bytes, which must be there; at most so many."""
         value = self.varint()
+        self.require(most is None or value <= most, f"{value} entries; a container has at most {most}")
         if value * each > self.left:
             raise self.damaged(f"{value} entries are announced in {self.left} bytes")
         return value

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import UnsupportedVersionError
+from . import limits
 from .fields import Fields, unpack_map
 from .levels import Axis, Grid, fitted_steps, levels_of
 from .tiles import Tile, tiles_of
@@ -115,7 +116,7 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
     not known here.
     """
     fields = Fields(payload, offset)
-    for codec in [fields.varint() for _ in range(fields.count())]:
+    for codec in [fields.varint() for _ in range(fields.count(most=limits.CODECS))]:
         fields.require(codec > 0, "a codec has the number 0")
         if codec > CODECS:
             raise UnsupportedVersionError(f"the container needs codec {codec}, which this program does not know")
@@ -123,6 +124,7 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
     tile, chunk, large = _sizes(fields), _sizes(fields), fields.u8()
     base, extent = fields.varint(), fields.real()
     fields.require(kind < len(TYPES) and channels > 0 and layers > 0 and base < 1 << 24, "a field is out of range")
+    fields.require(layers <= limits.LAYERS, f"{layers} layers; a container has at most {limits.LAYERS}")
     interfaces: list[Interface] = []
     if flags & 64:
         blocks, interfaces, patches = _arrangement(fields)
@@ -135,6 +137,7 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
     single = channels == 1 and bool(flags & 4) and len(blocks) == 1
     fields.require(single if plane else channels == 1 or not flags & 4, "a plane, or an array (H, W), of other points")
     total = channels + sum(max(attribute.components, 1) for attribute in attributes)
+    fields.require(total <= limits.CHANNELS, f"{total} channels; a container has at most {limits.CHANNELS}")
     fields.require(total <= fields.left, "the header ends before its lattices")
     types = [TYPES[kind]] * channels
     for attribute in attributes:
@@ -148,6 +151,8 @@ def read_header(payload: bytes, offset: int = 0) -> Header:
     fields.require(all(rule < 2 and step > 0 for rule, _, step in lattices), "a lattice of no known rule, or no step")
     empty = [fields.varint() for _ in types]
     grids = _grids(interfaces, patches)
+    told = total * (layers + len(grids[0].axes))
+    fields.require(told <= limits.ERRORS, f"{told} errors of channels; a container has at most {limits.ERRORS}")
     predictors = []
     for channel in range(len(types)):
         steps = fitted_steps(grids, channel < min(channels, 3))
@@ -174,15 +179,15 @@ def _sizes(fields: Fields) -> tuple[int, int]:
 
 def _arrangement(fields: Fields) -> tuple[list[Block], list[Interface], list[Patch]]:
     blocks, interfaces, patches = [], [], []
-    for _ in range(fields.count(3)):
+    for _ in range(fields.count(3, limits.BLOCKS)):
         rows, columns, bits = fields.varint(), fields.varint(), fields.u8()
         fields.require(rows > 0 and columns > 0 and bits < 4, "a block without points, or of unknown flags")
         blocks.append(Block(rows, columns, _pair(bits, 0)))
-    for _ in range(fields.count()):
+    for _ in range(fields.count(most=limits.INTERFACES)):
         value = fields.varint()
         fields.require(value > 3, "an interface without points")
         interfaces.append(Interface(value >> 2, bool(value & 2), bool(value & 1)))
-    for _ in range(fields.count(3)):
+    for _ in range(fields.count(3, limits.PATCHES)):
         number, flags, ends = fields.varint(), fields.u8(), fields.u8()
         fields.require(number < len(blocks) and flags < 128, "a part of no block, or of unknown flags")
         block = blocks[number]
@@ -253,7 +258,7 @@ def common_ends(interfaces: list[Interface], patches: list[Patch]) -> dict[End, 
 
 
 def _extras(fields: Fields, block: Block) -> tuple[list[Attribute], list[list[Any]] | None, list[Any] | None]:
-    data = fields.take(fields.varint())
+    data = fields.take(fields.count(most=limits.EXTRAS))
     extras = unpack_map(data, fields.offset + fields.position - len(data))
     attributes, plane = [], None
     try:
@@ -271,4 +276,6 @@ def _extras(fields: Fields, block: Block) -> tuple[list[Attribute], list[list[An
                 fields.require(known, "a plane's rule of no known kind")
     except (TypeError, ValueError, KeyError, IndexError) as error:
         raise fields.damaged(f"extras: {error!r}") from None
+    names = sum(len(a.name.encode("utf-8", "surrogatepass")) * max(a.components, 1) for a in attributes)
+    fields.require(names <= limits.NAMES, f"{names} bytes of names; a container has at most {limits.NAMES}")
     return attributes, plane, extras.get("joints")

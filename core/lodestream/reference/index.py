@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 from ..errors import CorruptStreamError
-from .container import PAGES, ROOT, Container, Segment, read_section, windows_of
+from . import limits
+from .container import PAGES, ROOT, Container, Segment, check_optional, read_section, windows_of
 from .fields import Errors, Fields, crc
 
 END = b"LODEEND\n"
@@ -80,7 +81,8 @@ def read_index(data: bytes, container: Container) -> Index:
     level_errors = [fields.errors(channels) for _ in range(header.finest + 1)]
     position = fields.varint()
     lengths += [fields.varint(), fields.varint()]
-    directory = [(fields.u8(), fields.varint(), fields.varint()) for _ in range(fields.count(3))]
+    directory = [(fields.u8(), fields.varint(), fields.varint()) for _ in range(fields.count(3, limits.OPTIONAL))]
+    check_optional([kind for kind, _, _ in directory], root.offset)
     optional = {place: length for _, place, length in directory}
     tables = []
     for count in (len(header.tiles), len(windows_of(header, container.masks)) if lengths[-2] else 0):
@@ -100,6 +102,7 @@ def read_index(data: bytes, container: Container) -> Index:
     parts = [[_page(book, *entry) for entry in table] for table in tables]
     book.end()
     segments = _segments(parts[0], container, [ends[layer] - 4 for layer in range(header.layers)])
+    fields.require(header.layers == 1 or all(segments), "a layer without segments that is not the only one")
     return Index(layer_errors, level_errors, segments, _chunks(parts[1], container, ends[-3] - 4), directory)
 
 

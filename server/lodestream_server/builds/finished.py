@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import CorruptStreamError, FormatError, OptionError, TooLargeError
@@ -36,9 +35,6 @@ ERRORS, CHECKED, TOLD = "errors", "checked", "told"
 _LONGEST_NAME = 4096
 
 _BLOCK = 1 << 20
-
-# As many are looked at while a client waits; a container of the encoder has some thirty.
-_MOST_SECTIONS = 10_000
 
 
 def is_container(path: Path) -> bool:
@@ -70,7 +66,7 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
     OptionError
         If there is any option.
     TooLargeError
-        If its metadata are longer than allowed.
+        If it has more sections than a container may have, or longer metadata.
     """
     from lodestream.formats import Format
 
@@ -78,18 +74,21 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
         raise FormatError(f"expected a container by itself, got it among {len(files)} files")
     for option in options:
         raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
-    _check_metadata(files[0])
+    _check_sections(files[0])
     return Format(name="lode", suffixes=(".lode",), sniff=lambda head, suffix: False)
 
 
-def _check_metadata(path: Path) -> None:
-    """Refuse metadata by the length that they announce; what else may be wrong is found when all is looked through."""
+def _check_sections(path: Path) -> None:
+    """Refuse what sections announce; what else may be wrong is found when all is looked through."""
     from lodestream.container import section_lengths
+    from lodestream.container.limits import MOST_SECTIONS
     from lodestream.container.metadata import MAX_BYTES
     from lodestream.container.sections import METADATA
 
     with path.open("rb") as file:
-        for kind, length in islice(section_lengths(file), _MOST_SECTIONS):
+        for number, (kind, length) in enumerate(section_lengths(file)):
+            if number == MOST_SECTIONS:
+                raise TooLargeError(f"expected at most {MOST_SECTIONS:,} sections in a container, got more")
             if kind == METADATA and length > MAX_BYTES:
                 raise TooLargeError(f"expected at most {MAX_BYTES} bytes of metadata in a container, got {length}")
 

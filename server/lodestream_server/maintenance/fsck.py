@@ -217,7 +217,7 @@ def check_container(path: Path, sha256: str) -> Index | str:
     OSError
         If it exists and cannot be read: the disk has a problem, which may pass.
     """
-    frames, digest = FrameReader(), hashlib.sha256()
+    frames, digest = FrameReader(keeps=()), hashlib.sha256()
     place = None
     try:
         with path.open("rb") as file:

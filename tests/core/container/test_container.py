@@ -163,8 +163,8 @@ def test_a_header_that_does_not_lie_is_read(sizes: dict[str, int]) -> None:
         (lying_header((2**20, 2**11), channels=2, flags=0), "predictors"),
         (lying_header((5, 5), channels=0), "expected points"),
         (lying_header((5, 5), channels=2), "expected points"),
-        (lying_header((5, 5), channels=70000, flags=0), "at most 65536"),
-        (lying_header((5, 5), channels=9000, flags=0, rest=b""), "more bytes"),
+        (lying_header((5, 5), channels=70000, flags=0), "at most 4,096 channels, got 70,000"),
+        (lying_header((5, 5), channels=4000, flags=0, rest=b""), "more bytes"),
         (lying_header((5, 5), layers=0), "0 layers"),
         (lying_header((5, 5), dtype=10), "a type below 10"),
         (lying_header((5, 5), tile=0), "expected tiles"),
@@ -184,7 +184,7 @@ def test_a_header_that_does_not_lie_is_read(sizes: dict[str, int]) -> None:
         (lying_header((5, 5), extent=math.nan), "expected an extent"),
         (lying_header((5, 5), codecs=(3, 1)), "each above the one before"),
         (lying_header((5, 5), codecs=(0, 1)), "each above the one before"),
-        (lying_header((5, 5), count=2**40), "expected a number of at most"),
+        (lying_header((5, 5), count=2**40), "at most 64 codecs"),
         (lying_header((5, 5), rest=b"\x01\x10\x00"), "predictors of 0 steps, got 1"),
         (lying_header((100, 100)), "predictors of 4 steps, got 0"),
     ],
@@ -217,9 +217,9 @@ def test_headers_of_more_than_fits_are_too_large_and_take_no_memory() -> None:
 
 def test_a_codec_that_is_not_there_is_named_before_anything_else_is_read() -> None:
     decoder = Decoder()
-    decoder.feed(lying_header((5, 5), layers=2**40))
+    decoder.feed(lying_header((5, 5), layers=1000))
     assert decoder.header is not None
-    assert (decoder.header.codecs, decoder.header.layer_count) == ((1,), 2**40)
+    assert (decoder.header.codecs, decoder.header.layer_count) == ((1,), 1000)
     for header in (lying_header((5, 5), codecs=(1, 9)), lying_header((0, 0), codecs=(1, 9), dtype=77)):
         with pytest.raises(UnsupportedVersionError, match="needs codec 9"):
             Decoder().feed(header)

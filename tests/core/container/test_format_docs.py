@@ -3,8 +3,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from lodestream.container import sections
+from lodestream.container import limits, metadata, sections
 from lodestream.planning import window_errors
+from lodestream.reference import limits as reference_limits
+from lodestream.reference.container import METADATA_LIMIT
 from lodestream.transform.lifting import TAPS
 
 TEXT = (Path(__file__).parents[3] / "docs" / "format.md").read_text()
@@ -37,3 +39,18 @@ def test_the_page_has_the_starts_of_the_contexts_of_large_units() -> None:
     starts = [int(number) for number in re.findall(r"\d+", header.partition("CLASS_STARTS[68] = {")[2])[:68]]
     assert numbers_after("At first n = 6, and P, over 2^16, is", 68) == starts
     assert "enum { STARTING_COUNT = 6 };" in header
+
+
+def test_the_page_has_the_limits_of_all_readers() -> None:
+    table = TEXT[TEXT.index("## 14. Limits") :]
+    figures = [int(number.replace(",", "")) for number in re.findall(r"\b(\d+(?:,\d{3})*)(?= in all|;| \|)", table)]
+    expected = [limits.LAYERS, limits.CHANNELS, limits.ERRORS, limits.BLOCKS, limits.PATCHES, limits.INTERFACES]
+    expected += [limits.NAMES, limits.EXTRAS, limits.CODECS, limits.OPTIONAL, 1, metadata.MAX_BYTES]
+    assert [figure for figure in figures if figure != 128] == expected
+    for name in ("LAYERS", "CHANNELS", "ERRORS", "BLOCKS", "PATCHES", "INTERFACES", "NAMES", "EXTRAS", "CODECS"):
+        assert getattr(reference_limits, name) == getattr(limits, name)
+    assert (reference_limits.OPTIONAL, METADATA_LIMIT) == (limits.OPTIONAL, metadata.MAX_BYTES)
+    source = (Path(__file__).parents[3] / "client" / "web" / "src" / "container" / "limits.ts").read_text()
+    for name, power in re.findall(r"^  (\w+): (2 \*\* \d+|\d+),$", source, re.MULTILINE):
+        base, _, exponent = power.partition(" ** ")
+        assert int(base) ** int(exponent or 1) == getattr(limits, name.upper())

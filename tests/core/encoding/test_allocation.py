@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream.container.limits import LAYERS
 from lodestream.encoding.allocation import _layer_ends, assign_layers
 from lodestream.encoding.curves import Curves, TileCurve, Worth
 from lodestream.grid.layout import Layout
@@ -127,7 +128,7 @@ def test_a_layer_ends_where_the_error_has_just_fallen() -> None:
     step = np.log(sizes) / np.log(1.02) % 1
     left: NDArray[np.float64] = sizes**-1.5 * np.exp(-0.5 * np.where(step < 0.2, step / 0.2, (1 - step) / 0.8))
     last = np.ones(sizes.size, np.bool_)
-    ends = np.array(_layer_ends(sizes, left[0] - left, last, False), np.int64)
+    ends = np.array(_layer_ends(sizes, left[0] - left, last, False, LAYERS), np.int64)
     inner = ends[(sizes[ends - 1] > 20_000) & (ends < 15_000)]
     assert len(inner) > 10
     assert np.abs(step[inner - 1] - 0.2).max() < 0.05
@@ -138,7 +139,7 @@ def test_a_layer_ends_with_a_step_where_one_ends_in_its_range() -> None:
     rng = np.random.default_rng(3)
     last = rng.random(sizes.size) < 0.1
     last[-1] = True
-    ends = np.array(_layer_ends(sizes, np.sqrt(sizes), last, False), np.int64)
+    ends = np.array(_layer_ends(sizes, np.sqrt(sizes), last, False, LAYERS), np.int64)
     assert last[ends[sizes[ends - 1] > 20_000] - 1].all()
 
 
@@ -146,7 +147,7 @@ def test_a_layer_ends_with_a_step_where_one_ends_in_its_range() -> None:
 def test_layers_end_one_after_another_and_with_the_last_pass(passes: int, few: bool, seed: int) -> None:
     rng = np.random.default_rng(seed)
     sizes = np.cumsum(rng.random(passes) * 10 ** rng.uniform(-3, 4, passes))
-    ends = _layer_ends(sizes, np.cumsum(rng.normal(size=passes)), rng.random(passes) < 0.5, few)
+    ends = _layer_ends(sizes, np.cumsum(rng.normal(size=passes)), rng.random(passes) < 0.5, few, LAYERS)
     assert ends[-1] == passes
     assert (np.diff([0, *ends]) > 0).all()
 

@@ -101,8 +101,8 @@ def test_patches_of_several_degrees_are_blocks(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("x\n", "bytes|text that begins with 'x'"),
-        ("-1\n", "a count of patches from 1 to 65,536 first"),
-        ("1e9\n", "a count of patches from 1 to 65,536 first"),
+        ("-1\n", "a count of patches from 1 to 16,384 first"),
+        ("1e9\n", "a count of patches from 1 to 16,384 first"),
         ("2\n1 1\n" + "0 0 0\n" * 4, "two degrees from 1 to 32 for patch 2 of 2, got the end of the file"),
         ("1\n0 3\n", "two degrees from 1 to 32 for patch 1 of 1, got 0 3"),
         ("1\nnan 3\n", "two degrees from 1 to 32 for patch 1 of 1, got nan 3"),

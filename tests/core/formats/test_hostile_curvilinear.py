@@ -123,7 +123,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         "TooLargeError",
         "20,000 patches of 16385 x 16385 points",
     ),
-    "patches that are not there": ("a.bpt", lambda: b"65536\n3 3\n1 2 3\n", {}, "FormatError", "16 control points"),
+    "patches that are not there": ("a.bpt", lambda: b"16384\n3 3\n1 2 3\n", {}, "FormatError", "16 control points"),
     "PCD of 2^62 points": (
         "a.pcd",
         lambda: PCD.format(1 << 31, 1 << 31, 1 << 62, "binary").encode(),

@@ -302,3 +302,34 @@ def test_a_build_of_a_container_does_not_encode(tmp_path: Path, exact: bytes, mo
 def _npy(folder: Path) -> Path:
     (folder / "1").write_bytes(npy(hills()))
     return folder / "1"
+
+
+def with_layers(count: int) -> bytes:
+    """A sound container but for its many layers, none of which has a segment."""
+    header = index_of(ls.encode(np.add.outer(np.arange(9.0), np.arange(8.0)))).header
+    header = replace(header, exact=False, corrected=False)
+    nothing = Errors(0.0, 0.0)
+    layers = [CodedLayer(nothing, [])] * count
+    return write_container(header, layers, [nothing] * (header.levels + 1), [], {}, exact=False)
+
+
+@pytest.mark.parametrize(
+    ("count", "problem"),
+    [
+        (1200, "at most 1,024 layers, got 1,200"),
+        (20_000, "at most 1,286 sections"),
+        (3, "segments in each of 3 layers"),
+    ],
+)
+def test_too_many_layers_and_empty_ones_are_refused(tmp_path: Path, count: int, problem: str) -> None:
+    """Nobody can open what would hold up the event loop, and its description is small."""
+    with running_server(tmp_path / "data", workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
+        answer = http.post("/v1/surfaces", content=with_layers(count))
+        if answer.status_code == 202:
+            made = finished(http, answer.json()["id"])
+            assert made["state"] == "failed"
+            assert problem in made["reason"]
+        else:
+            assert answer.status_code == 413
+            assert problem in answer.json()["detail"]
+        assert len(json.dumps(http.get("/v1/surfaces").json())) < 10_000

@@ -3,8 +3,7 @@ import { CorruptStreamError } from "../errors";
 import { type Arrangement, covers, type Interface, type Patch, type Side } from "../grid/multiblock";
 import type { Closed, Shape, Span } from "../types";
 import { type FieldReader, LARGEST } from "./fields";
-
-const MOST_PATCHES = 1 << 16;
+import { checkCount, LIMITS } from "./limits";
 
 /** A block's rows and columns, and which of its axes wrap. */
 export interface BlockShape {
@@ -17,7 +16,7 @@ export function parseArrangement(fields: FieldReader): { blocks: BlockShape[]; a
   const start = fields.at;
   const blocks: BlockShape[] = [];
   let points = 0;
-  for (let left = countOf(fields, 1); left > 0; left--) {
+  for (let left = countOf(fields, "blocks", 1); left > 0; left--) {
     const shape: Shape = [fields.varint(), fields.varint()];
     const flags = fields.byte();
     points += shape[0] * shape[1];
@@ -27,12 +26,14 @@ export function parseArrangement(fields: FieldReader): { blocks: BlockShape[]; a
     blocks.push({ shape, closed: [(flags & 1) !== 0, (flags & 2) !== 0] });
   }
   const interfaces: Interface[] = [];
-  for (let left = countOf(fields, 0); left > 0; left--) {
+  for (let left = countOf(fields, "interfaces", 0); left > 0; left--) {
     const number = fields.varint();
     interfaces.push({ length: Math.floor(number / 4), closed: number % 2 === 1, stops: number % 4 >= 2 });
   }
   const patches: Patch[] = [];
-  for (let left = countOf(fields, 1); left > 0; left--) patches.push(parsePatch(fields, blocks, interfaces));
+  for (let left = countOf(fields, "patches", 1); left > 0; left--) {
+    patches.push(parsePatch(fields, blocks, interfaces));
+  }
   const used = new Set(patches.flatMap((patch) => patch.sides.flatMap((side) => (side ? [side.interface] : []))));
   if (used.size !== interfaces.length) {
     const others = interfaces.length - used.size;
@@ -48,12 +49,13 @@ export function parseArrangement(fields: FieldReader): { blocks: BlockShape[]; a
   return { blocks, arrangement: { patches, interfaces } };
 }
 
-function countOf(fields: FieldReader, least: number): number {
+function countOf(fields: FieldReader, what: "blocks" | "interfaces" | "patches", least: number): number {
   const start = fields.at;
-  const count = fields.varint(MOST_PATCHES);
+  const count = fields.varint();
+  checkCount(count, LIMITS[what], what, start);
   // Each takes a byte at least: nothing is made that was not sent.
   if (count < least || count > fields.data.length) {
-    throw new CorruptStreamError(`expected ${least} to ${fields.data.length} of them, got ${count}`, start);
+    throw new CorruptStreamError(`expected ${least} to ${fields.data.length} ${what}, got ${count}`, start);
   }
   return count;
 }
@@ -76,7 +78,7 @@ function parsePatch(fields: FieldReader, blocks: readonly BlockShape[], interfac
   const stops = [(flags & 16) !== 0, (flags & 32) !== 0] as const;
   const sides = ([0, 1, 2, 3] as const).map((number): Side | null => {
     if (!(ends & (16 << number))) return null;
-    const value = fields.varint(2 * MOST_PATCHES);
+    const value = fields.varint(2 * LIMITS.interfaces);
     const side = { interface: value >> 1, reversed: value % 2 === 1 };
     const along = number < 2 ? 1 : 0;
     const shared = interfaces[side.interface];

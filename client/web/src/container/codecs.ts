@@ -1,6 +1,7 @@
 /** The codecs that a container needs: a reader that lacks one refuses it at its header, whatever else stands there. */
 import { CorruptStreamError, UnsupportedVersionError } from "../errors";
 import type { FieldReader } from "./fields";
+import { checkCount, LIMITS } from "./limits";
 
 /** What this reader decodes, by number, see docs/format.md, section 3. */
 export const CODECS: ReadonlyMap<number, string> = new Map([
@@ -15,7 +16,8 @@ export const CODECS: ReadonlyMap<number, string> = new Map([
 /** The list at the start of a header. Throws `UnsupportedVersionError` where one of them is not known. */
 export function parseCodecs(fields: FieldReader): number[] {
   const start = fields.at;
-  const count = fields.varint(fields.data.length);
+  const count = fields.varint();
+  checkCount(count, LIMITS.codecs, "codecs", start);
   const needed: number[] = [];
   for (let i = 0; i < count; i++) needed.push(fields.varint());
   if (needed.some((codec, i) => codec <= (needed[i - 1] ?? 0))) {

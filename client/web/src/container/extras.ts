@@ -1,6 +1,7 @@
 /** What few surfaces have, a MessagePack map in the header: attributes, a plane, joints (docs/format.md, section 3.2). */
 import { CorruptStreamError } from "../errors";
 import { type AttributeKind, DTYPES } from "../types";
+import { checkCount, LIMITS } from "./limits";
 import { isMap, reason, unpack } from "./sections";
 
 /**
@@ -29,6 +30,18 @@ export const NO_EXTRAS: Extras = { attributes: [], plane: null, jointChanges: nu
 
 /** Extras from their bytes; the header's payload stands at `offset`, and the surface has so many points. */
 export function parseExtras(data: Uint8Array, offset: number, points: number): Extras {
+  checkCount(data.length, LIMITS.extras, "bytes of extras", offset);
+  const extras = extrasOf(data, offset, points);
+  let names = 0;
+  for (const kind of extras.attributes) {
+    names += new TextEncoder().encode(kind.name).length * Math.max(kind.components, 1);
+  }
+  const what = "bytes of names of attributes, each counted for all of its components";
+  checkCount(names, LIMITS.names, what, offset);
+  return extras;
+}
+
+function extrasOf(data: Uint8Array, offset: number, points: number): Extras {
   try {
     const values = unpack(data);
     if (!isMap(values)) throw new TypeError("no map");

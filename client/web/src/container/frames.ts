@@ -2,6 +2,7 @@
 import { CorruptStreamError, UnsupportedVersionError } from "../errors";
 import { ByteBuffer } from "./buffer";
 import { crc32 } from "./crc";
+import { checkCount, LIMITS } from "./limits";
 import { checkMetadataLength, checkSignature, KIND, OPTIONAL, SIGNATURE_LENGTH, VERSION } from "./sections";
 
 /** A section whose CRC holds: its payload stands at `payloadOffset`, all of it at `offset` to `end`. */
@@ -15,12 +16,45 @@ export interface Frame {
 
 /** The kind and length of a section take at most so many bytes. */
 const LONGEST_START = 10;
+const CRC = 4; // bytes at the end of a section
 const KNOWN: ReadonlySet<number> = new Set(Object.values(KIND));
+
+/** A section whose bytes are checked as they pass, and not kept; `length` counts its CRC too. */
+class Passing {
+  #crc = 0;
+  #told = 0;
+  #place = 0;
+
+  constructor(
+    readonly kind: number,
+    readonly offset: number,
+    readonly length: number,
+  ) {}
+
+  /** Bytes that have not passed. */
+  get left(): number {
+    return this.length - this.#place;
+  }
+
+  /** Take the next bytes, at most as many as are left. */
+  take(data: Uint8Array): void {
+    const checked = Math.max(Math.min(data.length, this.left - CRC), 0);
+    this.#crc = crc32(data.subarray(0, checked), this.#crc);
+    for (const byte of data.subarray(checked)) this.#told = ((this.#told >>> 8) | (byte << 24)) >>> 0;
+    this.#place += data.length;
+  }
+
+  /** Refuse a section that does not match its CRC, or that is not known and must be; all bytes have passed. */
+  check(): void {
+    checkSound(this.#crc === this.#told, this.kind, this.offset);
+  }
+}
 
 /**
  * Sections in file order.
  *
- * Memory grows with what has arrived, never with what a length promises. Metadata that are too long are refused as soon
+ * Memory grows with what has arrived, never with what a length promises. Sections that are not known are checked as
+ * they pass. Metadata that are too long are refused as soon
  * as they say so.
  */
 export class FrameReader {
@@ -29,8 +63,10 @@ export class FrameReader {
   readonly #data = new ByteBuffer();
   #offset = 0; // of #data in the container
   #started = false;
+  #passing: Passing | null = null;
+  #optional = 0; // sections so far
 
-  /** Bytes of the container taken so far, partial sections not counted. */
+  /** Bytes of the container taken so far, without those of a section that wait for the rest of it. */
   get position(): number {
     return this.#offset;
   }
@@ -38,6 +74,11 @@ export class FrameReader {
   /** Bytes that wait for the rest of their section. */
   get pending(): number {
     return this.#data.length;
+  }
+
+  /** Whether a section has begun that is not whole. */
+  get partial(): boolean {
+    return this.pending > 0 || this.#passing !== null;
   }
 
   /**
@@ -48,13 +89,15 @@ export class FrameReader {
    */
   *feed(data: Uint8Array): Generator<Frame> {
     this.#data.append(data);
-    while (!this.ended) {
+    while (!this.ended && this.#begin()) {
+      if (this.#passing !== null) {
+        if (!this.#pass(this.#passing)) return;
+        continue;
+      }
       const frame = this.#next();
       if (frame === null) return;
-      if (KNOWN.has(frame.kind)) {
-        this.ended = frame.kind === KIND.index;
-        yield frame;
-      }
+      this.ended = frame.kind === KIND.index;
+      yield frame;
     }
   }
 
@@ -63,13 +106,39 @@ export class FrameReader {
     return this.#data.take(this.#data.length);
   }
 
-  #next(): Frame | null {
-    if (!this.#started && !this.#start()) return null;
+  /** Look at the start of the next section, unless one is passing; false: not enough of it has come. */
+  #begin(): boolean {
+    if (this.#passing !== null) return true;
+    if (!this.#started && !this.#start()) return false;
     const head = this.#data.peek(LONGEST_START);
     if (this.#offset === SIGNATURE_LENGTH && head.length && head[0] !== KIND.header) {
       throw new CorruptStreamError(`expected the header section first, got kind ${head[0]}`, SIGNATURE_LENGTH);
     }
     const extent = sectionExtent(head, this.#offset);
+    if (extent === null) return false;
+    const kind = head[0]!;
+    if (!KNOWN.has(kind)) {
+      if (kind >= OPTIONAL) this.#optional += 1;
+      checkCount(this.#optional, LIMITS.optional, "optional sections", this.#offset);
+      this.#passing = new Passing(kind, this.#offset, extent.end);
+    }
+    return true;
+  }
+
+  /** Let bytes of a section pass; false: there are more to come. */
+  #pass(passing: Passing): boolean {
+    const data = this.#data.peek(passing.left);
+    passing.take(data);
+    this.#offset += data.length;
+    this.#data.drop(data.length);
+    if (passing.left > 0) return false;
+    passing.check();
+    this.#passing = null;
+    return true;
+  }
+
+  #next(): Frame | null {
+    const extent = sectionExtent(this.#data.peek(LONGEST_START), this.#offset);
     if (extent === null || this.#data.length < extent.end) return null;
     const offset = this.#offset;
     const frame = this.#data.take(extent.end);
@@ -134,16 +203,9 @@ export function wholeSection(data: Uint8Array, offset: number, kind: number): Fr
 /** A whole section, whose payload starts at `start` of it, after its CRC was checked. */
 function checked(frame: Uint8Array, offset: number, start: number): Frame {
   const kind = frame[0]!;
-  const end = frame.length - 4;
-  const crc = new DataView(frame.buffer, frame.byteOffset + end, 4).getUint32(0, true);
-  if (crc32(frame.subarray(0, end)) !== crc) {
-    throw new CorruptStreamError(`expected a section of kind ${kind} to match its CRC, got other bytes`, offset);
-  }
-  if (!KNOWN.has(kind) && kind < OPTIONAL) {
-    throw new UnsupportedVersionError(
-      `expected sections of version ${VERSION}, got an unknown one of kind ${kind} that must not be skipped`,
-    );
-  }
+  const end = frame.length - CRC;
+  const crc = new DataView(frame.buffer, frame.byteOffset + end, CRC).getUint32(0, true);
+  checkSound(crc32(frame.subarray(0, end)) === crc, kind, offset);
   return {
     kind,
     offset,
@@ -151,4 +213,16 @@ function checked(frame: Uint8Array, offset: number, start: number): Frame {
     payload: frame.subarray(start, end),
     end: offset + frame.length,
   };
+}
+
+/** Refuse a section that is not sound, or that is not known and must be. */
+function checkSound(sound: boolean, kind: number, offset: number): void {
+  if (!sound) {
+    throw new CorruptStreamError(`expected a section of kind ${kind} to match its CRC, got other bytes`, offset);
+  }
+  if (!KNOWN.has(kind) && kind < OPTIONAL) {
+    throw new UnsupportedVersionError(
+      `expected sections of version ${VERSION}, got an unknown one of kind ${kind} that must not be skipped`,
+    );
+  }
 }

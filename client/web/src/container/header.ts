@@ -10,6 +10,7 @@ import { parseCodecs } from "./codecs";
 import { type Extras, type JointChange, NO_EXTRAS, type Plane, parseExtras } from "./extras";
 import { FieldReader, LARGEST } from "./fields";
 import type { Frame } from "./frames";
+import { checkCount, LIMITS } from "./limits";
 import { KIND } from "./sections";
 
 /** Most rows or columns of a block that kernels take. */
@@ -188,8 +189,9 @@ export function parseHeader(payload: Uint8Array, offset: number, length: number)
   if (dtype === undefined) {
     throw new CorruptStreamError(`expected a type below ${DTYPES.length}, got ${code}`, offset);
   }
-  const pointChannels = fields.varint(2 ** 16);
+  const pointChannels = fields.varint();
   const layerCount = fields.varint();
+  checkCount(layerCount, LIMITS.layers, "layers", offset);
   const tile = exponentsOf(fields.byte());
   const chunk = exponentsOf(fields.byte());
   const large = fields.byte();
@@ -209,6 +211,7 @@ export function parseHeader(payload: Uint8Array, offset: number, length: number)
     flags & 128 ? parseExtras(fields.take(fields.varint(payload.length)), offset, points) : NO_EXTRAS;
   let channels = pointChannels;
   for (const kind of extras.attributes) channels += Math.max(kind.components, 1);
+  checkCount(channels, LIMITS.channels, "channels", offset);
   const few = pointChannels === 0 || layerCount === 0 || ((flags & 4) !== 0 && pointChannels !== 1) || points < 2;
   if (few || points * channels > LARGEST) {
     const got = `${points} x ${channels}, ${layerCount} layers`;
@@ -228,6 +231,8 @@ export function parseHeader(payload: Uint8Array, offset: number, length: number)
   for (let channel = 0; channel < channels; channel++) lattices.push(parseLattice(fields));
   const grids = arrangement === null ? [plainGrid(blocks[0]!.shape, blocks[0]!.closed)] : gridsOf(arrangement);
   const layout = new Layout(grids, tile);
+  const errors = channels * (layerCount + layout.levels + 1);
+  checkCount(errors, LIMITS.errors, "errors of channels in layers and levels", offset);
   const empty = lattices.map(() => fields.varint(2 ** (layout.levels + 1) - 1));
   const predictors = parsePredictors(fields, layout, channels, Math.min(pointChannels, 3), offset);
   fields.end();

@@ -12,8 +12,9 @@ import { crc32 } from "./crc";
 import { FieldReader } from "./fields";
 import type { Frame } from "./frames";
 import type { Header } from "./header";
+import { checkCount, checkFilled, LIMITS } from "./limits";
 import { Index } from "./model";
-import { checkMetadataLength, FOOTER_LENGTH, OPTIONAL, sectionStart } from "./sections";
+import { checkMetadataLength, FOOTER_LENGTH, OPTIONAL, sectionStart, WINDOW_ERRORS } from "./sections";
 
 /** Tiles, or windows of the residual, that a page tells of. */
 export const PAGE = 256;
@@ -44,32 +45,35 @@ const endOf = (range: ByteRange): number => range.offset + range.length;
 
 /** The root of the index of a container with this header, from its section. */
 export function parseRoot(frame: Frame, header: Header): Root {
-  const most = frame.payload.length;
   const fields = new FieldReader(frame.payload, frame.payloadOffset);
   const lengths: { length: number; errors: Errors }[] = [];
-  for (let left = fields.varint(most); left > 0; left--) {
+  for (let left = toldCount(fields, header.layerCount, "layers"); left > 0; left--) {
     const length = fields.varint();
     lengths.push({ length, errors: fields.errors(header.channels) });
   }
   const levels: Errors[] = [];
-  for (let left = fields.varint(most); left > 0; left--) levels.push(fields.errors(header.channels));
+  for (let left = toldCount(fields, header.levels + 1, "levels"); left > 0; left--) {
+    levels.push(fields.errors(header.channels));
+  }
   const start = fields.varint();
   const residual = fields.varint();
   const said = fields.at;
   const metadataLength = fields.varint();
   checkMetadataLength(metadataLength, said, true);
-  const optional: OptionalSection[] = [];
-  for (let left = fields.varint(most); left > 0; left--) optional.push(parseOptional(fields));
-  const directories = [parseDirectory(fields), parseDirectory(fields)];
+  const optional = parseOptional(fields);
+  const counts = [pagesFor(header.layout.tiles.length), residual ? pagesFor(countWindows(header)) : 0];
+  const directories = counts.map((count) => parseDirectory(fields, count));
   fields.end();
+  const least = emptyLayer(header.channels);
+  const filled = lengths.map(({ length }) => length > least);
+  checkFilled(filled, lengths.length, frame.offset);
 
   const places = new Places(start, optional);
   const layers = lengths.map(({ length, errors }) => ({ range: places.next(length), errors }));
   const exact = residual ? places.next(residual) : null;
   const metadata = places.next(metadataLength);
   const pages = places.end();
-  const agree = layers.length === header.layerCount && levels.length === header.levels + 1;
-  if (start !== header.length || !agree || (exact !== null) !== header.corrected) {
+  if (start !== header.length || (exact !== null) !== header.corrected) {
     throw new CorruptStreamError("expected an index of the layers and levels of the header, got another", frame.offset);
   }
   let length = 0;
@@ -78,17 +82,13 @@ export function parseRoot(frame: Frame, header: Header): Root {
   if (places.left || first + length + CRC !== frame.offset) {
     throw new CorruptStreamError("expected sections that fill the container up to its index, got others", frame.offset);
   }
-  const counts = [pagesFor(header.layout.tiles.length), exact ? pagesFor(countWindows(header)) : 0];
-  const found = directories.map((directory, kind) => {
-    if (directory.length !== counts[kind]) {
-      throw new CorruptStreamError(`expected ${counts[kind]} pages of an index, got ${directory.length}`, frame.offset);
-    }
-    return directory.map((page): PagePlace => {
+  const found = directories.map((directory) =>
+    directory.map((page): PagePlace => {
       const range = { offset: first, length: page.length };
       first += page.length;
       return { range, crc: page.crc, told: page.told };
-    });
-  });
+    }),
+  );
   return {
     layers,
     levels,
@@ -109,6 +109,11 @@ export function parseIndex(pages: Frame, root: Frame, header: Header): Index {
   }
   const ranges = told.layers.map((layer) => layer.range);
   const segments = parseSegments(pagesOf(pages, told.segmentPages), header, ranges);
+  checkFilled(
+    segments.map((own) => own.length > 0),
+    segments.length,
+    pages.offset,
+  );
   let finest = 0;
   const layers = told.layers.map(({ range, errors }, number): LayerRecord => {
     for (const segment of segments[number]!) finest = Math.max(finest, header.layout.tiles[segment.tile]!.level);
@@ -164,20 +169,43 @@ class Places {
   }
 }
 
-function parseOptional(fields: FieldReader): OptionalSection {
+/** A count that is known already, so that nothing is read by another. */
+function toldCount(fields: FieldReader, count: number, what: string): number {
   const start = fields.at;
-  const kind = fields.byte();
-  const range = { offset: fields.varint(), length: fields.varint() };
-  if (kind < OPTIONAL || range.length < 6) {
-    throw new CorruptStreamError(`expected an optional section, got kind ${kind} of ${range.length} bytes`, start);
+  const told = fields.varint();
+  if (told !== count) throw new CorruptStreamError(`expected ${count} ${what} of an index, got ${told}`, start);
+  return told;
+}
+
+/** Bytes of the section of a layer that has no segments. */
+function emptyLayer(channels: number): number {
+  const payload = 8 + (channels > 1 ? 4 * channels : 0) + 1; // errors, the number of segments
+  return sectionStart(payload) + payload + CRC;
+}
+
+function parseOptional(fields: FieldReader): OptionalSection[] {
+  const start = fields.at;
+  const count = fields.varint();
+  checkCount(count, LIMITS.optional, "optional sections", start);
+  const found: OptionalSection[] = [];
+  for (let left = count; left > 0; left--) {
+    const at = fields.at;
+    const kind = fields.byte();
+    const range = { offset: fields.varint(), length: fields.varint() };
+    if (kind < OPTIONAL || range.length < 6) {
+      throw new CorruptStreamError(`expected an optional section, got kind ${kind} of ${range.length} bytes`, at);
+    }
+    found.push({ kind, range });
   }
-  return { kind, range };
+  const windows = found.filter(({ kind }) => kind === WINDOW_ERRORS).length;
+  checkCount(windows, 1, "sections of errors of windows", start);
+  return found;
 }
 
 /** Length and CRC-32 of each page, and where that stands. */
-function parseDirectory(fields: FieldReader): { length: number; crc: number; told: number }[] {
+function parseDirectory(fields: FieldReader, count: number): { length: number; crc: number; told: number }[] {
   const found: { length: number; crc: number; told: number }[] = [];
-  for (let left = fields.varint(fields.data.length); left > 0; left--) {
+  for (let left = toldCount(fields, count, "pages"); left > 0; left--) {
     const length = fields.varint();
     const told = fields.at;
     found.push({ length, crc: fields.u32(), told });

@@ -5,6 +5,7 @@ import type { Errors } from "../types";
 import { countWindows } from "./chunks";
 import { FieldReader } from "./fields";
 import type { Header } from "./header";
+import { checkFilled } from "./limits";
 
 // In the first byte of an entry: passes - 1 and skipped units from which on more bytes tell the rest.
 const [MOST_PASSES, MOST_SKIP] = [7, 15];
@@ -30,7 +31,9 @@ export function parseLayer(
   const entries: Entry[] = [];
   let unit = 0;
   let total = 0;
-  for (let left = fields.varint(units); left > 0; left--) {
+  const count = fields.varint(units);
+  checkFilled([count > 0], header.layerCount, offset);
+  for (let left = count; left > 0; left--) {
     const start = fields.at;
     const first = fields.byte();
     let passes = (first & 7) + 1;

@@ -11,7 +11,8 @@ import { DIGEST, FOOTER_LENGTH, KIND, type Metadata, parseFooter, parseMetadata 
 /** How many times its bytes an index takes in memory. */
 export const INDEX_GROWTH = 64;
 
-const FIRST_READ = 512;
+/** Bytes of a header that are read at once, at first and at most. */
+const [FIRST_READ, MOST_AT_ONCE] = [512, 2 ** 22];
 
 /** Reads bytes of a container; fewer than asked for only where it ends. */
 export type Read = (offset: number, length: number) => Promise<Uint8Array>;
@@ -65,7 +66,7 @@ export function* headerSteps(size: number, capacity?: Capacity): Generator<ByteR
   const reader = new FrameReader();
   let header: Header | null = null;
   let wanted = FIRST_READ;
-  for (let position = 0; position < size; wanted *= 2) {
+  for (let position = 0; position < size; wanted = Math.min(2 * wanted, MOST_AT_ONCE)) {
     capacity?.take(Math.min(wanted, size - position));
     const data = yield { offset: position, length: Math.min(wanted, size - position) };
     for (const frame of reader.feed(data)) {

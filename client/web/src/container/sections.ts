@@ -27,6 +27,8 @@ export const KIND = {
 } as const;
 /** Kinds from here on may be skipped by a reader that does not know them. */
 export const OPTIONAL = 128;
+/** Errors of windows. */
+export const WINDOW_ERRORS = 128;
 
 /** Bytes of a footer. */
 export const FOOTER_LENGTH = 28;

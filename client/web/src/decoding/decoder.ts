@@ -360,7 +360,7 @@ export class Decoder {
     begun.window?.follow(index);
     const slices = new Slices(index, select(index, this.#selection));
     this.#slices = slices;
-    if (this.layers.length || this.#frames.pending) {
+    if (this.layers.length || this.#frames.partial) {
       // The file was read in its own order so far, and is not any more.
       slices.continueFile(this.#frames.position);
       this.#followFocus();

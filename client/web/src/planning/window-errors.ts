@@ -9,12 +9,11 @@ import { wholeSection } from "../container/frames";
 import type { Exponents, Header } from "../container/header";
 import type { Index } from "../container/model";
 import type { Read } from "../container/reader";
+import { WINDOW_ERRORS } from "../container/sections";
 import { CorruptStreamError, OptionError } from "../errors";
 import { checkRegion } from "../grid/support";
 import type { ByteRange, Region } from "../types";
 
-/** Kind of the section. */
-const WINDOW_ERRORS = 128;
 // A code is a step of an eighth of an octave: 2^(-k / 8) over 2^16, rounded up; the last one says that there is no error.
 const STEPS = [65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734];
 const NOTHING = 255;
