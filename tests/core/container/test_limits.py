@@ -259,7 +259,7 @@ def test_many_channels_have_fewer_layers(monkeypatch: pytest.MonkeyPatch) -> Non
     assert 1 < header.layer_count <= 100 // 8 - header.levels - 1
     assert ls.decode(container).points.tobytes() == values.tobytes()
     monkeypatch.setattr(limits, "ERRORS", 40)
-    with pytest.raises(ls.TooLargeError, match="at most 40 errors of channels in layers and levels, got 48"):
+    with pytest.raises(ls.TooLargeError, match="at most 40 errors of channels in layers and levels, got 56"):
         ls.encode(ls.Surface(values, attributes={"a": values[..., 4:]}))
 
 
