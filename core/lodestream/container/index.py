@@ -278,10 +278,10 @@ def _parse_optional(fields: FieldReader) -> list[OptionalSection]:
     limits.check_count(count, limits.OPTIONAL, "optional sections", start)
     found = []
     for _ in range(count):
-        start, kind = fields.at, fields.byte()
+        at, kind = fields.at, fields.byte()
         place = ByteRange(fields.varint(), fields.varint())
         if kind < OPTIONAL or place.length < 6:
-            raise CorruptStreamError(f"expected an optional section, got kind {kind} of {place.length} bytes", start)
+            raise CorruptStreamError(f"expected an optional section, got kind {kind} of {place.length} bytes", at)
         found.append(OptionalSection(kind, place))
     windows = sum(optional.kind == WINDOW_ERRORS for optional in found)
     limits.check_count(windows, 1, "sections of errors of windows", start)

@@ -89,7 +89,7 @@ def test_a_decoder_lets_it_pass(long: Path) -> None:
 
 
 def test_frames_let_it_pass(long: Path) -> None:
-    frames, kinds = FrameReader(), []
+    frames, kinds = FrameReader(), list[int]()
     with little_memory():
         read_with(long, lambda data: kinds.extend(frame.kind for frame in frames.feed(data)))
     assert 200 not in kinds

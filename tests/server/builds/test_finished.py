@@ -314,7 +314,7 @@ def with_layers(count: int) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("count", "problem"),
+    ("count", "text"),
     [
         (1200, "at most 1,024 layers, got 1,200"),
         (20_000, "at most 1,286 sections"),
