@@ -160,7 +160,7 @@ def test_no_more_is_read_than_such_a_surface_has(monkeypatch: pytest.MonkeyPatch
     taken: list[int] = []
     monkeypatch.setattr(decoder.capacity, "take", taken.append)
     decoder.feed(small())
-    assert taken.count(decoder.view()._state.nbytes) >= len(decoder.layers) > 3
+    assert taken.count(decoder.view()._state.nbytes) >= len(decoder.layers)
 
 
 def test_an_index_counts_for_what_it_becomes_before_it_is_asked_for() -> None:

@@ -49,6 +49,11 @@ def written(seed: int, attribute: bool) -> bytes:
                 data = rng.bytes(int(rng.choice([1, 3, 127, 128, 300])))
                 layers[layer].append(CodedSegment(tile, channel, top, passes, begins, data))
                 left, begins = left - passes, False
+    used = {(segment.tile, segment.channel) for own in layers for segment in own}
+    free = (unit for unit in range(units) if divmod(unit, header.channels) not in used)
+    for own in layers:  # none may be without segments
+        if not own:
+            own.append(CodedSegment(*divmod(next(free), header.channels), 1, 1, True, rng.bytes(2)))
     pairs = ((0.5, 1.0),) * header.channels if header.channels > 1 else ()
     errors = [Errors(LAYERS - k, 2.0 * LAYERS, pairs) for k in range(LAYERS)]
     chunks = [rng.bytes(int(rng.choice([0, 1, 200]))) for _ in range(chunks_of_a_channel(header) * header.channels)]
