@@ -23,6 +23,7 @@ from starlette.types import Message, Receive
 
 from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT
 
+from ..operation.least_rate import LeastRate
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
 from .access import Caller
@@ -320,22 +321,20 @@ def _subtract(counter: Counter[Any], key: object, count: int) -> None:
 
 
 def _watched(request: Request, room: _Room, settings: Settings) -> Receive:
-    started, came = time.monotonic(), 0
+    rate, came = LeastRate(settings.least_rate, settings.idle_seconds, time.monotonic), 0
 
     async def receive() -> Message:
-        nonlocal started, came
+        nonlocal came
         message = await request.receive()
         size = len(message.get("body", b""))
         await room.take(size)
         came += size
-        now = time.monotonic()
-        if now - started >= settings.idle_seconds:
-            if came < settings.upload_rate * settings.idle_seconds and message.get("more_body", False):
-                raise SlowUploadError(
-                    f"expected at least {settings.upload_rate} bytes a second of an upload, got {came} bytes in "
-                    f"{now - started:.0f} s"
-                )
-            started, came = now, 0
+        slow = rate.shortfall(came)
+        if slow is not None and message.get("more_body", False):
+            raise SlowUploadError(
+                f"expected at least {settings.least_rate} bytes a second of an upload, got {slow[0]} bytes in "
+                f"{slow[1]:.0f} s"
+            )
         return message
 
     return receive

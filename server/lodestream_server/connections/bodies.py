@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import h11
 
 from .cuts import Allowance
 
-__all__ = ["MOST_REST", "CountedConnection"]
+__all__ = ["MOST_REST", "CountedConnection", "Offence"]
 
 #: How many bytes of a request are read after it was answered.
 MOST_REST = 64 * 1024
@@ -25,6 +25,13 @@ _LEAST_CHUNK = 16
 _FRAMING = 256 * 1024
 
 
+class Offence(NamedTuple):
+    """What is wrong with a request: the code and the detail of the answer."""
+
+    code: str
+    detail: str
+
+
 class CountedConnection(h11.Connection):
     """The server's side of HTTP/1.1, with counts of the bytes and chunks of each request.
 
@@ -32,15 +39,18 @@ class CountedConnection(h11.Connection):
     ----------
     chunks : int
         Number of chunks that have begun, of all requests.
-    offence : str or None
-        What is wrong with the chunks of a body, once something is; `next_event` then raises.
+    offence : Offence or None
+        What is wrong with the framing of a body, once something is; `next_event` then raises.
+    only_head : bool
+        Whether the last request has the method HEAD.
     """
 
     def __init__(self) -> None:
         super().__init__(h11.SERVER, _MOST_HEAD)
         self.chunks = 0
         self._whole = False
-        self.offence: str | None = None
+        self.offence: Offence | None = None
+        self.only_head = False
         self._allowed = Allowance(*_CHUNKS)
         self._promised = 0
         self._came = 0
@@ -62,7 +72,7 @@ class CountedConnection(h11.Connection):
         Raises
         ------
         h11.RemoteProtocolError
-            Also if the chunks of a body are too small.
+            Also if the length of a body is told in two ways, or its chunks are too small.
         """
         event = super().next_event()
         if isinstance(event, h11.Request):
@@ -83,7 +93,14 @@ class CountedConnection(h11.Connection):
 
     def _begin(self, request: h11.Request) -> None:
         headers = dict(request.headers)
+        self.only_head = request.method == b"HEAD"
         self._whole = b"transfer-encoding" not in headers
+        # RFC 9112, 6.1 and 6.3: a proxy in front may take the other of the two lengths, and what it takes for a body
+        # is the next request here, or the other way round.
+        if not self._whole and b"content-length" in headers:
+            self._refuse("bad-request", "expected Content-Length or Transfer-Encoding in a request, got both")
+        if not self._whole and request.http_version < b"1.1":
+            self._refuse("bad-request", "expected Transfer-Encoding in HTTP/1.1 only, got it in HTTP/1.0")
         self._promised = int(headers.get(b"content-length", b"0"))
         self._came = self._taken = 0
 
@@ -96,12 +113,15 @@ class CountedConnection(h11.Connection):
         if event.chunk_start:
             self.chunks += 1
             if not self._allowed.take():
-                self._refuse(f"chunks of at least {_LEAST_CHUNK} bytes on average, got smaller ones")
+                self._refuse_chunks(f"chunks of at least {_LEAST_CHUNK} bytes on average, got smaller ones")
             if self._came > 2 * self._taken + _FRAMING:
-                self._refuse(
+                self._refuse_chunks(
                     f"less framing than data in a chunked body, got {self._came} bytes with {self._taken} bytes of data"
                 )
 
-    def _refuse(self, words: str) -> None:
-        self.offence = f"expected {words}; send larger chunks, or Content-Length"
-        raise h11.RemoteProtocolError(self.offence)
+    def _refuse_chunks(self, words: str) -> None:
+        self._refuse("small-chunks", f"expected {words}; send larger chunks, or Content-Length")
+
+    def _refuse(self, code: str, detail: str) -> None:
+        self.offence = Offence(code, detail)
+        raise h11.RemoteProtocolError(detail)

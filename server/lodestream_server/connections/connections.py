@@ -1,23 +1,28 @@
 """HTTP connections with limits on waiting and reading.
 
-The head of a request must arrive in time, and a client must read its answer in time. Received data are processed in
-small pieces, so that other connections get their turn. If a request is answered before all of it has arrived, a bounded
-rest is read so that the client sees the answer; then the connection is cut.
+The head of a request must arrive in time, and a client must read its answer at a least rate. Received data are
+processed in small pieces, so that other connections get their turn. If a request is answered before all of it has
+arrived, a bounded rest is read so that the client sees the answer; then the connection is cut.
 """
 
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import json
+import struct
+import termios
+from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from ..operation.least_rate import LeastRate
 from ..operation.pace import Pace
 from ..operation.settings import Settings
-from .bodies import MOST_REST, CountedConnection
+from .bodies import MOST_REST, CountedConnection, Offence
 from .cuts import Cuts
 from .frames import call_when_lost
 from .open_files import most_connections
@@ -50,6 +55,7 @@ def connections(settings: Settings, cuts: Cuts, pace: Pace) -> type[H11Protocol]
     class Chosen(_Connection):
         head_seconds = settings.head_seconds
         idle_seconds = settings.idle_seconds
+        least_rate = settings.least_rate
         most = most_connections(settings)
 
     Chosen.cuts = cuts
@@ -65,7 +71,9 @@ class _Connection(H11Protocol):
     head_seconds : float
         How long the head of a request may take, its first byte included.
     idle_seconds : float
-        How long a client may take nothing of what is to be sent.
+        Seconds over which the rate is measured at which a client reads an answer.
+    least_rate : int
+        Bytes a second of an answer that a client must read at least.
     most : int
         How many connections there may be.
     cuts : Cuts
@@ -76,6 +84,7 @@ class _Connection(H11Protocol):
 
     head_seconds: float
     idle_seconds: float
+    least_rate: int
     most: int
     cuts: Cuts
     pace: Pace
@@ -95,9 +104,12 @@ class _Connection(H11Protocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         self._socket = transport
-        self._guarded = _Transport(self, transport)
+        rate = LeastRate(self.least_rate, self.idle_seconds, self.loop.time)
+        self._watch = _Watch(transport, self.loop, self.idle_seconds, rate)
+        self._guarded = _Transport(self, transport, self._watch.write)
         super().connection_made(cast(asyncio.Transport, self._guarded))
-        self._watch = _Watch(transport, self.loop, self.idle_seconds)
+        # Neither holds the connection, which is gone once it has become a stream.
+        self._watch.when_slow = partial(self.cuts.note, "slow-answer", self.client)
         if len(self.connections) > self.most:
             self._refuse(503, "busy", f"expected at most {self.most} connections; try again in a few seconds")
         else:
@@ -145,16 +157,11 @@ class _Connection(H11Protocol):
         super().connection_lost(exc)
         self._guarded.let_go()
 
-    def resume_writing(self) -> None:
-        if self._watch is not None:
-            self._watch.moved = True
-        super().resume_writing()
-
     def send_400_response(self, msg: str) -> None:
-        code = "bad-request" if self.conn.offence is None else "small-chunks"
+        code, detail = self.conn.offence or Offence("bad-request", "expected a valid HTTP/1.1 request")
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             self.cuts.note(code, self.client)
-            self._refuse(400, code, self.conn.offence or "expected a valid HTTP/1.1 request")
+            self._refuse(400, code, detail)
         else:
             # The answer is under way already, or was sent.
             self._cut(code)
@@ -276,18 +283,22 @@ class _Connection(H11Protocol):
         ]
         if status != 400:
             headers.append(("retry-after", "5"))
-        asked_for_head = self.conn.our_state is h11.SEND_RESPONSE and self.scope["method"] == "HEAD"
-        sent = h11.Data(data=b"" if asked_for_head else body)
+        only_head = self.conn.our_state is h11.SEND_RESPONSE and self.conn.only_head
+        sent = h11.Data(data=b"" if only_head else body)
         for event in (h11.Response(status_code=status, headers=headers), sent, h11.EndOfMessage()):
             self.transport.write(self.conn.send(event))
         self.transport.close()
 
 
 class _Transport:
-    """What a connection and its requests see of their transport: closing and reading are left to the connection."""
+    """What a connection and its requests see of their transport.
 
-    def __init__(self, connection: _Connection, transport: asyncio.Transport) -> None:
+    Closing and reading are left to the connection, and what is written is counted.
+    """
+
+    def __init__(self, connection: _Connection, transport: asyncio.Transport, write: Callable[[bytes], None]) -> None:
         self._transport = transport
+        self.write = write
         self.close = connection.close
         self.is_closing = connection.is_closing
         self.resume_reading = connection.resume_reading
@@ -303,26 +314,45 @@ class _Transport:
 
 
 class _Watch:
-    """Looks from time to time whether the other side takes what is to be sent; breaks the connection if it does not.
+    """Looks from time to time how much of an answer the client has read; breaks the connection if it is too little.
 
     It holds the transport and not the connection, which is gone once it has become a stream.
 
+    Parameters
+    ----------
+    transport : asyncio.Transport
+    loop : asyncio.AbstractEventLoop
+    seconds : float
+        Time between two looks.
+    rate : LeastRate
+
     Attributes
     ----------
-    moved : bool
-        Something has been taken since the last look.
     upgraded : bool
         The connection has become a stream.
+    when_slow : callable
+        Called before the connection is broken.
     """
 
-    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, seconds: float) -> None:
-        self.moved = False
+    def __init__(
+        self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, seconds: float, rate: LeastRate
+    ) -> None:
         self.upgraded = False
+        self.when_slow: Callable[[], None] = lambda: None
         self._transport = transport
         self._loop = loop
         self._seconds = seconds
-        self._unsent = 0
+        self._rate = rate
+        self._written = 0
         self._timer = loop.call_later(seconds, self._look)
+
+    def write(self, data: bytes) -> None:
+        """Write to the transport."""
+        # Until now the server kept the client waiting, and not the client the server.
+        if not self._transport.get_write_buffer_size():
+            self._rate.begin(self._read())
+        self._written += len(data)
+        self._transport.write(data)
 
     def end(self) -> None:
         """Stop looking, so that nothing of a connection that has ended is kept until the next look."""
@@ -334,9 +364,27 @@ class _Watch:
         if closing and not unsent:
             return
         # In a stream the other side's credit and the stream's own clock decide, until it is being closed.
-        judged = closing or not self.upgraded
-        if judged and not self.moved and 0 < self._unsent <= unsent:
+        if not unsent or (self.upgraded and not closing):
+            self._rate.begin(self._read())
+        elif self._rate.shortfall(self._read()) is not None:
+            self.when_slow()
             self._transport.abort()
             return
-        self._unsent, self.moved = unsent, False
         self._timer = self._loop.call_later(self._seconds, self._look)
+
+    def _read(self) -> int:
+        """Bytes that the client's system has acknowledged, up to a constant."""
+        return self._written - self._transport.get_write_buffer_size() - _queued(self._transport)
+
+
+def _queued(transport: asyncio.Transport) -> int:
+    """Bytes in the system's buffer of a socket that the other side has not acknowledged; 0 where it does not say.
+
+    The system takes more from a transport only when a third of that buffer is free, which may be a megabyte: a client
+    that reads slowly but steadily would seem to read nothing for minutes.
+    """
+    try:
+        handle = transport.get_extra_info("socket").fileno()
+        return int(struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))[0])
+    except (OSError, ValueError):  # a socket that is closed has no number
+        return 0

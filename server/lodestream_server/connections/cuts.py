@@ -13,7 +13,7 @@ __all__ = ["REASONS", "Allowance", "Cuts"]
 _log = logging.getLogger(__name__)
 
 #: Why a connection is cut; each is a ``kind`` of ``lodestream_errors_total``.
-REASONS = ("bad-request", "control-data", "fragments", "frames", "refused-body", "small-chunks")
+REASONS = ("bad-request", "control-data", "fragments", "frames", "refused-body", "slow-answer", "small-chunks")
 
 
 class Allowance:

@@ -72,10 +72,11 @@ class Bounds(BaseModel):
     idle_seconds: float = _seconds(
         60.0, "seconds for which a client may send nothing of an upload, do nothing in a stream, or not read its answer"
     )
-    upload_rate: int = Field(
+    least_rate: int = Field(
         default=1024,
         ge=0,
-        description="bytes a second that an upload must reach at least, on average over each `idle_seconds`",
+        description="bytes a second that a client must send of an upload, and read of an answer that waits for it, at "
+        "least, on average over each `idle_seconds`; with 0 it is enough that something moves",
     )
     head_seconds: float = _seconds(
         20.0, "seconds until the head of a request is complete, or until the token of a stream has arrived"

@@ -156,10 +156,10 @@ def test_numbers_are_limits_too(tmp_path: Path) -> None:
 
 
 def test_an_upload_that_is_too_slow_ends(tmp_path: Path) -> None:
-    made = limits(tmp_path, idle_seconds=1e-6, upload_rate=10**9)
+    made = limits(tmp_path, idle_seconds=1e-6, least_rate=10**9)
     with pytest.raises(SlowUploadError, match="1000000000 bytes a second"):
         asyncio.run(read(made, request(b"x", b"y", b"")))
-    assert asyncio.run(read(limits(tmp_path, idle_seconds=1e-6, upload_rate=0), request(b"x", b"y", b""))) == b"xy"
+    assert asyncio.run(read(limits(tmp_path, idle_seconds=1e-6, least_rate=0), request(b"x", b"y", b""))) == b"xy"
 
 
 def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:

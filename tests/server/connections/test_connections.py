@@ -8,7 +8,7 @@ import json
 import re
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.connections import connections
 from lodestream_server.connections.cuts import Cuts
+from lodestream_server.operation.least_rate import LeastRate
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.pace import Pace
 from lodestream_server.operation.settings import Settings
@@ -173,6 +174,124 @@ def test_an_answer_that_is_taken_slowly_comes_whole(impatient: tuple[str, dict[s
     assert len(data.partition(b"\r\n\r\n")[2]) == made["bytes"]
 
 
+def test_an_answer_that_is_taken_too_slowly_is_cut(tmp_path: Path) -> None:
+    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        made = push(http, npy(hills(700, 700)))
+    # No client reads so fast.
+    with running_server(tmp_path, workers=1, idle_seconds=0.2, least_rate=10**15) as url:
+        request = f"GET /v1/containers/{made['container']}.lode HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+        with connected(url, buffer=4096) as connection:
+            connection.sendall(request * 8)
+            came = 0
+
+            def cut() -> bool:
+                nonlocal came
+                try:
+                    piece = connection.recv(2048)
+                except ConnectionResetError:
+                    return True
+                came += len(piece)
+                return not piece
+
+            # It reads all the time, and never stops for as long as the limit says.
+            eventually(cut, "the connection to be cut")
+        assert came < 8 * made["bytes"]
+        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+            assert 'kind="slow-answer"' in http.get("/metrics").text
+            # What fits into the system's buffers waits for nobody.
+            assert http.get(made["url"]).status_code == 200
+
+
+class Slow:
+    """A transport and a loop whose clock stands until a test moves it."""
+
+    def __init__(self) -> None:
+        self.now, self.unsent, self.closing, self.aborted = 0.0, 0, False, False
+        self.timers: list[tuple[float, Callable[[], None]]] = []
+
+    def time(self) -> float:
+        return self.now
+
+    def call_later(self, seconds: float, work: Callable[[], None]) -> None:
+        self.timers.append((self.now + seconds, work))
+
+    def get_write_buffer_size(self) -> int:
+        return self.unsent
+
+    def get_extra_info(self, name: str) -> socket.socket:
+        closed = socket.socket()
+        closed.close()
+        return closed
+
+    def is_closing(self) -> bool:
+        return self.closing
+
+    def write(self, data: bytes) -> None:
+        self.unsent += len(data)
+
+    def abort(self) -> None:
+        self.aborted = True
+
+    def advance(self, seconds: float) -> None:
+        self.now += seconds
+        due = [timer for timer in self.timers if timer[0] <= self.now]
+        self.timers = [timer for timer in self.timers if timer[0] > self.now]
+        for _, work in due:
+            work()
+
+
+def watched(rate: int, seconds: float = 10.0) -> tuple[Slow, connections._Watch]:
+    slow: Any = Slow()
+    return slow, connections._Watch(slow, slow, seconds, LeastRate(rate, seconds, slow.time))
+
+
+@pytest.mark.parametrize(
+    ("rate", "taken", "stays"), [(100, 1000, True), (100, 990, False), (0, 1, True), (0, 0, False)]
+)
+@pytest.mark.parametrize("ending", [False, True])
+def test_an_answer_has_a_least_rate(rate: int, taken: int, stays: bool, ending: bool) -> None:
+    slow, watch = watched(rate)
+    watch.write(bytes(1 << 20))
+    for _ in range(20):
+        slow.unsent -= taken
+        # What is told to close first sends what it holds.
+        slow.closing = ending
+        slow.advance(10)
+    assert slow.aborted is not stays
+
+
+def test_time_in_which_nothing_waits_for_the_client_does_not_count() -> None:
+    slow, watch = watched(100)
+    for _ in range(20):
+        # The server has something to say only now and then, and just before the look.
+        slow.advance(9)
+        watch.write(bytes(5000))
+        slow.advance(1)
+        assert not slow.aborted
+        slow.unsent = 0
+        watch.write(b"x")
+        slow.unsent = 0
+    slow.unsent = 0
+    watch.write(bytes(5000))
+    watch.write(bytes(5000))  # what is added while something waits changes nothing
+    slow.advance(10)
+    slow.advance(10)
+    assert slow.aborted
+
+
+def test_a_stream_has_rules_of_its_own_until_it_is_closed() -> None:
+    slow, watch = watched(100)
+    watch.upgraded = True
+    slow.unsent = 5000
+    for _ in range(5):
+        slow.advance(10)
+    assert not slow.aborted
+    slow.closing = True
+    slow.advance(10)
+    slow.advance(10)
+    assert slow.aborted
+
+
 def test_a_silent_client_is_closed_with_a_reason(impatient: tuple[str, dict[str, Any]]) -> None:
     url, made = impatient
     silent: list[tuple[list[Event], str]] = [
@@ -253,6 +372,39 @@ def test_what_is_no_request_is_refused(impatient: tuple[str, Any], head: bytes) 
         connection.sendall(head)
         answer = all_of(connection)
     assert not answer or 400 <= status_of(answer) < 500
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD", "POST", "DELETE"])
+@pytest.mark.parametrize(
+    ("version", "framing"),
+    [
+        ("1.1", "Content-Length: 5\r\nTransfer-Encoding: chunked"),
+        ("1.1", "Transfer-Encoding: Chunked\r\nContent-Length: 0"),
+        ("1.1", "transfer-encoding: chunked\r\nX: y\r\ncontent-length: 5, 5"),
+        ("1.0", "Content-Length: 5\r\nTransfer-Encoding: chunked"),
+        ("1.0", "Transfer-Encoding: chunked"),
+    ],
+)
+def test_a_body_whose_length_is_told_in_two_ways_is_refused(
+    http: httpx.Client, server: str, method: str, version: str, framing: str
+) -> None:
+    before = listed(http)
+    head = f"{method} /v1/surfaces HTTP/{version}\r\nHost: localhost\r\n{framing}\r\n\r\n".encode()
+    with connected(server) as connection:
+        # Which of the two a proxy takes decides where it sees the next request: here nobody sees one.
+        connection.sendall(head + b"0\r\n\r\nGET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        answer = all_of(connection)
+    assert len(re.findall(rb"HTTP/1.1 \d", answer)) == 1
+    assert status_of(answer) == 400
+    assert b"connection: close" in answer.lower()
+    body = answer.partition(b"\r\n\r\n")[2]
+    if method == "HEAD":
+        assert body == b""
+    else:
+        document = json.loads(body)
+        assert document["code"] == "bad-request"
+        assert "Transfer-Encoding" in document["detail"]
+    assert listed(http) == before
 
 
 @pytest.mark.parametrize(
