@@ -77,12 +77,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         opened: Storage | None = getattr(app.state, "storage", None)
         storage = await asyncio.to_thread(Storage, chosen.data) if opened is None else opened
         builder = Builder(storage, chosen, metrics.built)
-        limits = Limits(
-            chosen, storage.root, lambda: len(storage), builder.pending_of, storage.kept, lambda: access.alone
-        )
+        limits = Limits(chosen, storage.root, storage.count_of, builder.pending_of, storage.kept, lambda: access.alone)
         metrics.watch(storage.root, lambda: len(storage), lambda: builder.pending)
         files_of_levels = await asyncio.to_thread(_level_files, chosen, storage, limits)
-        levels = LevelQueue(chosen, storage, files_of_levels, builder.fork_server)
+        levels = LevelQueue(chosen, storage, files_of_levels, builder.fork_server, limits.check_share)
         app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics, levels, pace)
         try:
             builder.start(limits.check_owner)
@@ -109,7 +107,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]
-    app.state.metrics, app.state.pace = metrics, pace
+    app.state.metrics, app.state.pace, app.state.alone = metrics, pace, lambda: access.alone
     app.openapi = lambda: interface.describe(app)  # type: ignore[method-assign]
     # The last one is the first that a request meets.
     app.add_middleware(Gate, access=access)

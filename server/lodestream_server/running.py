@@ -21,6 +21,7 @@ from .app import create_app
 from .connections.connections import connections
 from .connections.cuts import Cuts
 from .connections.frames import stream_connections
+from .connections.places import Places
 from .operation.logs import drain
 from .operation.settings import Settings
 from .storage.storage import Storage
@@ -124,7 +125,7 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         app,
         host=settings.host,
         port=settings.port,
-        http=connections(settings, cuts, pace),
+        http=connections(settings, cuts, pace, Places(settings, app.state.alone)),
         ws=stream_connections(cuts, pace),
         ws_max_size=MAX_MESSAGE,
         # What travels is coded already, and each connection would pay 64 KiB.

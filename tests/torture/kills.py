@@ -96,7 +96,7 @@ class _Torment:
 
     def round(self) -> None:
         """Start a server, compare it with the ledger, keep it busy, kill it, look at what is left."""
-        server = Server(self.data, max_client_streams=100)
+        server = Server(self.data)
         try:
             with server.client() as http:
                 self._compare(http)

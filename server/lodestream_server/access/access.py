@@ -17,6 +17,7 @@ from fastapi.requests import HTTPConnection
 
 from lodestream.errors import LodestreamError
 
+from ..connections.places import network_of
 from ..operation.settings import Settings
 from ..problems import BadTokenError, ForeignOriginError, NoTokenError, SmallScopeError
 from .tokens import Tokens
@@ -58,8 +59,8 @@ class Caller:
     admin: bool = False
     token: str | None = None
 
-    def may_delete(self, owner: str | None) -> bool:
-        """Whether this caller may delete a surface of this owner: its owner and an admin may."""
+    def may_change(self, owner: str | None) -> bool:
+        """Whether this caller may delete or retry a surface of this owner: its owner and an admin may."""
         return self.admin or (owner is not None and owner == self.owner)
 
 
@@ -241,10 +242,4 @@ def _bearer(connection: HTTPConnection) -> str | None:
 def anybody(connection: HTTPConnection) -> Caller:
     """A caller without a token, known by its address."""
     host = connection.client.host if connection.client is not None else "unknown"
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return Caller(f"{_ADDRESS}{host[:80]}", host[:80])
-    # One household or machine has at least a /64.
-    network = ipaddress.ip_network((address, 64), strict=False) if address.version == 6 else address
-    return Caller(f"{_ADDRESS}{network}", host)
+    return Caller(f"{_ADDRESS}{network_of(host)}", host[:80])

@@ -1,8 +1,7 @@
 """Limits on what happens at the same time and on disk space; requests beyond them are told to come back.
 
-A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds and bytes on disk
-as it leaves free for the others: one caller alone gets half of everything, the next one half of the rest. So a caller
-that has nothing yet always finds something. The rule does not apply if nobody else can write.
+A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds, surfaces, bytes
+on disk and streams as it leaves free for the others (`fair_share`). The rule does not apply if nobody else can write.
 
 Everything here runs in the event loop, between two awaits, so no lock is needed.
 """
@@ -23,6 +22,7 @@ from starlette.types import Message, Receive
 
 from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT
 
+from ..operation.fair_share import exceeds_share
 from ..operation.least_rate import LeastRate
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
@@ -51,8 +51,8 @@ class Limits:
     settings : Settings
     folder : Path
         A folder on the disk whose space is limited.
-    surfaces : callable
-        Returns the number of surfaces.
+    surfaces : callable (owner) -> (int, int)
+        Returns how many surfaces there are: all of them, and those of an owner.
     builds : callable (caller) -> (int, int)
         Returns how many builds wait or run: all of them, and those of the caller with this key.
     kept : callable (owner) -> int
@@ -65,7 +65,7 @@ class Limits:
         self,
         settings: Settings,
         folder: Path,
-        surfaces: Callable[[], int],
+        surfaces: Callable[[str | None], tuple[int, int]],
         builds: Callable[[str], tuple[int, int]],
         kept: Callable[[str | None], int],
         alone: Callable[[], bool],
@@ -77,76 +77,64 @@ class Limits:
         self._kept = kept
         self._alone = alone
         self._streams: Counter[str] = Counter()
-        self._credit = 0  # beyond the least, of all streams
+        self._credit: Counter[str] = Counter()  # beyond the least, of all streams, by caller
         self._openings: Counter[str] = Counter()
-        self._uploads: dict[asyncio.Timeout, str] = {}  # and whose they are
+        self._uploads: dict[asyncio.Timeout, Caller] = {}  # and whose they are
         self._promised: Counter[str] = Counter()  # bytes, by caller
         self._taken: Counter[str | None] = Counter()  # bytes of uploads under way, by owner
 
     @contextmanager
-    def stream(self, client: str) -> Iterator[int]:
+    def stream(self, caller: Caller) -> Iterator[int]:
         """Count an open stream for the length of the block; yields the most credit that is kept for it.
 
         What goes beyond `BASE_CREDIT` is an eighth of what the memory for streams has left, so that all streams
-        together never have more than that.
-
-        Parameters
-        ----------
-        client : str
-            Key of the client that reads it.
+        together never have more than that; and no more than the caller's share of that memory.
 
         Raises
         ------
         BusyError
             If the server has as many as allowed.
         TooManyError
-            If this client has as many as allowed.
+            If this caller has as many as allowed.
         """
-        most, most_each = self._settings.max_streams, self._settings.max_client_streams
-        if self._streams.total() >= most:
-            raise BusyError(f"expected at most {most} streams at the same time; try again in a few seconds")
-        if self._streams[client] >= most_each:
-            raise TooManyError(f"expected at most {most_each} streams of one client at the same time; end one of them")
-        self._streams[client] += 1
-        more = min((self._settings.memory_of_streams - self._credit) // _STREAM_SHARE, MAX_CREDIT - BASE_CREDIT)
-        self._credit += more
+        most = self._settings.max_streams
+        self.check_share("open streams", most, (self._streams.total(), self._streams[caller.key]), caller)
+        self._streams[caller.key] += 1
+        free = self._settings.memory_of_streams - self._credit.total()
+        more = min(free // _STREAM_SHARE, MAX_CREDIT - BASE_CREDIT)
+        if not self._alone():
+            # With it the caller has at most what is left then.
+            more = max(min(more, (free - self._credit[caller.key]) // 2), 0)
+        self._credit[caller.key] += more
         try:
             yield BASE_CREDIT + more
         finally:
-            self._credit -= more
-            _subtract(self._streams, client, 1)
+            _subtract(self._credit, caller.key, more)
+            _subtract(self._streams, caller.key, 1)
 
     @contextmanager
-    def opening(self, client: str) -> Iterator[None]:
+    def opening(self, caller: Caller) -> Iterator[None]:
         """Count a connection that has not shown a token yet. The limit equals that of streams, and is separate from it.
 
         Parameters
         ----------
-        client : str
-            Key of the client's address.
+        caller : Caller
+            Of the client's address.
 
         Raises
         ------
         BusyError
             If the server has as many as allowed.
         TooManyError
-            If this client has as many as are left for the others.
+            If this caller has as many as are left for the others.
         """
-        most, there, own = self._settings.max_streams, self._openings.total(), self._openings[client]
-        if there >= most:
-            raise BusyError(
-                f"expected at most {most} connections that have not sent a token yet; try again in a few seconds"
-            )
-        if own >= most - there:
-            raise TooManyError(
-                f"expected no more connections without a token of one address than are left for others, got {own}, "
-                f"and {most - there} of {most} are left"
-            )
-        self._openings[client] += 1
+        there = self._openings.total(), self._openings[caller.key]
+        self.check_share("connections that have not sent a token yet", self._settings.max_streams, there, caller)
+        self._openings[caller.key] += 1
         try:
             yield
         finally:
-            _subtract(self._openings, client, 1)
+            _subtract(self._openings, caller.key, 1)
 
     @asynccontextmanager
     async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:
@@ -166,16 +154,18 @@ class Limits:
         RestartingError
             If the server ends meanwhile.
         """
-        self._check_share("uploads in progress", self._settings.max_uploads, self._count(caller.key), caller)
+        uploads = list(self._uploads.values())
+        there = len(uploads), sum(other.key == caller.key for other in uploads)
+        self.check_share("uploads in progress", self._settings.max_uploads, there, caller)
         if stored:
             self.check_builds(caller)
-            self._check_surfaces()
+            self._check_surfaces(caller)
         size = request.headers.get("content-length", "")
         promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
         # One that is too large anyway is refused for that.
         room = _Room(self, caller, promised if stored and promised <= self._settings.upload_bytes else 0, stored)
         clock = asyncio.timeout(None)
-        self._uploads[clock] = caller.key
+        self._uploads[clock] = caller
         self._promised[caller.key] += room.promised
         try:
             async with clock:
@@ -204,7 +194,7 @@ class Limits:
         BusyError, TooManyError
             If the server, or the caller, has as many as allowed.
         """
-        self._check_share("pending builds", self._settings.max_builds, self._builds(caller.key), caller)
+        self.check_share("pending builds", self._settings.max_builds, self._builds(caller.key), caller)
 
     async def check_disk(self, caller: Caller, *, new: bool) -> None:
         """Check that everything that a caller has announced fits on the disk.
@@ -257,10 +247,9 @@ class Limits:
                 return
             most, why = (has + free) // 2, ", half of what they use there plus what is free"
         if has + promised > most:
-            whose = "those without a token" if owner is None else owner
             raise FullError(
-                f"expected at most {most} bytes of {whose} on the server's disk{why}, got {has} bytes and {promised} "
-                "to come; delete some of their surfaces"
+                f"expected at most {most} bytes of {_called(owner)} on the server's disk{why}, got {has} bytes and "
+                f"{promised} to come; delete some of their surfaces"
             )
 
     def took(self, room: _Room, size: int) -> None:
@@ -271,24 +260,48 @@ class Limits:
         room.promised -= size
         _subtract(self._promised, room.caller.key, size)
 
-    def _count(self, caller: str) -> tuple[int, int]:
-        owners = list(self._uploads.values())
-        return len(owners), owners.count(caller)
+    def check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
+        """Check that a caller may have one more of what callers share.
 
-    def _check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
+        Parameters
+        ----------
+        what : str
+            What is counted, in the plural, for error messages.
+        most : int
+            How many there may be.
+        there : (int, int)
+            How many there are: all of them, and those of the caller.
+        caller : Caller
+
+        Raises
+        ------
+        BusyError, TooManyError
+            If the server, or the caller, has as many as allowed.
+        """
         everybody, own = there
         if everybody >= most:
             raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
-        if own >= most - everybody and not self._alone():
+        if exceeds_share(most, everybody, own) and not self._alone():
             raise TooManyError(
                 f"expected no more {what} of {caller.name} than are left for others, got {own}, and {most - everybody} "
                 f"of {most} are left; try again when some are done"
             )
 
-    def _check_surfaces(self) -> None:
+    def _check_surfaces(self, caller: Caller) -> None:
+        """Check that one more surface is allowed, beside those that uploads in progress will be."""
         most = self._settings.max_surfaces
-        if self._surfaces() >= most:
+        uploads = list(self._uploads.values())
+        kept, kept_of_owner = self._surfaces(caller.owner)
+        everybody = kept + len(uploads)
+        own = kept_of_owner + sum(other.owner == caller.owner for other in uploads)
+        if everybody >= most:
             raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
+        if exceeds_share(most, everybody, own) and not self._alone():
+            whose = _called(caller.owner)
+            raise FullError(
+                f"expected no more surfaces of {whose} than are left for others, got {own}, and {most - everybody} of "
+                f"{most} are left; delete some of them"
+            )
 
 
 class _Room:
@@ -311,6 +324,10 @@ class _Room:
         if self._unchecked >= _STRIDE:
             self._unchecked = 0
             await self._limits.check_disk(self.caller, new=not self.promised)
+
+
+def _called(owner: str | None) -> str:
+    return "those without a token" if owner is None else owner
 
 
 def _subtract(counter: Counter[Any], key: object, count: int) -> None:

@@ -35,6 +35,7 @@ from starlette.requests import ClientDisconnect
 
 from lodestream.errors import InputError, LodestreamError, OptionError, StreamError, TooLargeError
 
+from ..access.access import Caller
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, LargeLevelError, RestartingError, TooManyError, UnfitLevelError
 from ..storage import damage
@@ -120,22 +121,32 @@ class LevelQueue:
     Parameters
     ----------
     settings : Settings storage : Storage files : LevelFiles fork_server : ForkServer
+    check_share : callable
+        See `Limits.check_share`.
     """
 
-    def __init__(self, settings: Settings, storage: Storage, files: LevelFiles, fork_server: ForkServer) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        storage: Storage,
+        files: LevelFiles,
+        fork_server: ForkServer,
+        check_share: Callable[[str, int, tuple[int, int], Caller], None],
+    ) -> None:
         self._settings = settings
         self._storage = storage
         self._files = files
+        self._check_share = check_share
         self._pool = Pool(1, fork_server)
         self._jobs: dict[Key, _Job] = {}
         self._turns: OrderedDict[str, deque[_Job]] = OrderedDict()
         self._working: tuple[_Job, asyncio.Task[None]] | None = None
-        self._waiting = 0
+        self._waiting: Counter[str] = Counter()  # requests, by caller
         self._callers: Counter[str] = Counter()
         self._lent: Counter[str] = Counter()
         self._closing = False
 
-    async def borrow(self, request: Request, key: Key, caller: str) -> Loan:
+    async def borrow(self, request: Request, key: Key, caller: Caller) -> Loan:
         """A level file, made if it does not exist; given up if the client disconnects meanwhile.
 
         Parameters
@@ -144,8 +155,7 @@ class LevelQueue:
             Its body must not have been read.
         key : Key
             An existing level and format.
-        caller : str
-            Key of the caller.
+        caller : Caller
 
         Raises
         ------
@@ -164,24 +174,24 @@ class LevelQueue:
         """
         return await _while_there(request, self.take(key, caller))
 
-    async def take(self, key: Key, caller: str) -> Loan:
+    async def take(self, key: Key, caller: Caller) -> Loan:
         """Like `borrow`, for a caller that does not disconnect."""
-        self._check_caller(caller)
-        self._callers[caller] += 1
+        self._check_caller(caller.key)
+        self._callers[caller.key] += 1
         try:
             lease = self._files.lend(key)
             if lease is None:
                 lease = await self._wait(key, caller)
             try:
-                self._check_bytes(caller)
+                self._check_bytes(caller.key)
             except TooManyError:
                 lease.release()
                 raise
         except BaseException:
-            self._leave(caller)
+            self._leave(caller.key)
             raise
-        self._lent[caller] += lease.size
-        return Loan(lease, partial(self._gave_back, caller, lease.size))
+        self._lent[caller.key] += lease.size
+        return Loan(lease, partial(self._gave_back, caller.key, lease.size))
 
     async def close(self) -> None:
         """Kill the process that makes a level, and remove the files."""
@@ -232,25 +242,26 @@ class LevelQueue:
         self._lent[caller] -= size
         self._leave(caller)
 
-    async def _wait(self, key: Key, caller: str) -> Lease:
-        most = self._settings.max_level_requests
-        if self._waiting >= most:
-            raise BusyError(f"expected at most {most} requests for levels at the same time; try again soon")
+    async def _wait(self, key: Key, caller: Caller) -> Lease:
+        there = self._waiting.total(), self._waiting[caller.key]
+        self._check_share("requests for levels", self._settings.max_level_requests, there, caller)
         job = self._jobs.get(key)
         if job is None:
             job = self._jobs[key] = _Job(key)
-            self._line_up(job, caller)
+            self._line_up(job, caller.key)
         elif job.callers:
-            self._line_up(job, caller)
+            self._line_up(job, caller.key)
         job.waiting += 1
-        self._waiting += 1
+        self._waiting[caller.key] += 1
         try:
             await asyncio.shield(job.done)
             assert job.lease is not None, "it was made"
             return job.lease.again()
         finally:
             job.waiting -= 1
-            self._waiting -= 1
+            self._waiting[caller.key] -= 1
+            if not self._waiting[caller.key]:
+                del self._waiting[caller.key]
             if not job.waiting:
                 self._abandon(job)
 

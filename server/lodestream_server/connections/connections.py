@@ -25,7 +25,7 @@ from ..operation.settings import Settings
 from .bodies import MOST_REST, CountedConnection, Offence
 from .cuts import Cuts
 from .frames import call_when_lost
-from .open_files import most_connections
+from .places import Places
 
 __all__ = ["connections"]
 
@@ -46,20 +46,21 @@ _TITLES = {
     "busy": "The server is busy; try again later",
     "idle": "The client was too slow",
     "small-chunks": "The chunks of the body are too small",
+    "too-many": "This client has too many connections",
 }
 
 
-def connections(settings: Settings, cuts: Cuts, pace: Pace) -> type[H11Protocol]:
+def connections(settings: Settings, cuts: Cuts, pace: Pace, places: Places) -> type[H11Protocol]:
     """The class of a server's HTTP connections; uvicorn creates one instance for each."""
 
     class Chosen(_Connection):
         head_seconds = settings.head_seconds
         idle_seconds = settings.idle_seconds
         least_rate = settings.least_rate
-        most = most_connections(settings)
 
     Chosen.cuts = cuts
     Chosen.pace = pace
+    Chosen.places = places
     return Chosen
 
 
@@ -74,8 +75,8 @@ class _Connection(H11Protocol):
         Seconds over which the rate is measured at which a client reads an answer.
     least_rate : int
         Bytes a second of an answer that a client must read at least.
-    most : int
-        How many connections there may be.
+    places : Places
+        Counts the connections.
     cuts : Cuts
         Where it is written down when the connection is cut.
     pace : Pace
@@ -85,7 +86,7 @@ class _Connection(H11Protocol):
     head_seconds: float
     idle_seconds: float
     least_rate: int
-    most: int
+    places: Places
     cuts: Cuts
     pace: Pace
     conn: CountedConnection
@@ -110,10 +111,12 @@ class _Connection(H11Protocol):
         super().connection_made(cast(asyncio.Transport, self._guarded))
         # Neither holds the connection, which is gone once it has become a stream.
         self._watch.when_slow = partial(self.cuts.note, "slow-answer", self.client)
-        if len(self.connections) > self.most:
-            self._refuse(503, "busy", f"expected at most {self.most} connections; try again in a few seconds")
-        else:
+        self._host = self.client[0] if self.client else "unknown"
+        refusal = self.places.take(self._host)
+        if refusal is None:
             self._follow_head()
+        else:
+            self._refuse(*refusal)
 
     def data_received(self, data: bytes) -> None:
         if self._rest_timer is not None:
@@ -144,7 +147,7 @@ class _Connection(H11Protocol):
         self._guarded.let_go()
         super().handle_websocket_upgrade(event)
         if self._watch is not None:
-            call_when_lost(self._socket.get_protocol(), self._watch.end)
+            call_when_lost(self._socket.get_protocol(), partial(_ended, self._watch, self.places, self._host))
         self._socket.resume_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -153,7 +156,7 @@ class _Connection(H11Protocol):
             self._rest_timer.cancel()
         self._held.clear()
         if self._watch is not None:
-            self._watch.end()
+            _ended(self._watch, self.places, self._host)
         super().connection_lost(exc)
         self._guarded.let_go()
 
@@ -288,6 +291,12 @@ class _Connection(H11Protocol):
         for event in (h11.Response(status_code=status, headers=headers), sent, h11.EndOfMessage()):
             self.transport.write(self.conn.send(event))
         self.transport.close()
+
+
+def _ended(watch: _Watch, places: Places, host: str) -> None:
+    """A connection has ended, as one or as a stream, whose own connection is another object."""
+    watch.end()
+    places.leave(host)
 
 
 class _Transport:

@@ -42,7 +42,6 @@ class Bounds(BaseModel):
     max_streams: int = _count(
         2000, "open streams; in addition as many connections whose first message, with the token, has not arrived"
     )
-    max_client_streams: int = _count(1000, "open streams of one token, or of one address without a token")
     max_level_requests: int = _count(32, "requests for levels as files that wait at the same time")
     max_client_level_requests: int = _count(
         16, "requests of one client for levels as files; each counts until the client has read its answer"

@@ -65,7 +65,7 @@ async def level(
         return unchanged
     key = Key(record.container or "", level, format_.name)
     with still_there(parts, surface):
-        loan = await parts.levels.borrow(request, key, (caller_of(request) or anybody(request)).key)
+        loan = await parts.levels.borrow(request, key, caller_of(request) or anybody(request))
     try:
         sort_out(request, loan.size, etag)
         headers["content-disposition"] = f'attachment; filename="{record.id}-{level}{format_.stream_suffix}"'

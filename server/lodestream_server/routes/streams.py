@@ -93,11 +93,11 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         if caller is None:
             # Nothing is told of the surface, not even whether it exists, before the token was seen; and nobody takes a
             # stream from those who have one by showing none.
-            with parts.limits.opening(anybody(socket).key):
+            with parts.limits.opening(anybody(socket)):
                 if first is None:
                     first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.reader_with(_token(first))
-        with parts.limits.stream(caller.key) as credit:
+        with parts.limits.stream(caller) as credit:
             record = ready(parts, surface)
             with still_there(parts, surface):
                 container = await asyncio.to_thread(parts.containers.open, record.container or "")

@@ -131,14 +131,17 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
         200: examples.answer("The surface is ready", examples.READY, location=True),
-        **responses(404, 424, 429, 503),
+        **responses(403, 404, 424, 429, 503),
     },
 )
 @needs("write")
 async def retry(request: Request, parts: Parts, surface: str) -> Response:
-    """Build a surface again that waits, failed or is missing; does nothing if it is ready or queued."""
-    caller = _caller(request)
-    if parts.storage.get(surface).state not in ("queued", "ready"):
+    """Build a surface again that waits, failed or is missing; does nothing if it is ready or queued.
+
+    Only its owner (the name of the token that it was uploaded with) and an admin may do this.
+    """
+    record, caller = _changeable(request, parts, surface)
+    if record.state not in ("queued", "ready"):
         parts.limits.check_builds(caller)
     record = await parts.builder.retry(surface, caller.key)
     if record.state in ("missing", "failed"):
@@ -154,21 +157,28 @@ async def delete(request: Request, parts: Parts, surface: str) -> Response:
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.
     """
-    record = parts.storage.get(surface)
-    caller = caller_of(request)
-    if caller is None or not caller.may_delete(record.owner):
-        whose = "nobody" if record.owner is None else "another owner"
-        raise NotOwnerError(
-            f"expected the owner of {surface} or an admin, got {_called(caller)}: it belongs to {whose}"
-        )
+    record, _ = _changeable(request, parts, surface)
     await parts.builder.delete(surface)
     if record.container is not None and not parts.storage.has_container(record.container):
         parts.levels.forget(record.container)
     return Response(status_code=204)
 
 
-def _called(caller: Caller | None) -> str:
-    return "nobody" if caller is None else caller.name
+def _changeable(request: Request, parts: State, surface: str) -> tuple[Record, Caller]:
+    """The record of a surface, and the caller, who may change it.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such surface.
+    NotOwnerError
+        If the caller is neither its owner nor an admin.
+    """
+    record, caller = parts.storage.get(surface), _caller(request)
+    if not caller.may_change(record.owner):
+        whose = "nobody" if record.owner is None else "another owner"
+        raise NotOwnerError(f"expected the owner of {surface} or an admin, got {caller.name}: it belongs to {whose}")
+    return record, caller
 
 
 def _caller(request: Request) -> Caller:

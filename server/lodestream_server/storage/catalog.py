@@ -55,6 +55,7 @@ class Catalog:
         self._containers: _Index = defaultdict(dict)
         self._served = Counter[str]()
         self._sizes = Counter[int]()
+        self._owned: Counter[str | None] = Counter()  # surfaces, by owner
         self._bytes: Counter[str | None] = Counter()  # by owner
         self._things: dict[tuple[str | None, str], _Thing] = {}  # by owner and name
         # In their order: each is appended to it.
@@ -89,6 +90,10 @@ class Catalog:
             self._discharge(record)
             self._forget(record)
 
+    def count_of(self, owner: str | None) -> int:
+        """Number of an owner's surfaces."""
+        return self._owned.get(owner, 0)
+
     def kept(self, owner: str | None) -> int:
         """Bytes of an owner's uploads and containers; shared ones count once."""
         return self._bytes.get(owner, 0)
@@ -121,6 +126,7 @@ class Catalog:
                     del index[key]
 
     def _count(self, record: Record, change: int) -> None:
+        _add(self._owned, record.owner, change)
         if record.state == "ready" and record.container is not None:
             _add(self._served, record.container, change)
         if record.state != "failed":

@@ -106,6 +106,10 @@ class Storage:
         """The surfaces whose uploaded files have this hash."""
         return self._catalog.of_digest(upload_sha256)
 
+    def count_of(self, owner: str | None) -> tuple[int, int]:
+        """Number of surfaces: all of them, and those of an owner."""
+        return len(self._catalog), self._catalog.count_of(owner)
+
     def kept(self, owner: str | None) -> int:
         """Bytes on disk of an owner's surfaces."""
         return self._catalog.kept(owner)

@@ -34,23 +34,24 @@ class Disk(NamedTuple):
     free: int
 
 
-ANNA, BERT, CARL = (Caller(f"token {name}", name, name) for name in ("anna", "bert", "carl"))
+ANNA, BERT, CARL, DORA = (Caller(f"token {name}", name, name) for name in ("anna", "bert", "carl", "dora"))
 
 
 def limits(
     folder: Path,
     surfaces: int = 0,
+    of_anna: int = 0,
     builds: int = 0,
     own: int = 0,
     kept: int = 0,
     alone: bool = True,
     **settings: Any,
 ) -> Limits:
-    """Of which ``own`` builds and ``kept`` bytes on the disk are Anna's."""
+    """Of which ``of_anna`` surfaces, ``own`` builds and ``kept`` bytes on the disk are Anna's."""
     return Limits(
         Settings(data=folder, **settings),
         folder,
-        lambda: surfaces,
+        lambda owner: (surfaces, of_anna if owner == ANNA.owner else 0),
         lambda caller: (builds, own if caller == ANNA.key else 0),
         lambda owner: kept if owner == ANNA.owner else 0,
         lambda: alone,
@@ -163,18 +164,20 @@ def test_an_upload_that_is_too_slow_ends(tmp_path: Path) -> None:
 
 
 def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:
-    made = limits(tmp_path, max_streams=3, max_client_streams=2)
+    made = limits(tmp_path, alone=False, max_streams=3)
     with ExitStack() as held:
-        held.enter_context(made.stream("a"))
-        with made.stream("a"), pytest.raises(TooManyError, match="at most 2"), made.stream("a"):
+        held.enter_context(made.stream(ANNA))
+        with made.stream(ANNA), pytest.raises(TooManyError, match="2, and 1 of 3 are left"), made.stream(ANNA):
             pass
-        held.enter_context(made.stream("b"))
-        held.enter_context(made.stream("c"))
-        for client in ("a", "d"):
-            with pytest.raises(BusyError, match="at most 3"), made.stream(client):
+        held.enter_context(made.stream(BERT))
+        with pytest.raises(TooManyError, match="1, and 1 of 3 are left"), made.stream(BERT):
+            pass
+        held.enter_context(made.stream(CARL))
+        for caller in (ANNA, DORA):
+            with pytest.raises(BusyError, match="at most 3"), made.stream(caller):
                 pass
     for _ in range(5):
-        with made.stream("a"), made.stream("a"):
+        with made.stream(ANNA), made.stream(ANNA):
             pass
 
 
@@ -183,7 +186,7 @@ def test_streams_together_have_no_more_under_way_than_their_memory(tmp_path: Pat
     made = limits(tmp_path, stream_memory=memory)
     for _ in range(2):  # what a stream had is given back
         with ExitStack() as held:
-            credits = [held.enter_context(made.stream("a")) for _ in range(100)]
+            credits = [held.enter_context(made.stream(ANNA)) for _ in range(100)]
         assert credits[0] == MAX_CREDIT
         assert credits == sorted(credits, reverse=True)
         assert credits[-1] >= BASE_CREDIT
@@ -191,19 +194,19 @@ def test_streams_together_have_no_more_under_way_than_their_memory(tmp_path: Pat
 
 
 def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Path) -> None:
-    made = limits(tmp_path, max_streams=4, max_client_streams=4)
+    made = limits(tmp_path, alone=False, max_streams=4)
     with ExitStack() as held:
-        for client in ("a", "a", "b"):
-            held.enter_context(made.opening(client))
-        with pytest.raises(TooManyError, match="got 2, and 1 of 4 are left"), made.opening("a"):
+        for caller in (ANNA, ANNA, BERT):
+            held.enter_context(made.opening(caller))
+        with pytest.raises(TooManyError, match="got 2, and 1 of 4 are left"), made.opening(ANNA):
             pass
-        held.enter_context(made.opening("c"))
-        with pytest.raises(BusyError, match="at most 4"), made.opening("d"):
+        held.enter_context(made.opening(CARL))
+        with pytest.raises(BusyError, match="at most 4"), made.opening(DORA):
             pass
-        for client in ("a", "b", "c", "d"):
-            held.enter_context(made.stream(client))
+        for caller in (ANNA, ANNA, BERT, CARL):
+            held.enter_context(made.stream(caller))
     for _ in range(5):
-        with made.opening("a"), made.opening("a"):
+        with made.opening(ANNA), made.opening(ANNA):
             pass
 
 
@@ -219,10 +222,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small(folder: Path) -> Iterator[tuple[str, str, dict[str, str]]]:
     """A server with little room: its address, a surface, and tokens."""
     file = TokenFile(folder / "tokens.json")
-    tokens = {name: file.create(name, ("write",))[0] for name in ("one", "two", "three")}
-    with running_server(
-        folder, workers=1, max_streams=4, max_client_streams=2, max_surfaces=2, max_uploads=1, upload_bytes=1 << 20
-    ) as url:
+    tokens = {name: file.create(name, ("write",))[0] for name in ("one", "two", "three", "four")}
+    with running_server(folder, workers=1, max_streams=4, max_surfaces=4, max_uploads=1, upload_bytes=1 << 20) as url:
         with client(url, tokens["one"]) as http:
             made = push(http, npy(hills(30, 20)))
         yield url, url + made["url"], tokens
@@ -257,10 +258,10 @@ def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str,
             stream.send(Open(credit=0))
             assert isinstance(stream.receive(), Opened)
         assert code_of(opened(held, "one")) == ("too-many", 4429)
-        stream = opened(held, "two")
+        stream = opened(held, "three")
         stream.send(Open(credit=0))
         assert isinstance(stream.receive(), Opened)
-        assert code_of(opened(held, "three")) == ("busy", 4503)
+        assert code_of(opened(held, "four")) == ("busy", 4503)
 
     def free() -> bool:
         with ExitStack() as held:
@@ -276,7 +277,7 @@ def test_who_shows_no_token_takes_no_stream_from_those_who_have_one(small: tuple
     with ExitStack() as held:
         silent = [held.enter_context(raw_stream(surface)) for _ in range(2)]
         assert code_of(held.enter_context(raw_stream(surface))) == ("too-many", 4429)
-        for name in ("one", "one", "two", "two"):
+        for name in ("one", "one", "two", "three"):
             headers = {"Authorization": f"Bearer {tokens[name]}"}
             stream = held.enter_context(raw_stream(surface, additional_headers=headers))
             stream.send(Open(credit=0))
@@ -343,7 +344,7 @@ def test_uploads_too_many_are_told_to_come_back(folder: Path, small: tuple[str, 
         assert eventually(taken, "room after the slow upload").status_code in (200, 202)
         full = http.post("/v1/surfaces", content=npy(hills(7, 5)))
         assert (full.status_code, full.json()["code"]) == (507, "full")
-        assert "2 surfaces" in full.json()["detail"]
+        assert "got 2, and 2 of 4 are left" in full.json()["detail"]
         assert refused_at_once(url, tokens["one"], (1 << 20) + 1).startswith(b"HTTP/1.1 507 ")
         # What is there already needs no room; the same bytes with an option are another surface.
         body = npy(hills(6, 5))

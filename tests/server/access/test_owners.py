@@ -94,6 +94,22 @@ def test_a_renewed_token_keeps_its_surfaces(office: Office) -> None:
         assert after.delete(where).status_code == 204
 
 
+@pytest.mark.parametrize("state", ["ready", "failed", "waiting"])
+def test_only_the_owner_and_an_admin_retry(office: Office, monkeypatch: pytest.MonkeyPatch, state: str) -> None:
+    with office.client("anna") as anna, office.client("bert") as bert, office.client("root", "admin") as root:
+        if state == "waiting":
+            monkeypatch.setattr(worker, "build", slow.kill)
+        where = str(anna.post("/v1/surfaces", content=BODY[:-1] if state == "failed" else BODY).headers["location"])
+        before = settled(anna, where)
+        assert before["state"] == state
+        assert problem(bert.post(f"{where}/retry")) == (403, "not-owner")
+        assert anna.get(where).json() == before
+        assert problem(bert.post("/v1/surfaces/0123/retry")) == (404, "not-found")
+        for client in (anna, root):
+            assert client.post(f"{where}/retry").status_code == (200 if state == "ready" else 202)
+            settled(anna, where)
+
+
 def test_what_nobody_owns_an_admin_deletes(tmp_path: Path) -> None:
     data, keys = tmp_path / "data", TokenFile(tmp_path / "tokens.json")
     with (
@@ -109,6 +125,8 @@ def test_what_nobody_owns_an_admin_deletes(tmp_path: Path) -> None:
             assert push(anna) != where
             assert anna.get(where).json()["state"] == "ready"
             assert problem(anna.delete(where)) == (403, "not-owner")
+            assert problem(anna.post(f"{where}/retry")) == (403, "not-owner")
+            assert root.post(f"{where}/retry").status_code == 200
             assert root.delete(where).status_code == 204
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lodestream import Block, Surface, encode
 from lodestream_server import running, running_server
-from lodestream_server.access.access import key_of
+from lodestream_server.access.access import Caller, key_of
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_queue, worker
 from lodestream_server.builds.level_files import Key, Lease, LevelFiles
@@ -99,9 +99,9 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     levels: list[int] = []
     wait = level_queue.LevelQueue._wait
 
-    async def noted(self: level_queue.LevelQueue, key: Key, caller: str) -> Lease:
+    async def noted(self: level_queue.LevelQueue, key: Key, caller: Caller) -> Lease:
         levels.append(key.level)
-        if caller == key_of("two"):
+        if caller.key == key_of("two"):
             (tmp_path / "go").touch()
         return await wait(self, key, caller)
 

@@ -27,6 +27,7 @@ from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.connections import connections
 from lodestream_server.connections.cuts import Cuts
+from lodestream_server.connections.places import Places
 from lodestream_server.operation.least_rate import LeastRate
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.pace import Pace
@@ -447,7 +448,8 @@ def test_a_reset_while_an_answer_ends_is_no_error_of_the_server(tmp_path: Path) 
             else:
                 ended.append(None)
 
-        kind = connections.connections(Settings(data=tmp_path, workers=1), Cuts(Metrics()), Pace())
+        settings = Settings(data=tmp_path, workers=1)
+        kind = connections.connections(settings, Cuts(Metrics()), Pace(), Places(settings, lambda: True))
         config = uvicorn.Config(app, http=kind, lifespan="off", log_config=None)
         config.load()
         listening = await loop.create_server(lambda: kind(config, ServerState(), {}), "127.0.0.1", 0)

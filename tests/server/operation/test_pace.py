@@ -18,6 +18,7 @@ from lodestream_server import Settings
 from lodestream_server.connections.connections import connections
 from lodestream_server.connections.cuts import Cuts
 from lodestream_server.connections.frames import stream_connections
+from lodestream_server.connections.places import Places
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.pace import PIECES_A_TURN, Pace, Paced
 from tests.server.connections.sockets import CHUNKS, PING, Place, chunked, frame, handshake
@@ -191,7 +192,10 @@ def accept(folder: Path, pace: Pace) -> list[Socket]:
     """Connections that have just been made."""
     settings, cuts = Settings(data=folder), Cuts(Metrics())
     config = uvicorn.Config(
-        behind, http=connections(settings, cuts, pace), ws=stream_connections(cuts, pace), log_config=None
+        behind,
+        http=connections(settings, cuts, pace, Places(settings, lambda: True)),
+        ws=stream_connections(cuts, pace),
+        log_config=None,
     )
     config.load()
     state, sockets = ServerState(), [Socket() for _ in range(MANY)]

@@ -17,6 +17,7 @@ import pytest
 from lodestream.errors import NotFoundError
 from lodestream.protocol.messages import CODES, Error
 from lodestream_server import running_server
+from lodestream_server.access.access import Caller
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_queue
 from lodestream_server.builds.level_files import Key, Lease
@@ -126,8 +127,8 @@ def test_a_level_whose_container_was_deleted_and_made_again_for_another(
     waiting: list[str] = []
     wait = level_queue.LevelQueue._wait
 
-    async def noted(self: level_queue.LevelQueue, key: Key, caller: str) -> Lease:
-        waiting.append(caller)
+    async def noted(self: level_queue.LevelQueue, key: Key, caller: Caller) -> Lease:
+        waiting.append(caller.key)
         return await wait(self, key, caller)
 
     monkeypatch.setattr(level_queue.LevelQueue, "_wait", noted)

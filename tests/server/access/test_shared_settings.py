@@ -1,0 +1,320 @@
+"""Each setting is shared, and leaves a share to others, or is not shared, for a reason."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AsyncExitStack, ExitStack
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lodestream.protocol.messages import BASE_CREDIT
+from lodestream_server import Settings
+from lodestream_server.access.access import Caller
+from lodestream_server.access.limits import Limits
+from lodestream_server.builds.level_files import Key, LevelFiles
+from lodestream_server.builds.level_queue import LevelQueue
+from lodestream_server.builds.shares import Turns
+from lodestream_server.connections.places import Places
+from lodestream_server.problems import FullError, TooManyError
+from tests.server.access.test_limits import ANNA, BERT, CARL, Disk, request
+from tests.server.helpers import PATIENCE
+
+# Storage and processes of levels that are not made.
+nothing: Any = None
+
+#: Settings that are not shared, and why.
+NOT_SHARED = {
+    "host": "an address",
+    "port": "an address",
+    "data": "a path",
+    "root_path": "a path",
+    "trusted_proxies": "addresses",
+    "insecure": "a switch",
+    "token_file": "a path",
+    "public_reads": "a switch",
+    "origins": "addresses",
+    "formats": "a list of words",
+    "log_format": "a word",
+    "log_level": "a word",
+    "dask": "an address; builds go there in their turns (workers)",
+    "upload_bytes": "of one upload",
+    "upload_files": "of one upload",
+    "max_vertices": "of one surface",
+    "keep_free": "disk space that nobody gets; the rest is shared (owner_bytes)",
+    "threads": "of one build",
+    "memory": "each build has its part of it (build_memory), whoever asked for it",
+    "build_memory": "of one build",
+    "build_seconds": "of one build",
+    "level_memory": "of one process; levels are made in turns (max_level_requests)",
+    "level_seconds": "of one level",
+    "max_client_level_requests": "of one client",
+    "idle_seconds": "of one connection",
+    "least_rate": "of one connection",
+    "head_seconds": "of one connection",
+    "bye_seconds": "of one connection",
+}
+
+
+class Town:
+    """Limits of a server, and the surfaces, builds and bytes that its callers have."""
+
+    def __init__(self, folder: Path, **settings: Any) -> None:
+        self.settings = Settings(data=folder, keep_free=0, **settings)
+        self.surfaces: Counter[str | None] = Counter()
+        self.builds: Counter[str] = Counter()
+        self.bytes: Counter[str | None] = Counter()
+        self.limits = Limits(
+            self.settings,
+            folder,
+            lambda owner: (self.surfaces.total(), self.surfaces[owner]),
+            lambda caller: (self.builds.total(), self.builds[caller]),
+            lambda owner: self.bytes[owner],
+            lambda: False,
+        )
+
+
+def taken(take: Callable[[Caller], object], caller: Caller) -> int:
+    """How many a caller gets before it is refused for what it has already."""
+    count = 0
+    with pytest.raises((TooManyError, FullError), match="left for others|half of what"):
+        # One that takes everything is told so by another error, or goes on for ever.
+        for count in range(10_000):  # noqa: B007 - what is left of it is the answer
+            take(caller)
+    return count
+
+
+def uploads(folder: Path) -> None:
+    town = Town(folder, max_uploads=8)
+
+    async def fill() -> list[int]:
+        async with AsyncExitStack() as held:
+
+            async def count(caller: Caller) -> int:
+                for number in range(9):
+                    try:
+                        await held.enter_async_context(town.limits.upload(request(b""), caller))
+                    except TooManyError:
+                        return number
+                raise AssertionError("one caller takes everything")
+
+            return [await count(caller) for caller in (ANNA, BERT, CARL)]
+
+    assert asyncio.run(fill()) == [4, 2, 1]
+
+
+def surfaces(folder: Path) -> None:
+    town = Town(folder, max_surfaces=8)
+
+    async def upload(caller: Caller) -> None:
+        async with town.limits.upload(request(b""), caller):
+            pass
+        town.surfaces[caller.owner] += 1
+
+    def take(caller: Caller) -> None:
+        asyncio.run(upload(caller))
+
+    # A token of another name is another owner; one of the same name is not.
+    assert [taken(take, caller) for caller in (ANNA, Caller("token x", "x", "anna"), BERT, CARL)] == [4, 0, 2, 1]
+    # Those that are being uploaded count as well.
+    town.surfaces.clear()
+    town.surfaces["anna"] = 3
+
+    async def two() -> None:
+        async with town.limits.upload(request(b""), ANNA):
+            await upload(ANNA)
+
+    with pytest.raises(FullError, match="surfaces of anna than are left for others"):
+        asyncio.run(two())
+
+
+def disk(folder: Path) -> None:
+    town = Town(folder)
+    free = 800
+
+    def take(caller: Caller) -> None:
+        nonlocal free
+        asyncio.run(town.limits.check_owner(caller.owner))
+        free -= 100
+        town.bytes[caller.owner] += 100
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: Disk(1000, 0, free))
+        for caller in (ANNA, BERT, CARL):
+            assert taken(take, caller) >= 1
+        assert free >= 0
+
+
+def builds(folder: Path) -> None:
+    town = Town(folder, max_builds=8)
+
+    def take(caller: Caller) -> None:
+        town.limits.check_builds(caller)
+        town.builds[caller.key] += 1
+
+    assert [taken(take, caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
+
+
+def open_streams(folder: Path) -> None:
+    town = Town(folder, max_streams=8)
+    for places in (town.limits.stream, town.limits.opening):
+        with ExitStack() as held:
+
+            def take(caller: Caller, held: ExitStack = held, places: Any = places) -> None:
+                held.enter_context(places(caller))
+
+            assert [taken(take, caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
+
+
+def memory_of_streams(folder: Path) -> None:
+    memory = 64 << 20
+    town = Town(folder, stream_memory=memory)
+    with ExitStack() as held:
+
+        def credit(caller: Caller) -> int:
+            return held.enter_context(town.limits.stream(caller)) - BASE_CREDIT
+
+        of_anna = sum(credit(ANNA) for _ in range(1000))
+        assert memory // 4 < of_anna <= memory // 2
+        assert credit(BERT) >= memory // 32
+        assert credit(CARL) >= memory // 64
+
+
+def connections(folder: Path) -> None:
+    town = Town(folder, max_connections=8, trusted_proxies=("10.0.0.0/24", "::7"))
+    places = Places(town.settings, lambda: False)
+
+    def count(*hosts: str) -> int:
+        for number, host in enumerate(itertools.cycle(hosts)):
+            refusal = places.take(host)
+            if refusal is not None:
+                places.leave(host)
+                assert refusal[:2] == (429, "too-many")
+                return number
+        raise AssertionError("unreachable")
+
+    assert count("192.0.2.1") == 4
+    # Addresses of one network are one client.
+    assert count("2001:db8::1", "2001:db8::2") == 2
+    assert count("192.0.2.2") == 1
+    # A trusted proxy stands for many clients.
+    assert places.take("10.0.0.9") is None
+    refusal = places.take("10.0.0.9")
+    assert refusal is not None
+    assert refusal[:2] == (503, "busy")
+    # What has ended makes room.
+    for host in ("10.0.0.9", "10.0.0.9", "192.0.2.1"):
+        places.leave(host)
+    assert [places.take("::7"), places.take("::7")] == [None, None]
+    alone = Places(town.settings, lambda: True)
+    assert [alone.take("127.0.0.1") for _ in range(8)] == [None] * 8
+
+
+def level_requests(folder: Path) -> None:
+    town = Town(folder, max_level_requests=8)
+
+    async def free() -> int:
+        return 1 << 30
+
+    async def fill() -> list[int]:
+        queue = LevelQueue(
+            town.settings, nothing, LevelFiles(folder / "levels", 1 << 20, free), nothing, town.limits.check_share
+        )
+        queue._go_on = lambda: None  # type: ignore[method-assign]  # nothing is made
+        waiting: list[asyncio.Task[Any]] = []
+
+        async def count(caller: Caller) -> int:
+            for number in range(9):
+                task = asyncio.create_task(queue.take(Key("a" * 64, len(waiting), "npy"), caller))
+                await asyncio.sleep(0)
+                if task.done():
+                    assert isinstance(task.exception(), TooManyError)
+                    return number
+                waiting.append(task)
+            raise AssertionError("one caller takes everything")
+
+        counts = [await count(caller) for caller in (ANNA, BERT, CARL)]
+        for task in waiting:
+            task.cancel()
+        await asyncio.gather(*waiting, return_exceptions=True)
+        return counts
+
+    assert asyncio.run(fill()) == [4, 2, 1]
+
+
+def disk_of_levels(folder: Path) -> None:
+    most = 4 << 20
+    town = Town(folder, max_client_level_requests=1000)
+
+    async def free() -> int:
+        return 1 << 30
+
+    async def fill() -> int:
+        files = LevelFiles(folder / "levels", most, free)
+        queue = LevelQueue(town.settings, nothing, files, nothing, town.limits.check_share)
+        for number in range(1000):
+            key = Key("a" * 64, number, "npy")
+            work = files.new_folder(key)
+            work.mkdir(parents=True)
+            (work / "level").write_bytes(b"")
+            files.add(key, work / "level", files.longest, kept=True).release()
+            try:
+                await queue.take(key, ANNA)
+            except TooManyError:
+                break
+        return await files.make_room()
+
+    assert asyncio.run(fill()) >= most // 8
+
+
+def turns_of_builds(folder: Path) -> None:
+    async def order() -> list[str]:
+        turns, began = Turns(2, 600.0), list[str]()
+
+        async def build(caller: Caller) -> None:
+            async with turns.turn(caller.key):
+                began.append(caller.name)
+                await asyncio.sleep(0)
+
+        async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group:
+            for caller in [*[ANNA] * 50, BERT]:
+                group.create_task(build(caller))
+        return began
+
+    # As soon as one of those that run has ended.
+    assert asyncio.run(order()).index("bert") <= 3
+
+
+#: Settings that callers share, and what shows that one of them cannot take everything.
+SHARED: dict[str, Callable[[Path], None]] = {
+    "max_uploads": uploads,
+    "max_surfaces": surfaces,
+    "owner_bytes": disk,
+    "max_builds": builds,
+    "max_streams": open_streams,
+    "stream_memory": memory_of_streams,
+    "max_connections": connections,
+    "max_level_requests": level_requests,
+    "level_disk": disk_of_levels,
+    "workers": turns_of_builds,
+}
+
+
+def test_each_setting_is_shared_or_not_for_a_reason() -> None:
+    assert SHARED.keys() | NOT_SHARED.keys() == Settings.model_fields.keys()
+    assert not SHARED.keys() & NOT_SHARED.keys()
+
+
+@pytest.mark.parametrize("name", SHARED)
+def test_one_caller_cannot_take_all_of_it(name: str, tmp_path: Path) -> None:
+    SHARED[name](tmp_path)
+
+
+def test_builds_have_equal_parts_of_the_memory(tmp_path: Path) -> None:
+    settings = Settings(data=tmp_path, workers=4, memory=8 << 30)
+    assert settings.memory_of_build * settings.workers == 8 << 30
