@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
@@ -159,8 +160,8 @@ class Target:
     Raises
     ------
     OptionError
-        If a value is not allowed, or two contradict each other: a level and other limits, a level or errors of channels
-        and a region, errors of channels and of the whole surface.
+        If a value is not allowed, an attribute is named twice, or two contradict each other: a level and other limits,
+        a level or errors of channels and a region, errors of channels and of the whole surface.
 
     Examples
     --------
@@ -205,6 +206,9 @@ class Target:
             check_spans(self.region)
         if self.first is not None:
             check_spans(self.first)
+        if self.attributes is not None and len(set(self.attributes)) < len(self.attributes):
+            name = next(name for name, count in Counter(self.attributes).items() if count > 1)
+            raise OptionError(f"expected each attribute once, got {name[:80]!r} twice")
         if self.channels and self.whole != (None, None):
             raise OptionError("expected either an error of the whole surface or errors of channels, got both")
         if self.channels and self.region is not None:

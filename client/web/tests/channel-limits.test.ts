@@ -59,6 +59,7 @@ describe("errors of channels", () => {
     [{ untilRms: { a: 1 }, untilMax: 2 }, /either an error of the whole surface or errors of channels/],
     [{ untilRms: { a: 1 }, level: 2 }, /either a level or other limits/],
     [{ untilMax: { a: -1 } }, /an error of 0 or more/],
+    [{ attributes: ["a", "b", "a"] }, /expected each attribute once, got "a" twice/],
     [
       {
         untilMax: { a: 1 },

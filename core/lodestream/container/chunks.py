@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..target import Region
 from .model import Header
 
-__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel", "first_chunks"]
+__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel", "chunks_touched", "first_chunks"]
 
 
 class ChunkPlace(NamedTuple):
@@ -38,6 +42,29 @@ def chunk_places(
                     down, across = (top, min(top + height, rows)), (left, min(left + width, columns))
                     for channel in range(header.channels):
                         yield ChunkPlace(channel, block, down, across, kept)
+
+
+def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which chunks a selection touches: bool, shape (chunk,), in the order of `chunk_places`.
+
+    Parameters
+    ----------
+    header : Header
+    region : ((int, int), (int, int)) or None
+        Rows and columns of the only block, half-open. None: all points of all blocks.
+    channels : bool, shape (channel,)
+        Which channels are wanted.
+    """
+    if region is None:
+        return np.tile(channels, chunks_of_a_channel(header))
+    touched = []
+    for length, (start, stop), exponent in zip(header.shape, region, header.chunk, strict=True):
+        first = np.arange(0, length, 1 << exponent)
+        touched.append((first < stop) & (start < np.minimum(first + (1 << exponent), length)))
+    windows = np.logical_and.outer(*touched).ravel()
+    kinds = 2 if header.kept and header.kept[0] else 1
+    chosen: NDArray[np.bool_] = np.logical_and.outer(np.tile(windows, kinds), channels).ravel()
+    return chosen
 
 
 def first_chunks(header: Header) -> list[int]:

@@ -211,8 +211,8 @@ def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
 
     Nothing else is read or checked; it ends with the root of the index, or where the bytes are no section any more.
     """
-    place = _START
-    while True:
+    place, size = _START, file.seek(0, 2)
+    while place < size:
         file.seek(place)
         head = file.read(10)
         length = 0

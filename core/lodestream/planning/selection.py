@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.capacity import Capacity
-from ..container.chunks import chunk_places
+from ..container.chunks import chunks_touched
 from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
 from ..grid.support import check_region, needed_tiles
@@ -53,16 +53,16 @@ class Selection:
             if len(header.blocks) > 1:
                 raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
             check_region(self.region, header.shape)
-        names = [kind.name for kind in header.attributes]
+        names = dict.fromkeys(kind.name for kind in header.attributes)
         for name in self.attributes or ():
             if name not in names:
                 raise OptionError(f"expected attributes among {', '.join(names) or 'none'}, got {name!r}")
 
     def channels(self, header: Header) -> NDArray[np.bool_]:
         """Which channels are wanted: bool, shape (channel,)."""
-        chosen = [True] * header.point_channels
+        chosen, names = [True] * header.point_channels, frozenset(self.attributes or ())
         for kind in header.attributes:
-            chosen += [self.attributes is None or kind.name in self.attributes] * kind.channels
+            chosen += [self.attributes is None or kind.name in names] * kind.channels
         return np.array(chosen)
 
     def check_size(self, header: Header, capacity: Capacity, level: int | None = None) -> None:
@@ -146,13 +146,6 @@ def select(index: Index, selection: Selection) -> SelectedSlices:
         return SelectedSlices(index.segments, {k: p for k, p in enumerate(index.chunks) if p.range.length}, True)
     tiles, channels = selection.tiles(header), selection.channels(header)
     segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
-    chunks = {}
-    if index.chunks:
-        for number, (window, chunk) in enumerate(zip(chunk_places(header), index.chunks, strict=True)):
-            touches = selection.region is None or all(
-                start < b and a < stop
-                for (start, stop), (a, b) in zip(selection.region, (window.rows, window.columns), strict=True)
-            )
-            if chunk.range.length and touches and channels[window.channel]:
-                chunks[number] = chunk
+    numbers = np.flatnonzero(chunks_touched(header, selection.region, channels)).tolist() if index.chunks else ()
+    chunks = {number: index.chunks[number] for number in numbers if index.chunks[number].range.length}
     return SelectedSlices(segments, chunks, False)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from ..container import ByteRange, Index
 from ..errors import CorruptStreamError, OptionError
 from ..planning.byte_ranges import RangeSet
+from ..planning.cost import check_cost, plan_cost
 from ..planning.plan import Mark, Plan
 from ..planning.planner import plan
 from ..planning.window_errors import WindowErrors, window_section
@@ -28,6 +29,7 @@ from ..protocol.messages import (
     Segments,
     Stop,
 )
+from ..protocol.wire import parse
 
 __all__ = ["Sender"]
 
@@ -94,10 +96,22 @@ class Sender:
         """State of the stream; closed and failed are final once `next_message` returns None."""
         return self._connection.state
 
-    @property
-    def plan_size(self) -> int:
-        """Segments, and ranges cached or sent, that a plan is made of; the time to make one is proportional to it."""
-        return len(self._index.segments) + len(self.cached) + len(self._given)
+    def cost(self, message: bytes) -> int:
+        """Steps of the plan that `receive` of this message makes, see `plan_cost`; 0 if it makes none.
+
+        Raises
+        ------
+        MessageError, UnsupportedVersionError
+            If it is not a message, as `receive` does.
+        """
+        if self.state not in (State.IDLE, State.ENDED):
+            return 0
+        event = parse(message)
+        return self._cost(event) if isinstance(event, Open) else 0
+
+    def _cost(self, event: Open) -> int:
+        ranges = len(event.held) + len(self.cached) + len(self._given)
+        return plan_cost(self._index, event.target, ranges, bounded=bool(event.window_errors))
 
     def receive(self, message: bytes) -> Event:
         """Take one message; returns its event.
@@ -184,6 +198,7 @@ class Sender:
         index = self._index
         bounded = bool(event.window_errors) and event.target.region is not None
         try:
+            check_cost(self._cost(event))
             windows = self._windows() if bounded else None
             chosen = plan(index, event.target, self._said(event), windows=windows, bounded=bounded)
         except OptionError as error:

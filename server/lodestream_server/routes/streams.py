@@ -18,7 +18,6 @@ from starlette.websockets import WebSocketDisconnect
 
 from lodestream.container import ByteRange
 from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
-from lodestream.planning.planner import plan
 from lodestream.planning.window_errors import window_section
 from lodestream.protocol.connection import State
 from lodestream.protocol.handshake import PARAMETER, from_address
@@ -55,8 +54,8 @@ router = APIRouter()
 # A close frame carries 125 bytes, two of them the code.
 _LONGEST_REASON = 123
 
-# Planning with more segments and ranges than this takes longer than the others should wait; each cached range takes at
-# least so many bytes of a message.
+# A plan of more steps than this (`Sender.cost`) takes longer than the others should wait; each cached range or name
+# takes at least so many bytes of a message.
 _PLANNED_AT_ONCE = 2048
 _BYTES_OF_A_RANGE = 3
 # In every message that asks for a window with its errors.
@@ -210,9 +209,9 @@ class _Session:
         """Bytes that the client did not hold of the surface and did not need: it met its target, or had seen enough."""
         if self._sender.why in (None, "complete"):
             return 0
-        held = self._sender.cached
-        missing = (gap for p in plan(self._container.index).ranges for gap in held.missing(p.offset, p.length))
-        return max(sum(length for _, length in missing) - self._sender.sent, 0)
+        end = self._container.index.surface_end
+        held = sum(length for _, length in self._sender.cached.overlap(0, end))
+        return max(end - held - self._sender.sent, 0)
 
     def close(self) -> None:
         """Close the container."""
@@ -272,14 +271,15 @@ class _Session:
             self._heard.set()
 
     def _takes_long(self, data: bytes) -> bool:
-        if self._sender.state is State.ENDED:
-            # Somebody who opens again and again does it in turn with others.
-            return isinstance(parse(data), Open)
-        if self._sender.state is not State.IDLE:
+        if self._sender.state not in (State.IDLE, State.ENDED):
             return False
         if _WINDOW in data and window_section(self._container.index) is not None:
             return True  # it is read from the disk
-        return self._sender.plan_size + len(data) // _BYTES_OF_A_RANGE > _PLANNED_AT_ONCE
+        if len(data) // _BYTES_OF_A_RANGE > _PLANNED_AT_ONCE:
+            return True  # it takes long to read already
+        steps = self._sender.cost(data)
+        # Somebody who opens again and again does it in turn with others.
+        return steps > (0 if self._sender.state is State.ENDED else _PLANNED_AT_ONCE)
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
         """Do what takes long beside the event loop, which serves the others meanwhile."""

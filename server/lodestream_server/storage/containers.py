@@ -7,8 +7,9 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from typing import TYPE_CHECKING, BinaryIO
 from weakref import WeakValueDictionary
 
@@ -29,6 +30,13 @@ __all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes"]
 # container open any more, as long as they take no more bytes than this.
 _INDEXES_KEPT = 16
 _BYTES_KEPT = 64 << 20
+
+# Of an index without its masks and metadata: that of the smallest surface, and the tables of its levels.
+_LEAST_INDEX = 16 << 10
+# How many times its bytes a header takes in memory: a block, with its sides and its grids, has some bytes there.
+_HEADER_GROWTH = 1024
+# How often the bytes of masks are in memory while the index is read.
+_COPIES_OF_MASKS = 4
 
 # Linux reads what it has in memory and refuses the rest; elsewhere a thread reads everything.
 _NOWAIT = getattr(os, "RWF_NOWAIT", 0)
@@ -91,6 +99,7 @@ class Containers:
         self._coming = 0  # bytes of indexes that are being read
         self._lock = threading.Lock()
         self._used: OrderedDict[str, Index] = OrderedDict()
+        self._sizes: dict[str, int] = {}  # bytes of indexes
         self._indexes: WeakValueDictionary[str, Index] = WeakValueDictionary()
         self._readers: WeakValueDictionary[str, _Reader] = WeakValueDictionary()
 
@@ -136,9 +145,11 @@ class Containers:
             with self._lock:
                 known = self._known(sha256)
             if known is None:
-                with self._room(index_memory(file)):
+                kept, masks = index_memory(file)
+                with self._room(kept + masks):
                     known = _read_index(file)
                     with self._lock:
+                        self._sizes[sha256] = kept
                         self._indexes[sha256] = known
                         self._known(sha256)
             return known
@@ -162,14 +173,15 @@ class Containers:
                 self._coming -= size
 
     def _taken(self) -> int:
-        return self._coming + sum(map(_memory_of, self._indexes.values()))
+        self._sizes = {sha256: self._sizes[sha256] for sha256 in tuple(self._indexes)}
+        return self._coming + sum(self._sizes.values())
 
     def _known(self, sha256: str) -> Index | None:
         index = self._indexes.get(sha256)
         if index is not None:
             self._used[sha256] = index
             self._used.move_to_end(sha256)
-            while len(self._used) > _INDEXES_KEPT or sum(map(_memory_of, self._used.values())) > _BYTES_KEPT:
+            while len(self._used) > _INDEXES_KEPT or sum(map(self._sizes.__getitem__, self._used)) > _BYTES_KEPT:
                 self._used.popitem(last=False)
         return index
 
@@ -186,29 +198,40 @@ def most_for_indexes() -> int:
     return memory_limit() // 8
 
 
-def index_memory(file: BinaryIO) -> int:
-    """Bytes of memory that a container's index will take, computed from the footer; 0 if there is no footer."""
+def index_memory(file: BinaryIO) -> tuple[int, int]:
+    """Bytes of memory that a container's index takes, from the lengths of its sections.
+
+    Returns
+    -------
+    int
+        Of the index that is kept, which has no masks and no metadata.
+    int
+        Of masks, while the index is read.
+    """
+    from lodestream.container.frames import section_lengths
     from lodestream.container.reader import INDEX_GROWTH
-    from lodestream.container.sections import FOOTER_LENGTH, parse_footer
+    from lodestream.container.sections import FOOTER_LENGTH, KEPT_MASKS, MASKS, parse_footer
 
     tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
     try:
-        return INDEX_GROWTH * parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
+        index = parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
     except CorruptStreamError:
-        return 0
-
-
-def _memory_of(index: Index) -> int:
-    from lodestream.container.reader import INDEX_GROWTH
-
-    return INDEX_GROWTH * index.index.length
+        index = 0
+    sections = [*islice(section_lengths(file), 2), (0, 0), (0, 0)]
+    header = sections[0][1]
+    masks = sections[1][1] if sections[1][0] in (MASKS, KEPT_MASKS) else 0
+    # A length that the file does not have is refused when it is read.
+    kept = _LEAST_INDEX + INDEX_GROWTH * index + _HEADER_GROWTH * min(header, tail)
+    return kept, _COPIES_OF_MASKS * min(masks, tail)
 
 
 def _read_index(file: BinaryIO) -> Index:
+    """The index without masks and metadata, which no plan needs."""
     from lodestream.container import read_index
 
     handle = file.fileno()
-    return read_index(partial(_read_from, handle), os.fstat(handle).st_size)
+    index = read_index(partial(_read_from, handle), os.fstat(handle).st_size)
+    return replace(index, header=replace(index.header, mask_data=(), kept_data=()), metadata_values={})
 
 
 def _read_from(handle: int, offset: int, length: int) -> bytes:

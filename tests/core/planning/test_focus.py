@@ -22,6 +22,7 @@ from lodestream.container import ByteRange, Header, Index, read_index
 from lodestream.decoding.view import View
 from lodestream.errors import OptionError
 from lodestream.planning.byte_ranges import RangeSet
+from lodestream.planning.cost import plan_cost
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection
 from lodestream.protocol.messages import MAX_DATA, MAX_HELD, End, Layer, MessageError, Open, Segments, Stop
@@ -334,13 +335,13 @@ def test_the_work_of_a_plan_grows_as_what_it_is_made_of(target: ls.Target) -> No
     for count in (MAX_HELD // 8, MAX_HELD):
         server = Sender(found, sha256)
         server.receive(serialize(Open(target, held=crumbs("floats", count), container=sha256)))
-        assert server.plan_size == count + len(found.segments)
+        near = replace(target, first=NEAR)
         while server.next_message() is not None:
             pass
         opening = steps_of(lambda server=server: plan(found, target, server.cached))  # type: ignore[misc]
-        turning = steps_of(lambda server=server: plan(found, replace(target, first=NEAR), server.cached))  # type: ignore[misc]
-        assert opening < 14 * server.plan_size
-        assert turning < 29 * server.plan_size
+        turning = steps_of(lambda server=server, near=near: plan(found, near, server.cached))  # type: ignore[misc]
+        assert opening < 14 * plan_cost(found, target, count)
+        assert turning < 29 * plan_cost(found, near, count)
 
 
 def test_a_slice_that_was_read_before_the_change_is_not_sent() -> None:
@@ -420,7 +421,7 @@ def test_what_is_sent_again_and_again_is_remembered_once() -> None:
                 wanted = None
         server.receive(serialize(Stop()))
         assert parse(server.next_message() or b"") == End("stopped")
-        sizes.append(server.plan_size)
+        sizes.append(server.cost(serialize(Open(ls.Target(order="level"), container=name))))
     assert server.sent == 5 * 20_000
     assert len(set(sizes)) == 1
 

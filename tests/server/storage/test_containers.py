@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import gc
 import threading
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO
 
 import httpx
+import numpy as np
 import pytest
 
-from lodestream import encode
+from lodestream import Block, Surface, Target, encode
 from lodestream.container import Index
+from lodestream.container.metadata import MAX_BYTES
+from lodestream.grid.layout import Layout
+from lodestream.planning.planner import plan
 from lodestream_server import running_server
 from lodestream_server.problems import BusyError
 from lodestream_server.storage import containers
@@ -59,7 +64,7 @@ def test_no_more_indexes_are_kept_than_are_worth_it(names: list[str]) -> None:
 def test_nor_more_than_so_many_bytes_of_them(names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     made = Containers(Storage.__new__(Storage))
     with made.open(names[0]).file as file:
-        each = containers.index_memory(file)
+        each = sum(containers.index_memory(file))
     assert each > 1000
     monkeypatch.setattr(containers, "_BYTES_KEPT", 3 * each + 1)
     before = _indexes() - 1
@@ -70,7 +75,7 @@ def test_nor_more_than_so_many_bytes_of_them(names: list[str], monkeypatch: pyte
 
 def test_those_that_are_open_have_room_for_so_many_bytes_of_indexes(names: list[str]) -> None:
     with Containers(Storage.__new__(Storage)).open(names[0]).file as file:
-        each = containers.index_memory(file)
+        each = sum(containers.index_memory(file))
     made = Containers(Storage.__new__(Storage), 5 * each)
     for name in names[5:20]:  # what nobody has open any more is in nobody's way
         made.open(name).close()
@@ -95,6 +100,56 @@ def test_a_container_whose_index_takes_too_much_is_not_taken(tmp_path: Path, mon
         assert "whose index takes at most" in surface["reason"]
         assert kept(tmp_path, "containers") == []
         assert len(kept(tmp_path, "uploads")) == 1
+
+
+def surfaces() -> dict[str, bytes]:
+    """Containers whose indexes are large in different ways, by name."""
+    random = np.random.default_rng(4)
+    heights, mask = hills(250, 240), random.random((250, 240)) > 0.5
+    x, y = np.meshgrid(np.arange(12.0), np.arange(12.0))
+    spoiled = heights.copy()
+    spoiled[mask] = np.where(random.random(int(mask.sum())) > 0.5, np.nan, np.inf)
+    cubes = [Block(np.stack([x + 11 * number, y, x * y], axis=2)) for number in range(30)]
+    return {
+        "small": encode(hills(9, 8)),
+        "heights": encode(heights),
+        "noise": encode(random.normal(size=(120, 120))),
+        "constant": encode(np.zeros((400, 400), np.float32)),
+        "holes": encode(Surface(heights, mask=mask)),
+        "holes of a constant": encode(Surface(np.zeros(mask.shape, np.float32), mask=mask)),
+        "not finite": encode(spoiled),
+        "attributes": encode(Surface(hills(20, 20), attributes={f"a{n}": hills(20, 20, n) for n in range(40)})),
+        "blocks": encode(Surface(blocks=cubes)),
+        "metadata": encode(Surface(hills(9, 8), metadata={"words": "word " * 10_000})),
+    }
+
+
+def test_what_is_counted_for_an_index_is_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Storage, "__init__", lambda self: None)
+    monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
+    for name, data in surfaces().items():
+        (tmp_path / name).write_bytes(data)
+        made = Containers(Storage.__new__(Storage))
+        Layout.single.cache_clear()
+        Layout.of.cache_clear()
+        gc.collect()
+        tracemalloc.start()
+        try:
+            opened = made.open(name)
+            for target in (Target(), Target(level=0), Target(order="level"), Target(attributes=())):
+                plan(opened.index, target)
+            if len(opened.index.header.blocks) == 1:
+                plan(opened.index, Target(region=((0, 5), (0, 5))))
+            gc.collect()
+            taken, most = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        kept, masks = containers.index_memory(opened.file)
+        opened.close()
+        assert taken <= kept, name
+        assert most <= kept + masks + 4 * MAX_BYTES, name
+        assert kept <= 8 * taken + 65_536, name
+        assert made._taken() == kept
 
 
 def _indexes() -> int:

@@ -54,6 +54,11 @@ export function makeTarget(options: TargetOptions = {}): Target {
     checkSpans(region);
   }
   if (first !== undefined) checkSpans(first);
+  if (attributes !== undefined && new Set(attributes).size < attributes.length) {
+    const once = new Set<string>();
+    const twice = attributes.find((name) => once.size === once.add(name).size);
+    throw new OptionError(`expected each attribute once, got ${JSON.stringify(twice?.slice(0, 80))} twice`);
+  }
   if (channels !== undefined && (untilRms ?? untilMax) !== undefined) {
     throw new OptionError("expected either an error of the whole surface or errors of channels, got both");
   }
