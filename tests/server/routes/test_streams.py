@@ -9,6 +9,7 @@ from collections.abc import MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -40,8 +41,10 @@ from lodestream.protocol.messages import (
 )
 from lodestream.protocol.wire import serialize
 from lodestream.transfer.download import Download, Ended
+from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.routes import streams
+from tests.core.planning.test_cost import crowded
 from tests.server.helpers import PATIENCE, closed, data_of, eventually, hills, npy, push, raw_stream
 
 
@@ -432,3 +435,15 @@ def test_a_client_that_is_gone_before_the_handshakes_end_is_no_error(offered: li
     }
     asyncio.run(streams.stream(WebSocket(scope, receive, send), None, "ab"))  # type: ignore[arg-type]
     assert len(sent) == 1
+
+
+def test_a_plan_of_many_chunks_is_not_made_in_the_event_loop() -> None:
+    index = crowded(65_536)
+    sender = Sender(index, "0" * 64)
+    session: Any = streams._Session.__new__(streams._Session)
+    session._sender, session._container = sender, SimpleNamespace(index=index)
+    # Hardly any bytes, and no segments.
+    message = serialize(Open(ls.Target(region=((1, 4), (2, 5)))))
+    assert len(message) < 100
+    assert session._takes_long(message)
+    assert not session._takes_long(serialize(Open()))
