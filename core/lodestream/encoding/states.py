@@ -14,7 +14,7 @@ from ..decoding.levels import known_levels
 from ..entropy.tiles import Tiles
 from ..grid.layout import Layout
 from ..transform.lifting import FRACTION_BITS
-from ..transform.pyramid import PADDING, inverse
+from ..transform.pyramid import PADDING, grids, inverse
 
 __all__ = ["Canvases", "StateReconstructor"]
 
@@ -71,6 +71,8 @@ class StateReconstructor:
         self.canvases: Canvases = [
             np.empty((header.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes
         ]
+        #: Where several grids are reconstructed: in one piece of memory, so that one call makes all levels of all grids.
+        self._together = grids(layout, layout.levels) if len(shapes) > 1 else None
         self._header, self._tiles, self._layout = header, tiles, layout
         most = layout.points(layout.levels) // _KEPT
         self._levels = [level for level in range(layout.levels) if _WORTH <= layout.points(level) <= most]
@@ -88,7 +90,8 @@ class StateReconstructor:
             Passes that remain of each tile of the surface.
         """
         header, layout, tiles = self._header, self._layout, self._tiles[channel]
-        arrays = [canvas[place, :, :-PADDING] for canvas in self.canvases]
+        shown = [canvas[place, :, :-PADDING] for canvas in self.canvases]
+        arrays = self._together or shown
         whole, bare = known_levels(header.layout, state, layout.levels)
         kept = self._kept.get(channel)
         shared = 0
@@ -112,6 +115,9 @@ class StateReconstructor:
             corners = zip(arrays, (layout.shape(k, level) for k in range(len(arrays))), strict=True)
             kept.grids.append([array[:rows, :columns].copy() for array, (rows, columns) in corners])
         inverse(arrays, layout, rules, layout.levels, whole, coordinate, start, bare)
+        if self._together is not None:
+            for canvas, array in zip(shown, arrays, strict=True):
+                canvas[...] = array
         return FRACTION_BITS if whole < layout.levels else 0
 
 

@@ -23,8 +23,8 @@ __all__ = ["LevelInverse", "inverse_levels", "memory_of"]
 #: Values of a level that are undone in one call.
 _AT_ONCE = 1 << 20
 
-#: Levels of all grids whose steps are told in one call.
-_MOST_GRIDS = 1 << 8
+#: Levels of all grids whose steps are told in one call: a table takes some 400 bytes for each.
+_MOST_GRIDS = 1 << 14
 
 #: Columns of a row of the kernel's table.
 _KIND, _PLANE, _AXIS, _ROWS, _COLUMNS, _MIDPOINTS, _RUN, _A, _B, _TABLE = range(10)
