@@ -88,7 +88,8 @@ class Decoder:
         self._finest = level
         self.capacity = Capacity(max_vertices)
         self.header: Header | None = None
-        self.index: Index | None = None
+        self._index: Index | None = None
+        self._unparsed: tuple[Frame, Frame] | None = None  # pages and root of an index that nobody has asked for
         self.metadata: dict[str, Any] | None = None
         self.layers: list[View] = []
         self._values: dict[str, Any] = {}
@@ -186,6 +187,21 @@ class Decoder:
             )
 
     @property
+    def index(self) -> Index | None:
+        """The index, once it has arrived; None before. It is parsed when it is first asked for.
+
+        Raises
+        ------
+        CorruptStreamError
+            If it contradicts itself or the header.
+        """
+        if self._unparsed is not None and self.header is not None:
+            known = index_of(*self._unparsed, self.header)
+            self._index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
+            self._unparsed = None
+        return self._index
+
+    @property
     def complete(self) -> bool:
         """Whether the whole surface has arrived; metadata and index may still be missing."""
         return bool(self.layers) and self.layers[-1].complete
@@ -248,15 +264,14 @@ class Decoder:
         elif frame.kind == sections.PAGES:
             self._pages = frame
         else:
-            self._take_index(frame, self.header)
+            self._take_index(frame)
 
-    def _take_index(self, root: Frame, header: Header) -> None:
+    def _take_index(self, root: Frame) -> None:
         pages, self._pages = self._pages, None
         if pages is None:
             raise CorruptStreamError("expected the pages of an index before its root, got the root", root.offset)
         self.capacity.take(INDEX_GROWTH * (root.end - pages.offset))
-        known = index_of(pages, root, header)
-        self.index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
+        self._unparsed = pages, root
 
     def _take_footer(self, data: Bytes) -> None:
         offset, length = self._frames.position, sections.FOOTER_LENGTH
@@ -381,11 +396,11 @@ class Decoder:
             self._take_metadata(read_metadata(bytes(run), place))
         elif self.header is not None:
             self.capacity.take(INDEX_GROWTH * len(run))
-            self.index = index_from(bytes(run), place, self.header)
-            chosen = select(self.index, self._selection)
+            self._index = index = index_from(bytes(run), place, self.header)
+            chosen = select(index, self._selection)
             if self._window is not None:
-                self._window.follow(self.index)
-            self._slices = Slices(self.index, chosen.segments, chosen.chunks, chosen.whole)
+                self._window.follow(index)
+            self._slices = Slices(index, chosen.segments, chosen.chunks, chosen.whole)
             if self.layers or self._frames.partial:
                 # The file was read in its own order so far, and is not any more.
                 self._slices.continue_file(self._frames.position)

@@ -71,7 +71,7 @@ class StateReconstructor:
         self.canvases: Canvases = [
             np.empty((header.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes
         ]
-        #: Where several grids are reconstructed: in one piece of memory, so that one call makes all levels of all grids.
+        #: Where several grids are made: in one piece of memory, so that one call makes all levels of all of them.
         self._together = grids(layout, layout.levels) if len(shapes) > 1 else None
         self._header, self._tiles, self._layout = header, tiles, layout
         most = layout.points(layout.levels) // _KEPT

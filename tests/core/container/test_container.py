@@ -361,7 +361,6 @@ def layer(*entries: sections.Entry, body: bytes | None = None, channels: int = 1
         [sections.section(sections.METADATA, b"\xdf\xff\xff\xff\xff")],
         [sections.section(sections.METADATA, b"\x91" * 5000)],
         [sections.section(sections.INDEX, b"\x00")],
-        [sections.section(sections.PAGES, b""), sections.section(sections.INDEX, b"\x00")],
         [sections.section(sections.HEADER, b"")],
         [layer()] * 11,
     ],
@@ -374,6 +373,19 @@ def test_sections_that_lie_are_corrupt(layers: list[bytes]) -> None:
     assert caught.value.offset >= index.header.length
     for view in decoder.layers:
         assert view.points.shape == index.header.shape
+
+
+def test_an_index_that_lies_is_corrupt_once_it_is_asked_for() -> None:
+    container, index = contained("small")
+    decoder = Decoder()
+    decoder.feed(container[: index.layers[-1].end])
+    assert decoder.index is None
+    decoder.feed(sections.section(sections.PAGES, b"") + sections.section(sections.INDEX, b"\x00"))
+    assert decoder.view().points.shape == index.header.shape
+    for _ in range(2):
+        with pytest.raises(CorruptStreamError) as caught:
+            decoder.index  # noqa: B018
+        assert caught.value.offset >= index.layers[-1].end
 
 
 def test_noise_in_place_of_every_segment_still_makes_pictures() -> None:
