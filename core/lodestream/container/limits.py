@@ -39,7 +39,7 @@ BLOCKS, PATCHES, INTERFACES = 1 << 14, 1 << 16, 1 << 16
 #: Bytes of the names of attributes in UTF-8, counted once for each channel.
 NAMES = 1 << 16
 #: Bytes of the extras: names, the rules of a plane, joints.
-EXTRAS = 1 << 20
+EXTRAS = 1 << 22
 #: Codecs that a header lists.
 CODECS = 64
 #: Optional sections.

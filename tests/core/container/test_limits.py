@@ -163,8 +163,8 @@ HEADERS: dict[str, tuple[Callable[[], dict[str, Any]], str]] = {
     "names": (lambda: {**attributes_of(["ä" * 100], 400), **FEW}, "at most 65,536 bytes of names .*, got 80,000"),
     "errors": (lambda: {**attributes_of(["a"], 999), "layer_count": 61}, "at most 65,536 errors of channels"),
     "extras": (
-        lambda: {"joint_changes": (((0, 1, 1) * 350_000, ()), ((), ()))},
-        "at most 1,048,576 bytes of extras",
+        lambda: {"joint_changes": (((0, 1, 1) * 1_400_000, ()), ((), ()))},
+        "at most 4,194,304 bytes of extras",
     ),
 }
 

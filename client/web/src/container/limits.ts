@@ -13,7 +13,7 @@ export const LIMITS = {
   /** Bytes of the names of attributes in UTF-8, counted once for each channel. */
   names: 2 ** 16,
   /** Bytes of the extras: names, the rules of a plane, joints. */
-  extras: 2 ** 20,
+  extras: 2 ** 22,
   codecs: 64,
   /** Optional sections. */
   optional: 256,
