@@ -24,7 +24,7 @@ from ..surface import Surface
 from ..target import Region, Target
 from .batches import Coded
 from .reconstruction import Progress, Reconstruction
-from .view import View
+from .view import Ending, View
 from .window_state import WindowState
 
 __all__ = ["Decoder", "View", "decode"]
@@ -39,7 +39,9 @@ class Decoder:
     """Decodes a container as its bytes come, and gives a `View` for each state whose errors are known.
 
     `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
-    `CorruptStreamError` with its offset; everything before it stays usable.
+    `CorruptStreamError` with its offset; everything before it stays usable. What a residual holds is known only when it
+    is applied, so this is done when the residual has arrived, and once more when the SHA-256 of the values has; the
+    surface is kept for the first who asks for it.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ class Decoder:
         self.metadata: dict[str, Any] | None = None
         self.layers: list[View] = []
         self._values: dict[str, Any] = {}
-        self._digest: dict[str, Any] = {}  # filled when it comes, for views that were made before
+        self._ending = Ending()  # filled when it comes, for views that were made before
         self._frames = FrameReader()
         self._pages: Frame | None = None  # of the index, before its root
         self._slices: Slices | None = None
@@ -197,7 +199,7 @@ class Decoder:
         """
         if self._unparsed is not None and self.header is not None:
             known = index_of(*self._unparsed, self.header)
-            self._index = replace(known, metadata_values=self.metadata or {}, digest=self._digest.get(DIGEST))
+            self._index = replace(known, metadata_values=self.metadata or {}, digest=self._ending.promised)
             self._unparsed = None
         return self._index
 
@@ -331,9 +333,28 @@ class Decoder:
 
     def _take_metadata(self, values: dict[str, Any]) -> None:
         if DIGEST in values:
-            self._digest[DIGEST] = values.pop(DIGEST)
+            self._ending.promised = values.pop(DIGEST)
         self.metadata = values
         self._values.update(values)
+        self._verify()
+
+    def _verify(self) -> None:
+        """Look at the values of the complete state if they need a residual, which may hold anything.
+
+        Raises
+        ------
+        CorruptStreamError
+            If they are damaged; what came before the residual stays.
+        """
+        header = self.header
+        if header is None or not (self.complete and header.corrected) or self._reconstruction.dropped:
+            return
+        if self._finest is None or self._finest >= header.levels:
+            try:
+                self.layers[-1].verify()
+            except CorruptStreamError:
+                self.layers.pop()
+                raise
 
     def _show(self, made: State) -> None:
         corrected = made.complete and self.header is not None and self.header.corrected
@@ -350,23 +371,23 @@ class Decoder:
         if window is not None:
             window.put_outside(made, state)
             figures = window.figures(made)
-        self.layers.append(
-            View(
-                made.number,
-                made.level,
-                made.bytes,
-                *figures,
-                made.complete,
-                self._reconstruction,
-                length,
-                state,
-                corrected,
-                self._values,
-                self._digest,
-                self._selection,
-                channels=made.channels if window is None else (),
-            )
+        view = View(
+            made.number,
+            made.level,
+            made.bytes,
+            *figures,
+            made.complete,
+            self._reconstruction,
+            length,
+            state,
+            corrected,
+            self._values,
+            self._ending,
+            self._selection,
+            channels=made.channels if window is None else (),
         )
+        self.layers.append(view)
+        self._verify()
 
     def _take_part(self, offset: int, data: Bytes) -> None:
         """Bytes of a plan, once the header is known."""

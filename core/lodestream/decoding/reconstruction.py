@@ -60,6 +60,8 @@ class Reconstruction:
         self._lock = Lock()
         self._chunks: dict[int, tuple[bytes | memoryview, int]] = {}
         self._tiles: list[Tiles] = []
+        #: Whether what was added is forgotten, see `drop`.
+        self.dropped = False
 
     @property
     def length(self) -> int:
@@ -80,6 +82,7 @@ class Reconstruction:
         """Forget all that was added and is not decoded: for whoever asks for no values."""
         self._queue.clear()
         self._chunks.clear()
+        self.dropped = True
 
     def prepare(self, length: int) -> None:
         """Decode the first ``length`` segments, if those that wait are worth the calls that this takes."""
@@ -114,9 +117,10 @@ class Reconstruction:
         if corrected:
             self._correct(blocks, chosen)
         masks = level_masks(header.patches, header.layout, level, header.masks)
-        for block, mask, kept in zip(blocks, masks, header.kept_masks, strict=True):
+        every = header.kept_masks if corrected else [None] * len(blocks)  # which nothing else needs, nor is upset by
+        for block, mask, kept in zip(blocks, masks, every, strict=True):
             if mask is not None and mask.any():  # else no node of so coarse a level is valid, see `View.surface`
-                block.clear(~(mask | kept) if corrected and kept is not None else ~mask, header.hole)
+                block.clear(~mask if kept is None else ~(mask | kept), header.hole)
         return blocks
 
     def _whole(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..container.digest import DIGEST, values_digest
+from ..container.digest import values_digest
 from ..container.model import Header
 from ..coordinates.height_fields import level_metadata, to_xyz
 from ..errors import CorruptStreamError, InputError, OptionError
@@ -22,7 +23,26 @@ from .level_grids import level_nodes
 from .reconstruction import Reconstruction, Values
 from .window_metadata import window_closed, window_grid, window_metadata
 
-__all__ = ["View"]
+__all__ = ["Ending", "View"]
+
+
+@dataclass
+class Ending:
+    """What all views of a surface know of its complete state.
+
+    Attributes
+    ----------
+    promised : str or None
+        The SHA-256 that the values must have, once it has come.
+    digest : str or None
+        The one that they have, once it was computed.
+    verified : list of (Selection, Surface)
+        The surface as `View.verify` computed it, until somebody takes it.
+    """
+
+    promised: str | None = None
+    digest: str | None = None
+    verified: list[tuple[Selection, Surface]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -71,7 +91,7 @@ class View:
     _state: NDArray[np.int8] = field(repr=False, compare=False)
     _corrected: bool = field(repr=False, compare=False)
     _metadata: dict[str, Any] = field(repr=False, compare=False)
-    _digest: dict[str, Any] = field(repr=False, compare=False)
+    _ending: Ending = field(repr=False, compare=False)
     _selection: Selection = field(repr=False, compare=False)
     channels: tuple[tuple[float, float], ...] = field(default=(), repr=False)
 
@@ -180,10 +200,38 @@ class View:
         values = dict(self._metadata if metadata is None else metadata)
         if level != header.levels:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
-        surface, values = self._positioned(Surface(blocks=self._blocks(level)), values, level)
+        kept = self._taken() if level == header.levels else None
+        if kept is None:
+            surface, values = self._positioned(Surface(blocks=self._blocks(level)), values, level)
+        else:
+            surface, values = kept, values if region is None else window_metadata(values, header.shape, region)
         self._check_digest(surface, level)
         surface.metadata = values
         return surface
+
+    def verify(self) -> None:
+        """Compute the complete surface and hold it to its SHA-256, if that has come; the next `surface` returns it.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a chunk of the residual does not hold what it should, or the SHA-256 is wrong.
+        """
+        try:
+            surface = self._shown(self._reconstruction.header.levels)
+        except InputError:
+            return  # nothing of this window is valid, which is no damage
+        self._ending.verified.append((self._selection, surface))
+
+    def _taken(self) -> Surface | None:
+        """The complete surface, if `verify` has computed it and nobody has taken it."""
+        if self._corrected:
+            with suppress(IndexError):
+                selection, surface = self._ending.verified.pop()
+                if selection == self._selection:
+                    return surface
+                self._ending.verified.append((selection, surface))
+        return None
 
     def _repr_html_(self) -> str:
         """What a notebook shows: a small picture, sizes and errors."""
@@ -261,11 +309,12 @@ class View:
     def _check_digest(self, surface: Surface, level: int) -> None:
         """Hold the values to the SHA-256 that came with them, where this is the complete surface and it is exact."""
         header, selection = self._reconstruction.header, self._selection
-        promised = self._digest.get(DIGEST)
+        promised = self._ending.promised
         if promised is None or not self.complete or not header.exact or level != header.levels:
             return
         if selection.region is None and selection.channels(header).all():
-            found = values_digest(surface.blocks)
+            found = self._ending.digest or values_digest(surface.blocks)
+            self._ending.digest = found
             if promised != found:
                 raise CorruptStreamError(f"expected values with the SHA-256 {promised}, got {found}", header.length)
 
@@ -278,11 +327,10 @@ class View:
 
     def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
         """Which holes of the only block have values."""
-        kept = self._reconstruction.header.kept_masks[0]
-        if kept is None or not (finest and self._corrected):
+        if not (finest and self._corrected):
             return None
-        region = self._selection.region
-        return kept if region is None else kept[slice(*region[0]), slice(*region[1])]
+        kept, region = self._reconstruction.header.kept_masks[0], self._selection.region
+        return kept if kept is None or region is None else kept[slice(*region[0]), slice(*region[1])]
 
     def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:
         """Points and attributes of a window of the only block."""

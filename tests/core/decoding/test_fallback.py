@@ -92,8 +92,15 @@ def test_slices_in_any_order_give_the_same_views(target: Target) -> None:
             assert_same(views[number].surface(), wanted[number].surface())
 
 
+def layers_of(name: str) -> bytes:
+    """A golden file without its residual, which would be applied when it comes."""
+    data = (GOLDEN / f"{name}.lode").read_bytes()
+    residual = index_of(data).residual
+    return data if residual is None else data[: residual.offset]
+
+
 def test_a_state_before_the_last_one_decodes_nothing_of_what_came_since() -> None:
-    data = (GOLDEN / "planar-open.lode").read_bytes()
+    data = layers_of("planar-open")
     with without_kernels():
         slow, fed_so_far = ls.Decoder(), 0
         while len(slow.layers) < 2:
@@ -113,7 +120,7 @@ def test_a_state_before_the_last_one_decodes_nothing_of_what_came_since() -> Non
 def test_an_interrupted_view_is_decoded_on_from_where_it_was(
     name: str, every: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    data = (GOLDEN / f"{name}.lode").read_bytes()
+    data = layers_of(name)
     wanted, code, blocks = fed(data).surface(), SmallUnit._code, 0
 
     def interrupted(*arguments: Any) -> int:
@@ -195,14 +202,14 @@ def test_what_strangers_send_is_taken_and_refused_alike(name: str) -> None:
         found.append(outcome(changed))
         with without_kernels():
             assert outcome(changed) == found[-1]
-    assert any(isinstance(last, str) for *_, last in filter(None, found))
+    assert any(isinstance(part, str) for parts in found for part in parts)
     assert any(isinstance(last, list) for *_, last in filter(None, found))
 
 
 def test_it_is_said_once_and_by_what_decodes(caplog: pytest.LogCaptureFixture) -> None:
     data = (GOLDEN / "planar-open.lode").read_bytes()
     with without_kernels(), caplog.at_level(logging.WARNING):
-        decoder = fed(data)
+        decoder = fed(layers_of("planar-open"))
         assert index_of(data).header.levels == 4
         assert not caplog.records
         decoder.surface()

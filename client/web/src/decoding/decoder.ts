@@ -55,6 +55,7 @@ export class Decoder {
   readonly #frames = new FrameReader();
   readonly #values: Metadata = {};
   readonly #digest: { value: string | null } = { value: null }; // filled when it comes, for views made before
+  readonly #ending: Shared["ending"] = { digest: null, verified: null };
   readonly #loose = new Map<number, { start: number; bytes: ByteBuffer }>(); // unfinished sections, by where each goes on
   readonly #footer = new ByteBuffer();
   #header: Header | null = null;
@@ -242,6 +243,7 @@ export class Decoder {
         reconstruction: new Reconstruction(this.#module, header),
         metadata: this.#values,
         digest: this.#digest,
+        ending: this.#ending,
       },
     };
   }
@@ -304,6 +306,22 @@ export class Decoder {
     this.#digest.value = takeDigest(values) ?? this.#digest.value;
     this.#metadata = values;
     Object.assign(this.#values, values);
+    this.#verify();
+  }
+
+  /**
+   * Look at the values of the complete state if they need a residual, which may hold anything. Throws
+   * `CorruptStreamError` where they are damaged; what came before the residual stays.
+   */
+  #verify(): void {
+    const header = this.#header;
+    if (!header?.corrected || !this.complete || (this.#finest ?? header.levels) < header.levels) return;
+    try {
+      this.view().verify();
+    } catch (error) {
+      if (error instanceof CorruptStreamError) this.layers.pop();
+      throw error;
+    }
   }
 
   #show(begun: Begun, made: State): void {
@@ -323,6 +341,7 @@ export class Decoder {
     window?.putOutside(made, state);
     const info = { ...made, bound: false, ...window?.figures(made) };
     this.layers.push(new View(info, shared, { length: shared.reconstruction.length, state }, this.#selection));
+    this.#verify();
   }
 
   /** Bytes of a plan, once the header is known. */

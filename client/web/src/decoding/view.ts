@@ -17,6 +17,8 @@ export interface Shared {
   readonly reconstruction: Reconstruction;
   readonly metadata: Metadata;
   readonly digest: { value: string | null };
+  /** The SHA-256 of the complete state, once it was computed, and its surface as `View.verify` left it, until taken. */
+  readonly ending: { digest: string | null; verified: { selection: Selection; surface: Surface } | null };
 }
 
 /** A block that is not shown whole has holes by itself: points of which a coordinate is not finite. */
@@ -90,14 +92,35 @@ export class View implements ViewInfo {
    */
   surface(level?: number): Surface {
     const { surface, digest } = this.#computed(level);
-    if (digest !== null) this.#check(digest, this.#shared.reconstruction.digest(valuesOf(surface.blocks)));
+    const { ending, reconstruction } = this.#shared;
+    if (digest !== null) {
+      ending.digest ??= reconstruction.digest(valuesOf(surface.blocks));
+      this.#check(digest, ending.digest);
+    }
     return surface;
+  }
+
+  /**
+   * Compute the complete surface and hold it to its SHA-256, if that has come; the next `surface` returns it. Throws
+   * `CorruptStreamError` where a chunk of the residual does not hold what it should, or the SHA-256 is wrong.
+   */
+  verify(): void {
+    try {
+      const surface = this.surface();
+      this.#shared.ending.verified = { selection: this.#selection, surface };
+    } catch (error) {
+      if (!(error instanceof InputError)) throw error; // nothing of this window is valid, which is no damage
+    }
   }
 
   /** As `surface`, but the SHA-256 is the platform's where it has one, which saves a quarter of the time. */
   async surfaceAsync(level?: number): Promise<Surface> {
     const { surface, digest } = this.#computed(level);
-    if (digest !== null) this.#check(digest, await this.#shared.reconstruction.digestAsync(valuesOf(surface.blocks)));
+    const { ending, reconstruction } = this.#shared;
+    if (digest !== null) {
+      ending.digest ??= await reconstruction.digestAsync(valuesOf(surface.blocks));
+      this.#check(digest, ending.digest);
+    }
     return surface;
   }
 
@@ -128,6 +151,12 @@ export class View implements ViewInfo {
       delete values.turn;
     }
     const chosen = selectedChannels(this.#selection, header);
+    const exact = this.complete && finest && header.exact && !region && chosen.every(Boolean);
+    const verified = finest ? this.#taken() : null;
+    if (verified !== null) {
+      const own = region ? windowMetadata(values, header.shape, region) : values;
+      return { surface: { blocks: verified.blocks, metadata: own }, digest: exact ? digest.value : null };
+    }
     const nodes = this.#nodes(shownLevel);
     const grids = region
       ? [this.#window(region, chosen)]
@@ -166,8 +195,16 @@ export class View implements ViewInfo {
       blocks = [withCoordinates(only, plane, placed, kept, header)];
     }
     if (region) values = windowMetadata(values, header.shape, region);
-    const exact = this.complete && finest && header.exact && !region && chosen.every(Boolean);
     return { surface: { blocks, metadata: values }, digest: exact ? digest.value : null };
+  }
+
+  /** The complete surface, if `verify` has computed it and nobody has taken it. */
+  #taken(): Surface | null {
+    const { ending } = this.#shared;
+    if (!this.#corrected || ending.verified?.selection !== this.#selection) return null;
+    const { surface } = ending.verified;
+    ending.verified = null;
+    return surface;
   }
 
   /** Whether the residual is known. */
