@@ -18,6 +18,8 @@ from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, Thread
 from pathlib import Path
 from typing import Any
 
+from tests.patience import PATIENCE
+
 __all__ = ["Ranged", "nginx", "plain", "ranged", "running"]
 
 _RANGE = re.compile(r"bytes=(\d+)-(\d+)")
@@ -174,7 +176,7 @@ def nginx(folder: Path, work: Path, behind: str = "http://127.0.0.1:9") -> Itera
     configuration.write_text(_CONFIGURATION.format(work=work, folder=folder, port=port, behind=behind))
     process = subprocess.Popen([program, "-p", str(work), "-c", str(configuration)], stderr=subprocess.DEVNULL)
     try:
-        until = time.monotonic() + 20
+        until = time.monotonic() + PATIENCE
         while time.monotonic() < until and process.poll() is None:
             with socket.socket() as probe:
                 if probe.connect_ex(("127.0.0.1", port)) == 0:
@@ -183,4 +185,4 @@ def nginx(folder: Path, work: Path, behind: str = "http://127.0.0.1:9") -> Itera
         yield f"http://127.0.0.1:{port}"
     finally:
         process.terminate()
-        process.wait(20)
+        process.wait(PATIENCE)

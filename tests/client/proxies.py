@@ -9,6 +9,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
+from tests.patience import PATIENCE
+
 from .files import running
 from .scripted import Answer
 
@@ -54,7 +56,7 @@ class _Handler(BaseHTTPRequestHandler):
         if handshake and (refusal := self.server.refusal) is not None:
             self._answer(refusal.status, dict(refusal.headers), refusal.body)
             return
-        connection = http.client.HTTPConnection(self.server.behind, timeout=30)
+        connection = http.client.HTTPConnection(self.server.behind, timeout=PATIENCE)
         headers = {name: value for name, value in self.headers.items() if name.lower() not in _OWN}
         connection.request(self.command, self.path, self.rfile.read(int(headers.get("Content-Length", 0))), headers)
         answer = connection.getresponse()

@@ -12,6 +12,7 @@ import pytest
 
 from lodestream_client.demo.plain import beginning, overview
 from lodestream_client.demo.terrain import bilinear, terrain
+from tests.patience import PATIENCE
 
 from .commands.test_program import environment
 
@@ -29,7 +30,7 @@ def test_the_demo(tmp_path: Path, plot: bool) -> None:
         f"sys.exit(show(Path(sys.argv[1]), as_json=True, shape={SHAPE}))"
     )
     command = [sys.executable, "-c", code, str(tmp_path / "demo")]
-    done = subprocess.run(command, capture_output=True, env=environment(), timeout=300, check=False)
+    done = subprocess.run(command, capture_output=True, env=environment(), timeout=PATIENCE, check=False)
     assert done.returncode == 0, done.stderr.decode()
     shown = json.loads(done.stdout)
     assert shown["shape"] == list(SHAPE)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.library import library_name
 from lodestream_client import sync
+from tests.patience import PATIENCE
 
 from .conftest import Run
 
@@ -36,7 +37,9 @@ class Bare:
     def run(self, *arguments: object) -> subprocess.CompletedProcess[str]:
         """Python, with these arguments."""
         command = [sys.executable, *map(str, arguments)]
-        return subprocess.run(command, env=self._environment, capture_output=True, text=True, timeout=200, check=False)
+        return subprocess.run(
+            command, env=self._environment, capture_output=True, text=True, timeout=PATIENCE, check=False
+        )
 
     def done(self, *arguments: object) -> str:
         """What a command that ends well says to standard error."""

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from lodestream.confinement import landlock, missing, places, seccomp
+from tests.patience import PATIENCE
 
 _LIBC = ctypes.CDLL(None)
 
@@ -56,7 +57,7 @@ def confined(tried: list[str], **rights: Any) -> dict[str, Any]:
         env=environment,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=True,
     )
     told: dict[str, Any] = json.loads(done.stdout)

@@ -16,6 +16,7 @@ import pytest
 from lodestream import parallel
 from lodestream.errors import OptionError
 from lodestream.parallel import VARIABLE, spread, threads
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
@@ -35,7 +36,7 @@ def test_results_stand_in_the_order_of_the_items(monkeypatch: pytest.MonkeyPatch
 
 def test_several_threads_are_at_work_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "3")
-    meeting = threading.Barrier(3, timeout=30)
+    meeting = threading.Barrier(3, timeout=PATIENCE)
     assert sorted(spread(lambda item: meeting.wait(), range(3))) == [0, 1, 2]
 
 
@@ -107,9 +108,9 @@ def test_whoever_comes_late_finds_nothing_and_keeps_nothing(monkeypatch: pytest.
     def outer(item: int) -> None:
         if threading.current_thread() is not caller:
             busy.set()
-            assert free.wait(30)
+            assert free.wait(PATIENCE)
         else:
-            assert busy.wait(30)
+            assert busy.wait(PATIENCE)
             items = [Item(), Item(), Item()]
             gone = [weakref.ref(item) for item in items]
             # The only other thread is at work: it will be asked in vain.
@@ -162,7 +163,7 @@ def test_an_interrupt_at_any_moment_leaves_nobody_waiting() -> None:
     # coverage takes locks of its own wherever an interrupt may come.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}
     command = [sys.executable, "-c", INTERRUPTED]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False, env=environment)
     assert (done.returncode, done.stdout) == (0, "3000\n"), done.stderr
 
 
@@ -173,7 +174,7 @@ def test_a_forked_process_starts_threads_of_its_own(monkeypatch: pytest.MonkeyPa
     spread(lambda item: time.sleep(0.001), range(8))
     child = os.fork()
     if not child:
-        meeting = threading.Barrier(2, timeout=30)
+        meeting = threading.Barrier(2, timeout=PATIENCE)
         os._exit(0 if sorted(spread(lambda item: meeting.wait(), range(2))) == [0, 1] else 1)
     assert os.waitpid(child, 0)[1] == 0
 

@@ -14,6 +14,7 @@ import pytest
 import lodestream as ls
 from lodestream import errors
 from lodestream.protocol.messages import MessageError
+from tests.patience import PATIENCE
 
 SOURCE = Path(ls.__file__)
 #: A script that VTK's process runs.
@@ -148,4 +149,4 @@ def test_whatever_raises_an_error_names_it() -> None:
 def run(script: str) -> str:
     """What a script prints in a fresh interpreter."""
     command = [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(SOURCE.parents[1])!r}); {script}"]
-    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=100).stdout.strip()
+    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=PATIENCE).stdout.strip()

@@ -17,12 +17,13 @@ from typing import Any, Self
 
 import httpx
 
+from tests.patience import PATIENCE as PATIENCE
+
 from .shim import Shim, library
 
 __all__ = ["PATIENCE", "Program", "Programs", "Server"]
 
 #: The longest that anything may take, in seconds: what takes longer hangs.
-PATIENCE = 60.0
 
 # A process from which others are forked has one thread.
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from tests.patience import PATIENCE as _PATIENCE
 from tests.server.helpers import eventually
 
 from .driver import Client
@@ -17,7 +18,6 @@ from .site import FOLDERS, Site, copy_tree
 
 __all__ = ["KINDS", "Disasters"]
 
-_PATIENCE = 150.0
 
 _MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
 

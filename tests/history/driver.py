@@ -12,11 +12,12 @@ from typing import Any, TypeAlias
 
 import httpx
 
+from tests.patience import PATIENCE as _PATIENCE
+
 from .events import Answer, History, Kind, Operation, Seen, Subject
 
 __all__ = ["Client", "Crowd", "Goods", "Server"]
 
-_PATIENCE = 150.0
 _SETTLED = ("ready", "failed", "missing", "waiting")
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 
 from lodestream_server.access.tokens import TokenFile
+from tests.patience import PATIENCE as _PATIENCE
 from tests.server import programs
 from tests.server.helpers import eventually
 from tests.torture.small_disk import can_mount
@@ -29,8 +30,6 @@ __all__ = ["FOLDERS", "Disk", "Site", "can_fill", "copy_tree"]
 
 #: The folders in which everything acknowledged lies.
 FOLDERS = ("records", "uploads", "containers")
-
-_PATIENCE = 150.0
 
 
 def can_fill() -> bool:

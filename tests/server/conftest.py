@@ -10,6 +10,7 @@ import pytest
 
 from lodestream_server import running_server
 from lodestream_server.access.tokens import SCOPES, TokenFile
+from tests.patience import PATIENCE
 from tests.server.helpers import Keys
 
 
@@ -38,7 +39,7 @@ def server(data: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def http(server: str) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=server, trust_env=False, timeout=60) as client:
+    with httpx.Client(base_url=server, trust_env=False, timeout=PATIENCE) as client:
         yield client
 
 

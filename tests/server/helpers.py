@@ -21,11 +21,9 @@ from websockets.sync.client import ClientConnection, connect
 from lodestream.protocol.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
 from lodestream.protocol.wire import parse, serialize
 from lodestream_server.storage.markers import MARKER
+from tests.patience import PATIENCE as PATIENCE
 
 T = TypeVar("T")
-
-# Nothing here takes longer than some seconds, but on a machine that does much else.
-PATIENCE = 150.0
 
 
 def hills(rows: int = 40, columns: int = 30, seed: int = 1) -> NDArray[np.float32]:

@@ -16,10 +16,11 @@ from typing import Any
 import httpx
 import pytest
 
+from tests.patience import PATIENCE as _PATIENCE
+
 __all__ = ["Server", "Within", "alive", "descendants", "resident", "server"]
 
 # Long enough for a machine that does several other things.
-_PATIENCE = 150.0
 
 
 @dataclass(frozen=True)

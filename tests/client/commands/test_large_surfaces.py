@@ -23,6 +23,7 @@ from lodestream_client.commands import decode_by_rows, values
 from lodestream_client.commands.building_options import BuildingOptions, work_folder
 from tests.clusters import local_cluster
 from tests.core.surfaces import terrain
+from tests.patience import PATIENCE
 
 from ..conftest import Run
 from .test_program import COMMAND, environment
@@ -30,7 +31,6 @@ from .test_program import COMMAND, environment
 LITTLE = ("--memory", "1MiB")
 
 #: Seconds until a build in a process of its own must have come so far.
-PATIENCE = 60
 
 
 @pytest.fixture(scope="module")

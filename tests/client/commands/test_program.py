@@ -21,6 +21,7 @@ import lodestream_client
 from lodestream.errors import UnavailableError
 from lodestream_client.commands import completion
 from lodestream_client.program import build_parser
+from tests.patience import PATIENCE
 
 from .. import manual
 from ..stream.test_misbehaving import websocket_server
@@ -38,7 +39,7 @@ def environment() -> dict[str, str]:
 
 def call(*arguments: object, data: bytes = b"") -> subprocess.CompletedProcess[bytes]:
     command = [*COMMAND, *map(str, arguments)]
-    return subprocess.run(command, input=data, capture_output=True, env=environment(), timeout=120, check=False)
+    return subprocess.run(command, input=data, capture_output=True, env=environment(), timeout=PATIENCE, check=False)
 
 
 def loaded_after(statement: str, names: Sequence[str]) -> list[str]:
@@ -109,7 +110,7 @@ def _completions(line: str, folder: Path) -> list[str]:
     """What a shell is told at the end of a line."""
     asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
     asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(folder / "told"), "_ARGCOMPLETE_IFS": "\n"}
-    done = subprocess.run(COMMAND, env={**environment(), **asked}, capture_output=True, timeout=120, check=False)
+    done = subprocess.run(COMMAND, env={**environment(), **asked}, capture_output=True, timeout=PATIENCE, check=False)
     assert done.returncode == 0, done.stderr
     return (folder / "told").read_text().split("\n")
 
@@ -134,7 +135,7 @@ def test_bash_knows_the_command_by_what_is_printed_for_it() -> None:
     pytest.importorskip("argcomplete")
     script = call("completion", "bash").stdout
     asked = b'eval "$(cat)"; complete -p lodestream; type _python_argcomplete'
-    done = subprocess.run(["bash", "-c", asked], input=script, capture_output=True, timeout=60, check=False)
+    done = subprocess.run(["bash", "-c", asked], input=script, capture_output=True, timeout=PATIENCE, check=False)
     assert done.returncode == 0, done.stderr
     assert b"-F _python_argcomplete lodestream" in done.stdout
 
@@ -148,7 +149,9 @@ def test_completion_without_its_library_says_what_to_install(monkeypatch: pytest
 def test_the_package_runs_as_a_module() -> None:
     command = [sys.executable, "-m", "lodestream"]
     for arguments in (["--version"], ["formats", "--json"], ["nonsense"]):
-        ours = subprocess.run([*command, *arguments], capture_output=True, env=environment(), timeout=120, check=False)
+        ours = subprocess.run(
+            [*command, *arguments], capture_output=True, env=environment(), timeout=PATIENCE, check=False
+        )
         assert ours.returncode == call(*arguments).returncode
         assert ours.stdout == call(*arguments).stdout
         assert ours.stderr == call(*arguments).stderr
@@ -161,7 +164,7 @@ def test_the_module_says_where_its_program_is_not_installed() -> None:
         capture_output=True,
         text=True,
         env=environment(),
-        timeout=120,
+        timeout=PATIENCE,
         check=False,
     )
     assert (done.returncode, done.stdout) == (1, "")
@@ -183,7 +186,9 @@ def test_a_closed_pipe_is_quiet(container_file: Path, arguments: tuple[str, ...]
     read, write = os.pipe()
     os.close(read)
     command = [*COMMAND, arguments[0], str(container_file), *arguments[1:]]
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, env=environment(), timeout=120, check=False)
+    done = subprocess.run(
+        command, stdout=write, stderr=subprocess.PIPE, env=environment(), timeout=PATIENCE, check=False
+    )
     os.close(write)
     assert done.returncode == 1
     assert done.stderr == b""
@@ -247,9 +252,9 @@ def test_an_interrupt_ends_with_one_line(tmp_path: Path) -> None:
         process = subprocess.Popen(
             [*COMMAND, "pull", url, str(tmp_path / "out.npy")], stderr=subprocess.PIPE, env=environment()
         )
-        assert heard.wait(60)
+        assert heard.wait(PATIENCE)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=PATIENCE)
     out = tmp_path / "out.npy"
     assert (process.returncode, said.decode()) == (130, f"lodestream: interrupted: {out} is not written\n")
     assert list(tmp_path.iterdir()) == []

@@ -18,6 +18,7 @@ from lodestream.formats import write
 from lodestream.grid.layout import Layout
 from lodestream_client import sync
 from lodestream_client.commands import watching
+from tests.patience import PATIENCE
 
 from ..conftest import Run
 
@@ -108,7 +109,7 @@ def test_nothing_waits_for_what_is_written_and_the_newest_is_next(
 
     def blocked(state: ls.Surface, path: str) -> None:
         begun.set()
-        assert go_on.wait(60)
+        assert go_on.wait(PATIENCE)
         written.append(float(np.sqrt(np.mean((state.points.astype(float) - terrain) ** 2))))
         if len(written) == 2:
             second.set()
@@ -116,12 +117,12 @@ def test_nothing_waits_for_what_is_written_and_the_newest_is_next(
     monkeypatch.setattr(watching, "write_surface", blocked)
     with watching.Watch(str(tmp_path / "out.npy"), None, ls.Target(), dict, "hill") as watch:
         watch.write(views[0], layout)
-        assert begun.wait(60)
+        assert begun.wait(PATIENCE)
         for view in views[1:9]:  # while the first is written
             watch.write(view, layout)
         assert not written
         go_on.set()
-        assert second.wait(60)
+        assert second.wait(PATIENCE)
     assert written == pytest.approx([views[0].rms, views[8].rms], rel=1e-3)
 
 

@@ -16,6 +16,7 @@ import pytest
 import lodestream as ls
 import lodestream_client
 from lodestream_client.terminal import output
+from tests.patience import PATIENCE
 
 from ..conftest import Run
 from ..scripted import document, problem, scripted
@@ -130,7 +131,7 @@ def test_warnings_and_logs_of_libraries() -> None:
         f"    warnings.warn({EVIL!a}, FormatWarning)\n"
         f"    logging.getLogger('x').error({EVIL!a})\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=True)
     assert done.stderr.count(r"\x1b]52;c;ZWNobw==\x07") == 3
     assert harmless(done.stderr)
 

@@ -22,7 +22,7 @@ import nbformat
 from nbclient import NotebookClient
 
 notebook = nbformat.read(sys.argv[1], as_version=4)
-NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
+NotebookClient(notebook, timeout=PATIENCE, kernel_name="python3").execute()
 nbformat.write(notebook, sys.argv[1])
 """
 

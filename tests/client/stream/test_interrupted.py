@@ -29,6 +29,7 @@ from lodestream_client.__main__ import main
 from lodestream_client.stream import cache
 from lodestream_client.stream.reconnecting import Transport
 from tests.links import Fault, linked
+from tests.patience import PATIENCE
 from tests.server.programs import Server, descendants
 
 from ..conftest import Run, make_terrain
@@ -127,7 +128,7 @@ def cached(folder: Path) -> int:
 
 
 def until(condition: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
-    end = time.monotonic() + 90
+    end = time.monotonic() + PATIENCE
     while not condition():
         assert process.poll() is None, f"it ended before: {process.communicate()!r}"
         assert time.monotonic() < end
@@ -153,7 +154,7 @@ def command(*arguments: object, before: str = "import sys") -> Iterator[subproce
 
 
 def end(process: subprocess.Popen[bytes]) -> tuple[int, str, str]:
-    out, err = process.communicate(timeout=90)
+    out, err = process.communicate(timeout=PATIENCE)
     return process.returncode, out.decode(), err.decode()
 
 

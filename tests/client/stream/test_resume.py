@@ -26,6 +26,7 @@ from lodestream_client import sync
 from lodestream_client.stream import cache, reconnecting
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, Link, linked
+from tests.patience import PATIENCE
 
 from ..conftest import Run
 from ..files import Ranged, ranged
@@ -279,7 +280,7 @@ def test_a_pull_that_is_killed_is_gone_on_with(
     command += ["--limit-rate", "64kbit", "--transport", transport]
     process = subprocess.Popen(command, env={**os.environ, "LODESTREAM_CACHE": str(folder)}, stderr=subprocess.DEVNULL)
     try:
-        until = time.monotonic() + 60
+        until = time.monotonic() + PATIENCE
         while not parts(folder) or parts(folder)[0].stat().st_size < 6000:
             assert time.monotonic() < until
             assert process.poll() is None, "it was to be killed before its end"

@@ -20,8 +20,8 @@ from lodestream.errors import RemoteProtocolError
 from lodestream_client.viewer import page_server
 from lodestream_client.viewer.page_server import PageServer, byte_range, serving
 from lodestream_client.viewer.sources import FileSource
+from tests.patience import PATIENCE
 
-PATIENCE = 600.0  # seconds after which something hangs, however busy the machine is
 DATA = bytes(range(256)) * 9
 
 

@@ -21,6 +21,7 @@ from lodestream_client.program import main
 from lodestream_client.viewer.sources import FileSource, RemoteSource
 from lodestream_client.viewer.static import write_static
 from tests.client.files import ranged
+from tests.patience import PATIENCE
 
 HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
 
@@ -275,4 +276,4 @@ def test_the_page_is_there_until_it_is_told_to_end(
         pass
     assert httpx.get(url + "surface.lode").content == container.read_bytes()
     viewing.send_signal(number)
-    assert viewing.wait(20) == code
+    assert viewing.wait(PATIENCE) == code

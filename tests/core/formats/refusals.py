@@ -18,7 +18,8 @@ from typing import Any
 
 __all__ = ["Refusal", "refusals"]
 
-SECONDS = 5
+#: Of a processor, which on a busy machine does less in each; what grows with the square of a file takes minutes.
+SECONDS = 30
 #: What a file may make a process take at most before the system refuses, so that a failing test harms nobody.
 _MOST_MEMORY = 3 << 30
 

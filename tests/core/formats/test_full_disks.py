@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE
+
 pytest.importorskip("h5netcdf")
 resource = pytest.importorskip("resource")
 
@@ -32,7 +34,9 @@ except OSError as error:
 def test_a_netcdf_that_does_not_fit_is_told_and_kills_nobody(tmp_path: Path, limit: int) -> None:
     # HDF5 ends a process whose writes fail.
     path = tmp_path / "a.nc"
-    done = subprocess.run([sys.executable, "-c", _WRITE, path, str(limit)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", _WRITE, path, str(limit)], capture_output=True, text=True, timeout=PATIENCE
+    )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == f"{errno.EFBIG} {path}"
     assert [it.name for it in tmp_path.iterdir()] == ["a.nc.first.nc"]
@@ -57,6 +61,8 @@ def test_a_store_that_does_not_fit_leaves_nothing(tmp_path: Path, limit: int) ->
     # Threads of zarr were still writing chunks while the folder was removed.
     pytest.importorskip("zarr")
     path = tmp_path / "a.zarr"
-    done = subprocess.run([sys.executable, "-c", _STORE, path, str(limit)], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", _STORE, path, str(limit)], capture_output=True, text=True, timeout=PATIENCE
+    )
     assert (done.returncode, done.stdout.strip()) == (0, "\n".join([f"{errno.EFBIG} {path}"] * 5)), done.stderr
     assert list(tmp_path.iterdir()) == []

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE
+
 pytest.importorskip("h5netcdf")
 
 #: Interrupts the main thread as a key does, while HDF5 is in one of its calls of the file.
@@ -38,6 +40,6 @@ except KeyboardInterrupt:
 @pytest.mark.parametrize("call", [1, 2, 5, 12])
 def test_an_interruption_is_told_and_kills_nobody(tmp_path: Path, call: int) -> None:
     command = [sys.executable, "-c", _WRITE, str(tmp_path / "a.nc"), str(call)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
     assert list(tmp_path.iterdir()) == []

@@ -19,6 +19,7 @@ from lodestream import formats
 from lodestream.bands import reading
 from lodestream.bands.reading import read_into
 from lodestream.errors import UnavailableError
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.filterwarnings("ignore:Consolidated metadata")
 
@@ -215,7 +216,9 @@ def test_nobody_waits_for_a_pipe_in_place_of_the_head_of_a_store(tmp_path: Path)
     sea().isel(time=0).drop_vars(["speed", "time"]).to_zarr(store, zarr_format=2, consolidated=False)
     os.mkfifo(store / "zarr.json")
     program = f"import lodestream; lodestream.read({os.fspath(store)!r})"
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    found = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
     assert "expected a Zarr store of regular files, got 'zarr.json', which is none" in found.stderr
 
 

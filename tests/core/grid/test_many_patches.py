@@ -27,7 +27,7 @@ TIMES, MORE = 8, 4
 NOISE = 0.5
 
 #: How long a file that is refused by a limit may take.
-AT_ONCE = 5.0
+AT_ONCE = 30.0
 
 #: Each with a number of patches, of which four times as many are read.
 READ: list[tuple[Maker, int]] = [

@@ -28,6 +28,7 @@ from lodestream_server import running_server
 from lodestream_server.access.tokens import SCOPES, TokenFile
 from lodestream_server.routes import streams
 from lodestream_server.storage.durable import write_file
+from tests.patience import PATIENCE
 from tests.server.helpers import Keys, Raw, closed, eventually, hills, npy, problem, push, raw_stream
 
 
@@ -46,14 +47,14 @@ class Served:
 @pytest.fixture(scope="module")
 def served(keys: Keys) -> Iterator[Served]:
     with running_server(keys.folder, workers=1) as url:
-        with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=keys.header("write")) as http:
+        with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE, headers=keys.header("write")) as http:
             made = push(http, npy(hills(30, 20)))
         yield Served(url, url + made["url"], keys)
 
 
 @pytest.fixture(scope="module")
 def http(served: Served) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=served.url, trust_env=False, timeout=60) as client:
+    with httpx.Client(base_url=served.url, trust_env=False, timeout=PATIENCE) as client:
         yield client
 
 
@@ -238,7 +239,7 @@ def last_error(stream: Raw) -> str:
 
 def test_without_tokens_a_stream_with_a_forged_host_needs_one(server: str) -> None:
     address = urlsplit(server)
-    connection = socket.create_connection((address.hostname, address.port), timeout=60)
+    connection = socket.create_connection((address.hostname, address.port), timeout=PATIENCE)
     with raw_stream(f"http://example.org:{address.port}/v1/surfaces/{'0' * 20}", sock=connection) as stream:
         stream.send(Open())
         assert refused(stream) == "no-token"
@@ -325,7 +326,7 @@ def test_a_shared_cache_keeps_only_what_everybody_may_read(served: Served, http:
 @pytest.mark.parametrize("method", ["GET", "DELETE"])
 def test_no_path_leads_out_of_the_folder(served: Served, method: str, path: str) -> None:
     address = urlsplit(served.url)
-    with socket.create_connection((address.hostname, address.port), timeout=60) as connection:
+    with socket.create_connection((address.hostname, address.port), timeout=PATIENCE) as connection:
         token = served.keys.tokens["admin"]
         connection.sendall(
             f"{method} {path} HTTP/1.1\r\nHost: {address.netloc}\r\nAuthorization: Bearer {token}\r\n"

@@ -232,7 +232,7 @@ def small(folder: Path) -> Iterator[tuple[str, str, dict[str, str]]]:
 @contextmanager
 def client(url: str, token: str) -> Iterator[httpx.Client]:
     headers = {"authorization": f"Bearer {token}"}
-    with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=headers) as http:
+    with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE, headers=headers) as http:
         yield http
 
 
@@ -371,7 +371,7 @@ def settled_upload(http: httpx.Client, body: bytes) -> httpx.Response | None:
 def test_a_server_without_room_says_so(tmp_path: Path) -> None:
     with (
         running_server(tmp_path, workers=1, keep_free=1 << 60) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         answer = http.post("/v1/surfaces", content=npy(hills()))
         assert (answer.status_code, answer.json()["code"]) == (507, "full")
@@ -381,7 +381,7 @@ def test_a_server_without_room_says_so(tmp_path: Path) -> None:
 def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with (
         running_server(tmp_path, workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, npy(hills()))
         eventually(lambda: not list((tmp_path / "work").iterdir()), "the build's folder to be removed")
@@ -400,13 +400,15 @@ def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: py
 def test_levels_are_asked_for_by_so_many_at_a_time(tmp_path: Path) -> None:
     with (
         running_server(tmp_path, workers=1, max_level_requests=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, npy(hills(100, 100)))
         statuses: list[int] = []
 
         def ask() -> None:
-            answer = httpx.get(f"{url}{made['url']}/levels/{len(made['levels']) - 1}", trust_env=False, timeout=60)
+            answer = httpx.get(
+                f"{url}{made['url']}/levels/{len(made['levels']) - 1}", trust_env=False, timeout=PATIENCE
+            )
             statuses.append(answer.status_code)
 
         threads = [threading.Thread(target=ask) for _ in range(6)]

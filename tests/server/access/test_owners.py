@@ -12,6 +12,7 @@ import pytest
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import worker
+from tests.patience import PATIENCE
 from tests.server.builds import slow
 from tests.server.helpers import eventually, hills, kept, npy, problem, settled
 
@@ -27,7 +28,7 @@ class Office:
     def client(self, name: str, scope: str = "write") -> httpx.Client:
         text, _ = self.keys.create(name, (scope,))
         headers = {"authorization": f"Bearer {text}"}
-        return httpx.Client(base_url=self.url, trust_env=False, timeout=60, headers=headers)
+        return httpx.Client(base_url=self.url, trust_env=False, timeout=PATIENCE, headers=headers)
 
 
 @pytest.fixture
@@ -114,7 +115,7 @@ def test_what_nobody_owns_an_admin_deletes(tmp_path: Path) -> None:
     data, keys = tmp_path / "data", TokenFile(tmp_path / "tokens.json")
     with (
         running_server(data, workers=1, token_file=keys.path) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         where = push(http)
         assert http.get(where).json()["owner"] is None
@@ -168,7 +169,7 @@ def test_what_a_delete_could_not_remove_does_not_take_what_was_uploaded_again(
             super().unlink(path)
 
     data = tmp_path / "data"
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         where = push(http)
         monkeypatch.setattr(durable, "disk", Stubborn())
         assert http.delete(where).status_code == 204
@@ -176,7 +177,7 @@ def test_what_a_delete_could_not_remove_does_not_take_what_was_uploaded_again(
         assert [name.partition(".")[2] for name in kept(data, "records")] == ["deleted"]
         monkeypatch.undo()
         assert push(http) == where
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert http.get(where).json()["state"] == "ready"
         assert http.delete(where).status_code == 204
         for folder in ("records", "uploads", "containers"):
@@ -193,7 +194,7 @@ def test_what_a_delete_could_not_remove_is_removed_by_the_next_start(
             """It stays."""
 
     data = tmp_path / "data"
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         where = push(http)
         monkeypatch.setattr(durable, "disk", Stubborn())
         assert http.delete(where).status_code == 204

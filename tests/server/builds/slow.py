@@ -19,6 +19,7 @@ from lodestream_server.builds.forkserver import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 from lodestream_server.storage import durable
+from tests.patience import PATIENCE as _PATIENCE
 from tests.server.storage.disks import FullDisk
 
 __all__ = [
@@ -71,7 +72,6 @@ def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
 
 
 # The server's limits are longer, and no test leaves it at that.
-_PATIENCE = 120.0
 
 _allowed: Callable[..., Allowed] = jobs._allowed
 _allowed_level: Callable[..., Allowed] = level_queue._allowed
@@ -119,7 +119,7 @@ def end_by(number: int) -> None:
 def share() -> list[int]:
     """Threads that it may have, those that take part where each waits for the others, and how nice it is."""
     together = Barrier(threads())
-    taking_part = set(spread(lambda _: (together.wait(20), get_ident())[1], range(threads())))
+    taking_part = set(spread(lambda _: (together.wait(_PATIENCE), get_ident())[1], range(threads())))
     return [threads(), len(taking_part), os.getpriority(os.PRIO_PROCESS, 0)]
 
 

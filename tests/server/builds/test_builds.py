@@ -30,7 +30,7 @@ from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, push, s
 def running(data: Path, **settings: Any) -> Iterator[httpx.Client]:
     with (
         running_server(data, **{"workers": 1, **settings}) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         yield http
 

@@ -33,6 +33,7 @@ from lodestream_server.builds.answers import ProcessDiedError, UnforeseenError
 from lodestream_server.builds.clusters import build_by_cluster
 from tests.clusters import local_cluster
 from tests.core.surfaces import terrain
+from tests.patience import PATIENCE
 from tests.server.builds import slow
 from tests.server.helpers import eventually, npy, push
 from tests.server.programs import Server, alive, server
@@ -167,7 +168,10 @@ def test_a_surface_that_is_only_parsed_is_no_answer_where_there_is_no_cluster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(worker, "build", slow.parse_only)
-    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with (
+        running_server(tmp_path, workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
         surface = push(http, npy(np.zeros((9, 9), np.float32)))
     assert surface["state"] == "waiting"
     assert "expected a container, got a surface that is only parsed" in surface["reason"]
@@ -256,7 +260,7 @@ def test_how_a_build_by_a_cluster_ends_is_told_and_logged(
     address = "tcp://127.0.0.1:8786"
     with (
         running_server(tmp_path, dask=address, **BEYOND) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         location = http.post("/v1/surfaces?filename=a.npy", content=large()).raise_for_status().headers["location"]
 
@@ -276,7 +280,7 @@ def test_how_a_build_by_a_cluster_ends_is_told_and_logged(
 def test_a_server_starts_where_no_scheduler_is_and_says_so_of_what_it_cannot_build(tmp_path: Path) -> None:
     with (
         running_server(tmp_path, dask="tcp://127.0.0.1:1", **BEYOND) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         assert push(http, npy(np.zeros((9, 9), np.float32)))["state"] == "ready"
         surface = push(http, large())
@@ -304,7 +308,7 @@ def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_
         first = Server(tmp_path / "data", **settings)
         with (
             contextlib.closing(SimpleNamespace(close=first.kill)),
-            httpx.Client(base_url=first.url, trust_env=False, timeout=60) as http,
+            httpx.Client(base_url=first.url, trust_env=False, timeout=PATIENCE) as http,
         ):
             deleted = http.post("/v1/surfaces?filename=a.npy", content=data).headers["location"]
             eventually(handing_out, "a build at the cluster")
@@ -319,7 +323,7 @@ def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_
         cluster.scale(2)
         with (
             server(tmp_path / "data", **settings) as second,
-            httpx.Client(base_url=second.url, trust_env=False, timeout=60) as http,
+            httpx.Client(base_url=second.url, trust_env=False, timeout=PATIENCE) as http,
         ):
             eventually(lambda: http.get(kept).json()["state"] == "ready", "the build to be done again")
             container = http.get(f"{kept}/container", follow_redirects=True).content

@@ -23,6 +23,7 @@ from lodestream_server.builds import jobs, worker
 from lodestream_server.builds.fork_control import ForkServer
 from lodestream_server.maintenance import fsck
 from lodestream_server.storage.durable import remove
+from tests.patience import PATIENCE
 from tests.server.builds.test_builds import running
 from tests.server.connections import hostile
 from tests.server.helpers import eventually, hills, kept, npy, push, settled
@@ -214,7 +215,7 @@ def test_the_file_of_the_progress_may_be_anything(tmp_path: Path, monkeypatch: p
         for _ in range(20):
             assert http.get(where).json()["progress"] == 0.0
         (data / "go").touch()
-        until = time.monotonic() + 60
+        until = time.monotonic() + PATIENCE
         while (told := http.get(where).json())["state"] == "building" and time.monotonic() < until:
             assert 0.0 <= told["progress"] <= 1.0
         assert settled(http, where)["state"] == "ready"

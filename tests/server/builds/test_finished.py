@@ -24,6 +24,7 @@ from lodestream_server.builds import worker
 from lodestream_server.maintenance import fsck, repair
 from lodestream_server.storage.records import plain
 from tests.core.container.forgery import index_of, rewritten, unchanged, with_layer_errors, with_metadata
+from tests.patience import PATIENCE
 from tests.server.helpers import eventually, hills, npy, problem, push, settled
 from tests.server.routes.test_bad_uploads import stored
 
@@ -195,7 +196,7 @@ def test_metadata_that_are_too_long_are_refused_at_once(http: httpx.Client, data
 def test_limits_of_builds_hold(tmp_path: Path, exact: bytes) -> None:
     with (
         running_server(tmp_path / "data", workers=1, max_vertices=40 * 30 - 1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, exact)
         assert made["state"] == "waiting"
@@ -219,7 +220,7 @@ def test_a_small_container_that_takes_much_memory_is_held_to_that_of_a_build(tmp
     assert len(container) < 2000
     with (
         running_server(tmp_path / "data", workers=1, build_memory=600 << 20) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, container)
         assert made["state"] == "waiting"
@@ -230,7 +231,7 @@ def test_a_small_container_that_takes_much_memory_is_held_to_that_of_a_build(tmp
 def test_what_takes_too_long_is_ended(tmp_path: Path, exact: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     with (
         running_server(tmp_path / "data", workers=1, build_seconds=0.001) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, exact)
         assert made["state"] == "waiting"
@@ -241,7 +242,7 @@ def test_whose_word_the_errors_are_outlives_a_repair(tmp_path: Path, exact: byte
     data = tmp_path / "data"
     with (
         running_server(data, workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = {name: push(http, body) for name, body in (("checked", exact), ("told", near))}
     assert fsck.check(data).findings == []
@@ -266,7 +267,7 @@ def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Pa
     data = tmp_path / "data"
     with (
         running_server(data, workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, exact)
         assert made["state"] == "ready"
@@ -274,7 +275,7 @@ def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Pa
     lost.unlink()
     with (
         running_server(data, workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         again = push(http, exact)
         assert (again["state"], again["container"], again["errors"]) == ("ready", made["container"], "checked")
@@ -325,7 +326,7 @@ def test_too_many_layers_and_empty_ones_are_refused(tmp_path: Path, count: int, 
     """Nobody can open what would hold up the event loop, and its description is small."""
     with (
         running_server(tmp_path / "data", workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         answer = http.post("/v1/surfaces", content=with_layers(count))
         if answer.status_code == 413:

@@ -23,6 +23,7 @@ from lodestream_server.operation.settings import Settings
 from tests.clusters import local_cluster
 from tests.core.bands.block_surfaces import block_surface
 from tests.core.surfaces import terrain
+from tests.patience import PATIENCE
 from tests.server.helpers import push
 
 pytest.importorskip("distributed")
@@ -118,7 +119,7 @@ def test_a_cluster_builds_what_is_large(cluster: Any, tmp_path: Path) -> None:
         running_server(
             tmp_path / "data", workers=1, build_memory=MEMORY, dask=cluster.scheduler_address, formats="npy"
         ) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=120) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         large = push(http, data)
         assert large["state"] == "ready", large

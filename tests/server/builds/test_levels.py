@@ -37,7 +37,7 @@ from tests.server.programs import alive, server
 @contextmanager
 def client(url: str, token: str | None = None) -> Iterator[httpx.Client]:
     headers = {} if token is None else {"authorization": f"Bearer {token}"}
-    with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=headers) as http:
+    with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE, headers=headers) as http:
         yield http
 
 

@@ -42,7 +42,7 @@ class Town:
         return {"Authorization": f"Bearer {self.tokens[name]}"}
 
     def client(self, name: str) -> httpx.Client:
-        return httpx.Client(base_url=self.url, trust_env=False, timeout=60, headers=self.header(name))
+        return httpx.Client(base_url=self.url, trust_env=False, timeout=PATIENCE, headers=self.header(name))
 
     def begin(self, name: str, length: int, body: bytes = b"xxxxxx") -> socket.socket:
         """An upload that says how large it is, and of which no more comes than this."""

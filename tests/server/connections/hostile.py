@@ -27,6 +27,7 @@ from lodestream.parallel import VARIABLE
 from lodestream_server.builds import worker
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
+from tests.patience import PATIENCE
 
 __all__ = [
     "burn",
@@ -181,7 +182,7 @@ def trick_progress(job: Job) -> Built | Parsed | Refused:
     progress = job.folder / "progress"
     progress.symlink_to("/dev/zero")
     go = job.folder.parent.parent / "go"
-    until = time.monotonic() + 60
+    until = time.monotonic() + PATIENCE
     while not go.exists() and time.monotonic() < until:
         time.sleep(0.01)
     progress.unlink()

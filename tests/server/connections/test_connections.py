@@ -42,7 +42,7 @@ def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, d
     """A server that waits for nobody, and a surface on it that no buffer takes whole."""
     data = tmp_path_factory.mktemp("data")
     # Built by one that is patient, which does not mind how busy this machine is.
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         made = push(http, npy(hills(700, 700)))
     # Not so short that a machine which does several other things keeps somebody waiting who is in time.
     with running_server(data, workers=1, head_seconds=SECONDS, idle_seconds=SECONDS, bye_seconds=SECONDS) as url:
@@ -517,7 +517,7 @@ def test_nothing_of_connections_is_kept_when_they_have_ended(tmp_path: Path) -> 
 
     # Patient: what is kept until the next look at a connection would be kept for longer than this waits.
     with running_server(tmp_path, workers=1, idle_seconds=10 * PATIENCE) as url:
-        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
             surface = push(http, npy(hills()))
         before = watches()
         for _ in range(5):

@@ -121,7 +121,10 @@ def test_pings_do_not_prolong_the_wait_for_open(tmp_path: Path, keys: Keys) -> N
 
 
 def test_messages_that_change_nothing_do_not_prolong_a_wait(tmp_path: Path) -> None:
-    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with (
+        running_server(tmp_path, workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
         made = push(http, npy(hills(30, 30)))
     settings: dict[str, Any] = {"workers": 1, "idle_seconds": 0.5, "bye_seconds": 0.5}
     with running_server(tmp_path, **settings) as url, raw_stream(url + made["url"]) as stream:

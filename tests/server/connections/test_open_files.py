@@ -22,6 +22,7 @@ from lodestream_server import Settings
 from lodestream_server.connections.open_files import most_connections, raise_file_limit
 from lodestream_server.operation import logs
 from lodestream_server.operation.repeats import SECONDS, Repeats
+from tests.patience import PATIENCE
 from tests.server.helpers import eventually, hills, npy, push
 
 # `serve` under a small limit.
@@ -51,16 +52,16 @@ def serving(folder: Path, files: int, *arguments: str) -> Iterator[tuple[str, Pa
             yield found[1], log
         finally:
             process.terminate()
-            process.wait(60)
+            process.wait(PATIENCE)
 
 
 def test_more_connections_than_files_neither_stop_the_server_nor_fill_its_log(tmp_path: Path) -> None:
-    with serving(tmp_path, 90) as (url, log), httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with serving(tmp_path, 90) as (url, log), httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         made = push(http, npy(hills()))
         address = urlsplit(url)
         with ExitStack() as held:
             for _ in range(150):
-                each = held.enter_context(socket.create_connection((address.hostname, address.port), timeout=10))
+                each = held.enter_context(socket.create_connection((address.hostname, address.port), timeout=PATIENCE))
                 each.sendall(b"GET /healthz HTTP/1.1\r\nHost: ")  # and no more
             # Its connection is from before: it is served, with a file of its own.
             for _ in range(3):

@@ -65,7 +65,7 @@ def serving(tmp_path: Path, *arguments: str) -> Iterator[tuple[subprocess.Popen[
 
 def test_the_server_says_where_it_listens_and_ends_when_told(tmp_path: Path) -> None:
     with serving(tmp_path) as (process, address):
-        with httpx.Client(base_url=address, trust_env=False, timeout=60) as http:
+        with httpx.Client(base_url=address, trust_env=False, timeout=PATIENCE) as http:
             assert http.get("/healthz").status_code == 200
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE) in (0, -signal.SIGTERM)
@@ -74,13 +74,16 @@ def test_the_server_says_where_it_listens_and_ends_when_told(tmp_path: Path) -> 
 
 
 def test_what_was_acknowledged_is_there_after_a_kill(tmp_path: Path) -> None:
-    with serving(tmp_path) as (process, address), httpx.Client(base_url=address, trust_env=False, timeout=60) as http:
+    with (
+        serving(tmp_path) as (process, address),
+        httpx.Client(base_url=address, trust_env=False, timeout=PATIENCE) as http,
+    ):
         ready = push(http, npy(hills(seed=1)))
         queued = http.post("/v1/surfaces", content=npy(hills(200, 200, seed=2)))
         assert queued.status_code == 202
         process.kill()
         process.wait(PATIENCE)
-    with serving(tmp_path) as (_, address), httpx.Client(base_url=address, trust_env=False, timeout=60) as http:
+    with serving(tmp_path) as (_, address), httpx.Client(base_url=address, trust_env=False, timeout=PATIENCE) as http:
         assert http.get(ready["url"]).json() == ready
         assert push(http, npy(hills(200, 200, seed=2)))["url"] == queued.headers["location"]
 

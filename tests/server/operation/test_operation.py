@@ -280,7 +280,7 @@ def last_word(stream: Raw) -> int | None:
 def test_told_to_end_a_server_ends_whatever_is_under_way(tmp_path: Path) -> None:
     with ExitStack() as running:
         process, url, log = running.enter_context(serving(tmp_path, "--log-format", "json"))
-        http = running.enter_context(httpx.Client(base_url=url, trust_env=False, timeout=60))
+        http = running.enter_context(httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE))
         made = push(http, npy(hills(90, 80)))
         # Streams that wait, one that never reads, an upload that does not go on, a build that takes its time.
         waiting = running.enter_context(raw_stream(url + made["url"], additional_headers={"x-request-id": "waits"}))
@@ -311,7 +311,7 @@ def test_told_to_end_a_server_ends_whatever_is_under_way(tmp_path: Path) -> None
     assert streams[1]["bytes"] == 100
     assert not any("Traceback" in line for line in lines)
     # What was acknowledged is taken up again.
-    with serving(tmp_path) as (_, url, _), httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with serving(tmp_path) as (_, url, _), httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         found = http.get(queued.headers["location"]).json()
         assert found["state"] in ("queued", "building", "ready")
         assert http.get(made["url"]).json() == made
@@ -378,7 +378,7 @@ def test_a_request_whose_own_work_was_cancelled_is_a_fault() -> None:
 
 def test_the_log_tells_of_requests_that_write_but_not_of_tokens(tmp_path: Path) -> None:
     with serving(tmp_path) as (_, url, log):
-        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
             http.get("/v1/surfaces?token=secret-1", headers={"authorization": "Bearer secret-2"})
             headers = {"authorization": "Bearer secret-3", "x-request-id": "r-7"}
             http.delete("/v1/surfaces/0?token=secret-4", headers=headers)
@@ -417,7 +417,7 @@ def test_links_and_clients_behind_a_proxy(tmp_path: Path) -> None:
     arguments = {"root_path": "/maps", "trusted_proxies": ("127.0.0.1",), "public_reads": True}
     with (
         running_server(tmp_path, workers=1, **arguments) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         answer = http.get("/v1/surfaces", headers={"x-forwarded-for": "192.0.2.1", "x-forwarded-proto": "https"})
         assert answer.status_code == 200

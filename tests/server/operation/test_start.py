@@ -196,7 +196,7 @@ def test_what_a_server_makes_is_its_owners_alone(tmp_path: Path) -> None:
     data = tmp_path / "above" / "data"
     with (
         running_server(data, workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         surface = push(http, npy(hills(12, 9)))
     assert surface["state"] == "ready"

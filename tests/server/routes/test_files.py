@@ -23,6 +23,7 @@ import lodestream as ls
 from lodestream.formats import write_stream
 from lodestream_server import running_server
 from lodestream_server.builds import levels
+from tests.patience import PATIENCE
 from tests.server.helpers import eventually, hills, npy, push
 
 
@@ -243,7 +244,7 @@ def test_a_server_of_one_thread_makes_every_format(tmp_path: Path) -> None:
     formats += ["tif", "cog", "asc"] if find_spec("rasterio") else []
     with (
         running_server(tmp_path / "data", workers=1, threads=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=120) as client,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as client,
     ):
         address = push(client, npy(hills(33, 20)))["url"]
         answers = {name: client.get(f"{address}/levels/2", params={"format": name}) for name in formats}
@@ -275,7 +276,7 @@ def test_a_file_that_was_sent_and_cannot_be_closed_cuts_no_connection(
     monkeypatch.setattr(anyio.AsyncFile, "aclose", fail)
     for path in (address, f"{surface['url']}/levels/2"):
         whole = http.get(path).content
-        with closing(HTTPConnection(http.base_url.host, http.base_url.port or 80, timeout=60)) as connection:
+        with closing(HTTPConnection(http.base_url.host, http.base_url.port or 80, timeout=PATIENCE)) as connection:
             connection.connect()
             first = connection.sock
             for headers in ({}, {"range": "bytes=0-9"}, {"range": "bytes=0-9,20-29"}, {}):

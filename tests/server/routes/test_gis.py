@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
+from tests.patience import PATIENCE
 from tests.server.helpers import Keys, hills, push
 from tests.server.programs import server
 
@@ -45,7 +46,7 @@ def place(keys: Keys) -> Iterator[tuple[str, str]]:
     with server(keys.folder / "gis", token_file=str(keys.folder / "tokens.json")) as running:
         url = running.url
         headers = {"authorization": f"Bearer {keys.tokens['admin']}"}
-        with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=headers) as http:
+        with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE, headers=headers) as http:
             surface = push(http, ls.encode(terrain()))
             yield f"{url}{surface['url']}/levels/{len(surface['levels']) - 1}", keys.tokens["read"]
 
@@ -82,7 +83,7 @@ def test_a_cog_is_read_by_ranges_and_has_overviews(authorised: str, place: tuple
         assert dataset.overviews(1) == [2]
         coarse = dataset.read(1, out_shape=(350, 300))
     assert abs(np.nanmean(coarse) - np.mean(terrain().points[terrain().mask])) < 0.5
-    with httpx.Client(trust_env=False, timeout=60, headers={"authorization": f"Bearer {place[1]}"}) as http:
+    with httpx.Client(trust_env=False, timeout=PATIENCE, headers={"authorization": f"Bearer {place[1]}"}) as http:
         head = http.head(address)
         assert (head.status_code, head.content, head.headers["accept-ranges"]) == (200, b"", "bytes")
         assert head.headers["content-type"] == "image/tiff; application=geotiff; profile=cloud-optimized"
@@ -118,7 +119,7 @@ def test_the_finest_level_has_the_columns_of_the_source_and_what_has_no_cog_says
     two = ls.Surface(blocks=[curved.blocks[0], ls.Block(curved.points + 99)])
     with (
         server(keys.folder / "seam") as running,
-        httpx.Client(base_url=running.url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=running.url, trust_env=False, timeout=PATIENCE) as http,
     ):
         surface = push(http, ls.encode(earth))
         for level, columns in ((-1, 37), (-2, 18)):

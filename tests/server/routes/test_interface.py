@@ -21,6 +21,7 @@ from schemathesis.core.result import Ok
 from schemathesis.specs.openapi.checks import negative_data_rejection, positive_data_acceptance
 
 from lodestream_server import Settings, create_app, running_server
+from tests.patience import PATIENCE
 from tests.server.helpers import eventually, hills, npy, push
 
 SCHEMA = schemathesis.openapi.from_dict(create_app(Settings(data=Path("nowhere"))).openapi())
@@ -63,7 +64,7 @@ class Server:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     with (
         running_server(tmp_path_factory.mktemp("data"), workers=1, upload_bytes=1 << 20) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         eventually(lambda: http.get("/readyz").status_code == 200, "the server to be ready")
         yield Server(url, http, push(http, npy(hills(40, 30))))

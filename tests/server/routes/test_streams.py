@@ -127,7 +127,7 @@ def test_what_is_granted_beyond_what_the_server_keeps_is_forgotten(
 ) -> None:
     with (
         running_server(tmp_path, workers=1, stream_memory=80_000) as server,
-        httpx.Client(base_url=server, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=server, trust_env=False, timeout=PATIENCE) as http,
     ):
         most = BASE_CREDIT + 10_000  # an eighth of the memory beside what every stream has
         assert gets_no_more(server + str(push(http, npy(points))["url"]), 2**40, most).credit == most
@@ -326,7 +326,7 @@ def test_clients_that_vanish_leave_no_task_and_no_file_behind(url: str) -> None:
 def test_a_server_that_ends_tells_its_clients_to_come_back(tmp_path: Path) -> None:
     with ExitStack() as running:
         address = running.enter_context(running_server(tmp_path / "data", workers=1))
-        with httpx.Client(base_url=address, trust_env=False, timeout=60) as http:
+        with httpx.Client(base_url=address, trust_env=False, timeout=PATIENCE) as http:
             made = push(http, npy(hills(90, 80)))
         with raw_stream(address + made["url"]) as stream:
             stream.send(Open(credit=100))

@@ -16,6 +16,7 @@ from lodestream_server.storage import catalog
 from lodestream_server.storage.catalog import Catalog
 from lodestream_server.storage.records import Record
 from lodestream_server.storage.storage import Storage
+from tests.patience import PATIENCE
 from tests.server.helpers import hills, npy
 
 _COUNT = 20_000
@@ -63,7 +64,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
         patch.setattr(Storage, "__init__", begin_full)
         with (
             running_server(folder, max_surfaces=_COUNT, workers=1) as url,
-            httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+            httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
         ):
             yield http
 

@@ -23,6 +23,7 @@ from lodestream_server.problems import BusyError
 from lodestream_server.storage import containers
 from lodestream_server.storage.containers import Containers
 from lodestream_server.storage.storage import Storage
+from tests.patience import PATIENCE
 from tests.server.helpers import hills, kept, push
 
 
@@ -94,7 +95,10 @@ def test_those_that_are_open_have_room_for_so_many_bytes_of_indexes(names: list[
 
 def test_a_container_whose_index_takes_too_much_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(containers, "most_for_indexes", lambda: 1000)
-    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with (
+        running_server(tmp_path, workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
         surface = push(http, encode(hills()))
         assert surface["state"] == "waiting"
         assert "whose index takes at most" in surface["reason"]

@@ -20,6 +20,7 @@ from lodestream_server import running_server
 from lodestream_server.builds import jobs, worker
 from lodestream_server.commands.fsck import register
 from lodestream_server.storage.storage import Storage
+from tests.patience import PATIENCE
 from tests.server.builds import slow
 from tests.server.helpers import hills, npy, push, settled, upload_of
 
@@ -32,7 +33,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str,
     data = tmp_path_factory.mktemp("fsck") / "data"
     with (
         running_server(data, workers=1) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=60) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         return data, [
             push(http, npy(hills(90, 80, seed=1)), name="one", precision="0.01"),
@@ -87,7 +88,7 @@ def test_a_repair_ends_where_the_disk_stays_full(
     finding = next(finding for finding in report["findings"] if finding["surface"] == surfaces[0]["id"])
     assert (finding["repaired"], finding["lost"]) == (False, False)
     assert "space on the server's disk" in finding["repair"]
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert settled(http, surfaces[0]["url"])["container"] == surfaces[0]["container"]
 
 
@@ -214,7 +215,7 @@ def test_what_is_damaged_is_set_aside_and_built_again(
     assert (data / "damaged" / "containers" / container.name).read_bytes() == damaged
     assert (data / "damaged" / "records" / record.name).read_text() == "{"
     assert is_whole(data, original, *surfaces)
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert [http.get(surface["url"]).json() for surface in surfaces] == [one, two, failed]
         stored = http.get(f"{one['url']}/container", follow_redirects=True).content
         assert np.array_equal(ls.decode(stored).points, ls.decode(container.read_bytes()).points)
@@ -254,7 +255,7 @@ def test_upload_and_container_damaged_at_once(fsck: Fsck, data: Path, surfaces: 
     code, report = fsck("--repair")
     assert code == 1
     assert {finding["what"] for finding in report["findings"] if finding["lost"]} == {"upload", "container"}
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert [http.get(surface["url"]).json()["state"] for surface in (one, two)] == ["missing", "ready"]
         assert http.get(f"{one['url']}/container").status_code == 503
         # The same file again is all that it takes.
@@ -276,7 +277,7 @@ def test_a_record_that_is_lost_keeps_what_may_be_its(
     assert (upload / "0").is_file()
     assert (data / "containers" / f"{one['container']}.lode").is_file()
     assert is_whole(data, original, two, failed)
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert http.get(one["url"]).json()["state"] == "missing"
         assert http.get(f"{one['url']}/container").status_code == 503
 

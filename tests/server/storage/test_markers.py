@@ -24,6 +24,7 @@ from lodestream_server.storage.durable import Disk, write_file
 from lodestream_server.storage.folders import Folders
 from lodestream_server.storage.markers import MARKER, adopt
 from lodestream_server.storage.storage import Storage
+from tests.patience import PATIENCE
 from tests.server.helpers import hills, npy, push, settled, upload_of
 
 FOLDERS = ("records", "uploads", "containers")
@@ -41,7 +42,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
     """A folder with a surface that is ready and one that failed."""
     data = tmp_path_factory.mktemp("markers") / "data"
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         return data, [push(http, npy(hills(seed=1)), name="one"), push(http, npy(hills(seed=2))[:-1])]
 
 
@@ -76,7 +77,7 @@ def as_of_before(data: Path) -> None:
 
 
 def served(data: Path) -> list[dict[str, Any]]:
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         found = http.get("/v1/surfaces").json()["surfaces"]
         return [http.get(entry["url"]).json() for entry in found]
 
@@ -136,13 +137,13 @@ def test_a_folder_of_before_is_deleted_from_and_shared(data: Path, surfaces: lis
     as_of_before(data)
     one = surfaces[0]
     folder = data / "uploads" / one["id"]
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         two = push(http, npy(hills(seed=1)), name="two")
         assert upload_of(data, two) == folder
         assert http.delete(one["url"]).status_code == 204
         assert http.get(two["url"]).json() == two
     assert one["id"] not in [surface["id"] for surface in served(data)]
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert http.delete(two["url"]).status_code == 204
     assert not folder.exists()
 
@@ -258,7 +259,7 @@ def test_adopting_without_records_that_was_cut_short_is_finished(
 ) -> None:
     shutil.rmtree(data / "records")
     cut_short(data, 1, monkeypatch)
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         for surface in surfaces:
             assert settled(http, surface["url"]) == surface
 
@@ -322,7 +323,7 @@ def test_adopting_what_was_moved(
 def test_a_server_says_in_one_line_why_it_does_not_start(data: Path, tmp_path: Path) -> None:
     (data / "uploads").rename(tmp_path / "uploads")
     command = [sys.executable, "-m", "lodestream_client", "serve", "--data", str(data), "--port", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith("lodestream: expected the marker of this data folder in uploads/")

@@ -16,6 +16,7 @@ from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.commands.fsck import register
 from lodestream_server.storage.markers import MARKER
+from tests.patience import PATIENCE
 from tests.server.helpers import hills, npy, problem, settled, upload_of
 
 BODY = npy(hills(seed=11))
@@ -53,7 +54,7 @@ class _Served:
         self._server = running_server(data, workers=1, token_file=keys, public_reads=True)
 
     def __enter__(self) -> httpx.Client:
-        self._http = httpx.Client(base_url=self._server.__enter__(), trust_env=False, timeout=60)
+        self._http = httpx.Client(base_url=self._server.__enter__(), trust_env=False, timeout=PATIENCE)
         return self._http
 
     def __exit__(self, *error: Any) -> None:

@@ -170,5 +170,5 @@ def test_a_level_of_a_surface_that_was_deleted_is_not_missing(tmp_path: Path, mo
 @contextmanager
 def _client(url: str, token: str | None = None) -> Iterator[httpx.Client]:
     headers = {} if token is None else {"authorization": f"Bearer {token}"}
-    with httpx.Client(base_url=url, trust_env=False, timeout=60, headers=headers) as http:
+    with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE, headers=headers) as http:
         yield http
