@@ -13,6 +13,7 @@ from ..coordinates.height_fields import coordinates
 from ..errors import FormatError
 from ..mesh import weld
 from ..surface import Block, Surface
+from ..text import printable
 from .notes import metadata_left_out, warn_left_out
 from .source import number
 
@@ -117,7 +118,10 @@ def words_of(kind: str, surface: Surface) -> dict[str, str]:
     surface : Surface
     """
     held = {key: surface.metadata[key] for key in _WORDS if isinstance(surface.metadata.get(key), str)}
-    words = {key: " ".join(text.split()) for key, text in held.items() if text.strip()}
+    lines = {key: " ".join(text.split()) for key, text in held.items() if text.strip()}
+    words = {key: printable(text) for key, text in lines.items()}
+    changed = [f"control characters of {key}" for key, text in lines.items() if words[key] != text]
+    warn_left_out(kind, changed, "which are written as Python writes them")
     long = [key for key, text in words.items() if len(text) > _LONGEST_WORDS]
     warn_left_out(kind, long, f"which is longer than {number(_LONGEST_WORDS)} characters")
     places = ("geotransform", "grid", "axes")  # the points of a mesh have places of their own

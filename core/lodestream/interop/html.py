@@ -7,6 +7,7 @@ import html
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+from ..text import printable
 from .pictures import SMALL, small_png
 
 if TYPE_CHECKING:
@@ -76,10 +77,10 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def table(title: str, rows: Iterable[tuple[str, str]], picture: bytes | None) -> str:
-    """Rows of a name and a value, beside a PNG; all of it text that is escaped."""
+    """Rows of a name and a value, beside a PNG; all of it text that is escaped, control characters too."""
     cells = "".join(
-        f'<tr><th style="text-align:left">{html.escape(name)}</th>'
-        f'<td style="text-align:left">{html.escape(value)}</td></tr>'
+        f'<tr><th style="text-align:left">{html.escape(printable(name))}</th>'
+        f'<td style="text-align:left">{html.escape(printable(value))}</td></tr>'
         for name, value in rows
     )
     image = ""

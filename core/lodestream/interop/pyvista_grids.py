@@ -100,8 +100,18 @@ def _structured(pv: Any, surface: Surface, number: int) -> Any:
             setattr(data, role, name)
     for key in _WORDS:
         if isinstance(surface.metadata.get(key), str):
-            grid.field_data[key] = [surface.metadata[key]]
+            grid.GetFieldData().AddArray(_text(key, surface.metadata[key]))
     return grid
+
+
+def _text(name: str, text: str) -> Any:
+    """A text as VTK has it: `field_data` of pyvista takes ASCII alone, and gives any."""
+    from vtkmodules.vtkCommonCore import vtkStringArray
+
+    array = vtkStringArray()
+    array.SetName(name)
+    array.InsertNextValue(text)
+    return array
 
 
 def from_pyvista(data: pyvista.DataObject) -> Surface:

@@ -176,7 +176,10 @@ def test_an_answer_that_is_taken_slowly_comes_whole(impatient: tuple[str, dict[s
 
 
 def test_an_answer_that_is_taken_too_slowly_is_cut(tmp_path: Path) -> None:
-    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+    with (
+        running_server(tmp_path, workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
         made = push(http, npy(hills(700, 700)))
     # No client reads so fast.
     with running_server(tmp_path, workers=1, idle_seconds=0.2, least_rate=10**15) as url:
@@ -197,7 +200,7 @@ def test_an_answer_that_is_taken_too_slowly_is_cut(tmp_path: Path) -> None:
             # It reads all the time, and never stops for as long as the limit says.
             eventually(cut, "the connection to be cut")
         assert came < 8 * made["bytes"]
-        with httpx.Client(base_url=url, trust_env=False, timeout=60) as http:
+        with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
             assert 'kind="slow-answer"' in http.get("/metrics").text
             # What fits into the system's buffers waits for nobody.
             assert http.get(made["url"]).status_code == 200

@@ -6,6 +6,7 @@ Source: the Zarr core specification, version 3.1; attributes as xarray reads and
 from __future__ import annotations
 
 import base64
+import errno
 import secrets
 import shutil
 import struct
@@ -83,6 +84,14 @@ def _write(surface: Surface, folder: Path) -> None:
                 zarr.consolidate_metadata(store)
     except (ValueError, TypeError, KeyError) as error:
         raise FormatError(f"expected a surface that Zarr can hold, got one that it refuses: {error}") from None
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        longest = max((len(name) for name in contents.variables), default=0)
+        raise FormatError(
+            "expected names of attributes that can name a folder, as Zarr stores have one for each, got one of "
+            f"{longest:,} characters"
+        ) from None
 
 
 @contextmanager

@@ -76,7 +76,7 @@ def _columns(attributes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
             if not survives(column, np.float64):
                 rounded.append(name)
             column = column.astype(np.float64)
-        label = _ascii(name, "!-~")
+        label = _ascii(name, "!-~") or "_"
         while label in result or label in ("x", "y", "z"):
             label += "_"
         result[label] = column

@@ -5,8 +5,9 @@ Source: "VTK XML Formats" of the VTK documentation; blanking as in VTK's vtkStru
 
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -17,13 +18,17 @@ from ...coordinates.height_fields import coordinates
 from ...errors import FormatWarning
 from ...mesh.cells import unpack_cells
 from ...surface import Block, Surface
+from ...text import printable
 from ..attributes import COLOR, NORMAL, TEXTURE
 from ..closing import MIN_CLOSED, wrapped_ends, wraps
 from ..mesh_output import exact_float, extra_channels, words_of
-from ..notes import warn
+from ..notes import listing, warn
 from .ghosts import HIDDEN_CELL, HIDDEN_POINT
 
 __all__ = ["Grid", "grid_of", "write", "write_block"]
+
+#: Characters that no XML has, not even escaped.
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _TYPES = {"i": "Int", "u": "UInt", "f": "Float"}
 _CHUNK = 1 << 20
@@ -54,6 +59,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     if len(grids) > 1:
         warn(f"VTS is written with {len(grids)} blocks stacked in its one grid, with hidden cells between them")
     _warn_of_faces(surface)
+    _warn_of_names(surface)
     _write_grid(surface, grids[0] if len(grids) == 1 else _stacked(grids), file)
 
 
@@ -61,6 +67,7 @@ def write_block(surface: Surface, number: int, file: BinaryIO) -> None:
     """Write one block, as `write` does those that are alone; what is lost of all is said with the first."""
     if number == 0:
         _warn_of_faces(surface)
+        _warn_of_names(surface)
     with warnings.catch_warnings():
         if number:
             warnings.simplefilter("ignore", FormatWarning)
@@ -120,7 +127,8 @@ def grid_of(surface: Surface, number: int, kind: str = "VTS") -> Grid:
     block = surface.blocks[number]
     axes = [exact_float(values, axis, kind) for values, axis in zip(_coordinates(surface, block), "xyz", strict=True)]
     points = np.stack(axes, axis=-1)
-    attributes = {_GHOSTS + "_" if name == _GHOSTS else name: values for name, values in block.attributes.items()}
+    names = _names(block.attributes, kind)
+    attributes = {names[name]: values for name, values in block.attributes.items()}
     for channel, name in extra_channels(block).items():
         attributes[name] = block.points[:, :, channel]
     hidden = np.zeros(block.shape, np.bool_) if block.mask is None else ~block.mask
@@ -141,6 +149,29 @@ def grid_of(surface: Surface, number: int, kind: str = "VTS") -> Grid:
     )
 
 
+def _names(attributes: Iterable[str], kind: str) -> dict[str, str]:
+    """Names of attributes in a grid, by their own: none is VTK's, and none in a file is empty or beyond XML."""
+    names: dict[str, str] = {}
+    free = {*attributes}
+    for name in attributes:
+        label = (_NOT_XML.sub(lambda found: printable(found[0]), name) or "_") if kind == "VTS" else name
+        while (label != name and label in free | {*names.values()}) or label == _GHOSTS:
+            label += "_"
+        names[name] = label
+    return names
+
+
+def _warn_of_names(surface: Surface) -> None:
+    """Say which attributes have other names in a file."""
+    names = _names(surface.blocks[0].attributes, "VTS")
+    renamed = {name: label for name, label in names.items() if name != label}
+    if (label := renamed.pop(_GHOSTS, None)) is not None:
+        warn(f"VTS is written with the attribute {_GHOSTS} as {label}, because VTS uses that name for hidden points")
+    if renamed:
+        listed = listing(f"{printable(name)!r} as {label}" for name, label in renamed.items())
+        warn(f"VTS is written with the attributes {listed}, because XML cannot hold their names")
+
+
 def _warn_of_faces(surface: Surface) -> None:
     """Say what a grid of quads does not tell."""
     faces = surface.metadata.get("faces")
@@ -152,8 +183,6 @@ def _warn_of_faces(surface: Surface) -> None:
     ]
     if closed:
         warn(f"VTS is written with open axes in place of closed ones of fewer than {MIN_CLOSED} points")
-    if _GHOSTS in surface.blocks[0].attributes:
-        warn(f"VTS is written with the attribute {_GHOSTS} as {_GHOSTS}_, because VTS uses that name for hidden points")
 
 
 def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:
