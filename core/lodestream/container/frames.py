@@ -94,7 +94,7 @@ class FrameReader:
         self._place = 0  # of what was not taken yet, in bytes of one call
         self._offset = 0  # of the same in the container
         self._passing: _Passing | None = None
-        self._optional = 0  # sections so far
+        self._optional = self._windows = 0  # optional sections so far, and those of errors of windows
         self._started = False
         self.ended = False  # the index was read: nothing but the footer follows
 
@@ -159,7 +159,9 @@ class FrameReader:
             return False
         if first[0] not in self._keeps:
             self._optional += first[0] >= sections.OPTIONAL
+            self._windows += first[0] == sections.WINDOW_ERRORS
             limits.check_count(self._optional, limits.OPTIONAL, "optional sections", self._offset)
+            limits.check_count(self._windows, 1, "sections of errors of windows", self._offset)
             self._passing = _Passing(first[0], self._offset, extent[1])
         return True
 

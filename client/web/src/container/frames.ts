@@ -3,7 +3,15 @@ import { CorruptStreamError, UnsupportedVersionError } from "../errors";
 import { ByteBuffer } from "./buffer";
 import { crc32 } from "./crc";
 import { checkCount, LIMITS } from "./limits";
-import { checkMetadataLength, checkSignature, KIND, OPTIONAL, SIGNATURE_LENGTH, VERSION } from "./sections";
+import {
+  checkMetadataLength,
+  checkSignature,
+  KIND,
+  OPTIONAL,
+  SIGNATURE_LENGTH,
+  VERSION,
+  WINDOW_ERRORS,
+} from "./sections";
 
 /** A section whose CRC holds: its payload stands at `payloadOffset`, all of it at `offset` to `end`. */
 export interface Frame {
@@ -65,6 +73,7 @@ export class FrameReader {
   #started = false;
   #passing: Passing | null = null;
   #optional = 0; // sections so far
+  #windows = 0; // those of errors of windows
 
   /** Bytes of the container taken so far, without those of a section that wait for the rest of it. */
   get position(): number {
@@ -119,7 +128,9 @@ export class FrameReader {
     const kind = head[0]!;
     if (!KNOWN.has(kind)) {
       if (kind >= OPTIONAL) this.#optional += 1;
+      if (kind === WINDOW_ERRORS) this.#windows += 1;
       checkCount(this.#optional, LIMITS.optional, "optional sections", this.#offset);
+      checkCount(this.#windows, 1, "sections of errors of windows", this.#offset);
       this.#passing = new Passing(kind, this.#offset, extent.end);
     }
     return true;
