@@ -24,12 +24,15 @@ from xarray.core import indexing
 from lodestream.container import read_index
 from lodestream.container.capacity import Capacity
 from lodestream.container.model import ByteRange, Header
-from lodestream.coordinates.height_fields import level_metadata
 from lodestream.decoding.decoder import Decoder, View
+from lodestream.decoding.level_grids import level_positions
+from lodestream.decoding.window_metadata import window_closed, window_metadata
 from lodestream.errors import InputError, LodestreamError, OptionError, named
+from lodestream.grid.window import taken
 from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
 from lodestream.planning.planner import plan
+from lodestream.planning.selection import Selection
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target, check_integer
 
@@ -52,7 +55,9 @@ class LodeBackend(BackendEntrypoint):
     """The engine ``lode`` of xarray, which finds it by its entry point."""
 
     description = "Open containers of Lodestream (.lode): files, URLs of files, and surfaces of a server"
-    open_dataset_parameters = ("filename_or_obj", "drop_variables", "level", "block", "token", "max_vertices")
+    open_dataset_parameters = (
+        *("filename_or_obj", "drop_variables", "level", "region", "block", "token", "max_vertices"),
+    )
     supports_groups = True
 
     def open_dataset(  # type: ignore[override]  # xarray passes what else the engine takes by keyword
@@ -61,6 +66,7 @@ class LodeBackend(BackendEntrypoint):
         *,
         drop_variables: str | Iterable[str] | None = None,
         level: int | None = None,
+        region: Region | None = None,
         block: int | None = None,
         token: str | None = None,
         max_vertices: int | None = None,
@@ -74,6 +80,9 @@ class LodeBackend(BackendEntrypoint):
         drop_variables : str or iterable of str, optional
         level : int, optional
             A coarser level; None: full resolution.
+        region : ((int, int), (int, int)), optional
+            This window only, of the full grid: rows and columns, half-open. Along a closed axis it may go on across the
+            seam, as columns 350:370 of 360.
         block : int, optional
             Of several blocks, the one to open; `open_datatree` opens all.
         token : str, optional
@@ -84,7 +93,8 @@ class LodeBackend(BackendEntrypoint):
         Raises
         ------
         OptionError
-            If a level or block is no integer or not there, or there are several blocks and none is chosen.
+            If a level, region or block is not there, there are several blocks and none is chosen, or a level and a
+            region are.
         StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
             If the container is damaged or too large, or cannot be had. A note of the error names the file.
         """
@@ -94,7 +104,7 @@ class LodeBackend(BackendEntrypoint):
             raise OptionError(f"expected block= of 0 to {blocks - 1}, or xarray.open_datatree, for {blocks} blocks")
         if block is not None and not 0 <= (block := check_integer("a block", block)) < blocks:
             raise OptionError(f"expected a block of 0 to {blocks - 1}, got {block}")
-        found = container.dataset(level, block or 0)
+        found = container.dataset(level, block or 0, region)
         drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
         return found.drop_vars(drop, errors="ignore")
 
@@ -193,22 +203,24 @@ class Container:
             run += self._source.read(offset + len(run), length - len(run))
         return bytes(run)
 
-    def dataset(self, level: int | None, block: int) -> xr.Dataset:
-        """The lazy Dataset of a block, at a level or (None) at full resolution.
+    def dataset(self, level: int | None, block: int, region: Region | None = None) -> xr.Dataset:
+        """The lazy Dataset of a block, at a level or (None) at full resolution, or of a window of the only one.
 
         Raises
         ------
         OptionError
-            If there is no such level, or it is no integer.
+            If there is no such level or window.
         """
+        if region is not None:
+            Selection(Target(level=level, region=region).region).check(self.header)
         finest = self.header.levels
         if level is not None and not 0 <= (level := check_integer("a level", level)) <= finest:
             raise OptionError(f"expected a level of 0 to {finest}, got {level}")
         level = finest if level is None else level
-        grid = self._grid(level, block)
+        grid = self._grid(level, block, region)
 
         def lazily(part: Part) -> tuple[Any, dict[str, Any]]:
-            array = _Lazy(self, part, grid, level, block)
+            array = _Lazy(self, part, grid, level, block, region)
             chunks = dict(zip(part.dims, (*self._chunks(grid), *array.shape[2:]), strict=True))
             packing = self._packing(part) if level == finest else {}
             return indexing.LazilyIndexedArray(array), {"preferred_chunks": chunks} | packing
@@ -235,7 +247,7 @@ class Container:
         )
         return rows, columns
 
-    def _grid(self, level: int, block: int) -> Grid:
+    def _grid(self, level: int, block: int, region: Region | None) -> Grid:
         header = self.header
         shape, closed = header.blocks[block]
         metadata = dict(self._index.metadata_values)
@@ -245,9 +257,12 @@ class Container:
             if known is None:
                 one = self.whole(level, ()).blocks[block]
                 return Grid.of(one, metadata)
-            if header.point_channels == 1 and header.plane is None:
-                metadata = level_metadata(metadata, shape, known, closed, header.levels - level)
+            if header.point_channels == 1:
+                metadata = level_positions(metadata, header, level)
             shape = known
+        if region is not None:
+            metadata, closed = window_metadata(metadata, shape, region), window_closed(closed, shape, region)
+            shape = region[0][1] - region[0][0], region[1][1] - region[1][0]
         attributes = tuple((kind.name, kind.dtype, kind.components) for kind in header.attributes)
         channels = 3 if header.plane is not None else 0 if header.flat else header.point_channels
         return Grid(shape, closed, channels, header.dtype, attributes, header.masked, metadata)
@@ -317,8 +332,11 @@ def _runs(places: Sequence[ByteRange]) -> list[list[ByteRange]]:
 class _Lazy(BackendArray):
     """One variable of a Dataset, decoded where it is indexed."""
 
-    def __init__(self, container: Container, part: Part, grid: Grid, level: int, block: int) -> None:
+    def __init__(
+        self, container: Container, part: Part, grid: Grid, level: int, block: int, region: Region | None
+    ) -> None:
         self._container, self._part, self._level, self._block = container, part, level, block
+        self._first = (0, 0) if region is None else (region[0][0], region[1][0])
         components = {name: count for name, _, count in grid.attributes}
         width = components.get(part.attribute, 0) if part.attribute is not None else 0
         self.shape = (*grid.shape, width) if width else grid.shape
@@ -337,6 +355,8 @@ class _Lazy(BackendArray):
             return np.empty((rows[1] - rows[0], columns[1] - columns[0], *self.shape[2:]), self.dtype)[
                 row, column, *key[2:]
             ]
+        spans = zip(self._first, (rows, columns), header.shape, strict=True)
+        rows, columns = (((first + start) % n, (first + start) % n + stop - start) for first, (start, stop), n in spans)
         around = self._around((rows, columns))
         values = values_of(self._container.window(around, names), self._part)
         (top, _), (left, _) = around
@@ -345,15 +365,19 @@ class _Lazy(BackendArray):
 
     def _around(self, region: Region) -> Region:
         """A region that is a surface: it has two points or more, one of them valid, of which there is one somewhere."""
-        mask, by = self._container.header.masks[0], 0
+        header, by = self._container.header, 0
+        mask = header.masks[0]
         while True:
-            (top, bottom), (left, right) = (
+            # One that crosses the seam grows at its end, until it has the whole axis.
+            rows, columns = (
                 (max(start - by, 0), min(stop + by, length))
-                for (start, stop), length in zip(region, self.shape, strict=False)
+                if stop <= length
+                else (start, min(stop + by, start + length))
+                for (start, stop), length in zip(region, header.shape, strict=True)
             )
-            enough = (bottom - top) * (right - left) > 1
-            if enough and (mask is None or mask[top:bottom, left:right].any()):
-                return (top, bottom), (left, right)
+            enough = (rows[1] - rows[0]) * (columns[1] - columns[0]) > 1
+            if enough and (mask is None or taken(mask, (rows, columns), header.shape).any()):
+                return rows, columns
             by = 2 * by + 1
 
 

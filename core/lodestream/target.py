@@ -151,7 +151,8 @@ class Target:
         Quality order: the data that reduce the error most come first. Level order: level by level; limits then stop at
         the end of a level.
     region : ((int, int), (int, int)) or None
-        Only this window: rows and columns, half-open, in full-resolution indices.
+        Only this window: rows and columns, half-open, in full-resolution indices. Along a closed axis it may go on
+        across the seam: of 360 columns, 350:370 are the last ten and the first ten.
     attributes : tuple of str or None
         Names of the attributes to include; None: all.
     first : ((int, int), (int, int)) or None

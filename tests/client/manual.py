@@ -57,7 +57,9 @@ What all commands have in common:
   by at most 1/32, so the error shown for one channel may be slightly above that of all channels together.
 - `decode --memory` writes NPY, GeoTIFF, COG, NetCDF and Zarr by bands within this memory, VTM and PLOT3D block by
   block. If another output needs more, it is refused, with the memory that it needs ([large.md](large.md)).
-- `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. `--attributes speed,kind`
+- `--roi 100:220,300:460` decodes rows 100 to 219 and columns 300 to 459 of the full grid. Along a closed axis a window
+  may go on across the seam: of 360 columns, `--roi 10:20,350:370` takes the last ten and then the first ten. Its
+  geotransform or axes go on beyond the seam, so that longitudes do not jump. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
   combined with each other and with the limits. `--roi` cannot be combined with `--level`, nor with errors of channels
   (NAME=E), because a container has bounds of the errors of windows only for all channels together.

@@ -67,7 +67,7 @@ def target(random: Random, index: Index) -> Target:
     order = random.choice(["quality", "level"])
     options: dict[str, Any] = {"order": order}
     if random.random() < 0.3:
-        options["first"] = _region(random, header.shape)
+        options["first"] = _region(random, *header.blocks[0])
     kind = random.choice(["whole", "level", "rms", "max", "bytes", "both", "region", "attributes", "channels"])
     errors = [layer.rms for layer in index.layers] + [0.0, 1e9]
     if kind == "level":
@@ -79,7 +79,7 @@ def target(random: Random, index: Index) -> Target:
     if kind in ("bytes", "both") or (kind == "region" and random.random() < 0.3):
         options["max_bytes"] = random.choice([1, 200, random.randrange(1, index.size + 100), index.surface_end])
     if kind == "region":
-        options["region"] = _region(random, header.shape)
+        options["region"] = _region(random, *header.blocks[0])
         if random.random() < 0.6:
             limit = Tolerance(10 ** random.uniform(-4, 0), relative=True)
             options[random.choice(["until_rms", "until_max"])] = limit
@@ -114,11 +114,12 @@ def case(random: Random, index: Index, windows: WindowErrors | None) -> dict[str
     return {"target": _options(asked), "held": held, "windows": mode, **made}
 
 
-def _region(random: Random, shape: tuple[int, int]) -> Region:
+def _region(random: Random, shape: tuple[int, int], closed: tuple[bool, bool]) -> Region:
     spans = []
-    for length in shape:
+    for length, wraps in zip(shape, closed, strict=True):
         start = random.randrange(length)
-        spans.append((start, random.randrange(start + 1, length + (2 if random.random() < 0.05 else 1))))
+        last = start + length if wraps and random.random() < 0.5 else length
+        spans.append((start, random.randrange(start + 1, last + (2 if random.random() < 0.05 else 1))))
     return spans[0], spans[1]
 
 

@@ -188,8 +188,13 @@ def window(chance: Random, container: bytes) -> dict[str, Any] | None:
     assert header is not None
     if len(header.blocks) > 1:
         return None
-    spans = [sorted(chance.sample(range(length + 1), 2)) for length in header.shape]
-    region = (spans[0][0], spans[0][1]), (spans[1][0], spans[1][1])
+    spans = []
+    for length, wraps in zip(*header.blocks[0], strict=True):
+        start, stop = sorted(chance.sample(range(length + 1), 2))
+        if wraps and chance.random() < 0.6:  # across the seam
+            start, stop = stop % length, stop % length + chance.randint(1, length)
+        spans.append((start, stop))
+    region = spans[0], spans[1]
     number = chance.choice([len(decoder.layers) - 1, chance.randrange(len(decoder.layers))])
     try:
         shown = decoder.layers[number].window(region)

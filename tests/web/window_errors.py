@@ -28,13 +28,16 @@ def main() -> None:
     holes = np.hypot(*(np.indices(_SHAPE) - np.array([[[120]], [[260]]]))) > 90
     chance = random.Random(1)
     for mask in (None, holes):
-        container = ls.encode(ls.Surface(heights, mask=mask))
+        container = ls.encode(ls.Surface(heights, (False, True), mask=mask))
         index = index_of(container)
         errors = read_window_errors(index, partial(read, container))
         assert errors is not None
         cases: list[dict[str, Any]] = []
         for _ in range(60):
             (top, bottom), (left, right) = (sorted(chance.sample(range(n + 1), 2)) for n in _SHAPE)
+            if chance.random() < 0.5:  # across the seam
+                left = chance.randrange(_SHAPE[1])
+                right = left + chance.randint(1, _SHAPE[1])
             region, layer = ((top, bottom), (left, right)), chance.randrange(len(index.layers))
             cases.append({"region": region, "layer": layer, "bounds": errors.bounds(region, layer)})
         valid = None if mask is None else base64.b64encode(mask.tobytes()).decode()

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..grid.window import samples
 from ..target import Region
 from .model import Header
 
@@ -51,16 +52,15 @@ def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.b
     ----------
     header : Header
     region : ((int, int), (int, int)) or None
-        Rows and columns of the only block, half-open. None: all points of all blocks.
+        Rows and columns of the only block, half-open, across the seam of a closed axis too. None: all points of all blocks.
     channels : bool, shape (channel,)
         Which channels are wanted.
     """
     if region is None:
         return np.tile(channels, chunks_of_a_channel(header))
     touched = []
-    for length, (start, stop), exponent in zip(header.shape, region, header.chunk, strict=True):
-        first = np.arange(0, length, 1 << exponent)
-        touched.append((first < stop) & (start < np.minimum(first + (1 << exponent), length)))
+    for length, span, exponent in zip(header.shape, region, header.chunk, strict=True):
+        touched.append(np.logical_or.reduceat(samples(span, length), np.arange(0, length, 1 << exponent)))
     windows = np.logical_and.outer(*touched).ravel()
     kinds = 2 if header.kept and header.kept[0] else 1
     chosen: NDArray[np.bool_] = np.logical_and.outer(np.tile(windows, kinds), channels).ravel()

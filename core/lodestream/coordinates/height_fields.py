@@ -8,7 +8,7 @@ that is float64, and of "rows": "x" where x runs along the rows. Without either,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..surface import Closed, Surface
 from .coordinate_rules import VALUES, Rule, bits, evaluate, fit_axis, neighbours, plain, rounded
-from .georeference import has_gap, level_coordinates, level_geotransform
+from .georeference import even_step, level_geotransform
 from .seams import wrapped
 
-__all__ = ["coordinates", "level_metadata", "to_heights", "to_xyz", "window_axes"]
+__all__ = ["axes_at", "coordinates", "grid_at", "level_metadata", "to_heights", "to_xyz"]
 
 _STRIP = 1 << 18
 
@@ -116,7 +116,7 @@ def coordinates(surface: Surface, rows: slice | None = None) -> tuple[NDArray[An
 
 def _coordinates(surface: Surface, rows: slice) -> tuple[NDArray[Any], NDArray[Any]]:
     metadata, shape = surface.metadata, surface.shape
-    nodes = metadata.get("nodes") or [None, None]
+    nodes = _nodes(metadata)
     row, column = (
         np.arange(n, dtype=np.float64) if at is None else np.asarray(at, np.float64)
         for n, at in zip(shape, nodes, strict=True)
@@ -145,6 +145,11 @@ def _coordinates(surface: Surface, rows: slice) -> tuple[NDArray[Any], NDArray[A
                 values = wrapped(values, angle["period"], angle["low"])
         planes.append(np.broadcast_to(rounded(values, dtype), (rows.stop - rows.start, shape[1])))
     return planes[0], planes[1]
+
+
+def _nodes(metadata: Mapping[str, Any]) -> Any:
+    """Places of rows and of columns; None for 0, 1, 2, ..."""
+    return metadata.get("nodes") or [None, None]
 
 
 def _axes(axes: Any) -> tuple[list[Rule], np.dtype[Any], bool]:
@@ -247,53 +252,76 @@ def _fit_plane(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) 
 
 
 def level_metadata(
-    metadata: dict[str, Any], shape: tuple[int, int], coarse: tuple[int, int], closed: Closed, halvings: int
+    metadata: Mapping[str, Any], shape: tuple[int, int], closed: Closed, places: Sequence[NDArray[np.int64]]
 ) -> dict[str, Any]:
-    """Metadata of the grid of a coarser level.
+    """Metadata of the grid of a coarser level of heights: its nodes lie where they stand in the full grid.
 
     Parameters
     ----------
-    metadata : dict
+    metadata : mapping
         Of the whole surface.
-    shape, coarse : (int, int)
-        Of the whole grid, and of the level's.
+    shape : (int, int)
+        Of the full grid.
     closed : (bool, bool)
-    halvings : int
-        How many levels the grid is below the surface.
+    places : two int64 arrays, shape (row,) and (column,)
+        The rows and the columns of the full grid at which the nodes stand, increasing.
 
     Returns
     -------
     dict
-        Without ``seam`` (the level's own grid is what was asked for). For heights (a surface of another kind keeps the
-        rest), x and y span what they span in the surface; where an axis has a gap, ``nodes`` has the places of the
-        nodes along rows and columns, in steps of the level's even grid, or None for the axis without one.
+        Without ``seam`` and ``turn``: the level's own grid is what was asked for. ``axes`` have the coordinates of the
+        nodes; without them ``geotransform`` is that of the level's even grid. Where the nodes are not evenly spaced,
+        since an axis had a gap, ``nodes`` has the places of rows and of columns in steps of that grid, or None for an
+        even axis; a geotransform beside ``axes`` is then left out.
     """
-    result = {key: value for key, value in metadata.items() if key not in ("seam", "turn")}
-    result["geotransform"] = level_geotransform(metadata.get("geotransform"), shape, coarse, closed)
-    across = [
-        full / nodes if wraps else (full - 1) / max(nodes - 1, 1)
-        for full, nodes, wraps in zip(shape, coarse, closed, strict=True)
-    ]
-    if "grid" in metadata:
-        result["grid"] = [
-            _coarser(rule, shape, coarse, across, down=channel == 1) for channel, rule in enumerate(metadata["grid"])
-        ]
+    result = {key: value for key, value in metadata.items() if key not in ("seam", "turn", "nodes")}
+    transform, nodes = metadata.get("geotransform"), []
+    for length, wraps, at, before in zip(shape, closed, places, _nodes(metadata), strict=True):
+        line = at if before is None else np.asarray(before, np.float64)[at]
+        step = even_step(length, len(at), wraps)
+        nodes.append(None if np.array_equal(line, step * np.arange(len(at))) else (line / step).tolist())
     if "axes" in metadata:
-        rules, _, swapped = _axes(metadata["axes"])
-        for name, channel in (("x", 0), ("y", 1)):
-            rule = _coarser(rules[channel], shape, coarse, across, down=(channel == 1) != swapped)
-            result["axes"] = {**result["axes"], name: rule}
-    nodes = [
-        (level_coordinates(n, wraps, halvings) / ratio).tolist() if has_gap(n, wraps, halvings) else None
-        for n, wraps, ratio in zip(shape, closed, across, strict=True)
-    ]
+        result["axes"] = axes_at(metadata["axes"], shape, places)
+        result.pop("geotransform", None)
+        if any(nodes) or transform is None:
+            return result
+    result["geotransform"] = level_geotransform(transform, shape, (len(places[0]), len(places[1])), closed)
     if any(nodes):
         result["nodes"] = nodes
     return result
 
 
-def window_axes(axes: Any, shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> dict[str, Any]:
-    """The ``axes`` of a window: the numbers themselves, from the first row and column to before the last.
+def grid_at(rules: Sequence[Rule], shape: tuple[int, int], places: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
+    """Metadata by which heights at some rows and columns of a grid get back x and y, see `coordinates`.
+
+    Parameters
+    ----------
+    rules : two rules, of x and of y
+        Of the grid.
+    shape : (int, int)
+        Of the grid.
+    places : two int64 arrays, shape (row,) and (column,)
+        Which rows and columns of it.
+    """
+    anywhere = []
+    for rule, length, down in zip(rules, (shape[1], shape[0]), (False, True), strict=True):
+        # The last number of such a rule is that of the last place of the grid.
+        anywhere.append(_listed(rule, length, np.arange(length), down) if rule[-1] is True else rule)
+    return {"grid": anywhere, "nodes": [line.tolist() for line in places]}
+
+
+def axes_at(axes: Any, shape: tuple[int, int], places: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
+    """The ``axes`` of some rows and columns of a grid, with the same coordinates there, bit for bit.
+
+    Parameters
+    ----------
+    axes : mapping
+        Of the grid.
+    shape : (int, int)
+        Of the grid.
+    places : two int64 arrays, shape (row,) and (column,)
+        Which rows and columns of it. Along a closed axis they may go on after its end, where the coordinates of the
+        first places follow, one turn further; the step across the seam is as long as the one before it.
 
     Raises
     ------
@@ -303,23 +331,37 @@ def window_axes(axes: Any, shape: tuple[int, int], rows: tuple[int, int], column
     rules, _, swapped = _axes(axes)
     result = dict(axes)
     for name, rule, down in (("x", rules[0], swapped), ("y", rules[1], not swapped)):
-        place, still = np.arange(shape[0 if down else 1], dtype=np.float64), np.zeros((1, 1))
-        at = place[:, None] if down else place[None, :]
-        values = evaluate(rule, at if down else still, still if down else at, down)
-        values = np.broadcast_to(values, at.shape).ravel()
-        result[name] = [*values[slice(*(rows if down else columns))].tolist(), VALUES]
+        length, line = (shape[0], places[0]) if down else (shape[1], places[1])
+        result[name] = _thinned(rule, length, line, down) or _listed(rule, length, line, down)
     return result
 
 
-def _coarser(rule: Rule, shape: tuple[int, int], coarse: tuple[int, int], ratios: Sequence[float], down: bool) -> Rule:
-    down_by, across_by = ratios
-    axis = 0 if down else 1
-    if len(rule) == 4 and rule[-1] != VALUES:
-        origin, across, by_row, shift = map(float, rule)
-        return [origin + shift * (across + by_row), across * across_by, by_row * down_by, 0.0]
-    place = np.arange(shape[axis], dtype=np.float64)
-    values = evaluate(rule, place[:, None], place[None, :], down).ravel()
-    at = np.arange(coarse[axis]) * ratios[axis]
-    if rule[-1] == VALUES:
-        return [*np.interp(at, place, values).tolist(), VALUES]
-    return [float(values[0]), float((values[-1] - values[0]) / (shape[axis] - 1) * ratios[axis])]
+def _listed(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> Rule:
+    """The values of a rule at some places of its axis, as a rule."""
+    axis, still = np.arange(length, dtype=np.float64), np.zeros((1, 1))
+    line = axis[:, None] if down else axis[None, :]
+    values = evaluate(rule, line if down else still, still if down else line, down)
+    values = np.broadcast_to(values, line.shape).ravel()
+    listed, beyond = values[places % length], places >= length
+    if beyond.any():
+        listed[beyond] += 2 * values[-1] - values[-2] - values[0]
+    return [*listed.tolist(), VALUES]
+
+
+def _thinned(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> Rule | None:
+    """The rule of every so many places of an axis, from the first one on; None where they, or the rule, are others.
+
+    Lists of values would be too long for metadata where rules are not. The step between nodes is a power of two, and
+    multiplying by one rounds nothing.
+    """
+    step = int(places[1]) if len(places) > 1 else 1
+    if step & (step - 1) or rule[-1] == VALUES or not np.array_equal(places, step * np.arange(len(places))):
+        return None
+    if rule[-1] is True:
+        return rule if places[-1] == length - 1 else None
+    if rule[-1] is False:
+        rule = [rule[0], *([0, rule[1]] if down else [rule[1], 0]), 0.5]
+    if len(rule) == 4:
+        origin, across, by_row, shift = rule
+        return [origin, across * step, by_row * step, shift / step]
+    return [rule[0], rule[1] * step, *rule[2:]]

@@ -18,7 +18,9 @@ from ..entropy.dequantize import UNANNOUNCED
 from ..entropy.tiles import Reading, Tiles, TileTable
 from ..errors import CorruptStreamError
 from ..grid.patches import assemble, level_masks
+from ..grid.window import hull, meets, taken
 from ..parallel import spread
+from ..planning.selection import restored
 from ..quantization.distortion import store_values
 from ..residual import chunk_coder
 from ..target import Region
@@ -164,17 +166,20 @@ class Reconstruction:
     ) -> Values:
         """A window of the surface, of one grid, when the first ``length`` segments are known.
 
-        Takes memory for what the window is made of, not for the surface. Its arrays have the
-        shape (row, column, component) of the window. See `blocks`.
+        Takes memory for what the window is made of, not for the surface; but an axis along which it crosses the seam is
+        made whole. Its arrays have the shape (row, column, component) of the window. See `blocks`.
         """
-        header = self.header
-        values = self._window_values(length, state, region, chosen)
+        header, shape = self.header, self.header.shape
+        around = restored(header, region)
+        inside = hull(around, shape)
+        values = self._window_values(length, state, inside, chosen)
         if corrected:
-            self._correct([values], chosen, region)
+            self._correct([values], chosen, around, (inside[0][0], inside[1][0]))
+        values = Values([taken(array, region, shape, (inside[0][0], inside[1][0])) for array in values.arrays])
         if (mask := header.masks[0]) is not None:
             if corrected and (kept := header.kept_masks[0]) is not None:
                 mask = mask | kept
-            values.clear(~mask[slice(*region[0]), slice(*region[1])], header.hole)
+            values.clear(~taken(mask, region, shape), header.hole)
         return values
 
     def _window_values(self, length: int, state: NDArray[np.int8], region: Region, chosen: NDArray[np.bool_]) -> Values:
@@ -197,16 +202,21 @@ class Reconstruction:
             arrays.append(array)
         return Values(arrays)
 
-    def _correct(self, blocks: list[Values], chosen: NDArray[np.bool_] | None, region: Region | None = None) -> None:
-        """Restore all windows of residual that there are, or of a region of the only block those inside."""
-        top, left = (region[0][0], region[1][0]) if region is not None else (0, 0)
+    def _correct(
+        self,
+        blocks: list[Values],
+        chosen: NDArray[np.bool_] | None,
+        region: Region | None = None,
+        first: tuple[int, int] = (0, 0),
+    ) -> None:
+        """Restore all windows of residual that there are, or of a region of the only block those inside.
+
+        The arrays begin at row and column ``first`` of the block.
+        """
         for number, window in enumerate(chunk_places(self.header)):
-            inside = region is None or all(
-                a <= start and stop <= b
-                for (start, stop), (a, b) in zip((window.rows, window.columns), region, strict=True)
-            )
+            inside = region is None or all(map(meets, region, (window.rows, window.columns), self.header.shape))
             if number in self._chunks and inside and (chosen is None or chosen[window.channel]):
-                values = blocks[window.block].window(window, top, left)
+                values = blocks[window.block].window(window, *first)
                 masks = self.header.kept_masks if window.kept else self.header.masks
                 mask, (data, offset) = masks[window.block], self._chunks[number]
                 valid = None if mask is None else mask[slice(*window.rows), slice(*window.columns)]

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.digest import values_digest
-from ..container.model import Header
-from ..coordinates.height_fields import level_metadata, to_xyz
+from ..coordinates.height_fields import grid_at, to_xyz
 from ..errors import CorruptStreamError, InputError, OptionError
 from ..grid.patches import level_masks
+from ..grid.window import contains, places, taken
 from ..joints import Nodes
-from ..planning.selection import Selection, restored
+from ..planning.selection import Selection
 from ..surface import Block, Closed, Surface, finite_block
 from ..target import Region
-from .level_grids import level_nodes
+from .level_grids import level_nodes, level_positions
 from .reconstruction import Reconstruction, Values
-from .window_metadata import window_closed, window_grid, window_metadata
+from .window_metadata import window_closed, window_metadata
 
 __all__ = ["Ending", "View"]
 
@@ -147,7 +147,8 @@ class View:
         Parameters
         ----------
         region : ((int, int), (int, int))
-            Rows and columns, half-open, in full-resolution indices.
+            Rows and columns, half-open, in full-resolution indices; along a closed axis they may go on across the seam,
+            as columns 350:370 of 360.
 
         Raises
         ------
@@ -157,9 +158,7 @@ class View:
         header, shown = self._reconstruction.header, self._selection.region
         selection = Selection(region, self._selection.attributes)
         selection.check(header)
-        if shown is not None and not all(
-            a <= start and stop <= b for (start, stop), (a, b) in zip(region, shown, strict=True)
-        ):
+        if shown is not None and not contains(shown, region, header.shape):
             raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
         state = self._state.copy()
         state[~selection.tiles(header)] = 0
@@ -258,7 +257,7 @@ class View:
         else:
             grids, masks = [self._window(region, chosen)], [header.masks[0]]
             if masks[0] is not None:
-                masks = [masks[0][slice(*region[0]), slice(*region[1])]]
+                masks = [taken(masks[0], region, header.shape)]
             closures = (window_closed(header.closed, header.shape, region),)
         return [self._block(*of) for of in zip(grids, masks, closures, strict=True)]
 
@@ -289,17 +288,11 @@ class View:
         header, region = self._reconstruction.header, self._selection.region
         finest = level == header.levels
         if not finest and len(surface.blocks) == 1 and header.point_channels == 1:
-            steps, told = header.levels - level, values.get("geotransform") is not None
-            values = level_metadata({**values, **_plane(header)}, header.shape, surface.shape, header.closed, steps)
-            if header.plane is not None:
-                surface.metadata.update({key: values.pop(key) for key in ("grid", "nodes") if key in values})
-                if not told:
-                    del values["geotransform"]  # of indices: these points have an x and a y of their own
-        else:
-            surface.metadata.update(_plane(header))
-            if header.plane is not None and region is not None:
-                surface.metadata.update(window_grid(header.plane["grid"], header.shape, region))
+            values = level_positions(values, header, level)
         if header.plane is not None:
+            rules, whole = header.plane["grid"], finest and region is None
+            shown = {"grid": rules} if whole else grid_at(rules, header.shape, self._nodes(level)[0])
+            surface.metadata.update(shown)
             try:
                 surface = to_xyz(surface, self._kept(finest))
             except InputError as error:
@@ -322,15 +315,17 @@ class View:
         """Which rows and columns of each block are shown at a level, or in the window."""
         header, region = self._reconstruction.header, self._selection.region
         if region is not None:
-            return [(np.arange(*region[0]), np.arange(*region[1]))]
+            rows, columns = map(places, region, header.shape)
+            return [(rows, columns)]
         return level_nodes(header, level)
 
     def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
         """Which holes of the only block have values."""
         if not (finest and self._corrected):
             return None
-        kept, region = self._reconstruction.header.kept_masks[0], self._selection.region
-        return kept if kept is None or region is None else kept[slice(*region[0]), slice(*region[1])]
+        header, region = self._reconstruction.header, self._selection.region
+        kept = header.kept_masks[0]
+        return kept if kept is None or region is None else taken(kept, region, header.shape)
 
     def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:
         """Points and attributes of a window of the only block."""
@@ -338,15 +333,5 @@ class View:
         if header.arrangement is not None:
             # A block that meets itself: what its sides share may lie anywhere in it.
             whole = self._reconstruction.blocks(*known, header.levels, self._corrected, chosen)[0]
-            first = 0, 0
-        else:
-            taken = restored(header, region)
-            whole = self._reconstruction.window(*known, taken, self._corrected, chosen)
-            first = taken[0][0], taken[1][0]
-        rows, columns = (slice(a - at, b - at) for (a, b), at in zip(region, first, strict=True))
-        return Values([array[rows, columns] for array in whole.arrays])
-
-
-def _plane(header: Header) -> dict[str, Any]:
-    """The metadata by which heights that came with x and y get them back, see `height_fields`."""
-    return {} if header.plane is None else {"grid": header.plane["grid"]}
+            return Values([taken(array, region, header.shape) for array in whole.arrays])
+        return self._reconstruction.window(*known, region, self._corrected, chosen)

@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import OptionError
 from ..target import Region
 from .axis import AxisStep
 from .layout import Layout
 from .tile_arrays import runs_of
+from .window import samples
 
-__all__ = ["check_region", "coefficients_needed", "needed_tiles"]
+__all__ = ["coefficients_needed", "needed_tiles"]
 
 #: Details that an update takes on either side of a node.
 _UPDATE = 10
@@ -26,39 +26,24 @@ _PREDICT = np.arange(-2, 4)
 Mask = NDArray[np.bool_]
 
 
-def check_region(region: Region, shape: tuple[int, int]) -> None:
-    """Refuse a region that is not inside a surface.
-
-    Raises
-    ------
-    OptionError
-        When it has no point, or points outside.
-    """
-    for (start, stop), length, name in zip(region, shape, ("rows", "columns"), strict=True):
-        if not 0 <= start < stop <= length:
-            raise OptionError(f"expected {name} within 0:{length}, at least one, got {start}:{stop}")
-
-
 def needed_tiles(layout: Layout, region: Region) -> Mask:
-    """Which tiles of a surface of one grid the points of a region need, parents included; bool, shape (tile,).
+    """Which tiles of a surface of one grid the points of a window need, parents included; bool, shape (tile,).
 
     Parents are there because the contexts of a tile's segments look at them.
     """
     arrays, shape = layout.tile_arrays, layout.grids[0].shape
-    samples = [np.zeros(n, np.bool_) for n in shape]
-    for axis, (start, stop) in enumerate(region):
-        samples[axis][start:stop] = True
+    wanted = [samples(span, length) for span, length in zip(region, shape, strict=True)]
     # Along each axis how many coefficients are needed before each one, nodes first, details after them: level after
     # level from the finest one, and where a level begins.
     before: tuple[list[NDArray[np.int64]], ...] = [], []
     begins = np.zeros((2, layout.levels + 2), np.int64)
     for level in range(layout.levels, -1, -1):
         for axis in range(2):
-            line = samples[axis]
+            line = wanted[axis]
             if level:
                 step = layout.steps(0, level)[axis]
                 line = coefficients_needed(line, step)
-                samples[axis] = line[: step.coarse]
+                wanted[axis] = line[: step.coarse]
             before[axis].append(np.append(0, line.cumsum()))
             begins[axis, level] = begins[axis, level + 1] + line.size + 1
     needed = np.zeros(arrays.count, np.bool_)

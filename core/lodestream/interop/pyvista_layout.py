@@ -48,9 +48,12 @@ def grid_of_block(surface: Surface, number: int) -> Grid:
         there = np.moveaxis(shown, axis, 0)
         ends = np.moveaxis(grid.points, axis, 0)
         if block.points.ndim == 2 and closed[axis]:
+            # Of a level the step across the seam may be shorter than the others: both sides of it make one turn.
+            nodes = (metadata.get("nodes") or [None, None])[axis]
+            share = 1 if nodes is None else (len(nodes) - nodes[-1]) / (nodes[-1] - nodes[-2])
             for channel, plane in enumerate(planes):
                 line = np.moveaxis(_padded(plane, closed, axis), axis, 0)
-                ends[-1, there[-1], channel] = (2 * line[-1] - line[-2])[there[-1]]
+                ends[-1, there[-1], channel] = (line[-1] + share * (line[-1] - line[-2]))[there[-1]]
         elif block.points.ndim == 3 and (closed[axis] or seams[axis]):
             for angle in angles:
                 at = there[-1] & there[-2]

@@ -90,7 +90,12 @@ def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> 
 
 def _has_place(grid: Grid) -> bool:
     metadata = grid.metadata
-    return bool(metadata.get("crs")) or (not grid.channels and metadata.get("geotransform") is not None)
+    return bool(metadata.get("crs")) or (not grid.channels and _transform(metadata) is not None)
+
+
+def _transform(metadata: Mapping[str, Any]) -> Any:
+    """The geotransform; None where it does not say where rows and columns are, as of levels that are not even."""
+    return None if "nodes" in metadata else metadata.get("geotransform")
 
 
 def _coordinates(xr: Any, grid: Grid) -> dict[str, Any]:
@@ -131,7 +136,7 @@ def axis_attributes(grid: Grid) -> dict[str, dict[str, str]]:
 
 def _spatial_ref(metadata: Mapping[str, Any]) -> dict[str, str]:
     """The CRS and the geotransform, as rioxarray and GDAL have them."""
-    crs, transform = metadata.get("crs"), metadata.get("geotransform")
+    crs, transform = metadata.get("crs"), _transform(metadata)
     attrs = {"crs_wkt": str(crs), "spatial_ref": str(crs)} if crs else {}
     return attrs | ({"GeoTransform": " ".join(map(repr, map(float, transform)))} if transform is not None else {})
 

@@ -11,7 +11,8 @@ from ..container.capacity import Capacity
 from ..container.chunks import chunks_touched
 from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
-from ..grid.support import check_region, needed_tiles
+from ..grid.support import needed_tiles
+from ..grid.window import aligned, check_region, hull
 from ..library import why_missing
 from ..target import Region, Target
 
@@ -25,7 +26,8 @@ class Selection:
     Attributes
     ----------
     region : ((int, int), (int, int)) or None
-        A window of the points: rows and columns, half-open, in full-resolution indices. None: all.
+        A window of the points: rows and columns, half-open, in full-resolution indices; along a closed axis it may
+        go on across the seam, as columns 350:370 of 360. None: all.
     attributes : tuple of str or None
         Names of attributes. None: all.
 
@@ -52,7 +54,7 @@ class Selection:
         if self.region is not None:
             if len(header.blocks) > 1:
                 raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
-            check_region(self.region, header.shape)
+            check_region(self.region, *header.blocks[0])
         names = dict.fromkeys(kind.name for kind in header.attributes)
         for name in self.attributes or ():
             if name not in names:
@@ -83,7 +85,7 @@ class Selection:
         layout = header.layout
         # Without the compiled kernels a window is cut out of the whole surface.
         if self.region is not None and header.arrangement is None and why_missing() is None:
-            rows, columns = restored(header, self.region)
+            rows, columns = hull(restored(header, self.region), header.shape)
             shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
         elif level is not None and level < layout.levels:
             shapes = [layout.shape(grid, level) for grid in range(len(layout.grids))]
@@ -105,14 +107,7 @@ class Selection:
 
 def restored(header: Header, region: Region) -> Region:
     """What has to be decoded for a region of the only block: a chunk of residual restores all of its own window."""
-    if not header.corrected:
-        return region
-    sizes = [1 << exponent for exponent in header.chunk]
-    rows, columns = (
-        (start // size * size, min(-(-stop // size) * size, length))
-        for (start, stop), size, length in zip(region, sizes, header.shape, strict=True)
-    )
-    return rows, columns
+    return aligned(region, header.shape, [1 << exponent for exponent in header.chunk]) if header.corrected else region
 
 
 def selection_of(target: Target) -> Selection:

@@ -19,7 +19,7 @@ from ..container.model import ByteRange, Header, Index
 from ..container.sections import WINDOW_ERRORS as KIND
 from ..container.sections import check_of
 from ..errors import CorruptStreamError, OptionError
-from ..grid.support import check_region
+from ..grid.window import check_region, is_whole, spans, taken
 from ..kernels import PART_COLUMNS, PART_ROWS
 from ..target import Region
 
@@ -86,14 +86,14 @@ class WindowErrors:
         """
         if len(self.header.blocks) > 1:
             raise OptionError(f"expected a surface of one block for a region, got {len(self.header.blocks)} blocks")
-        check_region(region, self.header.shape)
+        check_region(region, *self.header.blocks[0])
         if not 0 <= layer < self.codes.shape[1]:
             raise OptionError(f"expected a layer of 0 to {self.codes.shape[1] - 1}, got {layer}")
         mask, (rows, columns) = self.header.masks[0], region
         counts, fractions = self.cells(region, layer, mask)
         inside = (rows[1] - rows[0]) * (columns[1] - columns[0])
         if mask is not None:
-            inside = int(np.count_nonzero(mask[slice(*rows), slice(*columns)]))
+            inside = int(np.count_nonzero(taken(mask, region, self.header.shape)))
         if not inside:
             return 0.0, 0.0
         # A cell that the window only touches counts whole: all that its errors come from may lie inside.
@@ -114,7 +114,11 @@ class WindowErrors:
         float64, shape (row of cells, column of cells, 2)
             Bounds of RMS and maximum, over the surface's extent.
         """
-        window = tuple(slice(a >> e, (b - 1 >> e) + 1) for (a, b), e in zip(region, self.cell, strict=True))
+        touched = []
+        for span, length, exponent in zip(region, self.header.shape, self.cell, strict=True):
+            parts = [np.arange(start >> exponent, (stop - 1 >> exponent) + 1) for start, stop in spans(span, length)]
+            touched.append(np.unique(np.concatenate(parts)))  # a cell at both ends of the window counts once
+        window = np.ix_(*touched)
         counts = _cell_counts(self.header.shape, self.cell, mask)
         return counts[window], _FRACTIONS[self.codes[:, layer].reshape(*counts.shape, 2)[window]]
 
@@ -145,11 +149,11 @@ class WindowFigures:
     """
 
     def __init__(self, header: Header, region: Region, windows: WindowErrors | None = None) -> None:
-        check_region(region, header.shape)
+        check_region(region, *header.blocks[0])
         self._region, self._windows, self._extent = region, windows, header.extent
         (rows, columns), holes = region, sum(header.holes)
         points, inside = header.shape[0] * header.shape[1], (rows[1] - rows[0]) * (columns[1] - columns[0])
-        self.whole = inside == points
+        self.whole = is_whole(region, header.shape)
         # Points of a surface that touches itself are not all vertices: how many a window has is not counted.
         self._least = 0 if header.arrangement is not None else max(inside - holes, 0)
         self._root = math.sqrt((points - holes) / self._least) * _UPWARDS if self._least else math.inf

@@ -15,12 +15,9 @@ from numpy.typing import NDArray
 
 from lodestream import Decoder, encode
 from lodestream.coordinates.coordinate_rules import fit_axis
-from lodestream.coordinates.georeference import has_gap, level_coordinates
-from lodestream.coordinates.height_fields import coordinates, level_metadata, to_heights, to_xyz, window_axes
+from lodestream.coordinates.height_fields import axes_at, coordinates, level_metadata, to_heights, to_xyz
 from lodestream.errors import InputError
-from lodestream.grid.axis import axis_lengths
 from lodestream.surface import Block, Surface
-from lodestream.transform.least_squares import coarsen
 
 Array = NDArray[Any]
 
@@ -202,64 +199,6 @@ def test_heights_lie_at_the_centres_of_their_cells_or_at_their_indices() -> None
             coordinates(Surface(values, metadata=metadata))
 
 
-@pytest.mark.parametrize("closed", [False, True])
-def test_a_ramp_follows_the_coarsening(closed: bool) -> None:
-    for length in range(3, 60):
-        ramp = np.arange(length, dtype=np.float64)
-        for halvings in range(len(axis_lengths(length, closed)) + 1):
-            nodes = level_coordinates(length, closed, halvings)
-            steps = np.diff(np.append(nodes, nodes[0] + length) if closed else nodes)
-            assert (steps > 0).all()
-            ratio = length / len(nodes) if closed else (length - 1) / (len(nodes) - 1)
-            even = ratio * np.arange(len(nodes))
-            assert np.allclose(nodes, even, rtol=0, atol=1e-9) != has_gap(length, closed, halvings)
-            if not closed:
-                np.testing.assert_allclose(nodes, ramp, rtol=0, atol=1e-12 * length)
-                ramp = coarsen(ramp[:, None])[:, 0]
-
-
-def test_levels_of_closed_ramps_are_those_of_circles() -> None:
-    # On a fine circle the ramp and the sine of its angle are coarsened alike, as far as the sine is straight.
-    length = 4001
-    circle = np.sin(2 * np.pi / length * (np.arange(length) - length // 2))
-    for halvings in (1, 2, 3):
-        circle = coarsen(circle[:, None], (True, False))[:, 0]
-        nodes = level_coordinates(length, True, halvings) * (2 * np.pi / length)
-        middle = np.abs(nodes - np.pi) < 0.1
-        np.testing.assert_allclose(
-            circle[middle], np.sin(nodes - np.pi * (length // 2 * 2 / length))[middle], atol=1e-4
-        )
-
-
-@pytest.mark.parametrize("closed", [(False, False), (False, True), (True, True)])
-@pytest.mark.parametrize("shape", [(17, 33), (20, 31), (24, 16)])
-@pytest.mark.parametrize("rule", ["metres", "linspace", "decimals", "centres"])
-def test_coordinates_of_levels_are_those_of_coarsened_points(
-    shape: tuple[int, int], closed: tuple[bool, bool], rule: str
-) -> None:
-    points = xyz(AXES[rule](shape[1]), AXES["downwards"](shape[0]))
-    found = to_heights(Surface(points, closed))
-    assert found is not None
-    grid, rows, columns = points, *(np.arange(n, dtype=np.float64) for n in shape)
-    for halvings in range(1, 4):
-        coarse = coarsen(grid, closed)
-        if coarse.shape == grid.shape:
-            break
-        grid = coarse
-        metadata = level_metadata(found.metadata, shape, grid.shape[:2], closed, halvings)
-        rows, columns = (level_coordinates(n, c, halvings) for n, c in zip(shape, closed, strict=True))
-        x, y = coordinates(Surface(grid[..., 2], closed, metadata=metadata))
-        ends = points[0, -1] - points[0, 0], points[-1, 0] - points[0, 0]
-        np.testing.assert_allclose(x, np.broadcast_to(points[0, 0, 0] + columns * ends[0][0] / (shape[1] - 1), x.shape))
-        np.testing.assert_allclose(
-            y, np.broadcast_to(points[0, 0, 1] + rows[:, None] * ends[1][1] / (shape[0] - 1), y.shape)
-        )
-        if not any(closed):
-            np.testing.assert_allclose(x, grid[..., 0])
-            np.testing.assert_allclose(y, grid[..., 1])
-            assert np.array_equal(to_xyz(Surface(grid[..., 2], metadata=metadata)).points[..., 2], grid[..., 2])
-
-
 @pytest.mark.parametrize("rows", ["y", "x"])
 @pytest.mark.parametrize("rule", ["linspace", "decimals", "centres", "metres"])
 def test_axes_of_windows_are_those_of_the_surface(rows: str, rule: str) -> None:
@@ -268,7 +207,7 @@ def test_axes_of_windows_are_those_of_the_surface(rows: str, rule: str) -> None:
     shape = (9, 12)
     if rows == "x":
         axes, shape = {"x": fit_axis(x), "y": [*y.tolist(), "values"], "rows": "x"}, (12, 9)
-    window = window_axes(axes, shape, (2, 7), (1, 6))
+    window = axes_at(axes, shape, [np.arange(2, 7), np.arange(1, 6)])
     whole = coordinates(Surface(np.zeros(shape), metadata={"axes": axes}))
     for plane, part in zip(whole, coordinates(Surface(np.zeros((5, 5)), metadata={"axes": window})), strict=True):
         assert np.ascontiguousarray(plane[2:7, 1:6]).tobytes() == part.tobytes()
@@ -281,13 +220,13 @@ def test_metadata_of_levels_keep_the_rest_and_drop_the_seam() -> None:
         "crs": "here",
         "axes": {"x": [0.0, 1.0, 4.0, 9.0, 16.0, "values"], "y": [0, 1, 0, 0.5]},
     }
-    level = level_metadata(metadata, (7, 5), (4, 3), (False, False), 1)
+    open_axes, columns = (False, False), np.array([0, 2, 4])
+    level = level_metadata(metadata, (7, 5), open_axes, [np.array([0, 2, 4, 6]), columns])
     assert level["axes"]["x"] == [0.0, 4.0, 16.0, "values"]
-    assert level["axes"]["y"] == [0.5, 2.0, 0.0, 0.0]
-    assert "nodes" not in level
+    assert level["axes"]["y"] == [0, 2, 0, 0.25]
+    assert not level.keys() & {"nodes", "geotransform", "seam"}
     assert (level["name"], level["crs"]) == ("a", "here")
-    assert "seam" not in level
-    gapped = level_metadata({}, (6, 5), (4, 3), (False, False), 1)
+    gapped = level_metadata({}, (6, 5), open_axes, [np.array([0, 2, 4, 5]), columns])
     assert gapped["nodes"] == [pytest.approx([0.0, 1.2, 2.4, 3.0]), None]
     x, y = coordinates(Surface(np.zeros((4, 3)), metadata=gapped))
     assert (x[0].tolist(), y[:, 0].tolist()) == ([0, 2, 4], pytest.approx([0, 2, 4, 5]))

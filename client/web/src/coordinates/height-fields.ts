@@ -1,16 +1,14 @@
 /**
  * Height fields: where the points of heights lie. x and y of a grid follow a rule of the header (`plane`), or of the
- * metadata (`axes`, `geotransform`); those of a coarser level are such that the grid spans what the surface spans.
+ * metadata (`axes`, `geotransform`); nodes of a coarser level lie where they stand in the grid.
  */
 import { arePlane, type CoordinateRule, type Plane } from "../container/extras";
 import { isMap, type Metadata } from "../container/sections";
 import { InputError } from "../errors";
-import { axisLengths, axisStep, extension, hasTail } from "../grid/axis";
-import type { Closed, Region, Shape } from "../types";
-import { evaluate, interpolated, type RulePlane } from "./coordinate-rules";
+import type { Positions } from "../grid/patches";
+import type { Closed, Region, Shape, Span } from "../types";
+import { evaluate, type RulePlane } from "./coordinate-rules";
 
-/** h_j of the update step, as many as matter in float64. */
-const UPDATE = Array.from({ length: 24 }, (_, j) => (1 - 1 / Math.sqrt(2)) * (2 * Math.sqrt(2) - 3) ** j);
 /** Heights without a place of their own are drawn over their indices. */
 const INDICES = [-0.5, 1, 0, -0.5, 0, 1] as const;
 
@@ -87,51 +85,53 @@ function geotransformOf(value: unknown): Geotransform {
   return numbers as unknown as Geotransform;
 }
 
-/** Metadata, and rules of a plane, of the grid of a coarser level. */
-export interface LevelPlacement {
-  readonly metadata: Metadata;
-  readonly plane: Plane | null;
-  readonly nodes: Nodes;
+/** Samples of the full axis from one node of a level to the next, if all of these steps were equal. */
+export function evenStep(length: number, nodes: number, closed: boolean): number {
+  return closed ? length / nodes : (length - 1) / Math.max(nodes - 1, 1);
 }
 
 /**
- * Metadata of the grid of a coarser level of heights, `halvings` levels below the surface: x and y span what they span
- * in the surface. Where an axis has a gap, `nodes` has the places of the nodes, in steps of the level's even grid.
+ * Metadata of the grid of a coarser level of heights: its nodes lie where they stand in the full grid.
+ *
+ * `axes` have the coordinates of the nodes; without them `geotransform` is that of the level's even grid. Where the nodes
+ * are not evenly spaced, since an axis had a gap, `nodes` has the places of rows and of columns in steps of that grid, or
+ * null for an even axis; a geotransform beside `axes` is then left out.
+ *
+ * @param placed - The heights have an x and a y of their own.
+ * @param places - The rows and the columns of the full grid at which the nodes stand, increasing.
  */
-export function levelPlacement(
+export function levelMetadata(
   metadata: Metadata,
-  plane: Plane | null,
+  placed: boolean,
   shape: Shape,
-  coarse: Shape,
   closed: Closed,
-  halvings: number,
-): LevelPlacement {
-  const { seam: _seam, turn: _turn, ...result } = metadata;
-  const across = ([0, 1] as const).map((axis) =>
-    closed[axis] ? shape[axis] / coarse[axis] : (shape[axis] - 1) / Math.max(coarse[axis] - 1, 1),
-  ) as [number, number];
-  result.geotransform = levelGeotransform(metadata.geotransform ?? null, across);
+  places: Positions,
+): Metadata {
+  const { seam: _seam, turn: _turn, nodes: _nodes, ...result } = metadata;
+  const transform = metadata.geotransform ?? null;
+  const before = nodesOf(metadata.nodes);
+  const steps = ([0, 1] as const).map((axis) => evenStep(shape[axis], places[axis].length, closed[axis]));
+  const nodes = ([0, 1] as const).map((axis) => {
+    const line = Array.from(places[axis], (place) => before[axis]?.[place] ?? place);
+    const step = steps[axis]!;
+    return line.every((place, k) => place === step * k) ? null : line.map((place) => place / step);
+  });
+  const uneven = nodes[0] || nodes[1];
   if (metadata.axes !== undefined) {
-    const { rules, swapped } = axesOf(metadata.axes);
-    const x = coarser(rules[0], shape, coarse, across, swapped);
-    const y = coarser(rules[1], shape, coarse, across, !swapped);
-    result.axes = { ...(metadata.axes as Metadata), x, y };
+    result.axes = axesAt(metadata.axes, shape, places);
+    if (uneven || transform === null) delete result.geotransform;
+    else result.geotransform = levelGeotransform(transform, steps);
+    return result;
   }
-  const own: Plane | null = plane && [
-    coarser(plane[0], shape, coarse, across, false),
-    coarser(plane[1], shape, coarse, across, true),
-  ];
-  const nodes = ([0, 1] as const).map((axis) =>
-    hasGap(shape[axis], closed[axis], halvings)
-      ? levelCoordinates(shape[axis], closed[axis], halvings).map((place) => place / across[axis])
-      : null,
-  ) as unknown as Nodes;
-  if (plane === null && (nodes[0] || nodes[1])) result.nodes = nodes;
-  return { metadata: result, plane: own, nodes };
+  if (placed && transform === null) return result;
+  result.geotransform = levelGeotransform(transform, steps);
+  if (uneven && !placed) result.nodes = nodes;
+  return result;
 }
 
-/** The geotransform of a level's grid, which has a node for so many of the full grid's. */
-function levelGeotransform(transform: unknown, [down, across]: readonly [number, number]): number[] {
+/** The geotransform of a level's grid, whose nodes are so many samples of the full one apart. */
+function levelGeotransform(transform: unknown, steps: readonly number[]): number[] {
+  const [down, across] = steps as [number, number];
   const [x0, xColumn, xRow, y0, yColumn, yRow] = transform === null ? INDICES : geotransformOf(transform);
   return [
     x0 + 0.5 * xColumn * (1 - across) + 0.5 * xRow * (1 - down),
@@ -143,66 +143,45 @@ function levelGeotransform(transform: unknown, [down, across]: readonly [number,
   ];
 }
 
-function coarser(
-  rule: CoordinateRule,
-  shape: Shape,
-  coarse: Shape,
-  ratios: readonly [number, number],
-  down: boolean,
-): CoordinateRule {
-  const axis = down ? 0 : 1;
-  const last = rule.at(-1);
-  if (rule.length === 4 && last !== "values") {
-    const [origin, across, byRow, shift] = rule.map(Number) as [number, number, number, number];
-    return [origin + shift * (across + byRow), across * ratios[1], byRow * ratios[0], 0];
-  }
-  const places = Float64Array.from({ length: shape[axis] }, (_, i) => i);
-  const { values } = evaluate(rule, places, places, down);
-  if (last === "values") {
-    const at = Array.from({ length: coarse[axis] }, (_, i) => interpolated(values, i * ratios[axis]));
-    return [...at, "values"];
-  }
-  return [values[0]!, ((values[values.length - 1]! - values[0]!) / (shape[axis] - 1)) * ratios[axis]];
-}
-
 /**
- * Where the nodes of a coarser level lie along an axis, in indices of the full grid: the ramp 0, 1, 2, ... put through
- * the same coarsening as the surface. A closed axis goes on after its end, one turn of `length` further.
+ * `axes` of some rows and columns of a grid, with the same coordinates there. Along a closed axis places may go on after
+ * its end, where the coordinates of the first ones follow, one turn further; the step across the seam is as long as the
+ * one before it.
  */
-function levelCoordinates(length: number, closed: boolean, halvings: number): number[] {
-  let nodes = Array.from({ length }, (_, i) => i);
-  for (let done = 0; done < halvings; done++) {
-    const step = axisStep(nodes.length, closed);
-    if (!step.midpoints) break;
-    const current = nodes;
-    const after = (k: number) => current[2 * k + 2] ?? current[0]! + length;
-    const details = Array.from(
-      { length: step.midpoints },
-      (_, k) => current[2 * k + 1]! - (current[2 * k]! + after(k)) / 2,
-    );
-    const reach = UPDATE.length;
-    const table = extension(step, reach);
-    const detail = (k: number) => {
-      if (k >= 0 && k < step.midpoints) return details[k]!;
-      const beyond = k < 0 ? k + reach : k - step.midpoints + reach;
-      return table[2 * beyond + 1]! * details[table[2 * beyond]!]!;
-    };
-    nodes = Array.from({ length: step.run }, (_, k) =>
-      UPDATE.reduce((sum, tap, j) => sum + tap * (detail(k + j) + detail(k - 1 - j)), current[2 * k]!),
-    );
-    if (hasTail(step)) nodes.push(current.at(-1)!);
+function axesAt(axes: unknown, shape: Shape, places: Positions): Metadata {
+  const { rules, swapped } = axesOf(axes);
+  const at = (rule: CoordinateRule, down: boolean): CoordinateRule => {
+    const axis = down ? 0 : 1;
+    const thin = thinned(rule, shape[axis], places[axis], down);
+    if (thin !== null) return thin;
+    const all = Float64Array.from({ length: shape[axis] }, (_, i) => i);
+    const still = new Float64Array(1);
+    const { values } = evaluate(rule, down ? all : still, down ? still : all, down);
+    const line = values.length === all.length ? values : new Float64Array(all.length).fill(values[0]!);
+    const turn = 2 * line.at(-1)! - line.at(-2)! - line[0]!;
+    const listed = Array.from(places[axis], (k) => (k < all.length ? line[k]! : line[k - all.length]! + turn));
+    return [...listed, "values" as const];
+  };
+  return { ...(axes as Metadata), x: at(rules[0], swapped), y: at(rules[1], !swapped) };
+}
+
+/** The rule of every so many places of an axis, from the first one on; null where they, or the rule, are others. */
+function thinned(rule: CoordinateRule, length: number, places: Int32Array, down: boolean): CoordinateRule | null {
+  const step = places.length > 1 ? places[1]! : 1;
+  const kind = rule.at(-1);
+  if (step & (step - 1) || kind === "values" || !places.every((place, k) => place === step * k)) return null;
+  if (kind === true) return places.at(-1) === length - 1 ? rule : null;
+  if (rule.length === 4 || kind === false) {
+    const own = kind === false ? [rule[0], ...(down ? [0, rule[1]] : [rule[1], 0]), 0.5] : rule;
+    const [origin, across, byRow, shift] = own.map(Number) as [number, number, number, number];
+    return [origin, across * step, byRow * step, shift / step];
   }
-  return nodes;
+  const [origin, by, ...scale] = rule.map(Number) as [number, number, ...number[]];
+  return [origin, by * step, ...scale] as CoordinateRule;
 }
 
-/** Whether an axis that is coarsened so often has an interval without a midpoint on the way. */
-function hasGap(length: number, closed: boolean, halvings: number): boolean {
-  const finer = axisLengths(length, closed).slice(1).reverse().slice(0, halvings);
-  return finer.some((own) => own % 2 === (closed ? 1 : 0));
-}
-
-/** The plane of a window, whose places are rows and columns of the surface. */
-export function windowPlane(plane: Plane, shape: Shape): Plane {
+/** The rules of a plane of this shape for any of its rows and columns, which are the places then. */
+export function planeAnywhere(plane: Plane, shape: Shape): Plane {
   return plane.map((rule, channel) => {
     if (rule.at(-1) !== true) return rule;
     // Its last number is that of the last place of the surface.
@@ -211,7 +190,10 @@ export function windowPlane(plane: Plane, shape: Shape): Plane {
   }) as unknown as Plane;
 }
 
-/** Metadata of a window of a surface of this shape: a geotransform, or axes, move with it. */
+/**
+ * Metadata of a window of a surface of this shape: a geotransform, or axes, move with it. Across the seam of a closed axis
+ * both go on, beyond the end of the surface.
+ */
 export function windowMetadata(metadata: Metadata, shape: Shape, region: Region): Metadata {
   const { seam: _seam, turn: _turn, poles: _poles, ...values } = metadata;
   const [[top], [left]] = region;
@@ -221,18 +203,8 @@ export function windowMetadata(metadata: Metadata, shape: Shape, region: Region)
     values.geotransform = [x, xColumn, xRow, y0 + left * yColumn + top * yRow, yColumn, yRow];
   }
   if (values.axes !== undefined) {
-    const { rules, swapped } = axesOf(values.axes);
-    const moved = (rule: CoordinateRule, down: boolean) => {
-      const places = Float64Array.from({ length: shape[down ? 0 : 1] }, (_, i) => i);
-      const { values: all } = evaluate(
-        rule,
-        down ? places : new Float64Array(1),
-        down ? new Float64Array(1) : places,
-        down,
-      );
-      return [...all.subarray(...region[down ? 0 : 1]), "values"];
-    };
-    values.axes = { ...(values.axes as Metadata), x: moved(rules[0], swapped), y: moved(rules[1], !swapped) };
+    const range = ([start, stop]: Span): Int32Array => Int32Array.from({ length: stop - start }, (_, i) => start + i);
+    values.axes = axesAt(values.axes, shape, [range(region[0]), range(region[1])]);
   }
   return values;
 }

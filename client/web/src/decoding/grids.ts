@@ -1,8 +1,9 @@
 /** Grids of blocks: values of one array, and how they are put together from the grids of patches. */
 import type { Header } from "../container/header";
 import { isWhole, levelPositions, type NumberedPatch, patchPositions } from "../grid/patches";
+import { placesOf as placesIn, spansOf } from "../grid/window";
 import { ARRAYS } from "../kernels/arena";
-import type { DType, Shape, Values } from "../types";
+import type { DType, Region, Shape, Values } from "../types";
 import { holePattern, patternsOf, wordsOf } from "./bits";
 
 /** Values of a block: (rows, columns, components) in C order. */
@@ -58,16 +59,22 @@ export function putPoints(grid: Grid, channel: number, points: Int32Array, bytes
   }
 }
 
-/** Some rows and columns of a grid, half-open. */
-export function cutGrid(grid: Grid, rows: readonly [number, number], columns: readonly [number, number]): Grid {
+/** The window of a grid that begins at row and column `first` of one of this shape. */
+export function cutGrid(grid: Grid, region: Region, shape: Shape, first: readonly [number, number] = [0, 0]): Grid {
+  const [rows, columns] = region;
   const cut = newGrid(grid.dtype, [rows[1] - rows[0], columns[1] - columns[0]], grid.components);
   const from = patternsOf(grid.values);
   const to = patternsOf(cut.values);
   const words = wordsOf(grid.dtype) * grid.components;
-  const width = cut.shape[1] * words;
-  for (let row = 0; row < cut.shape[0]; row++) {
-    const start = ((rows[0] + row) * grid.shape[1] + columns[0]) * words;
-    to.set(from.subarray(start, start + width), row * width);
+  const runs = spansOf(columns, shape[1]);
+  let place = 0;
+  for (const row of placesIn(rows, shape[0])) {
+    for (const [left, right] of runs) {
+      const start = ((row - first[0]) * grid.shape[1] + left - first[1]) * words;
+      const run = from.subarray(start, start + (right - left) * words);
+      to.set(run, place);
+      place += run.length;
+    }
   }
   return cut;
 }

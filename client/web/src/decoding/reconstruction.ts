@@ -6,14 +6,16 @@ import { type BlockMasks, decodeKept, decodeMasks } from "../entropy/mask";
 import { TileTable } from "../entropy/tile-table";
 import { type Plane, Tiles } from "../entropy/tiles";
 import { patchesByBlock } from "../grid/patches";
+import { hullOf, meets } from "../grid/window";
 import { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
 import { platformSha256, sha256 } from "../kernels/sha256";
+import { restoredRegion } from "../planning/selection";
 import { decodeChunk } from "../residual/chunk-coder";
 import { allocatePlane, FRACTION_BITS, inverse } from "../transform/pyramid";
-import { DTYPE_BYTES, DTYPES, type DType, type Region, type Span } from "../types";
+import { DTYPE_BYTES, DTYPES, type DType, type Region } from "../types";
 import { reconstructWindow } from "./crop";
-import { assemble, clearGrid, type Grid, newGrid, putPoints, takePoints } from "./grids";
+import { assemble, clearGrid, cutGrid, type Grid, newGrid, putPoints, takePoints } from "./grids";
 
 /** A segment with its bytes: `passes` passes of a unit down from `first`. */
 export interface Coded {
@@ -96,15 +98,22 @@ export class Reconstruction {
    */
   blocks(known: Known, level: number, corrected: boolean, chosen: readonly boolean[]): BlockGrids[] {
     const blocks = this.#whole(known, level, chosen);
-    if (corrected) this.#correct(blocks, chosen, null);
+    if (corrected) this.#correct(blocks, chosen);
     return blocks;
   }
 
-  /** A window of the surface, of one grid. Takes memory for what the window is made of, not for the surface. */
+  /**
+   * A window of the surface, of one grid. Takes memory for what the window is made of, not for the surface; but an axis
+   * along which it crosses the seam is made whole.
+   */
   window(known: Known, region: Region, corrected: boolean, chosen: readonly boolean[]): BlockGrids {
-    const grids = this.#window(known, region, chosen);
-    if (corrected) this.#correct([grids], chosen, region);
-    return grids;
+    const { shape } = this.header;
+    const around = restoredRegion(this.header, region);
+    const hull = hullOf(around, shape);
+    const first = [hull[0][0], hull[1][0]] as const;
+    const grids = this.#window(known, hull, chosen);
+    if (corrected) this.#correct([grids], chosen, around, first);
+    return grids.map((grid) => cutGrid(grid, region, shape, first));
   }
 
   /** Give points of a block where `shown` is 0 the values of holes. */
@@ -252,13 +261,23 @@ export class Reconstruction {
     return Int8Array.from({ length: layout.tiles.length }, (_, tile) => every[tile * channels + channel]!);
   }
 
-  /** Restore all windows of the residual that there are, or of a region of the only block those inside. */
-  #correct(blocks: readonly BlockGrids[], chosen: readonly boolean[], region: Region | null): void {
+  /**
+   * Restore all windows of the residual that there are, or of a region of the only block those inside. The grids begin
+   * at row and column `first` of the block.
+   */
+  #correct(
+    blocks: readonly BlockGrids[],
+    chosen: readonly boolean[],
+    region: Region | null = null,
+    first: readonly [number, number] = [0, 0],
+  ): void {
+    const { shape } = this.header.blocks[0]!;
     let number = -1;
     for (const window of chunkPlaces(this.header)) {
       const chunk = this.#chunks.get(++number);
       if (!chunk || !chosen[window.channel]) continue;
-      if (region && !(isInside(window.rows, region[0]) && isInside(window.columns, region[1]))) continue;
+      if (region && !meets(region[0], window.rows, shape[0])) continue;
+      if (region && !meets(region[1], window.columns, shape[1])) continue;
       let component = window.channel;
       const grids = blocks[window.block]!;
       const grid = grids.find((one) => {
@@ -266,7 +285,7 @@ export class Reconstruction {
         if (!own) component -= one.components;
         return own;
       })!;
-      const points = this.#pointsOf(window, grid, region ? [region[0][0], region[1][0]] : [0, 0]);
+      const points = this.#pointsOf(window, grid, first);
       const restored = takePoints(grid, component, points);
       const values = decodeChunk(this.#arena, restored, grid.dtype, chunk.data, chunk.offset);
       putPoints(grid, component, points, values);
@@ -313,8 +332,4 @@ export class Reconstruction {
     if (waiting > 0) this.#queue = this.#queue.slice(waiting);
     return this.#tiles;
   }
-}
-
-function isInside(inner: Span, outer: Span): boolean {
-  return outer[0] <= inner[0] && inner[1] <= outer[1];
 }

@@ -4,11 +4,12 @@ import type { Header } from "../container/header";
 import type { Metadata } from "../container/sections";
 import type { State } from "../container/slices";
 import { rint } from "../coordinates/coordinate-rules";
-import { coordinatesOf, levelPlacement, type Nodes, windowMetadata, windowPlane } from "../coordinates/height-fields";
+import { coordinatesOf, levelMetadata, type Nodes, planeAnywhere, windowMetadata } from "../coordinates/height-fields";
 import { CorruptStreamError, InputError, OptionError } from "../errors";
 import { levelPositions, type Positions, patchesByBlock } from "../grid/patches";
-import { checkSelection, restoredRegion, type Selection, selectedChannels, selectedTiles } from "../planning/selection";
-import type { Block, ChannelErrors, Closed, PointArray, Region, Shape, Span, Surface, ViewInfo } from "../types";
+import { contains, placesOf } from "../grid/window";
+import { checkSelection, type Selection, selectedChannels, selectedTiles } from "../planning/selection";
+import type { Block, ChannelErrors, Closed, PointArray, Region, Shape, Surface, ViewInfo } from "../types";
 import { clearGrid, cutGrid, type Grid, newGrid } from "./grids";
 import type { BlockGrids, Known, Reconstruction } from "./reconstruction";
 
@@ -62,7 +63,8 @@ export class View implements ViewInfo {
   }
 
   /**
-   * The points of a window at full resolution; costs time and memory for the window only. Throws `OptionError` where the
+   * The points of a window at full resolution; costs time and memory for the window only. Along a closed axis it may go
+   * on across the seam, as columns 350:370 of 360. Throws `OptionError` where the
    * region is outside the surface, the surface has several blocks, or the view holds another region only.
    */
   window(region: Region): Surface {
@@ -70,10 +72,7 @@ export class View implements ViewInfo {
     const selection: Selection = { region, attributes: this.#selection.attributes };
     checkSelection(selection, header);
     const shown = this.#selection.region;
-    if (
-      shown &&
-      !([0, 1] as const).every((axis) => shown[axis][0] <= region[axis][0] && region[axis][1] <= shown[axis][1])
-    ) {
+    if (shown && !contains(shown, region, header.shape)) {
       throw new OptionError(
         `expected a region inside the one received, ${shown.join(" x ")}, got ${region.join(" x ")}`,
       );
@@ -181,13 +180,10 @@ export class View implements ViewInfo {
     let placed: Nodes = [null, null];
     const only = blocks.length === 1 ? blocks[0]! : null;
     if (!finest && only && header.pointChannels === 1) {
-      const halvings = header.levels - shownLevel;
-      const coarse = levelPlacement(values, plane, header.shape, only.shape, header.closed, halvings);
-      values = coarse.metadata;
-      plane = coarse.plane;
-      placed = coarse.nodes;
-    } else if (plane && region) {
-      plane = windowPlane(plane, header.shape);
+      values = levelMetadata(values, plane !== null, header.shape, header.closed, nodes[0]!);
+    }
+    if (plane && !(finest && !region)) {
+      plane = planeAnywhere(plane, header.shape);
       placed = [[...nodes[0]![0]], [...nodes[0]![1]]];
     }
     if (plane && only) {
@@ -216,7 +212,7 @@ export class View implements ViewInfo {
   #nodes(level: number): Positions[] {
     const { header } = this.#shared.reconstruction;
     const { region } = this.#selection;
-    if (region) return [[range(region[0]), range(region[1])]];
+    if (region) return [[placesOf(region[0], header.shape[0]), placesOf(region[1], header.shape[1])]];
     return patchesByBlock(header.patches, header.blocks.length).map((own, block) =>
       levelPositions(own, header.patches.length, header.layout, level, header.blocks[block]!.shape),
     );
@@ -236,14 +232,9 @@ export class View implements ViewInfo {
     if (header.arrangement) {
       // A block that meets itself: what its sides share may lie anywhere in it.
       const whole = reconstruction.blocks(this.#known, header.levels, this.#corrected, chosen)[0]!;
-      return whole.map((grid) => cutGrid(grid, region[0], region[1]));
+      return whole.map((grid) => cutGrid(grid, region, header.shape));
     }
-    const taken = restoredRegion(header, region);
-    const whole = reconstruction.window(this.#known, taken, this.#corrected, chosen);
-    const moved = ([0, 1] as const).map(
-      (axis): Span => [region[axis][0] - taken[axis][0], region[axis][1] - taken[axis][0]],
-    );
-    return whole.map((grid) => cutGrid(grid, moved[0]!, moved[1]!));
+    return reconstruction.window(this.#known, region, this.#corrected, chosen);
   }
 
   #block({ points, mask }: Shown, attributes: readonly Grid[], nodes: Positions, closed: Closed): Block {
@@ -264,10 +255,6 @@ export class View implements ViewInfo {
       columns: nodes[1],
     };
   }
-}
-
-function range([start, stop]: Span): Int32Array {
-  return Int32Array.from({ length: stop - start }, (_, i) => start + i);
 }
 
 /** A mask of a block at some of its rows and columns. */

@@ -5,29 +5,18 @@
  * details that give them back. An update takes ten details on either side, a third step two nodes to the left of a detail
  * and three to the right.
  */
-import { OptionError } from "../errors";
-import type { Region, Shape } from "../types";
+import type { Region } from "../types";
 import { type AxisStep, extension, hasTail, REACH } from "./axis";
 import type { Layout } from "./layout";
+import { samplesOf } from "./window";
 
-/** Refuse a region that is not inside a surface of this shape, or has no point. Throws `OptionError`. */
-export function checkRegion(region: Region, shape: Shape): void {
-  for (const axis of [0, 1] as const) {
-    const [start, stop] = region[axis];
-    if (!(0 <= start && start < stop && stop <= shape[axis])) {
-      const name = axis ? "columns" : "rows";
-      throw new OptionError(`expected ${name} within 0:${shape[axis]}, at least one, got ${start}:${stop}`);
-    }
-  }
-}
-
-/** Which tiles of a surface of one grid the points of a region need, parents included: 1 or 0 for each tile. */
+/** Which tiles of a surface of one grid the points of a window need, parents included: 1 or 0 for each tile. */
 export function neededTiles(layout: Layout, region: Region): Uint8Array {
   const { tiles } = layout;
   const needed = new Uint8Array(tiles.length);
   needed[0] = 1;
   const shape = layout.grids[0]!.shape;
-  let samples: Uint8Array[] = ([0, 1] as const).map((axis) => new Uint8Array(shape[axis]).fill(1, ...region[axis]));
+  let samples: Uint8Array[] = ([0, 1] as const).map((axis) => samplesOf(region[axis], shape[axis]));
   for (let level = layout.levels; level > 0; level--) {
     const steps = layout.steps(0, level);
     // Coefficients along each axis: nodes first, details after them.

@@ -5,8 +5,9 @@ import { chunkPlaces } from "../container/chunks";
 import type { Header } from "../container/header";
 import type { Index } from "../container/model";
 import { OptionError } from "../errors";
-import { checkRegion, neededTiles } from "../grid/support";
-import { type Chunk, DTYPE_BYTES, type Region, type Segment, type Shape, type Span } from "../types";
+import { neededTiles } from "../grid/support";
+import { aligned, checkRegion, hullOf, meets } from "../grid/window";
+import { type Chunk, DTYPE_BYTES, type Region, type Segment, type Shape } from "../types";
 
 /** The requested part of a surface: a window of its points, and attributes by name; without them all. */
 export interface Selection {
@@ -27,7 +28,7 @@ export function checkSelection(selection: Selection, header: Header): void {
     if (header.blocks.length > 1) {
       throw new OptionError(`expected a surface of one block for a region, got ${header.blocks.length} blocks`);
     }
-    checkRegion(selection.region, header.shape);
+    checkRegion(selection.region, header.shape, header.blocks[0]!.closed);
   }
   const names = header.attributes.map((kind) => kind.name);
   for (const name of selection.attributes ?? []) {
@@ -56,13 +57,7 @@ export function selectedTiles(selection: Selection, header: Header): Uint8Array 
 
 /** What has to be decoded for a region of the only block: a chunk of the residual restores all of its own window. */
 export function restoredRegion(header: Header, region: Region): Region {
-  if (!header.corrected) return region;
-  const [rows, columns] = ([0, 1] as const).map((axis): Span => {
-    const size = 2 ** header.chunk[axis];
-    const [start, stop] = region[axis];
-    return [Math.floor(start / size) * size, Math.min(Math.ceil(stop / size) * size, header.shape[axis])];
-  });
-  return [rows!, columns!];
+  return header.corrected ? aligned(region, header.shape, [2 ** header.chunk[0], 2 ** header.chunk[1]]) : region;
 }
 
 /** Refuse what takes more memory than there may be; `level` is the finest level that is wanted, if not all of them. */
@@ -72,7 +67,7 @@ export function checkSize(selection: Selection, header: Header, capacity: Capaci
   const { layout } = header;
   let shapes: Shape[];
   if (selection.region && !header.arrangement) {
-    const [rows, columns] = restoredRegion(header, selection.region);
+    const [rows, columns] = hullOf(restoredRegion(header, selection.region), header.shape);
     shapes = [[rows[1] - rows[0], columns[1] - columns[0]]];
   } else if (level !== undefined && level < layout.levels) {
     shapes = layout.grids.map((_, grid) => layout.shape(grid, level));
@@ -105,13 +100,11 @@ export function select(index: Index, selection: Selection): SelectedSlices {
   for (const window of index.chunks.length ? chunkPlaces(header) : []) {
     const chunk = index.chunks[number]!;
     const touches =
-      !selection.region || (meets(selection.region[0], window.rows) && meets(selection.region[1], window.columns));
+      !selection.region ||
+      (meets(selection.region[0], window.rows, header.shape[0]) &&
+        meets(selection.region[1], window.columns, header.shape[1]));
     if (chunk.range.length && touches && channels[window.channel]) chunks.set(number, chunk);
     number++;
   }
   return { segments, chunks, whole: false };
-}
-
-function meets(one: Span, other: Span): boolean {
-  return one[0] < other[1] && other[0] < one[1];
 }

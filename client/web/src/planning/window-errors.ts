@@ -11,8 +11,8 @@ import type { Index } from "../container/model";
 import type { Read } from "../container/reader";
 import { WINDOW_ERRORS } from "../container/sections";
 import { CorruptStreamError, OptionError } from "../errors";
-import { checkRegion } from "../grid/support";
-import type { ByteRange, Region } from "../types";
+import { checkRegion, spansOf } from "../grid/window";
+import type { ByteRange, Region, Span } from "../types";
 
 // A code is a step of an eighth of an octave: 2^(-k / 8) over 2^16, rounded up; the last one says that there is no error.
 const STEPS = [65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734];
@@ -50,12 +50,16 @@ export class WindowErrors {
     if (blocks.length > 1) {
       throw new OptionError(`expected a surface of one block for a region, got ${blocks.length} blocks`);
     }
-    checkRegion(region, shape);
+    checkRegion(region, shape, blocks[0]!.closed);
     if (!(Number.isInteger(layer) && layer >= 0 && layer < layerCount)) {
       throw new OptionError(`expected a layer of 0 to ${layerCount - 1}, got ${layer}`);
     }
-    const [rows, columns] = region;
-    const inside = countValid(mask, shape[1], rows[0], rows[1], columns[0], columns[1]);
+    let inside = 0;
+    for (const rows of spansOf(region[0], shape[0])) {
+      for (const columns of spansOf(region[1], shape[1])) {
+        inside += countValid(mask, shape[1], rows[0], rows[1], columns[0], columns[1]);
+      }
+    }
     if (!inside) return { rms: 0, maximum: 0 };
     const { squares, worst } = this.sums(region, layer, mask);
     const rms = Math.sqrt(squares / inside) * UPWARDS;
@@ -68,12 +72,12 @@ export class WindowErrors {
    */
   sums(region: Region, layer: number, mask: Uint8Array | null): { squares: number; worst: number } {
     const { shape, layerCount } = this.#header;
-    const [rows, columns] = region;
     const [height, width] = [2 ** this.cell[0], 2 ** this.cell[1]];
     const across = Math.ceil(shape[1] / width);
     let [squares, worst] = [0, 0];
-    for (let i = Math.floor(rows[0] / height); i * height < rows[1]; i++) {
-      for (let j = Math.floor(columns[0] / width); j * width < columns[1]; j++) {
+    const columns = touched(region[1], shape[1], width);
+    for (const i of touched(region[0], shape[0], height)) {
+      for (const j of columns) {
         const place = (i * across + j) * (2 * layerCount + 2) + 2 * layer;
         const bottom = Math.min((i + 1) * height, shape[0]);
         const right = Math.min((j + 1) * width, shape[1]);
@@ -105,7 +109,7 @@ export class WindowFigures {
 
   /** `header` is of one block, with the number of its holes. Throws `OptionError` where there is no such region. */
   constructor(header: Header, region: Region, windows: WindowErrors | null = null) {
-    checkRegion(region, header.shape);
+    checkRegion(region, header.shape, header.blocks[0]!.closed);
     this.#region = region;
     this.#windows = windows;
     this.#extent = header.extent;
@@ -136,6 +140,15 @@ export class WindowFigures {
 /** The error that a code stands for, over the surface's extent. */
 function fractionOf(code: number): number {
   return code === NOTHING ? 0 : 4 * STEPS[code % 8]! * 2 ** (-16 - Math.floor(code / 8));
+}
+
+/** The cells of so many samples of an axis that a window touches, increasing; one at both of its ends counts once. */
+function touched(span: Span, length: number, size: number): number[] {
+  const cells = new Set<number>();
+  for (const [start, stop] of spansOf(span, length)) {
+    for (let cell = Math.floor(start / size); cell * size < stop; cell++) cells.add(cell);
+  }
+  return [...cells].sort((a, b) => a - b);
 }
 
 function countValid(

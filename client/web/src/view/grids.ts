@@ -4,7 +4,7 @@ import type { CoordinateRule, Plane } from "../container/extras";
 import type { Header } from "../container/header";
 import type { Metadata } from "../container/sections";
 import { evaluate, type RulePlane } from "../coordinates/coordinate-rules";
-import { coordinatesOf, levelPlacement, type Placement, placementOf } from "../coordinates/height-fields";
+import { coordinatesOf, type Placement, placementOf } from "../coordinates/height-fields";
 import type { Block, PointArray } from "../types";
 import { unrolled } from "./maps";
 import type { AttributeGrid, AttributeInfo, Grid } from "./source";
@@ -25,7 +25,7 @@ function numbers({ values }: PointArray): Float64Array {
  *
  * @param metadata - Of the whole surface, which may be known before its container's have come.
  */
-export function gridOf(block: Block, number: number, header: Header, level: number, metadata: Metadata): Grid {
+export function gridOf(block: Block, number: number, header: Header, metadata: Metadata): Grid {
   const [rows, columns] = block.shape;
   const full = header.blocks[number]!.shape;
   const values = numbers(block.points);
@@ -36,7 +36,7 @@ export function gridOf(block: Block, number: number, header: Header, level: numb
     Float64Array.from(block.columns),
   ];
   if (areHeights(header)) {
-    const { placement, at } = placed(block, header, level, metadata);
+    const { placement, at } = placed(block, header, metadata);
     [rowsAt, columnsAt] = at;
     const [x, y] = coordinatesOf(placement, block.shape);
     fill(points, 0, x, rows, columns);
@@ -58,36 +58,21 @@ export function gridOf(block: Block, number: number, header: Header, level: numb
   return unrolled(grid, areHeights(header) || header.plane !== null, metadata);
 }
 
-/** Rules of x and y at a level, and where its rows and columns stand. */
+/** Rules of x and y, and the rows and columns of the full grid where those of a block stand. */
 function placed(
   block: Block,
   header: Header,
-  level: number,
   metadata: Metadata,
 ): { placement: Placement; at: [Float64Array, Float64Array] } {
-  const halvings = header.levels - level;
-  if (halvings === 0) {
-    const at: [Float64Array, Float64Array] = [Float64Array.from(block.rows), Float64Array.from(block.columns)];
-    const whole = block.shape.every((length, axis) => length === header.shape[axis as 0 | 1]);
-    const placement = placementOf(metadata);
-    if (whole) return { placement, at };
-    const { swapped } = placement;
-    const rules = placement.rules.map((rule, channel) =>
-      anywhere(rule, header.shape[(channel === 1) !== swapped ? 0 : 1]),
-    );
-    return { placement: { rules: rules as unknown as Plane, swapped, nodes: [[...at[0]], [...at[1]]] }, at };
-  }
-  const coarse = levelPlacement(metadata, null, header.shape, block.shape, header.closed, halvings);
-  const placement: Placement = { ...placementOf(coarse.metadata), nodes: coarse.nodes };
-  const at = ([0, 1] as const).map((axis) => {
-    const [length, nodes] = [header.shape[axis], block.shape[axis]];
-    const step = header.closed[axis] ? length / nodes : (length - 1) / Math.max(nodes - 1, 1);
-    const last = header.closed[axis] ? length : length - 1;
-    // Beside a gap nodes may stand slightly outside.
-    const place = (k: number): number => Math.min(Math.max(step * (coarse.nodes[axis]?.[k] ?? k), 0), last);
-    return Float64Array.from({ length: nodes }, (_, k) => place(k));
-  }) as [Float64Array, Float64Array];
-  return { placement, at };
+  const at: [Float64Array, Float64Array] = [Float64Array.from(block.rows), Float64Array.from(block.columns)];
+  const placement = placementOf(metadata);
+  if (block.shape.every((length, axis) => length === header.shape[axis as 0 | 1])) return { placement, at };
+  const { swapped } = placement;
+  const rules = placement.rules.map((rule, channel) =>
+    anywhere(rule, header.shape[(channel === 1) !== swapped ? 0 : 1]),
+  ) as unknown as Plane;
+  const nodes = at.map((line, axis) => Array.from(line, (place) => placement.nodes[axis]?.[place] ?? place));
+  return { placement: { rules, swapped, nodes: [nodes[0]!, nodes[1]!] }, at };
 }
 
 /** A rule that does not depend on how many places it is asked for: the one that names the last value of its axis. */

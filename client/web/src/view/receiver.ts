@@ -81,10 +81,10 @@ export class Receiver {
     const moment = asked ?? this.views.length - 1;
     const view = this.views[moment]!;
     const surface = await view.surfaceAsync(level === header.levels ? undefined : level);
-    const grids = surface.blocks.map((block, number) => gridOf(block, number, header, level, this.metadata));
+    const grids = surface.blocks.map((block, number) => gridOf(block, number, header, this.metadata));
     if (window === null) return { moment, grids };
     const [part] = view.window(window.region).blocks;
-    const fine = gridOf(part!, 0, header, header.levels, this.metadata);
+    const fine = gridOf(part!, 0, header, this.metadata);
     return { moment, grids: [composed(grids[0]!, thinned(fine, window.stride))] };
   }
 

@@ -18,7 +18,7 @@ describe.each(NAMES)("the grids of %s", (name) => {
     const metadata = decoder.metadata ?? {};
     for (let level = 0; level <= header.levels; level += 1) {
       const surface = decoder.surface(level === header.levels ? undefined : level);
-      const grids = surface.blocks.map((block, number) => gridOf(block, number, header, level, metadata));
+      const grids = surface.blocks.map((block, number) => gridOf(block, number, header, metadata));
       grids.forEach((grid, number) => {
         const block = surface.blocks[number]!;
         expect([grid.rowsAt.length, grid.columnsAt.length]).toEqual([...block.shape]);
@@ -32,6 +32,16 @@ describe.each(NAMES)("the grids of %s", (name) => {
         }
         const holes = grid.points.filter((value, k) => !Number.isFinite(value) && grid.mask?.[Math.floor(k / 3)] !== 0);
         expect(holes).toHaveLength(0);
+        if (areHeights(header)) {
+          // Nodes lie where they stand in the finest grid.
+          for (const [node, row, column] of [
+            [0, grid.rowsAt[0]!, grid.columnsAt[0]!],
+            [block.shape[0] * grid.columnsAt.length - 1, grid.rowsAt.at(-1)!, grid.columnsAt.at(-1)!],
+          ] as const) {
+            if (column >= header.shape[1] || row >= header.shape[0]) continue; // beyond the seam of a map
+            expect([...grid.points.subarray(3 * node, 3 * node + 2)]).toEqual(placeOf(metadata, header, row, column));
+          }
+        }
         expect(grid.attributes.map(({ name, components }) => ({ name, components }))).toEqual(attributesIn(header));
       });
       const geometry = new Geometry();
@@ -43,7 +53,7 @@ describe.each(NAMES)("the grids of %s", (name) => {
     }
     if (!areHeights(header)) return;
     const [block] = decoder.surface().blocks;
-    const grid = gridOf(block!, 0, header, header.levels, metadata);
+    const grid = gridOf(block!, 0, header, metadata);
     for (const [row, column] of [
       [0, 0],
       [header.shape[0] - 1, header.shape[1] - 1],

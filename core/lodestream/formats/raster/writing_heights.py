@@ -34,18 +34,16 @@ def even_heights(surface: Surface, title: str) -> Surface:
             kind = "planar points" if surface.points.shape[2] == 2 else "x, y, z"
             raise FormatError(f"expected heights on an even grid for {title}, got {kind} that are not")
         surface = heights
-    if "nodes" in surface.metadata:
-        warn(f"{title} assumes evenly spaced rows and columns; those of this level are only nearly so")
     return surface
 
 
 def geotransform(surface: Surface) -> Sequence[float] | None:
     """The affine rule nearest to where heights lie, six numbers in GDAL's order; None for mere indices."""
     metadata, (rows, columns) = surface.metadata, surface.shape
-    if metadata.get("geotransform") is not None:
+    if metadata.get("geotransform") is not None and "nodes" not in metadata:
         coordinates(surface, slice(0, 1))  # refuses what is none
         return [float(value) for value in metadata["geotransform"]]
-    if "grid" not in metadata and "axes" not in metadata:
+    if not {"grid", "axes", "nodes"} & metadata.keys():
         return None
     transform = []
     for first, last in zip(*(coordinates(surface, own) for own in (slice(0, 1), slice(rows - 1, rows))), strict=True):
@@ -57,9 +55,9 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
 
 
 def warn_off(surface: Surface, transform: Sequence[float], title: str) -> None:
-    """Say how far the cells are from where the heights are; those of a level have a note of their own."""
-    metadata = {key: value for key, value in surface.metadata.items() if key not in ("angles", "nodes")}
-    if "nodes" in surface.metadata or not {"grid", "axes"} & metadata.keys():
+    """Say how far the cells are from where the heights are."""
+    metadata = {key: value for key, value in surface.metadata.items() if key != "angles"}
+    if not {"grid", "axes", "nodes"} & metadata.keys():
         return
     exact = Surface(surface.points, mask=surface.mask, metadata=metadata)
     affine = Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform})

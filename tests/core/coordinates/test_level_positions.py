@@ -1,0 +1,174 @@
+"""Nodes of coarser levels lie where they stand in the finest grid, wherever x and y follow rules or are axes."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import lodestream as ls
+from lodestream.container.model import Header
+from lodestream.coordinates.height_fields import coordinates
+from lodestream.decoding.level_grids import level_nodes
+from lodestream.formats import read, write
+
+CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
+
+
+def decoder_of(surface: ls.Surface) -> ls.Decoder:
+    decoder = ls.Decoder()
+    decoder.feed(ls.encode(surface))
+    return decoder
+
+
+def header_of(decoder: ls.Decoder) -> Header:
+    assert decoder.header is not None
+    return decoder.header
+
+
+@st.composite
+def placements(draw: st.DrawFn) -> ls.Surface:
+    """Heights of any shape and closure, whose metadata place them by one of the rules there are."""
+    shape = draw(st.tuples(st.integers(2, 70), st.integers(2, 70)))
+    closed = draw(st.sampled_from(CLOSURES))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    heights = np.cumsum(rng.normal(size=shape), axis=0).astype("f4")
+    steps = rng.uniform(0.01, 40, 6) * rng.choice([-1, 1], 6)
+    kind = draw(st.sampled_from(["none", "raster", "rotated", "even axes", "uneven axes", "ends", "both"]))
+    rules = {
+        "even axes": [[steps[0], steps[1]], [steps[2], steps[3], False]],
+        "ends": [[steps[0], steps[0] + steps[1], True], [int(steps[2] * 9), 3, 1000]],
+        "uneven axes": [[*np.cumsum(rng.uniform(0.1, 2, n)).tolist(), "values"] for n in shape[::-1]],
+    }
+    metadata: dict[str, Any] = {}
+    if kind in ("raster", "both"):
+        metadata["geotransform"] = [steps[0] * 1e4, steps[1], 0.0, steps[2] * 1e4, 0.0, steps[3]]
+    if kind == "rotated":
+        metadata["geotransform"] = steps.tolist()
+    if kind in rules or kind == "both":
+        x, y = rules["uneven axes" if kind == "both" else kind]
+        metadata["axes"] = {"x": x, "y": y}
+        if draw(st.booleans()):
+            metadata["axes"]["dtype"] = "float32"
+        if kind == "even axes" and draw(st.booleans()):
+            metadata["axes"]["rows"] = "x"
+    return ls.Surface(heights, closed, metadata=metadata)
+
+
+def at_nodes(decoder: ls.Decoder, planes: tuple[NDArray[Any], ...], level: int) -> list[NDArray[Any]]:
+    rows, columns = level_nodes(header_of(decoder), level)[0]
+    return [plane[np.ix_(rows, columns)] for plane in planes]
+
+
+@settings(max_examples=200, deadline=None)
+@given(placements())
+def test_nodes_of_heights_lie_at_their_places_in_the_finest_grid(surface: ls.Surface) -> None:
+    decoder = decoder_of(surface)
+    full = coordinates(decoder.surface())
+    size = max(float(np.ptp(plane)) for plane in full) + max(float(np.abs(plane).max()) for plane in full)
+    for level in range(header_of(decoder).levels):
+        found = coordinates(decoder.surface(level))
+        for plane, wanted, whole in zip(found, at_nodes(decoder, full, level), full, strict=True):
+            np.testing.assert_allclose(plane, wanted, rtol=0, atol=1e-14 * size)
+            assert plane.min() >= whole.min() - 1e-14 * size
+            assert plane.max() <= whole.max() + 1e-14 * size
+            if "axes" in surface.metadata:
+                assert plane.tobytes() == wanted.tobytes()
+
+
+@settings(max_examples=60, deadline=None)
+@given(placements())
+def test_levels_of_levels_lie_there_as_well(surface: ls.Surface) -> None:
+    first = decoder_of(surface)
+    level = header_of(first).levels - 1
+    if level < 1:
+        return
+    coarse = first.surface(level)
+    second = decoder_of(coarse)
+    full = coordinates(coarse)
+    size = max(float(np.abs(plane).max() + np.ptp(plane)) for plane in full)
+    for coarser in range(header_of(second).levels + 1):
+        wanted = at_nodes(second, full, coarser)
+        for plane, own in zip(coordinates(second.surface(coarser)), wanted, strict=True):
+            np.testing.assert_allclose(plane, own, rtol=0, atol=1e-14 * size)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(st.integers(2, 60), st.integers(2, 60)),
+    st.sampled_from(CLOSURES),
+    st.sampled_from(["even", "ends", "rotated", "centres"]),
+    st.integers(0, 2**32),
+)
+def test_nodes_of_points_whose_x_and_y_are_rules_have_the_points_of_the_finest_grid(
+    shape: tuple[int, int], closed: tuple[bool, bool], kind: str, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(float)
+    x, y = {
+        "even": (columns * 0.25 - 7, rows * 30),
+        "ends": (np.broadcast_to(np.linspace(0.1, 7.3, shape[1]), shape), rows * -0.5),
+        "rotated": (3 + columns * 0.5 + rows * 0.25, 9 - columns * 0.25 + rows * 0.5),
+        "centres": ((columns + 0.5) * 0.1, (rows + 0.5) * 0.3),
+    }[kind]
+    points = np.stack([x, y, np.rint(rng.normal(size=shape) * 9)], axis=2)
+    decoder = decoder_of(ls.Surface(points, closed))
+    assert header_of(decoder).plane is not None
+    for level in range(header_of(decoder).levels):
+        found = decoder.surface(level).points
+        places = np.ix_(*level_nodes(header_of(decoder), level)[0])
+        assert np.array_equal(found[..., :2], points[places][..., :2])
+
+
+@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize("shape", [(40, 46), (33, 47), (65, 129)])
+def test_files_of_levels_have_these_places(shape: tuple[int, int], closed: bool, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    xarray = pytest.importorskip("xarray")
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    heights = (rows * 3 + columns % 7).astype("i2")
+    place = [500.0, 4.0, 0.0, 9000.0, 0.0, -2.0]
+    decoder = decoder_of(ls.Surface(heights, (False, closed), metadata={"geotransform": place}))
+    for level in range(2, header_of(decoder).levels):
+        surface, (at_rows, at_columns) = decoder.surface(level), level_nodes(header_of(decoder), level)[0]
+        x, y = 502.0 + 4.0 * at_columns, 8999.0 - 2.0 * at_rows
+        dataset = surface.to_xarray()
+        np.testing.assert_allclose(dataset.x, x, rtol=1e-14)
+        np.testing.assert_allclose(dataset.y, y, rtol=1e-14)
+        even = len({*np.diff(at_columns)}) == 1 and len({*np.diff(at_rows)}) == 1
+        netcdf, raster = tmp_path / "level.nc", tmp_path / "level.tif"
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "NetCDF is written without closure")
+            write(surface, netcdf)
+        with xarray.open_dataset(netcdf) as file:
+            np.testing.assert_allclose(file.x, x, rtol=1e-14)
+            np.testing.assert_allclose(file.y, y, rtol=1e-14)
+        with warnings.catch_warnings(record=True) as notes:
+            warnings.simplefilter("always")
+            write(surface, raster)
+        told = [str(note.message) for note in notes if "assumes evenly spaced rows and columns: " in str(note.message)]
+        assert bool(told) == (not even)
+        with rasterio.open(raster) as file:
+            across, down = file.transform.a, file.transform.e
+            first = file.transform.c + across / 2, file.transform.f + down / 2
+        # Where steps are even they are those of the nodes, also of a closed axis that cannot be halved.
+        assert first == pytest.approx((x[0], y[0]))
+        last = first[0] + across * (len(x) - 1), first[1] + down * (len(y) - 1)
+        assert last == pytest.approx((x[-1], y[-1]))
+        assert read(raster).shape == surface.shape
+
+
+def test_a_map_closes_after_one_turn_at_every_level() -> None:
+    pytest.importorskip("pyvista")
+    heights = np.add.outer(np.arange(20), np.cos(np.arange(45) * np.pi / 22.5)).astype("f4")
+    surface = ls.Surface(heights, (False, True), metadata={"geotransform": [-4.0, 8.0, 0.0, 40.0, 0.0, -2.0]})
+    decoder = decoder_of(surface)
+    for level in range(header_of(decoder).levels + 1):
+        x = np.asarray(decoder.surface(level).to_pyvista().points[:, 0])
+        assert (x.min(), x.max()) == pytest.approx((0, 360))
