@@ -23,7 +23,7 @@ from lodestream.target import Tolerance
 from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Identity, Progress
-from .requests.bodies import Asked, Body, Closure, Parcel, Source, opened, prepared
+from .requests.bodies import Asked, Body, Closure, Parcel, Source, are_files, opened, prepared
 from .requests.calls import Flow
 from .stream.aio_stream import Stream
 from .stream.options import ConnectKeywords, ConnectOptions
@@ -78,6 +78,7 @@ async def upload(
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
     filename: str | None = None,
     nodata: float | str | None = None,
+    local: bool = False,
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
@@ -90,7 +91,9 @@ async def upload(
     'ready'
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
-    parcel = await _prepared(sources, asked, progress)
+    ask = not local and are_files(sources)
+    read_there = await _run(api.formats_read(url), url, token) if ask else None
+    parcel = await _prepared(sources, asked, progress, read_there, local)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:
         return await _run(api.upload(url, parcel.parameters, body, wait, progress), url, token)
@@ -197,7 +200,9 @@ class _GivenUpError(Exception):
     """Nobody waits for the encoder any more."""
 
 
-async def _prepared(sources: Sequence[Source], asked: Asked, progress: Progress | None) -> Parcel:
+async def _prepared(
+    sources: Sequence[Source], asked: Asked, progress: Progress | None, read_there: frozenset[str] | None, local: bool
+) -> Parcel:
     given_up = threading.Event()
 
     def told(stage: str, fraction: float) -> None:
@@ -207,7 +212,7 @@ async def _prepared(sources: Sequence[Source], asked: Asked, progress: Progress 
             progress(stage, fraction)
 
     try:
-        return await asyncio.to_thread(prepared, sources, asked, told)
+        return await asyncio.to_thread(prepared, sources, asked, told, read_there, local)
     except asyncio.CancelledError:
         given_up.set()
         raise

@@ -21,7 +21,7 @@ from lodestream.target import Tolerance
 from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Identity, Progress
-from .requests.bodies import Asked, Closure, Source, opened, prepared
+from .requests.bodies import Asked, Closure, Source, are_files, opened, prepared
 from .requests.calls import Flow
 from .stream.options import ConnectKeywords, ConnectOptions
 from .stream.sync_stream import Stream
@@ -128,6 +128,7 @@ def upload(
     attribute_precision: Mapping[str, Tolerance | float | str] | None = None,
     filename: str | None = None,
     nodata: float | str | None = None,
+    local: bool = False,
 ) -> Description:
     """Upload a surface.
 
@@ -152,7 +153,7 @@ def upload(
     wait : bool
         Whether to wait until the surface is ready to be streamed.
     progress : callable or None
-        Called as ``progress(stage, fraction)`` with the stages ``encoding`` (of a surface in memory), ``sending`` and
+        Called as ``progress(stage, fraction)`` with the stages ``encoding`` (of what is encoded here), ``sending`` and
         ``building``.
     token : str or None
         Token, if the server needs one.
@@ -163,6 +164,9 @@ def upload(
         none of an open file and of bytes.
     nodata : float, str or None
         A value, or "nan", that marks holes though the file does not say so, see `lodestream.read`.
+    local : bool
+        Encode files here and send a container. So are files of a format that the server does not read, with a
+        `FormatWarning`.
 
     Returns
     -------
@@ -192,7 +196,9 @@ def upload(
     [2, 2]
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
-    parcel = prepared(sources, asked, progress)
+    ask = not local and are_files(sources)
+    read_there = _run(api.formats_read(url), url, token) if ask else None
+    parcel = prepared(sources, asked, progress, read_there, local)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:
         return _run(api.upload(url, parcel.parameters, body, wait, progress), url, token)

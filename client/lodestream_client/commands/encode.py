@@ -6,13 +6,12 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lodestream.errors import OptionError
-
+from ..requests.local import checked_options
 from ..terminal.interrupts import interruptible
 from ..terminal.output import LONG, human_size, note, note_holes, print_json, progress_bar, require_folder
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
@@ -114,7 +113,7 @@ def read_surface(
     import lodestream as ls
 
     with option_hints(names), input_files(names) as files:
-        format_options = _format_options(options.format_options)
+        format_options = checked_options(options.format_options)
         given: dict[str, Any] = {"closed": options.closed, "filename": files.filename}
         given |= {"format_name": options.format_name, "nodata": options.nodata}
         if folder is None:
@@ -182,11 +181,3 @@ def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions)
     else:
         grid = " x ".join(map(str, blocks[0].shape)) if len(blocks) == 1 else f"{len(blocks)} blocks of"
         note(f"{grid} points, {human_size(size)} ({size / raw:.1%} of the arrays) in {seconds:.1f} s")
-
-
-def _format_options(options: Mapping[str, str]) -> dict[str, Any]:
-    # Parameters of `read` that are no options of any format.
-    for key in ("path", "closed", "max_vertices", "filename", "allowed", "format_name", "room", "folder", "memory"):
-        if key in options:
-            raise OptionError(f"{key} is not an option of any format")
-    return dict(options)

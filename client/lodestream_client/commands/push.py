@@ -46,6 +46,11 @@ def register(subparsers: Subparsers) -> None:
         help="each file is a surface of its own: prints URL and FILE on one line; a file that fails does not end "
         "it, but makes the exit code 1",
     )
+    parser.add_argument(
+        "--local",
+        action="store_true",
+        help="encode here and upload the container (default: only files of a format that the server does not read)",
+    )
     parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has stored the upload")
     add_token_option(parser)
     add_json_option(parser)
@@ -59,6 +64,7 @@ class PushOptions:
     url: str
     surface: SurfaceOptions
     each: bool
+    local: bool
     wait: bool
     token: str | None
     json: bool
@@ -73,6 +79,7 @@ def _options(args: argparse.Namespace) -> PushOptions:
         args.url,
         surface_options(args),
         args.each,
+        args.local,
         not args.no_wait,
         token_of(args),
         args.json,
@@ -152,8 +159,12 @@ def _uploaded(options: PushOptions) -> Description:
         total = human_size(sum(Path(path).stat().st_size for path in files.paths))
         task = bar.add_task("sending", total=1.0, figures=total)
 
+        stages = set[str]()
+
         def progress(stage: str, fraction: float) -> None:
-            bar.update(task, description=stage, completed=fraction, figures=total if stage == "sending" else "")
+            stages.add(stage)
+            figures = total if stages == {"sending"} else ""  # of a container that is made here the size is another
+            bar.update(task, description=stage, completed=fraction, figures=figures)
 
         return sync.upload(
             options.url,
@@ -164,6 +175,7 @@ def _uploaded(options: PushOptions) -> Description:
             attribute_precision=wanted.quality.attributes,
             closed=wanted.closed,
             nodata=wanted.nodata,
+            local=options.local,
             name=wanted.name,
             options=wanted.format_options,
             wait=options.wait,

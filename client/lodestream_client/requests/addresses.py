@@ -11,6 +11,7 @@ from lodestream.errors import OptionError, RemoteProtocolError
 __all__ = [
     "container_url",
     "counterpart",
+    "formats_url",
     "is_loopback",
     "is_surface",
     "is_url",
@@ -46,6 +47,11 @@ def surfaces_url(url: str) -> str:
     """
     base = _clean(url)
     return base if base.endswith(_SURFACES) else base + _SURFACES
+
+
+def formats_url(url: str) -> str:
+    """The URL of the list of formats that a server reads, from the server's URL or from that of its surfaces."""
+    return surfaces_url(url).removesuffix(_SURFACES) + "/v1/formats"
 
 
 def surface_url(url: str) -> str:

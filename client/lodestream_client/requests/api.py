@@ -30,6 +30,7 @@ __all__ = [
     "describe",
     "describe_file",
     "fetch_range",
+    "formats_read",
     "identify",
     "identity_of_file",
     "list_surfaces",
@@ -128,6 +129,18 @@ def upload(
     answer = yield Call("POST", collection, _named(parameters, body), body=body)
     surface = _described(_checked(answer, collection), _location(answer, collection))
     return (yield from _followed(surface, wait, progress))
+
+
+def formats_read(url: str) -> Flow[frozenset[str] | None]:
+    """The formats that a server reads; None where it does not say: its answer to the upload says what is wrong."""
+    answer = yield Call("GET", addresses.formats_url(url))
+    if answer is None or answer.status != 200:
+        return None
+    try:
+        names = parse(answer.content).get("formats")
+    except ValueError:
+        return None
+    return frozenset(map(str, names)) if isinstance(names, list) else None
 
 
 def retry(url: str, wait: bool, progress: Progress | None) -> Flow[Description]:

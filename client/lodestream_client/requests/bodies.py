@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from lodestream.surface import Surface
 
-__all__ = ["Asked", "Body", "Closure", "Parcel", "Source", "opened", "prepared"]
+__all__ = ["Asked", "Body", "Closure", "Parcel", "Source", "are_files", "opened", "prepared"]
 
 File: TypeAlias = "str | os.PathLike[str] | BinaryIO | bytes"
 #: What can be uploaded: a file by its name, one that is open, the bytes of one, or a surface in memory: all that
@@ -31,10 +32,11 @@ _CHUNK = 64 * 1024
 
 @dataclass(frozen=True)
 class Parcel:
-    """An upload: files with their names (empty: the file's own name), and the query of the request."""
+    """An upload: files with their names (empty: the file's own name), the query, and a folder that goes with it."""
 
     files: tuple[tuple[str, File], ...]
     parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
+    folder: tempfile.TemporaryDirectory[str] | None = None
 
 
 class Body:
@@ -93,8 +95,36 @@ def _length(file: BinaryIO) -> int:
     return end
 
 
-def prepared(sources: Sequence[Source], asked: Asked, progress: Callable[[str, float], None] | None) -> Parcel:
-    """Prepare an upload; a surface in memory is encoded, which takes time.
+def are_files(sources: Sequence[Source]) -> bool:
+    """Whether these are files, and not a surface in memory.
+
+    Raises
+    ------
+    InputError
+        If a source has another type.
+    """
+    return bool(sources) and not any(map(in_memory, sources))
+
+
+def prepared(
+    sources: Sequence[Source],
+    asked: Asked,
+    progress: Callable[[str, float], None] | None,
+    read_there: Collection[str] | None = None,
+    local: bool = False,
+) -> Parcel:
+    """Prepare an upload; a surface in memory is encoded, and so are files that the server does not read.
+
+    Parameters
+    ----------
+    sources : sequence of files, or one surface
+    asked : Asked
+    progress : callable or None
+        Called as ``progress("encoding", fraction)``.
+    read_there : collection of str or None
+        The formats that the server reads; None: it does not say.
+    local : bool
+        Encode files whatever the server reads.
 
     Raises
     ------
@@ -111,6 +141,19 @@ def prepared(sources: Sequence[Source], asked: Asked, progress: Callable[[str, f
         if len(sources) > 1:
             raise InputError(f"expected a surface in memory as the only source, got {len(sources)} sources")
         return Parcel((("surface.lode", encoded(sources[0], asked, progress)),))
+    if local or read_there is not None:
+        from .local import encoded_here
+
+        folder = tempfile.TemporaryDirectory(prefix="lodestream-")
+        try:
+            given = cast("Sequence[File]", sources)
+            container = encoded_here(given, asked, None if local else read_there, Path(folder.name), progress)
+        except BaseException:
+            folder.cleanup()
+            raise
+        if container is not None:
+            return Parcel((("surface.lode", container),), folder=folder)
+        folder.cleanup()
     names = [asked.filename or "", *[""] * (len(sources) - 1)]
     files = tuple((name, cast("File", source)) for name, source in zip(names, sources, strict=True))
     return Parcel(files, _parameters(asked))
@@ -130,6 +173,8 @@ def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Itera
         If a file cannot be opened.
     """
     with ExitStack() as stack:
+        if parcel.folder is not None:
+            stack.enter_context(parcel.folder)
         files: list[tuple[str, BinaryIO]] = []
         for name, source in parcel.files:
             if isinstance(source, str | os.PathLike):

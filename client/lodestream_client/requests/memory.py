@@ -17,7 +17,7 @@ from lodestream.target import Tolerance
 if TYPE_CHECKING:
     from lodestream.surface import Closed, Surface
 
-__all__ = ["Asked", "Closure", "encoded", "in_memory"]
+__all__ = ["Asked", "Closure", "encoded", "in_memory", "noted"]
 
 #: Which axes of a grid wrap, in the words of the command line.
 Closure = Literal["auto", "none", "rows", "cols", "both"]
@@ -112,7 +112,7 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
     from lodestream.encoding.encoder import encode
 
     surface = _surface(source, asked)
-    surface.metadata = _noted(surface)
+    surface.metadata = noted(surface)
     return encode(
         surface,
         quality=asked.quality,
@@ -149,7 +149,7 @@ def _surface(source: Any, asked: Asked) -> Surface:
     return surface
 
 
-def _noted(surface: Surface) -> dict[str, Any]:
+def noted(surface: Surface) -> dict[str, Any]:
     """Its metadata, with a note of what a container does not keep: others are told by the container alone."""
     from lodestream.container.metadata import check
     from lodestream.encoding.losses import at_holes

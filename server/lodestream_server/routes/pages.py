@@ -108,6 +108,18 @@ async def readyz(parts: Parts) -> Response:
 
 @readable(
     router,
+    "/v1/formats",
+    summary="File formats",
+    responses={200: examples.answer("Names of formats", {"formats": ["npy", "geotiff", "netcdf", "lode"]})},
+)
+@needs("write")
+async def formats(parts: Parts) -> Response:
+    """The file formats that this server reads; lode are containers. A client encodes files of other formats itself."""
+    return JSONResponse({"formats": list(parts.settings.formats)})
+
+
+@readable(
+    router,
     "/metrics",
     summary="Figures for Prometheus",
     response_class=Response,

@@ -1,0 +1,163 @@
+"""Files of a format that the server does not read are encoded here and sent as a container, and others by request."""
+
+from __future__ import annotations
+
+import asyncio
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lodestream as ls
+import lodestream_client as client
+from lodestream.errors import FormatError, FormatWarning, OptionError, RemoteError
+from lodestream_client import sync
+from lodestream_client.requests.api import Description
+from lodestream_client.requests.bodies import Source
+from lodestream_server import running_server
+from tests.server.routes.test_switched_off import vmec
+
+from ..conftest import Run
+
+HEIGHTS = np.round(np.random.default_rng(4).normal(size=(9, 7)), 3)
+NOTE = "the server does not read files of format"
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A server with its default formats."""
+    with running_server(tmp_path_factory.mktemp("plain") / "data", workers=1) as url:
+        yield url
+
+
+@pytest.fixture
+def text(tmp_path: Path) -> Path:
+    path = tmp_path / "hill.txt"
+    np.savetxt(path, HEIGHTS, fmt="%.3f")
+    return path
+
+
+def values_of(url: str) -> ls.Surface:
+    with sync.connect(url) as stream:
+        *_, view = stream
+    return view.surface()
+
+
+def test_the_server_says_what_it_reads(plain: str, server: str) -> None:
+    import httpx
+
+    default = httpx.get(f"{plain}/v1/formats").json()["formats"]
+    assert {"npy", "netcdf", "lode"} <= set(default)
+    assert not {"text", "vmec", "usgs-dem"} & set(default)
+    assert "text" in httpx.get(f"{server}/v1/formats").json()["formats"]
+
+
+@pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
+@pytest.mark.parametrize("kind", ["path", "file", "bytes"])
+def test_a_file_of_a_format_that_is_switched_off(plain: str, text: Path, kind: str, asynchronous: bool) -> None:
+    stages: list[str] = []
+
+    def progress(stage: str, fraction: float) -> None:
+        stages.append(stage)
+
+    def upload(source: Source) -> Description:
+        filename = None if kind == "path" else "hill.txt"
+        if asynchronous:
+            return asyncio.run(client.upload(plain, source, filename=filename, progress=progress))
+        return sync.upload(plain, source, filename=filename, progress=progress)
+
+    words = rf"{NOTE} text: .*hill\.txt is encoded here and sent as a container"
+    with text.open("rb") as file:
+        sources: dict[str, Source] = {"path": text, "file": file, "bytes": text.read_bytes()}
+        with pytest.warns(FormatWarning, match=words):
+            surface = upload(sources[kind])
+    assert surface.state == "ready"
+    assert surface.details["metadata"]["name"] == "hill"
+    np.testing.assert_array_equal(values_of(surface.url).points, HEIGHTS)
+    assert stages[0] == "encoding"
+    assert "sending" in stages
+
+
+def test_a_server_that_reads_it_gets_the_file(server: str, text: Path) -> None:
+    stages: list[str] = []
+    surface = sync.upload(server, text, progress=lambda stage, fraction: stages.append(stage))
+    assert "encoding" not in stages
+    np.testing.assert_array_equal(values_of(surface.url).points, HEIGHTS)
+
+
+def test_by_request(server: str, text: Path) -> None:
+    stages: list[str] = []
+    surface = sync.upload(server, text, local=True, name="here", progress=lambda stage, fraction: stages.append(stage))
+    assert "encoding" in stages
+    assert surface.details["metadata"]["name"] == "here"
+    np.testing.assert_array_equal(values_of(surface.url).points, HEIGHTS)
+
+
+def test_all_options_are_kept(plain: str, text: Path) -> None:
+    with pytest.warns(FormatWarning) as caught:
+        surface = sync.upload(
+            plain, text, precision=0.1, closed="rows", nodata=float(HEIGHTS[0, 0]), options={"layout": "heights"}
+        )
+    assert any("masks 1 of 63 points" in str(warning.message) for warning in caught)
+    values = values_of(surface.url)
+    assert values.closed == (True, False)
+    assert values.mask is not None
+    assert np.argwhere(~values.mask).tolist() == [[0, 0]]
+    assert np.abs(values.points - HEIGHTS)[values.mask].max() <= 0.1
+    assert surface.details["exact"] is False
+    with pytest.raises(OptionError, match="expected an option of format text"):
+        sync.upload(plain, text, options={"band": "1"})
+    with pytest.raises(OptionError, match="room is not an option of any format"):
+        sync.upload(plain, text, options={"room": "1"})
+
+
+def test_several_files_are_one_surface(plain: str, tmp_path: Path) -> None:
+    rows, columns = np.mgrid[0:5, 0:6] / 3
+    for name, values in {"x": columns + rows, "y": rows, "z": rows * columns}.items():
+        np.savetxt(tmp_path / f"{name}.dat", values)
+    with pytest.warns(FormatWarning, match=NOTE):
+        surface = sync.upload(plain, *(tmp_path / f"{name}.dat" for name in "xyz"))
+    assert values_of(surface.url).points.shape == (5, 6, 3)
+
+
+def test_what_is_known_only_to_the_reader(plain: str, tmp_path: Path) -> None:
+    path = tmp_path / "w7x.nc"
+    path.write_bytes(vmec())
+    with pytest.warns(FormatWarning, match=rf"{NOTE} vmec"):
+        surface = sync.upload(plain, path, options={"resolution": "8x16"})
+    assert surface.details["shape"] == [8, 16]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", FormatWarning)
+        assert sync.upload(plain, path, options={"variable": "rmnc"}).state == "ready"  # a NetCDF like any other
+
+
+def test_what_cannot_be_read_is_refused(plain: str, text: Path, tmp_path: Path) -> None:
+    text.write_text("1 2 3\n4 5\n")
+    with pytest.raises(FormatError, match=r"hill\.txt: expected 2 lines of 3 numbers"):
+        sync.upload(plain, text)
+    (tmp_path / "a.tif").write_bytes(b"nothing")
+    with pytest.raises(FormatError, match=r"a\.tif: expected a file of format"):
+        sync.upload(plain, tmp_path / "a.tif")
+    (tmp_path / "a.nc").write_bytes(b"CDF\x01 and no more")
+    with pytest.raises(RemoteError, match=r"a\.nc: expected"):
+        sync.upload(plain, tmp_path / "a.nc")
+
+
+def test_containers_go_as_they_are(plain: str, container_file: Path) -> None:
+    surface = sync.upload(plain, container_file, local=True)
+    assert sync.fetch_range(surface.url, 0, surface.details["bytes"]) == container_file.read_bytes()
+
+
+def test_push(run: Run, plain: str, text: Path) -> None:
+    code, stdout, stderr = run("push", text, plain)
+    assert code == 0, stderr
+    assert f"{NOTE} text: {text} is encoded here and sent as a container" in stderr
+    np.testing.assert_array_equal(values_of(stdout.strip()).points, HEIGHTS)
+    np.save(text.with_suffix(".npy"), HEIGHTS)
+    code, stdout, stderr = run("push", text.with_suffix(".npy"), plain, "--local")
+    assert (code, NOTE in stderr) == (0, False), stderr
+    np.testing.assert_array_equal(values_of(stdout.strip()).points, HEIGHTS)
+    code, stdout, stderr = run("push", "--each", text, text.with_suffix(".npy"), plain)
+    assert (code, stderr.count(NOTE), len(stdout.splitlines())) == (0, 1, 2), stderr
