@@ -52,7 +52,7 @@ def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.b
     ----------
     header : Header
     region : ((int, int), (int, int)) or None
-        Rows and columns of the only block, half-open, across the seam of a closed axis too. None: all points of all blocks.
+        Rows and columns of the only block, half-open, across the seam of a closed axis too. None: all of all blocks.
     channels : bool, shape (channel,)
         Which channels are wanted.
     """
