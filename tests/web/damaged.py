@@ -53,6 +53,7 @@ def said(data: bytes) -> dict[str, Any]:
     try:
         decoder.feed(data)
         decoder.finish()
+        decoder.index  # noqa: B018 - which is parsed when it is asked for; browsers parse it at once
     except LodestreamError as error:
         found["error"] = _plain(error)
     found["views"] = [[view.number, view.level, view.bytes, view.rms, view.max_error] for view in decoder.layers]
