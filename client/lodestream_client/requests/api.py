@@ -133,7 +133,8 @@ def upload(
 
 def formats_read(url: str) -> Flow[frozenset[str] | None]:
     """The formats that a server reads; None where it does not say: its answer to the upload says what is wrong."""
-    answer = yield Call("GET", addresses.formats_url(url))
+    # Not of another server: the upload that this is for follows no redirect either.
+    answer = yield Call("GET", addresses.formats_url(url), redirected=False)
     if answer is None or answer.status != 200:
         return None
     try:

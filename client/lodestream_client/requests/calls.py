@@ -28,7 +28,7 @@ class Call:
     """A request to make; the complete answer is sent back.
 
     With ``partial``, an answer that is a whole file is sent back without being read. Of other answers at most `most`
-    bytes are read.
+    bytes are read. Redirects are followed if `redirected` says so, and never where the request changes something.
     """
 
     method: str
@@ -38,6 +38,7 @@ class Call:
     body: Body | None = None
     partial: bool = False
     most: int = LONGEST_ANSWER
+    redirected: bool = True
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
     if token is not None and addresses.same_origin(call.url, url):
         headers["Authorization"] = f"Bearer {token}"
     options: dict[str, Any] = {"method": call.method, "url": call.url, "headers": headers}
-    if call.method not in ("GET", "HEAD"):
+    if not call.redirected or call.method not in ("GET", "HEAD"):
         options["follow_redirects"] = False  # nothing is changed, and no file sent, where nobody said so
     if call.parameters:
         options["params"] = dict(call.parameters)

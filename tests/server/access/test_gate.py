@@ -29,6 +29,7 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/healthz"): None,
     ("GET", "/readyz"): None,
     ("GET", "/metrics"): "admin",
+    ("GET", "/v1/formats"): "write",
     ("GET", "/v1/surfaces"): "read",
     ("POST", "/v1/surfaces"): "write",
     ("GET", "/v1/surfaces/{surface}"): "read",

@@ -235,6 +235,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/healthz",
         "/readyz",
         "/metrics",
+        "/v1/formats",
         "/v1/surfaces",
         "/v1/surfaces/{surface}",
         "/v1/surfaces/{surface}/retry",
