@@ -74,8 +74,9 @@ What all commands have in common:
 
 - OUT and the picture of `--picture` are replaced, never changed in place, so a program that opens them finds a complete
   file. Each time OUT is replaced, a line on standard error says so, with the error of the new file.
-- They are written in parallel with the stream, which does not wait for them. Each time the newest state is written;
-  states in between are skipped. The last state is always written. Notes on what the format cannot hold are printed
+- They are written in parallel with the stream, which does not wait for them; a process of its own draws. Each time the
+  newest state is written; states in between are skipped. The last state is always written, and drawn. A picture that
+  cannot be drawn makes the exit code 1 after OUT is written. Notes on what the format cannot hold are printed
   once, with the last state.
 - OUT cannot be a Zarr store: a folder cannot be replaced in this way.
 - Each of these files has the name and position of the surface, since the metadata are requested first.

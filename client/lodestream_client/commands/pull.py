@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,6 +44,7 @@ from .watching import Watch, check_picture, check_watched
 if TYPE_CHECKING:
     from ..stream.reconnecting import Transport
     from ..sync import Stream
+    from ..viewer.drawing import Drawing
 
 __all__ = ["PullOptions", "register", "run"]
 
@@ -188,13 +189,22 @@ def run(args: argparse.Namespace) -> int:
         check_watched(options.out)
     if options.picture is not None:
         check_picture(options.picture)
-    with interruptible(), Kept(options.resume) as kept:
-        return _pull(options, kept)
+    with interruptible(), Kept(options.resume) as kept, _drawing(options) as drawing:
+        return _pull(options, kept, drawing)
 
 
-def _pull(options: PullOptions, kept: Kept) -> int:
+def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:
+    """The process that draws, if a picture is wanted: it starts while the stream does."""
+    if options.picture is None:
+        return nullcontext()
+    from ..viewer.drawing import Drawing
+
+    return Drawing(options.picture, options.url, window=options.target.region is not None)
+
+
+def _pull(options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
     try:
-        outcome, broke = _written(options, kept)
+        outcome, broke = _written(options, kept, drawing)
     except KeyboardInterrupt as interrupt:
         raise type(interrupt)(f"{_words(interrupt)}: {options.name} is not written") from None
     outcome.report(options.json)
@@ -206,7 +216,9 @@ def _pull(options: PullOptions, kept: Kept) -> int:
     return exit_code(broke) if isinstance(broke, KeyboardInterrupt) else 1
 
 
-def _written(options: PullOptions, kept: Kept) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
+def _written(
+    options: PullOptions, kept: Kept, drawing: Drawing | None
+) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
     """What has been written, and what ended the stream before it had all that was asked for."""
     import lodestream.decoding.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
 
@@ -216,7 +228,7 @@ def _written(options: PullOptions, kept: Kept) -> tuple[Outcome, KeyboardInterru
     if options.resume:
         kept.use(sync.identify(options.url, token=options.token))
     arrived = RangeSet()
-    stream, metadata, broke = _receive(options, kept, arrived)
+    stream, metadata, broke = _receive(options, kept, drawing, arrived)
     if broke is not None:
         if not stream.decoder.layers:
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
@@ -227,15 +239,13 @@ def _written(options: PullOptions, kept: Kept) -> tuple[Outcome, KeyboardInterru
     outcome = _outcome(options, stream, metadata, arrived, started)
     outcome.write(options.out)
     header = stream.decoder.header
-    if options.picture is not None and header is not None:
-        Watch(options.out, options.picture, options.target, metadata, options.url).draw(
-            stream.decoder.view(), header.layout
-        )
+    if drawing is not None and header is not None:
+        drawing.draw(stream.decoder.view(), header.layout, metadata())
     return outcome, broke
 
 
 def _receive(
-    options: PullOptions, kept: Kept, arrived: RangeSet
+    options: PullOptions, kept: Kept, drawing: Drawing | None, arrived: RangeSet
 ) -> tuple[Stream, Metadata, KeyboardInterrupt | LodestreamError | None]:
     """The stream at its end, its metadata, and what ended it before it had all that was asked for.
 
@@ -271,7 +281,7 @@ def _receive(
         )
         kept.follow(stream)
         metadata = Metadata(stream, kept, options.token, arrived)
-        watch = Watch(options.out, options.picture, options.target, metadata, options.url) if options.watch else None
+        watch = Watch(options.out, drawing, options.target, metadata) if options.watch else None
         try:
             with watch or nullcontext(), stream:
                 for number, view in enumerate(stream):

@@ -201,7 +201,7 @@ def _wait() -> None:
 
 
 def _draw(options: ViewOptions, out: Path) -> None:
-    from ..viewer.pictures import draw, least_size, view_after
+    from ..viewer.pictures import Picture, least_size, view_after, write_png
 
     require_folder(out)
     with _source(options) as source:
@@ -216,7 +216,7 @@ def _draw(options: ViewOptions, out: Path) -> None:
                 continue
             path = out.with_name(f"{out.stem}-{label}{out.suffix}") if label else out
             view, layout = view_after(source, most, options.max_vertices)
-            draw(view, layout, source.name, path)
+            write_png(Picture.of(view, layout, source.name).png(), path)
             note(f"{path}: {view.bytes} bytes, RMS error {view.rms:.6g}, maximum {view.max_error:.6g}")
 
 

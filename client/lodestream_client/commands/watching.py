@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from lodestream.grid.layout import Layout
     from lodestream.target import Target
 
+    from ..viewer.drawing import Drawing
+
     _State = tuple[View, Layout, Mapping[str, Any]]
 
 __all__ = ["Watch", "check_picture", "check_watched"]
@@ -63,30 +65,28 @@ def check_picture(picture: Path) -> None:
 class Watch:
     """The surface as far as it has come, in OUT and in a picture; a context manager that waits for what it has begun.
 
-    A thread writes and draws, so that nothing waits for it: of the states that come meanwhile the newest is next.
+    A thread writes, and a process draws, so that nothing waits for them: of the states that come meanwhile the newest
+    is next.
 
     Parameters
     ----------
     out : str
         File to replace.
-    picture : Path or None
-        PNG to replace.
+    drawing : Drawing or None
+        Draws states too.
     target : Target
         What of the surface is written.
     metadata : callable
         Returns the metadata of the surface; called with each state, in the caller's thread.
-    name : str
-        What the surface is called in the picture if its metadata do not say.
     """
 
     def __init__(
-        self, out: str, picture: Path | None, target: Target, metadata: Callable[[], Mapping[str, Any]], name: str
+        self, out: str, drawing: Drawing | None, target: Target, metadata: Callable[[], Mapping[str, Any]]
     ) -> None:
         self._out = out
-        self._picture = picture
+        self._drawing = drawing
         self._target = target
         self._metadata = metadata
-        self._name = name
         self._lock = Lock()
         self._next: _State | None = None
         self._thread: Thread | None = None
@@ -142,18 +142,7 @@ class Watch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FormatWarning)
             write_surface(view.surface(self._target.level, metadata), self._out)
-        self._draw(view, layout, metadata)
+        if self._drawing is not None:
+            self._drawing.offer(view, layout, metadata)
         within = "at most " if view.bound else ""
         note(f"{self._out}: {human_size(view.bytes)}, level {view.level}, RMS error {within}{view.rms:.4g}")
-
-    def draw(self, view: View, layout: Layout) -> None:
-        """Draw a state, if a picture is wanted."""
-        self._draw(view, layout, self._metadata())
-
-    def _draw(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
-        if self._picture is not None:
-            from ..viewer.pictures import draw
-
-            name = metadata.get("name")
-            window = self._target.region is not None
-            draw(view, None if window else layout, name if isinstance(name, str) else self._name, self._picture)

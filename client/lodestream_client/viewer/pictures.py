@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +14,7 @@ from lodestream.decoding.decoder import Decoder
 from lodestream.errors import UnavailableError
 from lodestream.interop.pictures import DPI, draw_surface
 from lodestream.planning.planner import plan
+from lodestream.surface import Block, Surface
 from lodestream.target import Target
 from lodestream.text import printable
 
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
 
-__all__ = ["draw", "least_size", "require_matplotlib", "view_after"]
+__all__ = ["Picture", "least_size", "require_matplotlib", "view_after", "write_png"]
 
 _PIXELS = 1000  # along the longer side of a height field
 _LONGEST = 100  # characters of a name
@@ -81,37 +84,59 @@ def require_matplotlib() -> None:
         raise UnavailableError("pictures need matplotlib: pip install 'lodestream[plot]'") from None
 
 
-def draw(view: View, layout: Layout | None, name: str, path: Path) -> None:
-    """Write a picture of a view, with its bytes and its errors above it.
+@dataclass(frozen=True)
+class Picture:
+    """What a picture shows: blocks of points of one level, with what is known of their angles, and the title."""
 
-    Parameters
-    ----------
-    view : View
-    layout : Layout or None
-        Of the surface: a level with enough nodes for the picture is drawn. None: the finest, as a window needs.
-    name : str
-        Of the surface.
-    path : Path
-        PNG to write.
+    surface: Surface
+    title: str
 
-    Raises
-    ------
-    UnavailableError
-        If matplotlib is not installed.
-    """
-    require_matplotlib()
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    @classmethod
+    def of(cls, view: View, layout: Layout | None, name: str) -> Picture:
+        """A view of a surface, with its bytes and its errors as title.
 
-    figure = Figure(layout="constrained", dpi=DPI)
-    FigureCanvasAgg(figure)
-    draw_surface(figure, view.surface(None if layout is None else _level(layout)), _PIXELS)
-    exact = "exact" if view.complete and view.rms == 0 else f"RMS error {view.rms:.3g}, maximum {view.max_error:.3g}"
-    title = printable(" ".join(name.split()))[:_LONGEST]
-    # What a file or a server calls itself is no formula.
-    figure.suptitle(f"{title}\n{human_size(view.bytes)}, {exact}", fontsize=11, parse_math=False)
+        Parameters
+        ----------
+        view : View
+        layout : Layout or None
+            Of the surface: a level with enough nodes for the picture is drawn. None: the finest, as a window needs.
+        name : str
+            Of the surface.
+        """
+        surface = view.surface(None if layout is None else _level(layout))
+        blocks = [Block(block.points, block.closed, mask=block.mask) for block in surface.blocks]
+        exact = (
+            "exact" if view.complete and view.rms == 0 else f"RMS error {view.rms:.3g}, maximum {view.max_error:.3g}"
+        )
+        title = printable(" ".join(name.split()))[:_LONGEST]
+        return cls(Surface(blocks=blocks, metadata=surface.metadata), f"{title}\n{human_size(view.bytes)}, {exact}")
+
+    def png(self) -> bytes:
+        """Draw it.
+
+        Raises
+        ------
+        UnavailableError
+            If matplotlib is not installed.
+        """
+        require_matplotlib()
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(layout="constrained", dpi=DPI)
+        FigureCanvasAgg(figure)
+        draw_surface(figure, self.surface, _PIXELS)
+        # What a file or a server calls itself is no formula.
+        figure.suptitle(self.title, fontsize=11, parse_math=False)
+        file = io.BytesIO()
+        figure.savefig(file, format="png")
+        return file.getvalue()
+
+
+def write_png(png: bytes, path: Path) -> None:
+    """Write a drawn picture, in place of one that is there."""
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
+        temporary.write_bytes(png)
 
 
 def _level(layout: Layout) -> int | None:

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import errno
 import os
+import signal
+import sys
 from itertools import pairwise
 from pathlib import Path
 from threading import Event
+from time import sleep
 
 import numpy as np
+import psutil
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
 import lodestream as ls
 from lodestream.formats import write
-from lodestream.grid.layout import Layout
 from lodestream_client import sync
 from lodestream_client.commands import watching
+from lodestream_client.commands.outcome import write_surface
+from lodestream_client.terminal.interrupts import Terminated
+from lodestream_client.viewer import drawing
+from lodestream_client.viewer.pictures import Picture, write_png
 from tests.patience import PATIENCE
 
 from ..conftest import Run
@@ -76,26 +83,23 @@ def test_what_is_written_early_has_its_place_and_notes_come_once(run: Run, serve
 
 
 def test_a_picture_is_drawn_beside_it(run: Run, surface: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lodestream_client.viewer import pictures
-
-    drawn: list[int] = []
-    draw = pictures.draw
-
-    def seen(view: ls.View, layout: Layout | None, name: str, path: Path) -> None:
-        draw(view, layout, name, path)
-        with Image.open(path) as picture:
-            picture.load()
-            drawn.append(view.bytes)
-
-    monkeypatch.setattr(pictures, "draw", seen)
     out, picture = tmp_path / "out.npy", tmp_path / "out.png"
     assert run("pull", surface, out, "--picture", picture)[0] == 0
-    assert len(drawn) == 1
-    drawn.clear()
+    last = picture.read_bytes()
+    drawn = list[bytes]()
+
+    def seen(png: bytes, path: Path) -> None:
+        write_png(png, path)
+        with Image.open(path) as shown:
+            shown.load()
+        drawn.append(png)
+
+    monkeypatch.setattr(drawing, "write_png", seen)
+    assert run("pull", surface, out, "--picture", picture, "--watch", *SLOW)[0] == 0
+    assert drawn[-1] == last == picture.read_bytes(), "the last state is drawn whatever came before"
     assert run("pull", surface, out, "--picture", picture, "--watch", "--roi", "0:40,0:40", *SLOW)[0] == 0
-    assert len(drawn) > 1
-    assert drawn == sorted(drawn)
-    assert {each.name for each in tmp_path.iterdir()} == {"out.npy", "out.png"}
+    assert picture.read_bytes() == drawn[-1] != last
+    assert {file.name for file in tmp_path.iterdir()} == {"out.npy", "out.png"}
 
 
 def test_nothing_waits_for_what_is_written_and_the_newest_is_next(
@@ -115,7 +119,7 @@ def test_nothing_waits_for_what_is_written_and_the_newest_is_next(
             second.set()
 
     monkeypatch.setattr(watching, "write_surface", blocked)
-    with watching.Watch(str(tmp_path / "out.npy"), None, ls.Target(), dict, "hill") as watch:
+    with watching.Watch(str(tmp_path / "out.npy"), None, ls.Target(), dict) as watch:
         watch.write(views[0], layout)
         assert begun.wait(PATIENCE)
         for view in views[1:9]:  # while the first is written
@@ -124,6 +128,132 @@ def test_nothing_waits_for_what_is_written_and_the_newest_is_next(
         go_on.set()
         assert second.wait(PATIENCE)
     assert written == pytest.approx([views[0].rms, views[8].rms], rel=1e-3)
+
+
+#: A process that finishes no picture until there is a file `go` in a folder.
+BLOCKED = """
+import pathlib, pickle, sys, time
+from lodestream_client.viewer import drawing, pictures
+png, folder = pictures.Picture.png, pathlib.Path(sys.argv[1])
+def blocked(picture):
+    (folder / "begun").touch()
+    while not (folder / "go").exists():
+        time.sleep(0.01)
+    return png(picture)
+pictures.Picture.png = blocked
+drawing.serve(sys.stdin.buffer, sys.stdout.buffer)
+"""
+
+#: A process whose every picture fails, or that ends at the first one.
+FAILING = """
+import os, sys
+from lodestream_client.viewer import drawing, pictures
+def failing(picture):
+    {}
+pictures.Picture.png = failing
+drawing.serve(sys.stdin.buffer, sys.stdout.buffer)
+"""
+
+
+def drawn_by(monkeypatch: pytest.MonkeyPatch, program: str, *args: object) -> None:
+    """Have another program draw."""
+    monkeypatch.setattr(drawing, "command", lambda: [sys.executable, "-c", program, *map(str, args)])
+
+
+def children() -> set[int]:
+    return {process.pid for process in psutil.Process().children(recursive=True)}
+
+
+def test_the_stream_does_not_wait_for_a_picture(
+    run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A picture that is never finished holds no state back: it is let go on when the stream has ended."""
+    folder, out, picture = tmp_path / "folder", tmp_path / "out.npy", tmp_path / "out.png"
+    folder.mkdir()
+    drawn_by(monkeypatch, BLOCKED, folder)
+    draw, before = drawing.Drawing.draw, children()
+    ended = list[bool]()
+
+    def last(process: drawing.Drawing, *state: object) -> None:
+        while not (folder / "begun").exists():
+            sleep(0.01)
+        ended.append(picture.exists())
+        assert np.load(out).tobytes() == terrain.tobytes(), "OUT does not wait for pictures"
+        (folder / "go").touch()
+        draw(process, *state)  # type: ignore[arg-type]
+
+    offer, waiting = drawing.Drawing.offer, Event()
+
+    def first(process: drawing.Drawing, *state: object) -> None:
+        if not waiting.is_set():  # the first state finds a process that is ready
+            process._answer.result()
+            waiting.set()
+        offer(process, *state)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(drawing.Drawing, "offer", first)
+    monkeypatch.setattr(drawing.Drawing, "draw", last)
+    assert run("pull", surface, out, "--picture", picture, "--watch", *SLOW)[0] == 0
+    assert ended == [False], "the stream ended while the first picture was drawn"
+    assert picture.exists()
+    assert children() == before, "no process is left"
+
+
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        (FAILING.format("raise ValueError('no ink')"), "the picture cannot be drawn: ValueError: no ink"),
+        (FAILING.format("os._exit(7)"), "out.png: the process that draws pictures ended with code 7"),
+        ("raise SystemExit(3)", "out.png: the process that draws pictures ended with code 3"),
+    ],
+)
+def test_a_picture_that_cannot_be_drawn_is_told_after_the_surface_is_written(
+    run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, words: str
+) -> None:
+    drawn_by(monkeypatch, program)
+    before = children()
+    out, picture = tmp_path / "out.npy", tmp_path / "out.png"
+    for more in ((), ("--watch", *SLOW)):
+        out.unlink(missing_ok=True)
+        code, _, stderr = run("pull", surface, out, "--picture", picture, *more)
+        assert code == 1
+        assert stderr.splitlines()[-1].endswith(words)
+        assert np.load(out).tobytes() == terrain.tobytes()
+    assert not picture.exists()
+    assert children() == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_leaves_no_process_that_draws(
+    run: Run, surface: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """Once while a picture is being drawn, and once more while the last one is waited for."""
+    drawn_by(monkeypatch, BLOCKED, tmp_path)
+    before = children()
+
+    def interrupted(state: ls.Surface, path: str) -> None:
+        write_surface(state, path)
+        os.kill(os.getpid(), number)
+
+    def last(process: drawing.Drawing, *state: object) -> None:
+        raise Terminated("terminated") if number == signal.SIGTERM else KeyboardInterrupt
+
+    monkeypatch.setattr(watching, "write_surface", interrupted)
+    monkeypatch.setattr(drawing.Drawing, "draw", last)
+    code, *_ = run("pull", surface, tmp_path / "out.npy", "--picture", tmp_path / "out.png", "--watch", *SLOW)
+    assert code == 128 + number
+    assert children() == before
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_the_process_draws_what_is_drawn_here(tmp_path: Path, terrain: Terrain) -> None:
+    decoder = ls.Decoder()
+    views = decoder.feed(ls.encode(terrain))
+    assert decoder.header is not None
+    layout, path = decoder.header.layout, tmp_path / "out.png"
+    with drawing.Drawing(path, "hill", window=False) as process:
+        for view in (views[3], views[-1]):
+            process.draw(view, layout, {})
+            assert path.read_bytes() == Picture.of(view, layout, "hill").png()
 
 
 def test_an_out_that_cannot_be_replaced_ends_it(

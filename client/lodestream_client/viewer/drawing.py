@@ -1,0 +1,165 @@
+"""The process that draws the pictures of ``pull``, which takes seconds of a processor that the stream does not miss.
+
+This module run as a program is that process. It reads a pickled `Picture` after another from its standard input and
+answers each on standard output with a pickled PNG, or with the error; its first answer says that it is ready. It ends
+when its input does, so also if the program that has started it was killed.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from lodestream.errors import LodestreamError, UnavailableError
+
+from .pictures import Picture, write_png
+
+if TYPE_CHECKING:
+    from lodestream.decoding.view import View
+    from lodestream.grid.layout import Layout
+
+__all__ = ["Drawing", "command"]
+
+
+def command() -> list[str]:
+    """The command of the process that draws."""
+    return [sys.executable, "-P", "-m", "lodestream_client.viewer.drawing"]
+
+
+class Drawing:
+    """Draws states of a surface into a file, in a process that is started once; a context manager that ends it.
+
+    Parameters
+    ----------
+    path : Path
+        PNG to replace.
+    name : str
+        What the surface is called if its metadata do not say.
+    window : bool
+        The states are of a window.
+    """
+
+    def __init__(self, path: Path, name: str, *, window: bool) -> None:
+        self._path = path
+        self._name = name
+        self._window = window
+
+    def __enter__(self) -> Drawing:
+        # A session of its own: Ctrl-C in a terminal is handled here, and ends the process with the block.
+        self._process = subprocess.Popen(
+            command(),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        # The thread waits for the process, so that nothing else does.
+        self._thread = ThreadPoolExecutor(1, "lodestream-drawing")
+        self._answer: Future[None] = self._thread.submit(self._received)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.kill()
+        self._thread.shutdown(cancel_futures=True)
+        with self._process:  # closes its pipes and waits for it
+            if self._process.stdin is not None:
+                _close(self._process.stdin)
+
+    def offer(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
+        """Have a state drawn, unless another one is being drawn; if one could not be, `draw` raises that."""
+        if self._answer.done() and self._answer.exception() is None:
+            self._send(view, layout, metadata)
+
+    def draw(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
+        """Draw a state after the one that is being drawn, and wait for it.
+
+        Raises
+        ------
+        LodestreamError, OSError
+            If it, or an earlier one, could not be drawn or written.
+        """
+        self._answer.result()
+        self._send(view, layout, metadata)
+        self._answer.result()
+
+    def _send(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
+        name = metadata.get("name")
+        called = name if isinstance(name, str) else self._name
+        picture = Picture.of(view, None if self._window else layout, called)
+        self._answer = self._thread.submit(self._drawn, picture)
+
+    def _drawn(self, picture: Picture) -> None:
+        assert self._process.stdin is not None
+        try:
+            pickle.dump(picture, self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+        except OSError:  # it has ended
+            raise self._ended() from None
+        self._received()
+
+    def _received(self) -> None:
+        """Wait for an answer of the process, and write the picture if it is one."""
+        assert self._process.stdout is not None
+        try:
+            answer = pickle.load(self._process.stdout)
+        except (EOFError, pickle.UnpicklingError):
+            raise self._ended() from None
+        if isinstance(answer, LodestreamError):
+            raise answer
+        if answer:
+            write_png(answer, self._path)
+
+    def _ended(self) -> UnavailableError:
+        code = self._process.wait()
+        return UnavailableError(f"cannot draw {self._path}: the process that draws pictures ended with code {code}")
+
+
+def _close(pipe: Any) -> None:
+    """Close a pipe to a process that has ended, which takes no more of what was not sent yet."""
+    with suppress(OSError):
+        pipe.close()
+
+
+def serve(pictures: BinaryIO, answers: BinaryIO) -> None:
+    """Draw pictures until there are no more; see the head of this module.
+
+    Parameters
+    ----------
+    pictures, answers : binary files
+    """
+
+    def answer(value: bytes | LodestreamError) -> None:
+        pickle.dump(value, answers)
+        answers.flush()
+
+    import matplotlib.figure  # noqa: F401 - before the first picture, while the stream begins
+
+    answer(b"")
+    while True:
+        try:
+            picture = pickle.load(pictures)
+        except EOFError:
+            return
+        try:
+            png = picture.png()
+        except LodestreamError as error:
+            answer(error)
+        except Exception as error:  # of a library that does not say what it may raise
+            words = " ".join(str(error).split())
+            answer(UnavailableError(f"the picture cannot be drawn: {type(error).__name__}: {words}"))
+        else:
+            answer(png)
+
+
+if __name__ == "__main__":
+    # What a library may print is no answer.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    serve(sys.stdin.buffer, answers)
