@@ -282,7 +282,7 @@ class Surface:
     def from_xarray(
         data: xarray.Dataset | xarray.DataArray | xarray.DataTree,
         *,
-        attributes: Iterable[str] | None = None,
+        attributes: str | Iterable[str] | None = None,
         closed: Closed | None = None,
         **options: str,
     ) -> Surface:
@@ -292,9 +292,9 @@ class Surface:
         ----------
         data : Dataset, DataArray or DataTree
             What has chunks of dask is computed.
-        attributes : iterable of str, optional
-            Variables that become attributes; None: all over the same two dimensions. Flags (bool) become 0 and 1 of
-            type uint8. What is no number is left out, with a `FormatWarning`.
+        attributes : str or iterable of str, optional
+            Variables that become attributes, as a list or a text with commas; None: all over the same two dimensions.
+            Flags (bool) become 0 and 1 of type uint8. What is no number is left out, with a `FormatWarning`.
         closed : (bool, bool), optional
             Which axes are closed; None: as `to_xarray` left it, or those whose longitudes go around the Earth.
         **options

@@ -25,7 +25,7 @@ from lodestream.surface import Surface
 DATA = Path(__file__).parents[3] / "shared" / "data"
 
 #: Some of these files have more variables than the one that is read.
-pytestmark = pytest.mark.filterwarnings("ignore:left out variables of the same grid:lodestream.errors.FormatWarning")
+pytestmark = pytest.mark.filterwarnings("ignore:left out:lodestream.errors.FormatWarning")
 
 Array = NDArray[Any]
 
@@ -219,6 +219,7 @@ def test_coordinates_of_topobathy_are_the_vectors_in_the_file() -> None:
 
 
 @pytest.mark.parametrize("name", ["bigtujunga.tif", "SainteHelens.dem", "lidar_dsm_2m.tif", BIJOU, "etopo20.cdf"])
+@pytest.mark.filterwarnings("ignore:GeoTIFF is written without tag x#modulo:lodestream.errors.FormatWarning")
 def test_another_library_finds_heights_holes_and_place(tmp_path: Path, name: str) -> None:
     rasterio = pytest.importorskip("rasterio")
     surface, container = streamed(name)

@@ -29,7 +29,7 @@ _FINGERPRINT = {DIGEST: "0" * 64}
 FOREIGN = "foreign"
 
 #: Maps of which single entries are dropped, so many levels deep; of the other values, the whole one.
-_DEPTHS = {"bands": 2, "faces": 1, "foreign": 1, "scalars": 1, "tags": 2}
+_DEPTHS = {"bands": 2, "faces": 1, "foreign": 1, "scalars": 1, "tags": 2, "types": 1}
 
 _Path = tuple[str | int, ...]
 
@@ -88,8 +88,8 @@ def check_length(length: int, offset: int, *, section: bool = False) -> None:
 def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str, int]]]:
     """Drop the largest entries of metadata that are too large for a container.
 
-    Entries of ``tags``, ``bands``, ``scalars`` and ``faces`` are dropped one by one, other values as a whole. Some room
-    is left for later additions, such as a server's notes.
+    Entries of ``tags``, ``types``, ``bands``, ``scalars`` and ``faces`` are dropped one by one, other values as a
+    whole. Some room is left for later additions, such as a server's notes.
 
     Parameters
     ----------

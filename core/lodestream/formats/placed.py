@@ -13,7 +13,7 @@ from ..container.metadata import fitted
 from ..coordinates.coordinate_rules import VALUES, evaluate, fit_axis
 from ..coordinates.seams import merge, unwrap, wrapped
 from ..errors import FormatError
-from ..scratch import IN_MEMORY, Room
+from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed, Surface
 from .longitudes import TURN, close_around, encircles
 
@@ -57,7 +57,8 @@ def place(
     Where both coordinates are vectors and evenly spaced, the result is heights with a ``geotransform``, and with
     ``axes`` where that alone does not say every coordinate bit for bit; otherwise, and where these would be too long
     for metadata, x, y, z. Longitudes that jump are
-    unwrapped; an axis that goes once around the Earth is closed.
+    unwrapped; an axis that goes once around the Earth is closed. A missing height is a hole that keeps its x and y: as
+    one of x, y, z it is NaN.
 
     Parameters
     ----------
@@ -65,28 +66,33 @@ def place(
     x, y : Coordinate
     closed : (bool, bool) or None
         What was said of the surface; None leaves it to what the coordinates show.
-    mask, attributes, metadata
+    mask : bool, shape (H, W), optional
+        True where there is a height; None: everywhere.
+    attributes, metadata
         See `Surface`.
     room : Room
         Where x, y, z go.
     """
-    extras: dict[str, Any] = {"mask": mask, "attributes": attributes or {}}
+    extras: dict[str, Any] = {"attributes": attributes or {}}
     values = dict(metadata or {})
     if x.axis is not None and y.axis == 1 - x.axis:
         even = [_even(coordinate) for coordinate in (x, y)]
         rules = _georeference(x, y, even[0], even[1]) if even[0] is not None and even[1] is not None else None
         # Rules that are too long for metadata are no way to say where each point lies: x and y themselves are.
         if rules is not None and not any(name == "axes" for name, _ in fitted(values | rules)[1]):
-            surface = Surface(heights, **extras, metadata=values | rules)
+            surface = Surface(heights, mask=mask, **extras, metadata=values | rules)
             for coordinate, found in zip((x, y), even, strict=True):
                 if coordinate.degrees and coordinate.axis is not None and found is not None:
                     surface = close_around(surface, (coordinate.axis, found.step), closed)
             return surface
     planes = [_plane(coordinate, heights.shape) for coordinate in (x, y)]
-    dtype = np.result_type(*planes, heights)
+    dtype = np.result_type(*planes, heights, *(() if mask is None else (np.float32,)))
     points = room.empty((*heights.shape, 3), dtype)
     for channel, plane in enumerate((*planes, heights)):
         points[..., channel] = plane
+    if mask is not None:
+        for rows in rows_at_once(heights.shape):
+            points[rows, :, 2][~mask[rows]] = np.nan
     degrees = [channel for channel, coordinate in enumerate((x, y)) if coordinate.degrees]
     surface = merge(
         Surface(points, **extras, metadata=values), closed, angle=(degrees[0], TURN) if degrees else None, room=room
@@ -166,10 +172,7 @@ def _plane(coordinate: Coordinate, shape: tuple[int, ...]) -> NDArray[Any]:
 
 def _closed(surface: Surface, longitude: int) -> Surface:
     """Close the axes along which the grid goes around the Earth without repeating its first line."""
-    degrees = surface.points.astype(np.float64)
-    if surface.mask is not None:
-        degrees[~surface.mask] = np.nan
-    east, north = degrees[..., longitude], degrees[..., 1 - longitude]
+    east, north = (surface.points[..., channel].astype(np.float64) for channel in (longitude, 1 - longitude))
     closed = tuple(surface.closed[axis] or encircles(east, north, axis) for axis in (0, 1))
     if closed == surface.closed:
         return surface

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 
 from ..coordinates.coordinate_rules import VALUES
 from ..coordinates.height_fields import coordinates
+from ..coordinates.seams import wrapped
 from ..errors import FormatError
+from ..formats.netcdf.attribute_texts import attributes_of
+from ..formats.netcdf.values import PACKING, RANGES
 from ..formats.notes import survives, warn
-from ..surface import Block, Closed, Surface
+from ..surface import DTYPES, Block, Closed, Surface
 
 __all__ = [
     "MARK",
@@ -39,18 +42,16 @@ __all__ = [
 MARK = "lodestream"
 
 #: Metadata that coordinates say, or that stand in attributes of the CF conventions.
-_TOLD = ("geotransform", "grid", "axes", "nodes", "crs", "unit", "tags")
+_TOLD = ("geotransform", "grid", "axes", "nodes", "crs", "unit", "tags", "angles", "dtype")
+
+#: What metadata say of angles that were unwrapped.
+_ANGLE = ("channel", "period", "low")
 
 #: Metadata that are true of rows and columns in their order only.
 ORDERED = ("faces", "poles", "turn")
 
 #: What tags say of the values of a file, which are decoded here, and what xarray has in the encoding of a variable.
-_OF_THE_FILE = frozenset(
-    (
-        *("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned", "dtype"),
-        *("valid_min", "valid_max", "valid_range", "coordinates", "grid_mapping"),
-    )
-)
+_OF_THE_FILE = frozenset((*PACKING, "dtype", "coordinates", "grid_mapping"))
 
 
 def is_ordered(metadata: Mapping[str, Any]) -> bool:
@@ -98,6 +99,12 @@ class Grid:
         return cls(block.shape, block.closed, channels, dtype, attributes, block.mask is not None, metadata)
 
     @property
+    def shown(self) -> np.dtype[Any]:
+        """The type that points have in a Dataset: the one of their file, if unwrapping angles needed another."""
+        name = self.metadata.get("dtype")
+        return np.dtype(name) if self.channels and isinstance(name, str) and name in DTYPES else self.dtype
+
+    @property
     def dims(self) -> tuple[str, str]:
         """Names of the dimensions of rows and columns."""
         if self.channels:
@@ -122,6 +129,8 @@ class Part:
         The attribute of the surface.
     coordinate : bool
         Whether it is x or y.
+    angle : (float, float) or None
+        The full turn of angles that were unwrapped, and the least of them in the file.
     attrs : dict
     """
 
@@ -131,6 +140,7 @@ class Part:
     channel: int | None = None
     attribute: str | None = None
     coordinate: bool = False
+    angle: tuple[float, float] | None = None
     attrs: dict[str, Any] = field(default_factory=dict)
 
 
@@ -139,7 +149,7 @@ def parts_of(grid: Grid) -> list[Part]:
     dims = grid.dims
     taken = {"x", "y", "xc", "yc", "spatial_ref", *dims}
     taken |= {"row", "column"} if is_ordered(grid.metadata) else set()
-    dtype = _with_nan(grid.dtype) if grid.holes else grid.dtype
+    dtype = _with_nan(grid.shown) if grid.holes else grid.shown
     parts: list[Part] = []
     name = grid.metadata.get("variable")
     heights = _free(name if isinstance(name, str) and name else "z", taken)
@@ -155,7 +165,18 @@ def parts_of(grid: Grid) -> list[Part]:
         shape = (*dims, _free(f"{label}_component", taken)) if components else dims
         parts.append(Part(label, shape, kind, attribute=own, attrs=_said(grid.metadata, own)))
     letters = "xy" if grid.channels else ""
-    return parts + [Part(letter, dims, dtype, channel=k, coordinate=True) for k, letter in enumerate(letters)]
+    angles = _angles(grid.metadata)
+    return parts + [Part(it, dims, dtype, k, coordinate=True, angle=angles.get(k)) for k, it in enumerate(letters)]
+
+
+def _angles(metadata: Mapping[str, Any]) -> dict[int, tuple[float, float]]:
+    """The channels of angles that were unwrapped; whoever made the container may have written anything."""
+    found = {}
+    for angle in given if isinstance(given := metadata.get("angles"), Sequence) else ():
+        if isinstance(angle, Mapping) and all(isinstance(angle.get(key), int | float) for key in _ANGLE):
+            channel, period, low = (angle[key] for key in _ANGLE)
+            found[int(channel)] = float(period), float(low)
+    return found
 
 
 def values_of(block: Block, part: Part) -> NDArray[Any]:
@@ -169,6 +190,8 @@ def values_of(block: Block, part: Part) -> NDArray[Any]:
     if part.attribute is not None:
         return block.attributes[part.attribute]
     points = block.points if part.channel is None else block.points[..., part.channel]
+    if part.angle is not None:
+        points = wrapped(points, *part.angle)
     if block.mask is None or part.dtype.kind != "f" or (part.channel or 0) > 2:
         return points.astype(part.dtype, copy=False)
     hidden = ~block.mask if block.kept is None else ~(block.mask | block.kept)
@@ -194,14 +217,13 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def _said(metadata: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """What tags of a NetCDF say of one variable, or of the whole file."""
-    tags = metadata.get("tags")
-    texts = tags.get("") if isinstance(tags, Mapping) else None
-    if not isinstance(texts, Mapping):
-        return {}
-    start = f"{name}#"
-    found = {key.removeprefix(start): text for key, text in texts.items() if str(key).startswith(start)}
-    return {key: text for key, text in found.items() if key not in _OF_THE_FILE}
+    """What tags of a NetCDF say of one variable; limits of valid values that are no numbers say nothing."""
+    found = attributes_of(metadata, name)
+    return {
+        key: value
+        for key, value in found.items()
+        if key not in _OF_THE_FILE and not (key in RANGES and isinstance(value, str))
+    }
 
 
 @dataclass(frozen=True)
@@ -270,8 +292,7 @@ def mark_of(grid: Grid, parts: Sequence[Part]) -> str:
     """What the Dataset's attribute `MARK` holds, as JSON."""
     heights = next((part.name for part in parts if part.attribute is None and part.channel in (None, 2)), None)
     names = {part.name: part.attribute for part in parts if part.attribute is not None}
-    told = {*_TOLD, *(() if grid.channels else ("angles",))}
-    metadata, lost = in_json({key: value for key, value in grid.metadata.items() if key not in told})
+    metadata, lost = in_json({key: value for key, value in grid.metadata.items() if key not in _TOLD})
     if lost:
         warn(f"the Dataset is made without {', '.join(lost)}, which JSON cannot hold")
     mark = {"shape": list(grid.shape), "closed": list(grid.closed), "dims": list(grid.dims)}

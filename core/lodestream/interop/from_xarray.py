@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from ..coordinates.height_fields import coordinates
 from ..errors import FormatError, InputError, OptionError
-from ..formats.netcdf import reader as netcdf
-from ..formats.netcdf.choice import Choice, choose
+from ..formats.netcdf.attribute_texts import TYPES, text_of
+from ..formats.netcdf.choice import Choice, choose, names_in
+from ..formats.netcdf.dataset import attributes_with_limits, surface_of
+from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces
 from ..formats.notes import listing, warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
 from ..scratch import IN_MEMORY, Room, rows_at_once
@@ -32,12 +34,16 @@ __all__ = ["from_xarray"]
 _OF_THE_SHAPE = ("seam", "dtype", "angles", *ORDERED)
 
 
+#: Coordinates by which `to_xarray` numbers rows and columns.
+_NUMBERS = ("row", "column")
+
+
 def from_xarray(
     data: xarray.Dataset | xarray.DataArray | xarray.DataTree,
     room: Room = IN_MEMORY,
     /,
     *,
-    attributes: Iterable[str] | None = None,
+    attributes: str | Iterable[str] | None = None,
     closed: Closed | None = None,
     **options: str,
 ) -> Surface:
@@ -76,13 +82,13 @@ def from_xarray(
 def _of_dataset(
     xr: Any,
     data: Any,
-    attributes: Iterable[str] | None,
+    attributes: str | Iterable[str] | None,
     closed: Closed | None,
     room: Room,
     options: Mapping[str, str],
 ) -> Surface:
     mark = _mark(data)
-    wanted = None if attributes is None else list(attributes)
+    wanted = None if attributes is None else names_in(attributes)
     # A shallow copy with the attributes that a file would have: decoding has moved some of them to the encoding.
     left_out = _left_out(data, mark, options, wanted)
     whole = xr.Dataset(
@@ -97,12 +103,17 @@ def _of_dataset(
     given = {**_names(whole, mark, options, wanted), **options}
     wraps = None if mark is None else _closed(whole, mark)
     source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, given, (), wraps, room=room)
-    # Attributes of a surface are no coordinates of it, whatever they are called.
+    # Attributes of a surface are no coordinates of it, whatever they are called; nor are numbers of rows and columns.
     own = [] if mark is None else [name for name in mark["attributes"] if name not in given.values()]
-    choice = choose(source, whole.drop_vars(own, errors="ignore"))
-    choice = replace(choice, attributes=_attributes(whole, choice, wanted))
-    whole = _numbers(whole, choice.attributes)
-    surface = _placed(netcdf.surface_of(source, whole, choice), whole, choice.heights, room)
+    numbers = [] if mark is None else [name for name in _NUMBERS if name not in given.values()]
+    choice = choose(source, whole.drop_vars([*own, *numbers], errors="ignore"))
+    further = _attributes(whole, choice, wanted)
+    choice = replace(choice, attributes=tuple(dict.fromkeys((*further, *choice.attributes))))
+    read = _numbers(whole, choice.attributes).drop_vars([*numbers, *_no_numbers(whole, choice)], errors="ignore")
+    surface, notes = surface_of(source, read, choice, "xarray")
+    surface = _placed(surface, whole, choice.heights, room)
+    for text in notes:
+        warn(text)
     metadata = {key: value for key, value in surface.metadata.items() if key not in ("name", "format")}
     names = {} if mark is None else mark["attributes"]
     if mark is not None:
@@ -153,31 +164,44 @@ def _as_stored(variable: Any, room: Room, places: Mapping[str, str] | None = Non
     """
     encoding, values = variable.encoding, variable
     told = {k: encoding[k] for k in ("grid_mapping", "coordinates") if k in encoding}
-    attrs = {**variable.attrs, **(places or {}), **told}
+    attrs = {**variable.attrs, **(places or {}), **told, **_unpacked_limits(variable)}
     fill, dtype = encoding.get("_FillValue"), np.dtype(encoding.get("dtype") or variable.dtype)
-    packed = any(encoding.get(key) is not None for key in ("scale_factor", "add_offset"))
-    if read and fill is not None and dtype.kind in "iu" and variable.dtype.kind == "f" and not packed:
+    if read and dtype.kind in "iu" and variable.dtype.kind == "f" and not is_packed(encoding):
         whole = _integers(variable, dtype, fill, room)
         if whole is not None:
-            return variable.__class__(variable.dims, whole, {**attrs, "_FillValue": dtype.type(fill)})
+            missing = {} if fill is None else {"_FillValue": dtype.type(fill)}
+            return variable.__class__(variable.dims, whole, {**attrs, **missing})
     copy = values.copy(deep=False)
     copy.attrs = attrs
     return copy
 
 
+def _unpacked_limits(variable: Any) -> dict[str, Any]:
+    """Limits of values that were packed in a file: they are numbers as stored there if they are integers."""
+    encoding = variable.encoding
+    if not is_packed(encoding) or is_packed(variable.attrs):
+        return {}
+    packing = {key: encoding[key] for key in PACKING if key in encoding and key not in ("_FillValue", "missing_value")}
+    dtype = np.dtype(encoding.get("dtype") or np.int32)
+    stored = variable.__class__((), np.zeros((), dtype), {**variable.attrs, **packing})
+    return {key: value for key, value in attributes_with_limits(stored).items() if key in RANGES}
+
+
 def _integers(variable: Any, dtype: np.dtype[Any], fill: Any, room: Room) -> NDArray[Any] | None:
     """Floats as the integers that they are, NaN as the value that stands for them; None where they are no integers."""
     limits, result, anything = np.iinfo(dtype), room.empty(variable.shape, dtype), False
-    for window, part in netcdf.pieces(variable, room):
+    for window, part in pieces(variable, room):
         values = part.values
         valid = ~np.isnan(values)
         known = values[valid]
+        if fill is None and not valid.all():
+            return None
         if known.size and not (limits.min <= known.min() and known.max() <= limits.max):
             return None
         whole = known.astype(dtype)
-        if not (whole == known).all() or (whole == dtype.type(fill)).any():
+        if not (whole == known).all() or (fill is not None and (whole == dtype.type(fill)).any()):
             return None
-        own = np.full(values.shape, fill, dtype)
+        own = np.full(values.shape, 0 if fill is None else fill, dtype)
         own[valid] = whole
         result[window] = own
         anything |= bool(known.size)
@@ -215,7 +239,7 @@ def _closed(whole: Any, mark: Mapping[str, Any]) -> Closed:
 
 def _in_order(whole: Any, choice: Choice) -> bool:
     """Whether rows and columns are those that `to_xarray` numbered, each at its place."""
-    numbers = [whole.variables.get(name) for name in ("row", "column")]
+    numbers = [whole.variables.get(name) for name in _NUMBERS]
     return all(
         own is not None and own.dims == (dim,) and np.array_equal(own.values, np.arange(length))
         for own, dim, length in zip(numbers, choice.dims, choice.shape, strict=True)
@@ -224,27 +248,37 @@ def _in_order(whole: Any, choice: Choice) -> bool:
 
 def _attributes(whole: Any, choice: Choice, wanted: list[str] | None) -> tuple[str, ...]:
     """The other variables over the same dimensions, with or without one of components."""
-    found, no_numbers = [], []
+    found = []
     for name in map(str, whole.data_vars):
         if name == choice.heights or (wanted is not None and name not in wanted):
             continue
         variable = whole.variables[name]
-        dims = tuple(map(str, (dim for dim in variable.dims if dim not in choice.index)))
-        fits = dims[:2] == choice.dims and len(dims) <= 3
+        fits = _fits(variable, choice)
         if fits and variable.dtype.kind in "iufb":
             found.append(name)
-        elif fits and wanted is None:
-            no_numbers.append(name)
-        elif fits:
+        elif fits and wanted is not None:
             raise OptionError(f"expected attributes of numbers or flags, got {name!r} of {variable.dtype}")
         elif wanted is not None:
-            raise OptionError(f"expected attributes over {' and '.join(choice.dims)}, got {name!r} over {list(dims)}")
+            dims = [str(dim) for dim in variable.dims if dim not in choice.index]
+            raise OptionError(f"expected attributes over {' and '.join(choice.dims)}, got {name!r} over {dims}")
     missing = [name for name in wanted or () if name not in whole.data_vars]
     if missing:
         raise OptionError(f"expected attributes among {', '.join(map(str, whole.data_vars))}, got {missing[0]!r}")
-    if no_numbers:
-        warn(f"left out variables that are no numbers: {listing(no_numbers)}")
+    if wanted is None and (left_out := _no_numbers(whole, choice)):
+        warn(f"left out variables that are no numbers: {listing(left_out)}")
     return tuple(found)
+
+
+def _fits(variable: Any, choice: Choice) -> bool:
+    """Whether a variable lies over the same rows and columns, with or without an axis of components."""
+    dims = [str(dim) for dim in variable.dims if dim not in choice.index]
+    return len(dims) <= 3 and set(dims[:2]) == set(choice.dims)
+
+
+def _no_numbers(whole: Any, choice: Choice) -> list[str]:
+    """Variables over the same rows and columns that are neither numbers nor flags."""
+    variables = {str(name): whole.variables[name] for name in whole.data_vars}
+    return [name for name, it in variables.items() if _fits(it, choice) and it.dtype.kind not in "iufb"]
 
 
 def _placed(surface: Surface, whole: Any, name: str | None, room: Room) -> Surface:
@@ -310,10 +344,14 @@ def _restored(
     usual = axis_attributes(Grid.of(surface.blocks[0], result | {"tags": {"": told}}))
     for letter, attributes in usual.items():
         for key, text in attributes.items():
-            if texts.get(f"{letter}#{key}") == text and f"{letter}#{key}" not in told:
+            if texts.get(f"{letter}#{key}") == text_of(text)[0] and f"{letter}#{key}" not in told:
                 del texts[f"{letter}#{key}"]  # `to_xarray` says so of every surface of this kind
     others = {key: value for key, value in tags.items() if key} if isinstance(tags, dict) else {}
     result.pop("tags", None)
+    types = {**metadata.get(TYPES, {}), **(kept[TYPES] if isinstance(kept.get(TYPES), dict) else {})}
+    result.pop(TYPES, None)
+    if types := {key: kind for key, kind in types.items() if key in texts}:
+        result[TYPES] = types
     if texts or others:
         result["tags"] = {**others, **({"": texts} if texts else {})}
     if "variable" in metadata and "variable" not in kept:

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coordinates.height_fields import coordinates
-from ..formats.netcdf.names import AXIS_WORDS, is_east, is_geographic
+from ..formats.netcdf.attribute_texts import attributes_of
+from ..formats.netcdf.crs import grid_mapping
+from ..formats.netcdf.names import axis_words, is_east, is_geographic, is_rotated
 from ..surface import Block, Surface
 from .dataset_layout import MARK, Grid, Part, axes_of, is_ordered, mark_of, parts_of, values_of
 from .optional import require_library
@@ -78,11 +80,9 @@ def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> 
         for dim, name, length in zip(grid.dims, ("row", "column"), grid.shape, strict=True):
             places[name] = xr.Variable((dim,), np.arange(length))
     if mapping:
-        places["spatial_ref"] = xr.Variable((), np.int64(0), _spatial_ref(grid.metadata))
-    texts = grid.metadata.get("tags", {})
-    whole = texts.get("") if isinstance(texts, Mapping) else None
-    start = "NC_GLOBAL#"
-    attrs = {k.removeprefix(start): v for k, v in (whole or {}).items() if str(k).startswith(start)}
+        said = {"crs": grid.metadata.get("crs"), "geotransform": _transform(grid.metadata)}
+        places["spatial_ref"] = xr.Variable((), np.int64(0), grid_mapping(said))
+    attrs = attributes_of(grid.metadata, "NC_GLOBAL")
     attrs |= {MARK: mark_of(grid, parts)}
     found: xarray.Dataset = xr.Dataset(variables, places, attrs)
     return found
@@ -119,26 +119,18 @@ def _coordinates(xr: Any, grid: Grid) -> dict[str, Any]:
     }
 
 
-def axis_attributes(grid: Grid) -> dict[str, dict[str, str]]:
+def axis_attributes(grid: Grid) -> dict[str, dict[str, Any]]:
     """The attributes of x and y: what the conventions say of them, and what a file said (tags ``x#units``, ...)."""
     crs = grid.metadata.get("crs")
     degrees = {angle["channel"] for angle in grid.metadata.get("angles", ()) if isinstance(angle, Mapping)}
-    tags = grid.metadata.get("tags")
-    texts = tags.get("") if isinstance(tags, Mapping) else None
-    given = texts if isinstance(texts, Mapping) else {}
-    x, y = ({key: given[f"{it}#{key}"] for key in AXIS_WORDS if f"{it}#{key}" in given} for it in "xy")
+    x, y = (attributes_of(grid.metadata, letter) for letter in "xy")
+    if is_rotated(crs):
+        return {"x": axis_words("x", crs) | {"axis": "X"} | x, "y": axis_words("y", crs) | {"axis": "Y"} | y}
     if is_geographic(crs) or degrees == {0} or (not crs and is_east(x.get("units"))):
         return {"x": _EAST | x, "y": _NORTH | y}
     if crs or degrees:
         return {"x": _X | x, "y": _Y | y}
     return {"x": {"axis": "X"} | x, "y": {"axis": "Y"} | y}
-
-
-def _spatial_ref(metadata: Mapping[str, Any]) -> dict[str, str]:
-    """The CRS and the geotransform, as rioxarray and GDAL have them."""
-    crs, transform = metadata.get("crs"), _transform(metadata)
-    attrs = {"crs_wkt": str(crs), "spatial_ref": str(crs)} if crs else {}
-    return attrs | ({"GeoTransform": " ".join(map(repr, map(float, transform)))} if transform is not None else {})
 
 
 def _packing(block: Block, grid: Grid, part: Part) -> dict[str, Any]:

@@ -43,7 +43,7 @@ __all__ = ["MEDIA_TYPES", "FileTooLongError", "LevelJob", "MadeLevel", "RefusedL
 _REVISION = 2
 
 # What else decides about the bytes of some format.
-_LIBRARIES = ("h5netcdf", "h5py", "lodestream", "numpy", "rasterio", "scipy", "vtk")
+_LIBRARIES = ("cf-xarray", "h5netcdf", "h5py", "lodestream", "numpy", "pyproj", "rasterio", "scipy", "vtk", "xarray")
 
 #: The formats of a level, and what they are called on the way.
 MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if format_.write}

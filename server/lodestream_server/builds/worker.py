@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import importlib
 import logging
 import os
 import re
@@ -58,6 +59,9 @@ __all__ = [
 ]
 
 _log = logging.getLogger(__name__)
+
+#: The libraries that read NetCDF, of which a process would take a second to import them.
+_NETCDF = ("scipy.io", "xarray", "cf_xarray", "h5netcdf", "pyproj")
 
 #: The values of ``closed``; `auto` leaves what the file says.
 CLOSED = ("auto", "none", "rows", "cols", "both")
@@ -209,7 +213,8 @@ class Refused:
 def preload() -> None:
     """Import what builds and levels need, so that a process that is forked for one has it at once.
 
-    The libraries that read some formats are not among it: a process imports those when it comes to such a file.
+    Libraries that read NetCDF are among it, if they are installed, since a process would take a second to import them.
+    Libraries that read other formats are not: a process imports those when it comes to such a file.
 
     Raises
     ------
@@ -230,6 +235,9 @@ def preload() -> None:
 
     from . import levels  # noqa: F401
 
+    for name in _NETCDF:
+        with suppress(ImportError):  # the extra is not installed
+            importlib.import_module(name)
     library()
 
 

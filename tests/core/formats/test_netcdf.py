@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lodestream import formats
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.coordinates.seams import restore
-from lodestream.errors import FormatError, OptionError, SwitchedOffError, UnavailableError
+from lodestream.errors import FormatError, FormatWarning, OptionError, SwitchedOffError, UnavailableError
 
 xarray = pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
@@ -153,17 +153,26 @@ def test_the_conventions_tell_coordinates_from_variables(tmp_path: Path) -> None
         "where_n": (("j", "i"), rows - columns / 9, NORTH),
         "where_e_bnds": (("j", "i", "corner"), np.zeros((6, 9, 4))),
     }
-    surface = formats.read(save(tmp_path / "a.nc", variables))
+    with pytest.warns(FormatWarning, match="left out: where_e_bnds$"):
+        surface = formats.read(save(tmp_path / "a.nc", variables))
     np.testing.assert_array_equal(surface.points, np.dstack((columns + rows / 9, rows - columns / 9, hills())))
-    # Vectors that the conventions know are before arrays; others behind.
-    vectors: Variables = {"i": ("i", np.arange(9.0) * 5, {"axis": "X"}), "j": ("j", np.arange(6.0) * 4, {"axis": "Y"})}
-    known = formats.read(save(tmp_path / "b.nc", variables | vectors))
+    del variables["where_e_bnds"]
+    # Vectors that the conventions know, in another unit, are before arrays; others behind.
+    vectors: Variables = {
+        "i": ("i", np.arange(9.0) * 5, {"axis": "X", "units": "m"}),
+        "j": ("j", np.arange(6.0) * 4, {"axis": "Y", "units": "m"}),
+    }
+    with pytest.warns(FormatWarning, match="x and y are i and j; where_e and where_n are kept as attributes"):
+        known = formats.read(save(tmp_path / "b.nc", variables | vectors))
     assert known.metadata["geotransform"] == [-2.5, 5.0, 0.0, -2.0, 0.0, 4.0]
+    np.testing.assert_array_equal(known.attributes["where_e"], columns + rows / 9)
     plain = {name: parts[:2] for name, parts in vectors.items()}
-    np.testing.assert_array_equal(formats.read(save(tmp_path / "c.nc", variables | plain)).points, surface.points)
+    with pytest.warns(FormatWarning, match="x and y are where_e and where_n; left out: j, i"):
+        behind = formats.read(save(tmp_path / "c.nc", variables | plain))
+    np.testing.assert_array_equal(behind.points, surface.points)
 
 
-@pytest.mark.filterwarnings("ignore:left out variables of the same grid:lodestream.errors.FormatWarning")
+@pytest.mark.filterwarnings("ignore:left out:lodestream.errors.FormatWarning")
 def test_options_name_the_variable_and_its_coordinates(tmp_path: Path) -> None:
     rows, columns = np.indices((6, 9)).astype(np.float64)
     path = save(
@@ -369,7 +378,7 @@ def test_the_core_of_a_tokamak_is_closed(tmp_path: Path, inside: int, closed: tu
     assert formats.read(path, x="Rxy", y="Zxy", closed="none").closed == (False, False)
 
 
-@pytest.mark.filterwarnings("ignore:left out variables of the same grid:lodestream.errors.FormatWarning")
+@pytest.mark.filterwarnings("ignore:left out:lodestream.errors.FormatWarning")
 def test_the_boundary_of_a_stellarator_is_a_torus(tmp_path: Path) -> None:
     modes: Variables = {
         "rmnc": (("radius", "mode"), np.array([[0.0, 0.0, 0.0], [3.0, 1.0, 0.1]])),

@@ -78,6 +78,7 @@ def test_shards_and_strange_chunks(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_into(tmp_path / "files", [tmp_path / "a.zarr"], 1 << 10).points, hills())
 
 
+@pytest.mark.filterwarnings("ignore:left out. time:lodestream.errors.FormatWarning")
 def test_chunks_that_are_not_there_have_the_fill_value(tmp_path: Path) -> None:
     sea().isel(time=0).drop_vars("speed").to_zarr(
         tmp_path / "a.zarr", zarr_format=2, encoding={"depth": {"chunks": (30, 70)}}
@@ -121,6 +122,7 @@ def test_an_array_with_names_of_dimensions_is_the_variable_of_its_group(tmp_path
     assert surface.metadata["geotransform"] == whole.metadata["geotransform"]
 
 
+@pytest.mark.filterwarnings("ignore:left out. time:lodestream.errors.FormatWarning")
 def test_encode_takes_a_path(tmp_path: Path) -> None:
     store = tmp_path / "a.zarr"
     sea().isel(time=0).drop_vars("speed").to_zarr(store)

@@ -1,19 +1,23 @@
-"""Which variable of a NetCDF is the surface, over which coordinates, and at which time or depth."""
+"""Which variable of a Dataset is the surface, over which coordinates, and at which time or depth."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
 from math import prod
 from typing import Any
 
 import numpy as np
 
 from ...errors import FormatError, OptionError
+from ..notes import listing
 from ..source import Source
-from .names import is_longitude, is_time, letters_of, time_of
+from .names import associated, is_longitude, is_time, letters_of, mate_of, time_of
+from .no_grids import NoGrid, no_grid_of
+from .positions import are_elsewhere
+from .values import raw_values
 
-__all__ = ["Choice", "Found", "choose", "others"]
+__all__ = ["Choice", "Found", "choose", "names_in", "others"]
 
 _REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
 _ANCILLARY = "ancillary_variables"
@@ -33,11 +37,14 @@ class Found:
         The axis of the surface that it runs along; None for both.
     degrees : bool
         It is a longitude.
+    dims : tuple of str
+        Its dimensions in the order of the surface's.
     """
 
     name: str
     axis: int | None
     degrees: bool
+    dims: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,8 @@ class Choice:
         Names of further variables.
     nbytes : int
         Of all that is read.
+    notes : tuple of str
+        Which of several coordinates were taken.
     """
 
     heights: str | None
@@ -68,6 +77,17 @@ class Choice:
     y: Found | None
     attributes: tuple[str, ...]
     nbytes: int
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class _Places:
+    """The coordinates of a surface, variables that are kept beside it, and notes about the choice."""
+
+    x: Found | None = None
+    y: Found | None = None
+    beside: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
 def choose(source: Source, dataset: Any) -> Choice:
@@ -79,27 +99,48 @@ def choose(source: Source, dataset: Any) -> Choice:
         When there is nothing to read or more than one way to read it; the message names what there is.
     """
     variables: Mapping[Hashable, Any] = dataset.variables
+    no_grid = no_grid_of(dataset)
     given = {key: _named(source, variables, key) for key in ("variable", "x", "y") if key in source.options}
     planar = "variable" not in given and {"x", "y"} <= set(given)
-    main = given["x"] if planar else given.get("variable") or _only(dataset, set(given.values()))
+    main = given["x"] if planar else given.get("variable") or _only(dataset, set(given.values()), no_grid)
+    if no_grid is not None and no_grid.takes(main, variables[main].dims):
+        raise FormatError(no_grid.refusal(main if "variable" in given or planar else ""))
     index = _index(source, dataset, variables[main].dims)
     dims = _surface_dims(dataset, main, index)
     shape = (int(dataset.sizes[dims[0]]), int(dataset.sizes[dims[1]]))
     index |= {dim: 0 for dim in variables[main].dims if dim not in dims and dim not in index}
     x, y = (_found(dataset, given[key], dims, index) if key in given else None for key in ("x", "y"))
-    if x is None and y is None:
-        x, y = _conventional(dataset, main, dims, index)
-    attributes = []
-    for name in filter(None, str(source.options.get("attributes", "")).split(",")):
-        if name not in variables or _left(variables[name].dims, index) != dims or not _numeric(variables[name]):
+    places = _Places(x, y) if x or y else _conventional(dataset, main, dims, index)
+    attributes = [*dict.fromkeys((*names_in(source.options.get("attributes", ())), *places.beside))]
+    for name in attributes:
+        if (
+            name not in variables
+            or set(_left(variables[name].dims, index)) != set(dims)
+            or not _numeric(variables[name])
+        ):
             raise OptionError(f"expected attributes= of variables over {dims[0]} and {dims[1]}, got {name!r}")
-        attributes.append(name)
-    names = {main, *attributes, *(found.name for found in (x, y) if found)}
+    names = {main, *attributes, *(found.name for found in (places.x, places.y) if found)}
     nbytes = sum(
         variables[name].dtype.itemsize * prod(dataset.sizes[dim] for dim in variables[name].dims if dim not in index)
         for name in names
     )
-    return Choice(None if planar else main, dims, shape, index, x, y, tuple(attributes), nbytes)
+    heights, notes = None if planar else main, tuple(places.notes)
+    return Choice(heights, dims, shape, index, places.x, places.y, tuple(attributes), nbytes, notes)
+
+
+def names_in(names: Any) -> list[str]:
+    """Split the value of an option that names variables: a text with commas, or several names.
+
+    Raises
+    ------
+    OptionError
+        If it is neither.
+    """
+    if isinstance(names, str):
+        return [name.strip() for name in names.split(",") if name.strip()]
+    if not isinstance(names, Iterable):
+        raise OptionError(f"expected attributes as names or a text with commas, got {type(names).__name__}")
+    return [str(name) for name in names]
 
 
 def others(dataset: Any, choice: Choice) -> list[str]:
@@ -135,9 +176,14 @@ def _listing(variables: Mapping[Hashable, Any]) -> str:
     return ", ".join(names[:_MOST_NAMES] + ["..."] * (len(names) > _MOST_NAMES)) or "nothing"
 
 
-def _only(dataset: Any, coordinates: set[str]) -> str:
+def _only(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> str:
     """The only variable over a surface that is no coordinate of another."""
     variables = dataset.variables
+    if no_grid is not None:
+        on_grids = {name: it for name, it in variables.items() if not no_grid.takes(str(name), it.dims)}
+        if not any(_numeric(it) and sum(length > 1 for length in it.shape) >= 2 for it in on_grids.values()):
+            raise FormatError(no_grid.refusal())
+        variables = on_grids
     beside = {str(name) for name in dataset.sizes} | coordinates
     for variable in variables.values():
         beside |= _referred(variable) | set(str(variable.attrs.get(_ANCILLARY, "")).split())
@@ -229,37 +275,73 @@ def _surface_dims(dataset: Any, name: str, index: Mapping[str, int]) -> tuple[st
 def _found(dataset: Any, name: str, dims: tuple[str, str], index: Mapping[str, int]) -> Found:
     variable = dataset.variables[name]
     left = _left(variable.dims, index)
-    if left not in (dims, dims[:1], dims[1:]):
+    if set(left) not in (set(dims), {dims[0]}, {dims[1]}):
         raise FormatError(
             f"expected {name} over {dims[0]} and {dims[1]} or one of them, got {', '.join(left) or 'none'}"
         )
-    axis = None if left == dims else dims.index(left[0])
-    return Found(name, axis, is_longitude(name, variable.attrs))
+    axis = dims.index(left[0]) if len(left) == 1 else None
+    return Found(name, axis, is_longitude(name, variable.attrs), dims if axis is None else left)
 
 
-def _conventional(
-    dataset: Any, main: str, dims: tuple[str, str], index: Mapping[str, int]
-) -> tuple[Found | None, Found | None]:
-    """The coordinates that the conventions give a variable: vectors that they know, arrays, then any vectors."""
+def _conventional(dataset: Any, main: str, dims: tuple[str, str], index: Mapping[str, int]) -> _Places:
+    """The coordinates that the conventions give a variable.
+
+    Vectors that they know come first, unless there are arrays too and the vectors lie elsewhere; then arrays; then any
+    vectors along the dimensions. Arrays that are not taken are kept beside the surface.
+    """
     variables = dataset.variables
-    named = [name for name in str(variables[main].attrs.get("coordinates", "")).split() if name in variables]
+    related = associated(dataset, main)
     letters = letters_of(dataset)
-    beside = str(variables[main].attrs.get(_ANCILLARY, "")).split()  # say something of the values, not where they lie
+    beside = related[_ANCILLARY]  # say something of the values, not where they lie
     others = [name for name in letters if name != main and name not in beside]
-    ways: list[dict[str, Found]] = [{}, {}]
-    for name in (*dims, *named, *others):
-        if name not in variables or not _numeric(variables[name]):
+    vectors: dict[str, Found] = {}
+    arrays: dict[str, list[Found]] = {"x": [], "y": []}
+    for name in dict.fromkeys((*dims, *related["coordinates"], *others)):
+        if name not in variables or not _numeric(variables[name]) or name not in letters:
             continue
-        left, letter = _left(variables[name].dims, index), letters.get(name)
-        if letter and left in (dims, dims[:1], dims[1:]):
-            ways[left == dims].setdefault(letter, _found(dataset, name, dims, index))
-    for way in ways:
-        if len(way) == 2:
-            return way["x"], way["y"]
+        left = set(_left(variables[name].dims, index))
+        if left in ({dims[0]}, {dims[1]}):
+            vectors.setdefault(letters[name], _found(dataset, name, dims, index))
+        elif left == set(dims):
+            arrays[letters[name]].append(_found(dataset, name, dims, index))
+    pair = _pair(arrays["x"], arrays["y"])
+    places = _Places(vectors.get("x"), vectors.get("y"))
     plain = [
         _found(dataset, dim, dims, index)
         if dim in variables and _numeric(variables[dim]) and variables[dim].dims == (dim,)
         else None
         for dim in dims
     ]
-    return plain[1], plain[0]
+    if pair is None:
+        return places if len(vectors) == 2 else _Places(plain[1], plain[0])
+    names = " and ".join(found.name for found in pair)
+    if len(vectors) == 2:
+        named = f"{vectors['x'].name} and {vectors['y'].name}"
+        if not are_elsewhere(dataset, (vectors["x"], vectors["y"]), pair, index):
+            places.beside += [found.name for found in pair]
+            places.notes.append(f"x and y are {named}; {names} are kept as attributes")
+            return places
+        places.notes.append(f"x and y are {names}; left out are {named}, which lie elsewhere by more than half a cell")
+    else:
+        lines = dict.fromkeys(found.name for found in (*vectors.values(), *filter(None, plain)))
+        if left_out := [name for name in lines if not _counts(variables[name])]:
+            places.notes.append(f"x and y are {names}; left out: {listing(left_out)}")
+    places.x, places.y = pair
+    return places
+
+
+def _counts(vector: Any) -> bool:
+    """Whether a vector does nothing but number its places, from 0 or 1 on."""
+    values = raw_values(vector)
+    return values.ndim == 1 and any(np.array_equal(values, np.arange(len(values)) + first) for first in (0, 1))
+
+
+def _pair(x: list[Found], y: list[Found]) -> tuple[Found, Found] | None:
+    """The first array of x and the array of y that belongs to it, by its name; none: there are not both."""
+    if not x or not y:
+        return None
+    mates = {mate_of(found.name).lower(): found for found in reversed(x)}
+    named = next((found for found in y if found.name.lower() == mate_of(x[0].name).lower()), None)
+    if named is not None:
+        return x[0], named
+    return mates.get(y[0].name.lower(), x[0]), y[0]

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from ...errors import FormatError, TooLargeError
 from ..source import number
 
-__all__ = ["check"]
+__all__ = ["groups_of"]
 
 _MOST_OBJECTS = 2_000
 _HARMLESS_CHUNK = 64 << 20
@@ -28,8 +27,10 @@ _MOST_COUNTED = 4_000
 _DEFLATE, _SHUFFLE, _FLETCHER = 1, 2, 3
 
 
-def check(path: Path) -> None:
-    """Refuse links out of the file and circles inside it, values outside it, and chunks that expand beyond their size.
+def groups_of(file: BinaryIO) -> list[str]:
+    """Check a file and find its groups with values, such as "forecast/surface".
+
+    Refuse links out of the file and circles inside it, values outside it, and chunks that expand beyond their size.
 
     Raises
     ------
@@ -37,9 +38,13 @@ def check(path: Path) -> None:
     """
     import h5py
 
-    with h5py.File(path, "r", locking=False) as file:
-        for dataset in _datasets(file):
+    groups: dict[str, None] = {}
+    with h5py.File(file, "r") as opened:
+        for dataset in _datasets(opened):
             _check_dataset(dataset)
+            if dataset.ndim and (group := str(dataset.name).strip("/").rpartition("/")[0]):
+                groups[group] = None
+    return sorted(groups)
 
 
 def _datasets(file: Any) -> Iterator[Any]:

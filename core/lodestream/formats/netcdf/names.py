@@ -1,25 +1,38 @@
-"""Which variables of a NetCDF are x, y or times: by the CF conventions, by their names where a file says nothing."""
+"""Which variables of a Dataset are x, y or times: by cf-xarray, or by names where attributes say nothing."""
 
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 __all__ = [
     "AXIS_WORDS",
+    "associated",
     "axis_words",
+    "is_angle",
     "is_east",
     "is_geographic",
     "is_longitude",
+    "is_rotated",
     "is_time",
-    "letter_of",
     "letters_of",
+    "mate_of",
     "time_of",
 ]
 
-_EAST = ("degrees_east", "degree_east", "degrees_e", "degree_e", "degreese", "degreee")
-_NORTH = ("degrees_north", "degree_north", "degrees_n", "degree_n", "degreesn", "degreen")
+#: What cf-xarray calls x and y; a longitude first, whatever else it is.
+_ROLES = {"longitude": "x", "latitude": "y", "X": "x", "Y": "y"}
+
+#: Names that mean x or y where no attribute says anything else.
+_PLAIN = {
+    **dict.fromkeys(("x", "lon", "longitude", "easting"), "x"),
+    **dict.fromkeys(("y", "lat", "latitude", "northing"), "y"),
+}
+
+#: Attributes that refer to other variables.
+_KINDS = ("coordinates", "grid_mapping", "bounds", "ancillary_variables", "cell_measures")
 
 #: What a surface keeps of what a file says of x and y, as tags ``x#units`` and the like.
 AXIS_WORDS = ("standard_name", "long_name", "units")
@@ -49,47 +62,103 @@ def is_geographic(crs: Any) -> bool:
     return isinstance(crs, str) and crs.lstrip().upper().startswith(("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS"))
 
 
+def is_rotated(crs: Any) -> bool:
+    """Whether a WKT is one of longitudes and latitudes of another pole."""
+    return is_geographic(crs) and "DERIVINGCONVERSION[" in crs.upper()
+
+
 def axis_words(letter: str, crs: Any) -> dict[str, str]:
     """What the conventions say of x or y under a CRS (WKT, or nothing)."""
+    if is_rotated(crs):
+        return {"standard_name": f"grid_{_DEGREES[letter][0]}", "units": "degrees"}
     if is_geographic(crs):
         standard, units = _DEGREES[letter]
         return {"standard_name": standard, "units": units}
     return {"standard_name": f"projection_{letter}_coordinate"} if crs else {}
 
 
-def letter_of(name: str, attributes: Mapping[str, Any]) -> str | None:
-    """Whether the conventions, or a plain name, make a variable x or y."""
-    standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
-    axis = str(attributes.get("axis", "")).upper()
-    plain = name.lower()
-    if standard in ("longitude", "projection_x_coordinate", "grid_longitude") or units in _EAST or axis == "X":
-        return "x"
-    if standard in ("latitude", "projection_y_coordinate", "grid_latitude") or units in _NORTH or axis == "Y":
-        return "y"
-    if plain in ("x", "lon", "longitude", "easting"):
-        return "x"
-    return "y" if plain in ("y", "lat", "latitude", "northing") else None
-
-
 def letters_of(dataset: Any) -> dict[str, str]:
-    """The variables that are x or y: those of the conventions first, then pairs of names that mean both.
+    """Find the variables that are x or y, by cf-xarray; then pairs of names that mean both.
 
     A pair has the same dimensions, or is of two vectors along different ones; its attributes say nothing else.
+
+    Returns
+    -------
+    dict of str to {"x", "y"}
+        Variables that the conventions know come first.
     """
     variables = {str(name): variable for name, variable in dataset.variables.items()}
-    letters = {name: letter for name, it in variables.items() if (letter := letter_of(name, it.attrs))}
+    letters = _by_conventions(variables)
     by_case = {name.lower(): name for name in variables}
-    for name, variable in variables.items():
-        match = _X_NAME.fullmatch(name)
-        if match is None:
+    for name in variables:
+        other = by_case.get(mate_of(name).lower())
+        if other is None or {name, other} & letters.keys() or not _says_nothing(variables[name], variables[other]):
             continue
-        other = by_case.get(f"{match['before']}{_MATES[match['word'].lower()]}{match['behind']}".lower())
-        if other is None or {name, other} & letters.keys() or not _says_nothing(variable, variables[other]):
-            continue
-        dims = variable.dims, variables[other].dims
-        if dims[0] == dims[1] or (len(dims[0]) == len(dims[1]) == 1):
+        dims = variables[name].dims, variables[other].dims
+        if set(dims[0]) == set(dims[1]) or (len(dims[0]) == len(dims[1]) == 1):
             letters |= {name: "x", other: "y"}
     return letters
+
+
+def mate_of(name: str) -> str:
+    """Give the name of y that belongs to a name of x, such as ``XLAT_M`` to ``XLONG_M``; empty: it is no such name."""
+    match = _X_NAME.fullmatch(name)
+    return "" if match is None else f"{match['before']}{_MATES[match['word'].lower()]}{match['behind']}"
+
+
+def associated(dataset: Any, name: str) -> dict[str, list[str]]:
+    """Find the variables that the attributes of a variable refer to, by cf-xarray.
+
+    Returns
+    -------
+    dict of str to list of str
+        Of each of the attributes ``coordinates``, ``grid_mapping``, ``bounds``, ``ancillary_variables`` and
+        ``cell_measures`` the variables that are there.
+    """
+    import cf_xarray  # noqa: F401  # adds the accessor
+    import xarray
+
+    texts = {
+        key: text for key, text in dataset.variables[name].attrs.items() if key in _KINDS and isinstance(text, str)
+    }
+    words = {word.rstrip(":") for text in texts.values() for word in text.split()} & set(dataset.variables)
+    # Of a Dataset with thousands of variables cf-xarray takes minutes; these are all that it needs to see.
+    outline = xarray.Dataset(dict.fromkeys(words, ((), 0)) | {name: ((), 0, texts)})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of variables that are not there, and attributes that cannot be read
+        related = outline.cf.get_associated_variable_names(name, error=False)
+    return {key: [str(other) for other in related[key]] for key in _KINDS}
+
+
+def _by_conventions(variables: Mapping[str, Any]) -> dict[str, str]:
+    """The variables that the criteria of cf-xarray make x or y; units are recognised in other spellings too."""
+    from cf_xarray.criteria import coordinate_criteria
+
+    def is_role(role: str, attributes: Mapping[str, Any]) -> bool:
+        criteria = coordinate_criteria[role].items()
+        return any(isinstance(text := attributes.get(key), str) and text in values for key, values in criteria)
+
+    letters = {}
+    for name, variable in variables.items():
+        if variable.dtype.kind not in "iuf":
+            continue
+        attributes = dict(variable.attrs)
+        attributes["units"] = _canonical(attributes.get("units"))
+        attributes |= {key: str(attributes[key]).lower() for key in ("standard_name",) if key in attributes}
+        attributes |= {key: str(attributes[key]).upper() for key in ("axis",) if key in attributes}
+        # A longitude with axis Y, as of a turned grid, is x all the same.
+        letter = next((letter for role, letter in _ROLES.items() if is_role(role, attributes)), None)
+        if letter := letter or _PLAIN.get(name.lower()):
+            letters[name] = letter
+    return letters
+
+
+def _canonical(units: Any) -> Any:
+    """Units of longitudes and latitudes as the conventions spell them, from other spellings; others as they are."""
+    plain = str(units).strip().lower().replace("_", " ").replace("degrees", "degree")
+    if plain in ("degree east", "degree e", "degreee", "degree longitude"):
+        return "degrees_east"
+    return "degrees_north" if plain in ("degree north", "degree n", "degreen", "degree latitude") else units
 
 
 def _says_nothing(*variables: Any) -> bool:
@@ -103,13 +172,18 @@ def _says_nothing(*variables: Any) -> bool:
 
 def is_east(units: Any) -> bool:
     """Whether units are degrees to the east."""
-    return str(units).lower() in _EAST
+    return bool(_canonical(units) == "degrees_east")
+
+
+def is_angle(attributes: Mapping[str, Any]) -> bool:
+    """Whether the units of a coordinate are degrees."""
+    return str(attributes.get("units", "")).strip().lower().startswith("deg")
 
 
 def is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:
     """Whether the values of a variable are degrees around the Earth."""
     standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
-    if units in _EAST:
+    if is_east(units):
         return True
     match = _X_NAME.fullmatch(name)
     called = match is not None and match["word"].lower().startswith("lon")

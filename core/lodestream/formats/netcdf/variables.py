@@ -18,12 +18,14 @@ from ...scratch import rows_at_once
 from ...surface import Surface
 from ..holes import Rows, fill_of
 from ..notes import listing, metadata_left_out, warn, warn_left_out
-from .names import AXIS_WORDS, axis_words, is_geographic
+from .attribute_texts import TYPES, value_of
+from .crs import grid_mapping
+from .names import AXIS_WORDS, axis_words, is_geographic, is_rotated
 
 __all__ = ["Contents", "Variable", "contents_of", "strips"]
 
 _PLACE = ("geotransform", "grid", "axes")
-_HELD = (*_PLACE, "crs", "unit", "tags", "nodata", "variable")
+_HELD = (*_PLACE, "crs", "unit", "tags", TYPES, "nodata", "variable")
 
 #: What our own variables say; a tag of the same name is left out.
 _OURS = frozenset(
@@ -85,7 +87,7 @@ class Contents:
     """Variables by their names, and attributes of the file."""
 
     variables: dict[str, Variable]
-    attributes: dict[str, str]
+    attributes: dict[str, Any]
 
 
 def contents_of(surface: Surface, title: str) -> Contents:
@@ -145,9 +147,12 @@ class _Names:
     """The names of variables, each once and as CF allows them, and attributes of the file."""
 
     def __init__(self, surface: Surface) -> None:
-        self.x, self.y = ("lon", "lat") if is_geographic(surface.metadata.get("crs")) else ("x", "y")
+        crs = surface.metadata.get("crs")
+        self.x, self.y = ("lon", "lat") if is_geographic(crs) else ("x", "y")
+        if is_rotated(crs):
+            self.x, self.y = "rlon", "rlat"
         self.changed: list[str] = []
-        self.of_file: dict[str, str] = {}
+        self.of_file: dict[str, Any] = {}
         self._taken = {self.x, self.y, "crs"}
         self.main = self.new(str(surface.metadata.get("variable") or "height"))
         self.attributes = {name: self.new(name) for name in surface.attributes}
@@ -250,33 +255,32 @@ def _filled(variable: Variable, mask: NDArray[np.bool_] | None, title: str, noda
 
 
 def _mapping(surface: Surface) -> dict[str, Any]:
-    """What the variable of the CRS says: its WKT under both names in use, and the place for GDAL."""
-    wkt = str(surface.metadata["crs"])
-    attributes: dict[str, Any] = {"crs_wkt": wkt, "spatial_ref": wkt}
-    transform = surface.metadata.get("geotransform")
-    if surface.points.ndim == 2 and transform is not None and "nodes" not in surface.metadata:
-        attributes["GeoTransform"] = " ".join(repr(float(value)) for value in transform)
-    if is_geographic(wkt):
-        attributes["grid_mapping_name"] = "latitude_longitude"
-    return attributes
+    """What the variable of the CRS says: the CRS, and the place for GDAL where it is that of all points."""
+    metadata = surface.metadata
+    if surface.points.ndim == 2 and "nodes" not in metadata:
+        return grid_mapping(metadata)
+    return grid_mapping({"crs": metadata["crs"]})
 
 
 def _add_tags(surface: Surface, names: _Names, variables: Mapping[str, Variable]) -> list[str]:
-    """Give the file and its variables the attributes that GDAL's tags say they had; what is lost, in words."""
-    tags = surface.metadata.get("tags")
+    """Give the file and its variables the attributes that the tags say they had; what is lost, in words."""
+    tags, types = surface.metadata.get("tags"), surface.metadata.get(TYPES)
+    kinds = types if isinstance(types, Mapping) else {}
     lost = []
     axes = {"x": names.x, "y": names.y}
     of_variable = {str(surface.metadata.get("variable") or names.main): names.main, **names.attributes}
     for space, values in tags.items() if isinstance(tags, Mapping) else ():
         for key, text in values.items() if isinstance(values, Mapping) else ():
             owner, sharp, name = str(key).partition("#")
-            fits = not space and isinstance(text, str) and name and name not in _OURS and not _UNSAFE.search(name)
+            known = not space and isinstance(text, str) and bool(name) and not _UNSAFE.search(name)
+            fits = known and name not in _OURS
+            value = value_of(text, kinds.get(key)) if known else None
             if fits and sharp and owner == _GLOBAL:
-                names.of_file[name] = text
-            elif not space and isinstance(text, str) and name in AXIS_WORDS and axes.get(owner) in variables:
-                variables[axes[owner]].attributes.setdefault(name, text)
+                names.of_file[name] = value
+            elif (fits or (known and name in AXIS_WORDS)) and axes.get(owner) in variables:
+                variables[axes[owner]].attributes.setdefault(name, value)
             elif fits and sharp and of_variable.get(owner) in variables:
-                variables[of_variable[owner]].attributes.setdefault(name, text)
+                variables[of_variable[owner]].attributes.setdefault(name, value)
             elif not (sharp and name in _OURS):
                 lost.append(f"tag {key}")
     return lost

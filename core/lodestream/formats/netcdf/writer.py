@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import warnings
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
@@ -78,11 +80,23 @@ def _write_all(path: Path, contents: Contents, stop: Event) -> None:
     with Output(path) as output:
         try:
             with h5netcdf.File(output, "w") as group:
-                group.attrs.update(contents.attributes)
+                group.attrs.update(_attributes(contents.attributes))
                 for name, variable in contents.variables.items():
                     _write(group, name, variable, output, stop)
         finally:
             output.check()
+
+
+def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes as NetCDF has them: texts, lists of texts and numbers; what else JSON can say as a text of it."""
+    plain = (str, int, float, np.ndarray, np.generic)
+    return {
+        key: value
+        if (isinstance(value, plain) and not isinstance(value, bool))
+        or (isinstance(value, list) and value and all(isinstance(word, str) for word in value))
+        else json.dumps(value)
+        for key, value in attributes.items()
+    }
 
 
 def _write(group: Any, name: str, variable: Variable, output: Output, stop: Event) -> None:
@@ -95,7 +109,7 @@ def _write(group: Any, name: str, variable: Variable, output: Output, stop: Even
         sides = (min(length, _CHUNK) for length in variable.shape[:2])
         said |= {**_DEFLATE, "chunks": (*sides, *[1] * (len(variable.shape) - 2))}
     made = group.create_variable(name, variable.dims, variable.dtype, **said)
-    made.attrs.update(variable.attributes)
+    made.attrs.update(_attributes(variable.attributes))
     if not variable.shape:
         made[...] = variable.rows(slice(None))
         return

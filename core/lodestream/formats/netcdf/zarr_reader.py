@@ -7,7 +7,7 @@ import os
 import stat
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -18,7 +18,7 @@ from ...sources import read_source
 from ...surface import Surface
 from ..notes import listing, warn
 from ..source import Source, number
-from .reader import chosen_of
+from .reader import check_group, group_of, of_group, parents_of, with_parents
 
 __all__ = ["folder_size", "is_store", "read"]
 
@@ -27,6 +27,9 @@ _HEADS = ("zarr.json", ".zgroup", ".zarray")
 
 #: So many chunks may all be missing; of more there should be a byte each.
 _HARMLESS_CHUNKS = 1 << 16
+
+#: Groups that are looked through, each of which is a folder.
+_MOST_GROUPS = 2_000
 
 #: Codecs and filters of both versions that turn bytes into numbers and do nothing else: pickle runs what a file says.
 _CODECS = frozenset(
@@ -69,14 +72,13 @@ def read(source: Source) -> Surface:
         source = replace(source, path=folder.parent, options={"variable": folder.name, **source.options})
     source = replace(source, size=folder_size(source.path))
     notes: list[str] = []
-    with _opened(source, notes) as (array, dataset):
+    with _opened(source, notes) as (array, dataset, groups):
         if dataset is None:
             surface = _of_array(source, array)
         else:
             _check_chunks(source, ((it.shape, it.encoding.get("chunks") or ()) for it in dataset.variables.values()))
-            surface, left_out = chosen_of(source, dataset, "zarr")
-            if left_out:
-                notes.append(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
+            surface, more = of_group(source, dataset, groups, "zarr")
+            notes += more
     for text in notes:  # said here, for the libraries' own warnings are not shown while the store is open
         warn(text)
     return surface
@@ -109,17 +111,20 @@ def _check_chunks(source: Source, arrays: Iterable[tuple[tuple[int, ...], tuple[
 
 
 @contextmanager
-def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any]]:
-    """The array that a store is, or the group that it is as a Dataset with values as they are stored.
+def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[str]]]:
+    """The array that a store is, or a group as a Dataset with values as they are stored; and all groups of the store.
 
     Of a group, variables with codecs that are not known are left out, and named in the notes.
     """
     try:
+        import cf_xarray  # noqa: F401
+        import pyproj  # noqa: F401
         import xarray
         import zarr
     except ImportError:
         raise UnavailableError(
-            "expected zarr and xarray for Zarr stores, which are not both installed: install lodestream[zarr]"
+            "expected zarr and xarray with cf-xarray and pyproj for Zarr stores, which are not all installed: "
+            "install lodestream[zarr]"
         ) from None
     store = _store(zarr, source.path)
     try:
@@ -134,22 +139,31 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any]]:
             if isinstance(node, zarr.Array):
                 if unknown := _unknown(node.metadata.to_dict()):
                     raise FormatError(f"expected an array in codecs that are known, got {unknown[:60]!r}")
-                yield node, None
+                yield node, None, []
                 return
-            left_out = _left_out(node)
+            groups, name = _groups(node), group_of(source)
+            check_group(name, groups)
+            left_out = _left_out(node[name] if name else node, bool(groups))
             if left_out:
                 notes.append(f"left out variables: {listing(left_out.values())}")
-            with xarray.open_dataset(
-                store,
-                engine="zarr",
-                consolidated=False,
-                decode_cf=False,
-                create_default_indexes=False,
-                cache=False,
-                chunks=None,
-                drop_variables=list(left_out),
-            ) as dataset:
-                yield None, dataset
+            with ExitStack() as stack:
+
+                def opened(group: str) -> Any:
+                    unknown = left_out if group == name else _left_out(node[group] if group else node, True)
+                    dataset = xarray.open_dataset(
+                        store,
+                        engine="zarr",
+                        group=group or None,
+                        consolidated=False,
+                        decode_cf=False,
+                        create_default_indexes=False,
+                        cache=False,
+                        chunks=None,
+                        drop_variables=list(unknown),
+                    )
+                    return stack.enter_context(dataset)
+
+                yield None, with_parents(opened(name), map(opened, parents_of(name))), groups
     except UnavailableError:
         raise
     except InputError as error:
@@ -161,8 +175,35 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any]]:
         raise FormatError(f"expected a whole Zarr store, got one that is not readable: {reason[:120]}") from None
 
 
-def _left_out(group: Any) -> dict[str, str]:
+def _groups(group: Any) -> list[str]:
+    """Paths of all groups with arrays inside a group, such as "forecast/surface".
+
+    Raises
+    ------
+    TooLargeError
+        If there are more groups than a store that is read may have.
+    """
+    found, rest, count = [], [("", group)], 0
+    while rest:
+        path, outer = rest.pop()
+        for name, inner in outer.groups():
+            count += 1
+            if count > _MOST_GROUPS:
+                raise TooLargeError(f"expected at most {number(_MOST_GROUPS)} groups in a Zarr store, got more")
+            rest.append((f"{path}/{name}".strip("/"), inner))
+        if path and any(array.ndim for _, array in outer.arrays()):
+            found.append(path)
+    return sorted(found)
+
+
+def _left_out(group: Any, others: bool) -> dict[str, str]:
     """The arrays of a group that are no variables for us, each with the reason in words.
+
+    Parameters
+    ----------
+    group : Group of zarr
+    others : bool
+        Whether there is something else to read if there is no variable.
 
     Raises
     ------
@@ -170,7 +211,6 @@ def _left_out(group: Any) -> dict[str, str]:
         If there is no other.
     """
     found: dict[str, str] = {}
-    others = False
     for name, array in group.arrays():
         described = array.metadata.to_dict()
         if codec := _unknown(described):

@@ -12,13 +12,14 @@ import shutil
 import struct
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ...errors import FormatError, UnavailableError
 from ...surface import Surface
+from .attribute_texts import plain_of
 from .variables import Variable, contents_of, strips
 
 __all__ = ["SUFFIXES", "sniff", "write_beside"]
@@ -76,7 +77,7 @@ def _write(surface: Surface, folder: Path) -> None:
     codec = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
     try:
         with _store(folder) as store:
-            group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=dict(contents.attributes))
+            group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=_attributes(contents.attributes))
             for name, variable in contents.variables.items():
                 _write_variable(group, name, variable, codec)
             with warnings.catch_warnings():
@@ -129,7 +130,7 @@ def _write_variable(group: Any, name: str, variable: Variable, codec: Any) -> No
         dtype=variable.dtype,
         fill_value=variable.dtype.type(0) if fill is None else fill,
         dimension_names=variable.dims,
-        attributes=variable.attributes | ({} if fill is None else {"_FillValue": _as_json(fill)}),
+        attributes=_attributes(variable.attributes) | ({} if fill is None else {"_FillValue": _as_json(fill)}),
         compressors=codec,
     )
     if not variable.shape:
@@ -137,6 +138,11 @@ def _write_variable(group: Any, name: str, variable: Variable, codec: Any) -> No
         return
     for rows, values in strips(variable, _CHUNK if len(variable.shape) > 1 else variable.shape[0]):
         made[rows] = values
+
+
+def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes as JSON has them."""
+    return {key: plain_of(value) for key, value in attributes.items()}
 
 
 def _as_json(fill: Any) -> int | str:

@@ -1,0 +1,104 @@
+"""The CRS of a Dataset: its WKT, or what pyproj makes of the attributes of its grid mapping; and back.
+
+Source: CF conventions 1.11, section 5.6 and appendix F.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .names import associated
+
+__all__ = ["crs_of", "grid_mapping"]
+
+#: The grid mapping that rioxarray and GDAL name so, where no variable names one.
+_USUAL = "spatial_ref"
+
+#: Parts of an extended attribute: the name of a grid mapping, and the coordinates that it is for.
+_PART = re.compile(r"([^\s:]+)\s*:\s*([^:]*)(?=\s[^\s:]+\s*:|$)")
+
+
+def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, str | None, list[str]]:
+    """Find the CRS of a variable.
+
+    Parameters
+    ----------
+    dataset : Dataset of xarray
+    name : str
+        The variable.
+    places : sequence of str
+        Names of its coordinates x and y. Of several grid mappings, the one for these counts.
+
+    Returns
+    -------
+    crs : str or None
+        As WKT.
+    mapping : str or None
+        Name of the variable of the grid mapping.
+    notes : list of str
+        What pyproj does not understand.
+    """
+    variables = dataset.variables
+    mappings = associated(dataset, name)["grid_mapping"] or [_USUAL]
+    text = variables[name].attrs.get("grid_mapping", "")
+    of_places = {part[1]: set(part[2].split()) for part in _PART.finditer(str(text))}
+    mappings.sort(key=lambda mapping: -len(of_places.get(mapping, set()) & set(places)))
+    mapping = mappings[0]
+    if mapping not in variables:
+        return None, None, []
+    attributes = variables[mapping].attrs
+    for key in ("crs_wkt", "spatial_ref"):
+        wkt = attributes.get(key)
+        if isinstance(wkt, str) and wkt.strip():
+            return wkt, mapping, []
+    if "grid_mapping_name" not in attributes:
+        unnamed = set(attributes) - {"GeoTransform"}
+        return None, None, [f"left out {mapping}, a grid mapping without a name"] if unnamed else []
+    import pyproj
+
+    try:
+        crs = pyproj.CRS.from_cf({key: _plain(value) for key, value in attributes.items()})
+    except Exception as error:  # a file may say anything, and pyproj fails in several ways
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        return None, None, [f"left out the grid mapping {mapping}, which pyproj does not understand: {reason}"]
+    notes = []
+    if attributes["grid_mapping_name"] == "geostationary" and any(_in_radians(variables, it) for it in places):
+        height = _plain(attributes.get("perspective_point_height"))
+        notes.append(f"x and y are angles in radians; metres of the CRS are {height} times as many")
+    return str(crs.to_wkt()), mapping, notes
+
+
+def grid_mapping(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Say a CRS in attributes of a grid mapping: CF's by pyproj, WKT under both names in use, and the geotransform."""
+    crs, transform = metadata.get("crs"), metadata.get("geotransform")
+    attributes: dict[str, Any] = {}
+    if crs:
+        attributes = {**_said_by_cf(str(crs)), "crs_wkt": str(crs), "spatial_ref": str(crs)}
+    if transform is not None:
+        attributes["GeoTransform"] = " ".join(repr(float(value)) for value in transform)
+    return attributes
+
+
+def _said_by_cf(wkt: str) -> dict[str, Any]:
+    try:
+        import pyproj
+
+        attributes = pyproj.CRS.from_wkt(wkt).to_cf()
+    except Exception:  # pyproj is not installed, or whoever made the surface may have written anything
+        return {}
+    return {key: np.array(value) if isinstance(value, tuple) else value for key, value in attributes.items()}
+
+
+def _in_radians(variables: Mapping[str, Any], name: str) -> bool:
+    return str(variables[name].attrs.get("units", "")).lower() in ("rad", "radian", "radians")
+
+
+def _plain(value: Any) -> Any:
+    """A number of an attribute as Python has it, several as a list."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist() if np.size(value) != 1 else np.ravel(value)[0].item()
+    return value

@@ -1,0 +1,239 @@
+"""The surface of a Dataset of xarray, whatever it was opened from: a NetCDF, HDF5, a Zarr store, or in memory.
+
+Which variable and which coordinates is said by the CF conventions, as `choice` finds them with cf-xarray; a CRS is made
+by pyproj. Values are those that are stored (xarray's ``decode_cf=False``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...coordinates.seams import merge
+from ...scratch import IN_MEMORY, Room, rows_at_once
+from ...surface import Closed, Surface
+from ..notes import listing, survives
+from ..placed import Coordinate, place
+from ..source import Source, number
+from .attribute_texts import TYPES, text_of
+from .choice import Choice, Found, others
+from .crs import crs_of
+from .names import associated, axis_words
+from .values import PACKING, RANGES, Values, chosen, is_packed, raw_values, values_of
+
+__all__ = ["attributes_with_limits", "surface_of"]
+
+#: Attributes that refer to other variables.
+_REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
+
+#: Attributes that say how a file stores values; `Surface` has the values.
+_STORAGE = (*PACKING, *_REFERENCES, "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
+
+
+def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[Surface, list[str]]:
+    """Make a surface of a variable of a Dataset, its coordinates, and further variables as attributes.
+
+    Parameters
+    ----------
+    source : Source
+        With the options that choose; no file of it is opened.
+    dataset : Dataset of xarray
+        With values as they are stored, and the attributes of their file. Read by windows where they are large for the
+        room of `source`.
+    choice : Choice
+        What of it, as `choose` finds it by the options and the conventions.
+    format_name : str
+
+    Returns
+    -------
+    surface : Surface
+        A missing height is a hole that keeps its x and y; a point without x or y keeps its height.
+    notes : list of str
+        What is left out, or was chosen among several; not that `others` of the same grid are left out.
+
+    Raises
+    ------
+    FormatError, OptionError, TooLargeError
+        If it is no surface.
+    """
+    source.check_array(choice.shape, np.dtype(np.float64))
+    metadata, notes = _metadata(source, dataset, choice, format_name)
+    reader = _Reader(source, dataset, choice)
+    axes = [None if found is None else reader.coordinate(found) for found in (choice.x, choice.y)]
+    x, y = (axis or Coordinate(np.arange(choice.shape[1 - k]), 1 - k) for k, axis in enumerate(axes))
+    heights = None if choice.heights is None else reader.values(choice.heights, choice.dims)
+    attributes = {name: reader.attribute(name, heights) for name in choice.attributes}
+    extras: dict[str, Any] = {"attributes": attributes, "metadata": metadata}
+    if heights is None:
+        points = np.stack(np.broadcast_arrays(*(_plane(axis) for axis in (x, y))), axis=-1)
+        surface = merge(Surface(points, **extras), source.closed, room=source.room)
+    elif choice.x is None and choice.y is None:
+        surface = Surface(heights.array, mask=heights.valid, **extras)
+    else:
+        said = {"closed": source.closed, "room": source.room, **extras}
+        surface = place(heights.array, x, y, mask=heights.valid, **said)
+    notes += reader.notes + ([] if heights is None else _without_place(heights, x, y))
+    return _closed_fields(source, dataset, choice, surface), notes
+
+
+class _Reader:
+    """Reads the variables that were chosen, and notes what it left out of their values."""
+
+    def __init__(self, source: Source, dataset: Any, choice: Choice) -> None:
+        self._source, self._dataset, self._choice = source, dataset, choice
+        self.notes: list[str] = []
+
+    def values(self, name: str, dims: Sequence[str]) -> Values:
+        """The values of a variable over these dimensions."""
+        values = values_of(chosen(self._dataset.variables[name], self._choice.index), dims, self._source.room)
+        if values.outside:
+            self.notes.append(f"{number(values.outside)} values of {name} are outside its valid range, and missing")
+        return values
+
+    def coordinate(self, found: Found) -> Coordinate:
+        """A coordinate, NaN where it is missing."""
+        values = self.values(found.name, found.dims)
+        return Coordinate(_with_nan(values, self._source.room), found.axis, found.degrees)
+
+    def attribute(self, name: str, heights: Values | None) -> NDArray[Any]:
+        """Further values of the points: integers become floats with NaN where some are missing at valid points."""
+        variable = chosen(self._dataset.variables[name], self._choice.index)
+        dims = self._choice.dims
+        values = self.values(name, (*dims, *(dim for dim in map(str, variable.dims) if dim not in dims)))
+        if values.valid is None or values.array.dtype.kind == "f":
+            return values.array
+        valid = values.valid if values.valid.ndim == 2 else values.valid.all(axis=2)
+        needed = np.ones(valid.shape, np.bool_) if heights is None or heights.valid is None else heights.valid
+        return _with_nan(values, self._source.room) if (needed & ~valid).any() else values.array
+
+
+def _with_nan(values: Values, room: Room) -> NDArray[Any]:
+    """Values with NaN where they are missing: integers as floats of 32 bits, or of 64 where these do not hold them."""
+    array, valid = values.array, values.valid
+    if valid is None or array.dtype.kind == "f":
+        return array
+    strips = list(rows_at_once(array.shape))
+    single = all(survives(array[rows][valid[rows]], np.float32) for rows in strips)
+    floats = room.empty(array.shape, np.float32 if single else np.float64)
+    for rows in strips:
+        floats[rows] = np.where(valid[rows], array[rows], np.nan)
+    return floats
+
+
+def _plane(axis: Coordinate) -> NDArray[Any]:
+    """A coordinate with two axes, one of which may have length 1."""
+    return axis.values if axis.axis is None else np.expand_dims(axis.values, 1 - axis.axis)
+
+
+def _without_place(heights: Values, x: Coordinate, y: Coordinate) -> list[str]:
+    """Say how many heights there are without x or y."""
+    planes, count = [_plane(axis) for axis in (x, y)], 0
+    for rows in rows_at_once(heights.array.shape):
+        known = [np.isfinite(plane[rows] if plane.shape[0] > 1 else plane) for plane in planes]
+        valid = True if heights.valid is None else heights.valid[rows]
+        count += int(np.count_nonzero(~(known[0] & known[1]) & valid))
+    return [f"{number(count)} values have no x or y: they are holes until a stream is complete"] if count else []
+
+
+def _metadata(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[dict[str, Any], list[str]]:
+    """What the file says of itself and of the variables that are read; and notes.
+
+    Tags have the names that GDAL has for attributes of files. Coordinates are x and y, whatever the file calls them;
+    what the CRS says of them already is left out.
+    """
+    metadata, notes = source.metadata(format_name), list(choice.notes)
+    variables, main = dataset.variables, choice.heights
+    found = {letter: it.name for letter, it in (("x", choice.x), ("y", choice.y)) if it is not None}
+    places = [*found.values()]
+    crs, mapping, more = crs_of(dataset, main or places[0], places)
+    notes += more
+    told: dict[str, Any] = {}
+    if main is not None:
+        told["variable"] = main
+        if isinstance(unit := variables[main].attrs.get("units"), str) and unit.strip():
+            told["unit"] = unit
+    if crs is not None:
+        told["crs"] = crs
+    said: dict[str, Any] = {f"NC_GLOBAL#{key}": value for key, value in dataset.attrs.items()}
+    for name in (*([main] if main else []), *choice.attributes):
+        attributes = attributes_with_limits(variables[name])
+        if name == main and "unit" in told:
+            attributes.pop("units", None)
+        said |= {f"{name}#{key}": value for key, value in attributes.items()}
+    for letter, name in found.items():
+        usual = {**axis_words(letter, crs), "axis": letter.upper()}
+        attributes = attributes_with_limits(variables[name])
+        said |= {f"{letter}#{key}": value for key, value in attributes.items() if not _same(value, usual.get(key))}
+    texts = {name: text_of(value) for name, value in said.items()}
+    if texts:
+        metadata["tags"] = {"": {name: text for name, (text, _) in texts.items()}}
+    if types := {name: kind for name, (_, kind) in texts.items() if kind is not None}:
+        metadata[TYPES] = types
+    metadata |= told
+    taken = {main, *choice.attributes, *places, mapping}
+    if left_out := _left_out(dataset, choice, taken):
+        notes.append(f"left out: {listing(left_out)}")
+    return metadata, notes
+
+
+def _same(value: Any, usual: Any) -> bool:
+    return isinstance(value, str) and value == usual
+
+
+def attributes_with_limits(variable: Any) -> dict[str, Any]:
+    """Choose the attributes of a variable that say something of values, not of how they are stored.
+
+    Limits of packed values are unpacked.
+    """
+    attributes = {str(key): value for key, value in variable.attrs.items() if key not in _STORAGE}
+    if not is_packed(variable.attrs) or np.dtype(variable.dtype).kind not in "iu":
+        return attributes
+    import xarray
+
+    packing = {key: variable.attrs[key] for key in ("scale_factor", "add_offset", "_Unsigned") if key in variable.attrs}
+    for key in RANGES:
+        limits = np.ravel(attributes.get(key, ()))
+        if limits.size and limits.dtype.kind in "iu":
+            stored = xarray.Variable(("limit",), limits.astype(variable.dtype), packing)
+            attributes[key] = values_of(stored, ("limit",), IN_MEMORY).array
+    return attributes
+
+
+def _left_out(dataset: Any, choice: Choice, taken: set[str | None]) -> list[str]:
+    """Variables that say something of the values or of where they lie, and are neither taken nor offered as attributes.
+
+    These are bounds, areas and others along rows or columns, and those that the variable names as its coordinates: a
+    time, a depth.
+    """
+    variables = dataset.variables
+    known = {*others(dataset, choice), *taken, *choice.dims}
+    named = associated(dataset, choice.heights)["coordinates"] if choice.heights else []
+    along = [str(name) for name, it in variables.items() if set(choice.dims) & set(it.dims)]
+    left_out = [name for name in dict.fromkeys((*along, *named)) if name not in known]
+    return [name for name in left_out if not set(variables[name].dims) & set(choice.index)]
+
+
+def _closed_fields(source: Source, dataset: Any, choice: Choice, surface: Surface) -> Surface:
+    """Close the poloidal axis of a tokamak's core, which files of BOUT++ describe by their own numbers."""
+    names = ("nx", "ny", "ixseps1", "ixseps2", "jyseps1_1", "jyseps2_2")
+    variables = dataset.variables
+    if (
+        source.closed is not None
+        or "y" not in choice.dims
+        or not all(name in variables and variables[name].size == 1 for name in names)
+    ):
+        return surface
+    nx, ny, inner, outer, first, last = (int(np.ravel(raw_values(variables[name]))[0]) for name in names)
+    closed = [*surface.closed]
+    closed[choice.dims.index("y")] |= min(inner, outer) >= nx and first < 0 and last >= ny - 1
+    return _with_closed(surface, (bool(closed[0]), bool(closed[1])))
+
+
+def _with_closed(surface: Surface, closed: Closed) -> Surface:
+    if closed == surface.closed:
+        return surface
+    mask, attributes = surface.mask, surface.attributes
+    return Surface(surface.points, closed, mask=mask, attributes=attributes, metadata=surface.metadata)

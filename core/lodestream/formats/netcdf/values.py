@@ -1,0 +1,194 @@
+"""Values of variables of a Dataset: which are missing, packed ones unpacked by xarray, large ones by windows.
+
+Sources: CF conventions 1.11, sections 2.5.1 and 8.1; NetCDF Users Guide, appendix B, on valid_range and _Unsigned.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...scratch import Room
+from ...sources import windows
+
+__all__ = ["PACKING", "RANGES", "Values", "chosen", "is_packed", "limits_of", "pieces", "raw_values", "values_of"]
+
+#: Attributes that say how values are stored.
+PACKING = ("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned")
+
+#: Attributes that say which values are valid.
+RANGES = ("valid_range", "valid_min", "valid_max")
+
+
+@dataclass(frozen=True)
+class Values:
+    """The values of one variable on a grid.
+
+    Attributes
+    ----------
+    array : integers or floats, shape (row, column)
+        Floats are NaN where they are missing; integers are as they were stored.
+    valid : bool, shape (row, column), or None
+        Where there is a value; None: everywhere.
+    outside : int
+        Number of values that are missing only because they lie outside the valid range.
+    """
+
+    array: NDArray[Any]
+    valid: NDArray[np.bool_] | None
+    outside: int
+
+
+def chosen(variable: Any, index: Mapping[str, int]) -> Any:
+    """A variable without the dimensions of which an index was chosen; nothing is read yet."""
+    return variable.isel({dim: at for dim, at in index.items() if dim in variable.dims})
+
+
+def pieces(variable: Any, room: Room) -> Iterator[tuple[Any, Any]]:
+    """Divide a variable into what is read at a time: an index and that part of it, of which nothing is read yet.
+
+    All of it, unless it is large for the room and has two axes or more; then windows of whole chunks.
+    """
+    if variable.ndim < 2 or not room.takes(variable.nbytes):
+        yield ..., variable
+        return
+    for window in windows(variable.shape, _chunk(variable)):
+        yield window, variable[window]
+
+
+def _chunk(variable: Any) -> tuple[int, int]:
+    """Rows and columns of the chunks that Dask or a file has, 1 where there are none."""
+    preferred = variable.encoding.get("preferred_chunks") or {}
+    lengths = variable.chunks or [preferred.get(dim, 1) for dim in variable.dims]
+    rows, columns = (max(length) if isinstance(length, tuple) else int(length) for length in lengths[:2])
+    return max(rows, 1), max(columns, 1)
+
+
+def values_of(variable: Any, dims: Sequence[str], room: Room) -> Values:
+    """Read the values of a variable, shape (row, column), or those of a vector or a single number.
+
+    Parameters
+    ----------
+    variable : Variable of xarray
+        With values as they are stored, and the attributes that say how.
+    dims : sequence of str
+        Its dimensions in the order that is wanted.
+    room : Room
+        Where large arrays go.
+    """
+    turn = [variable.dims.index(dim) for dim in dims]
+    array: NDArray[Any] | None = None
+    valid: NDArray[np.bool_] | None = None
+    outside = 0
+    for window, part in pieces(variable, room):
+        values, mask, count = _decoded(np.asarray(part.values), variable.attrs)
+        outside += count
+        values, mask = values.transpose(turn), None if mask is None else mask.transpose(turn)
+        if window is ...:
+            return Values(values, mask, outside)
+        place = (*(window[axis] for axis in turn[:2]), ...)
+        shape = tuple(variable.shape[axis] for axis in turn)
+        array = room.empty(shape, values.dtype.newbyteorder("=")) if array is None else array
+        array[place] = values
+        if mask is not None and valid is None:
+            valid = room.empty(shape, np.dtype(np.bool_))
+            valid[...] = True
+        if mask is not None and valid is not None:
+            valid[place] = mask
+    assert array is not None  # a variable has rows
+    return Values(array, valid, outside)
+
+
+def raw_values(variable: Any) -> NDArray[Any]:
+    """Give the values of a small variable as they are stored, of its shape."""
+    return _signed(np.asarray(variable.values), variable.attrs)
+
+
+def is_packed(attributes: Mapping[str, Any]) -> bool:
+    """Whether stored values are others than those that they stand for; a scale of 1 and an offset of 0 change none."""
+    return _number(attributes, "scale_factor", 1.0) != 1.0 or _number(attributes, "add_offset", 0.0) != 0.0
+
+
+def limits_of(attributes: Mapping[str, Any]) -> tuple[Any, Any]:
+    """The least and the greatest valid value, each None where there is none.
+
+    Attributes that are no numbers say nothing.
+    """
+    both = np.ravel(attributes.get("valid_range", ()))
+    low, high = both if both.dtype.kind in "iuf" and both.size == 2 else (None, None)
+    low, high = (
+        single[0] if (single := np.ravel(attributes.get(key, ()))).dtype.kind in "iuf" and single.size == 1 else limit
+        for key, limit in (("valid_min", low), ("valid_max", high))
+    )
+    return low, high
+
+
+def _number(attributes: Mapping[str, Any], key: str, default: float) -> float:
+    values = np.ravel(attributes.get(key, default))
+    return float(values[0]) if values.dtype.kind in "iuf" and values.size else default
+
+
+def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]:
+    """Integers of any shape with or without a sign, as ``_Unsigned`` says of what NetCDF classic has no type for."""
+    kind = {"true": "u", "false": "i"}.get(str(attributes.get("_Unsigned", "")).lower())
+    if kind is None or values.dtype.kind not in "iu" or kind == values.dtype.kind:
+        return values
+    return values.view(values.dtype.str.replace(values.dtype.kind, kind))
+
+
+def _like(number: Any, stored: np.dtype[Any], attributes: Mapping[str, Any]) -> Any:
+    """A number of an attribute, as ``_Unsigned`` says if it has the type of the stored integers."""
+    number = np.asarray(number).ravel()
+    if stored.kind in "iu" and number.dtype.kind in "iu" and number.dtype.itemsize == stored.itemsize:
+        return _signed(number, attributes)[0]
+    return number[0]
+
+
+def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None, int]:
+    """Values by the conventions' rules; where there are any (None: everywhere); how many lie outside the valid range.
+
+    Of packed integers, limits of an integer type are those of stored values, others those of unpacked ones.
+    """
+    packed = is_packed(attributes)
+    raw = _signed(stored, attributes)
+    valid = np.ones(raw.shape, np.bool_)
+    for key in ("_FillValue", "missing_value"):
+        for missing in np.ravel(attributes.get(key, ())):
+            if isinstance(missing, np.number):
+                valid &= raw != _like(missing, stored.dtype, attributes)
+    values = _unpacked(stored, attributes) if packed else raw
+    if values.dtype.kind == "f":
+        valid &= ~np.isnan(values)
+    inside = np.ones((), np.bool_)
+    for limit, is_within in zip(limits_of(attributes), (np.greater_equal, np.less_equal), strict=True):
+        if limit is not None and not np.isnan(limit):
+            of_stored = packed and stored.dtype.kind in "iu" and limit.dtype.kind in "iu"
+            inside = inside & is_within(raw if of_stored else values, _like(limit, stored.dtype, attributes))
+    outside = 0
+    if inside.ndim and not inside.all():
+        outside = int(np.count_nonzero(valid & ~inside))
+        valid &= inside
+    if valid.all():
+        return values, None, 0
+    if values.dtype.kind == "f":
+        values = np.where(valid, values, values.dtype.type(np.nan))
+    return values, valid, outside
+
+
+def _unpacked(stored: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]:
+    """What packed values of any shape stand for, in the type that xarray gives them."""
+    import xarray
+
+    dims = [f"axis_{number}" for number in range(stored.ndim)]
+    packing = {key: attributes[key] for key in PACKING if key in attributes}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of several fill values
+        decoded = xarray.conventions.decode_cf_variable(
+            "values", xarray.Variable(dims, stored, packing), decode_times=False
+        )
+    return np.asarray(decoded.values)
