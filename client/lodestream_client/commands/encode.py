@@ -7,13 +7,24 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lodestream.errors import LodestreamError
+
 from ..requests.local import checked_options
 from ..terminal.interrupts import interruptible
-from ..terminal.output import LONG, human_size, note, note_holes, print_json, progress_bar, require_folder
+from ..terminal.output import (
+    LONG,
+    human_size,
+    note,
+    note_holes,
+    print_json,
+    progress_bar,
+    require_folder,
+    require_parent,
+)
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .building_options import (
     BuildingOptions,
@@ -21,15 +32,17 @@ from .building_options import (
     building_options,
     work_folder,
 )
-from .inputs import input_files, option_hints
+from .inputs import input_files, option_hints, reason_of
+from .series import EachFolder, Part, named_files, parts
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
+from .values import parse_pair
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from lodestream.surface import Surface
 
-__all__ = ["EncodeOptions", "read_surface", "register", "run"]
+__all__ = ["EncodeOptions", "encode_files", "read_surface", "register", "run"]
 
 
 def register(subparsers: Subparsers) -> None:
@@ -44,23 +57,41 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument("files", nargs="+", metavar="FILE", help="file to read; - for standard input")
     parser.add_argument("out", metavar="OUT.lode", help="container to write; - for standard output")
     add_surface_options(parser)
+    parser.add_argument(
+        "--each",
+        action=EachFolder,
+        type=parse_pair,
+        metavar="WHAT=FOLDER",
+        help="in place of OUT: write a container for each step along a dimension of a NetCDF or Zarr store, such as "
+        "time, or for each variable, into a folder; they are named by it, and are a series",
+    )
     add_building_options(parser)
     add_json_option(parser)
 
 
 @dataclass(frozen=True)
 class EncodeOptions:
-    """What the command line asks of an encoding: `files` and `out` are names, ``-`` standard input and output."""
+    """What the command line asks of an encoding: `files` and `out` are names, ``-`` standard input and output.
+
+    `each` is what there is a container for, and the folder of all of them, where there are several.
+    """
 
     files: tuple[str, ...]
     out: str
     surface: SurfaceOptions
     building: BuildingOptions
     json: bool
+    each: tuple[str, Path] | None = None
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
     """The options; ends the program if the command line is wrong."""
+    if args.each is not None:
+        files = (*args.files, *([] if args.out is None else [args.out]))
+        if len(files) > 1 or files[0] == "-":
+            args.parser.error(f"argument --each: expected one FILE and no OUT, got {' '.join(files)}")
+        along, folder = args.each
+        return EncodeOptions(files, "", surface_options(args), building_options(args), args.json, (along, Path(folder)))
     if args.out != "-" and Path(args.out).suffix.lower() != ".lode":
         args.parser.error(f"expected a container OUT.lode or - last, got {args.out}")
     standard_output_once(args, "container")
@@ -71,24 +102,68 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 @interruptible()
 def run(args: argparse.Namespace) -> int:
     """Read, encode, write."""
-    from lodestream.bands.cluster import executor_of
     from lodestream.library import require
 
     options = _options(args)
     require("encoding")
+    if options.each is not None:
+        return _run_each(options, *options.each)
     if options.out != "-":
         require_folder(Path(options.out))
+    figures = encode_files(options)
+    if options.json:
+        print_json(figures)
+    return 0
+
+
+def _run_each(options: EncodeOptions, along: str, folder: Path) -> int:
+    """Write a container for each step or variable; 1 if any could not be made."""
+    file = options.files[0]
+    require_parent(folder)
+    surfaces = parts(file, along, options.surface)
+    folder.mkdir(exist_ok=True)
+    made: list[dict[str, Any]] = []
+    failed: list[dict[str, str]] = []
+    for part, name in named_files(surfaces):
+        try:
+            made.append(encode_files(replace(options, out=str(folder / name), surface=part.options), part))
+        except (LodestreamError, OSError) as error:
+            failed.append({"file": file, along: part.label, "reason": reason_of(error)})
+            note(f"{part.label}: {failed[-1]['reason']}")
+    if options.json:
+        print_json({"surfaces": made, "failed": failed})
+    elif failed:
+        note(f"{len(failed)} of {len(surfaces)} surfaces failed")
+    return 1 if failed else 0
+
+
+def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, Any]:
+    """Make the container, say so on standard error, and return what ``--json`` prints.
+
+    Parameters
+    ----------
+    options : EncodeOptions
+    part : Part, optional
+        Of the files; gives the surface its name and its place in a series.
+
+    Raises
+    ------
+    LodestreamError, OSError
+    """
+    from lodestream.bands.cluster import executor_of
+
     started = time.monotonic()
     with executor_of(options.building.dask) as executor, work_folder(options.building, options.out) as folder:
         surface = read_surface(options.files, options.surface, folder / "files", options.building.memory)
+        if part is not None:
+            part.mark(surface)
         if options.surface.quality.rms is None:  # a stream for one error is refused instead
             _note_memory(surface, options.building.memory)
         made = _made(surface, options, folder, executor)
         size = len(made) if made is not None else Path(options.out).stat().st_size
         if made is not None:
             sys.stdout.buffer.write(made)
-        _report(surface, size, time.monotonic() - started, options)
-    return 0
+        return _report(surface, size, time.monotonic() - started, options)
 
 
 def read_surface(
@@ -162,22 +237,20 @@ def _note_memory(surface: Surface, memory: int | None) -> None:
         )
 
 
-def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions) -> None:
+def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions) -> dict[str, Any]:
     blocks = surface.blocks
     note_holes(sum(block.holes for block in blocks), sum(math.prod(block.shape) for block in blocks))
     raw = sum(array.nbytes for block in blocks for array in (block.points, *block.attributes.values()))
-    if options.json:
-        alone = blocks[0] if len(blocks) == 1 else None
-        print_json(
-            {
-                "out": options.out,
-                "bytes": size,
-                "raw_bytes": raw,
-                "shape": None if alone is None else list(alone.shape),
-                "closed": None if alone is None else list(alone.closed),
-                "seconds": round(seconds, 3),
-            }
-        )
-    else:
+    if not options.json:
         grid = " x ".join(map(str, blocks[0].shape)) if len(blocks) == 1 else f"{len(blocks)} blocks of"
-        note(f"{grid} points, {human_size(size)} ({size / raw:.1%} of the arrays) in {seconds:.1f} s")
+        of = "" if options.each is None else f"{options.out}: "
+        note(f"{of}{grid} points, {human_size(size)} ({size / raw:.1%} of the arrays) in {seconds:.1f} s")
+    alone = blocks[0] if len(blocks) == 1 else None
+    return {
+        "out": options.out,
+        "bytes": size,
+        "raw_bytes": raw,
+        "shape": None if alone is None else list(alone.shape),
+        "closed": None if alone is None else list(alone.closed),
+        "seconds": round(seconds, 3),
+    }

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 from lodestream.errors import FormatWarning, LodestreamError
 
-__all__ = ["Inputs", "input_files", "named", "no_container", "option_hints", "option_words"]
+__all__ = ["Inputs", "input_files", "named", "no_container", "option_hints", "option_words", "reason_of"]
 
 _STANDARD_INPUT = "standard input"
 
@@ -48,6 +48,11 @@ def named(error: LodestreamError, name: str, advice: str = "") -> LodestreamErro
     words = f"{_STANDARD_INPUT if name == '-' else name}: {error}" + (f"; {advice}" if advice else "")
     error.args = (words, *error.args[1:])
     return error
+
+
+def reason_of(error: LodestreamError | OSError) -> str:
+    """Why a file failed, in words for a line about it."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 @contextmanager

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import argparse
+import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lodestream.errors import LodestreamError
+from lodestream.quality import Quality
 
 from ..errors import UnreachableError
 from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
-from .inputs import input_files, option_hints, option_words
+from .building_options import BuildingOptions
+from .encode import EncodeOptions, encode_files
+from .inputs import input_files, option_hints, option_words, reason_of
+from .series import FILE, EachWord, Part, parts
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
 from .values import parse_server
 
 if TYPE_CHECKING:
     from ..requests.api import Description
     from ..requests.bodies import Source
+
+    # What a surface is called, what --json says of it, and its upload.
+    _Upload = tuple[str, dict[str, str], Callable[[], Description]]
 
 __all__ = ["PushOptions", "register", "run"]
 
@@ -42,10 +52,15 @@ def register(subparsers: Subparsers) -> None:
     add_surface_options(parser)
     parser.add_argument(
         "--each",
-        action="store_true",
-        help="each file is a surface of its own: prints URL and FILE on one line; a file that fails does not end "
+        action=EachWord,
+        nargs="?",
+        metavar="WHAT",
+        help="each file is a surface of its own: prints URL and FILE on one line. With the name of a dimension of a "
+        "NetCDF or Zarr store, such as time, or with variable: each step, or each variable, of the only FILE is a "
+        "surface, encoded here and named by it, and they are a series; prints URL and name. What fails does not end "
         "it, but makes the exit code 1",
     )
+    parser.set_defaults(first_file=[])
     parser.add_argument(
         "--local",
         action="store_true",
@@ -58,12 +73,15 @@ def register(subparsers: Subparsers) -> None:
 
 @dataclass(frozen=True)
 class PushOptions:
-    """What the command line asks of an upload: names of `files`, ``-`` for standard input, to the server at `url`."""
+    """What the command line asks of an upload: names of `files`, ``-`` for standard input, to the server at `url`.
+
+    `each` is what there is a surface for: `FILE`, a dimension, or ``variable``; None: the files are one surface.
+    """
 
     files: tuple[str, ...]
     url: str
     surface: SurfaceOptions
-    each: bool
+    each: str | None
     local: bool
     wait: bool
     token: str | None
@@ -72,11 +90,19 @@ class PushOptions:
 
 def _options(args: argparse.Namespace) -> PushOptions:
     """The options; ends the program if the command line is wrong."""
-    if args.each and args.name is not None and len(args.files) > 1:
+    files, url = [*args.first_file, *args.files], args.url
+    if url is None:  # the word after --each was the first file, or the URL
+        try:
+            url = parse_server(files.pop(0 if "://" in files[0] else -1))
+        except argparse.ArgumentTypeError as error:
+            args.parser.error(f"argument URL: {error}")
+    if args.each == FILE and args.name is not None and len(files) > 1:
         args.parser.error("argument --name: not allowed with --each, since all surfaces would have one name")
+    if args.each not in (None, FILE) and (len(files) > 1 or files[0] == "-"):
+        args.parser.error(f"argument --each: expected one FILE for each {args.each}, got {' '.join(files)}")
     return PushOptions(
-        standard_input_once(args, args.files),
-        args.url,
+        standard_input_once(args, files),
+        url,
         surface_options(args),
         args.each,
         args.local,
@@ -89,7 +115,7 @@ def _options(args: argparse.Namespace) -> PushOptions:
 def run(args: argparse.Namespace) -> int:
     """Upload, wait, print the address."""
     options = _options(args)
-    if options.each:
+    if options.each is not None:
         return _run_each(options)
     surface = _uploaded(options)
     note_details(surface.details, words=option_words)
@@ -101,29 +127,62 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_each(options: PushOptions) -> int:
-    """Upload one file after another; 1 if any was refused. A server that is not reached ends it."""
+    """Upload one surface after another; 1 if any was refused. A server that is not reached ends it."""
     made: list[dict[str, object]] = []
     failed: list[dict[str, str]] = []
-    for name in options.files:
-        file = _STANDARD_INPUT if name == "-" else name
+    uploads = _files(options) if options.each == FILE else _parts(options, str(options.each))
+    for label, words, upload in uploads:
         try:
-            surface = _uploaded(replace(options, files=(name,)))
+            surface = upload()
         except UnreachableError:
             raise
         except (LodestreamError, OSError) as error:
-            reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-            failed.append({"file": name, "reason": reason})
-            note(reason if file in reason else f"{file}: {reason}")
+            reason = reason_of(error)
+            failed.append({**words, "reason": reason})
+            note(reason if label in reason else f"{label}: {reason}")
             continue
-        note_details(surface.details, f"{file}: ", option_words)
-        made.append({**surface.details, "url": surface.url, "file": name})
+        note_details(surface.details, f"{label}: ", option_words)
+        made.append({**surface.details, "url": surface.url, **words})
         if not options.json:
-            say(f"{surface.url} {file}")
+            say(f"{surface.url} {label}")
     if options.json:
         print_json({"surfaces": made, "failed": failed})
     elif failed:
-        note(f"{len(failed)} of {len(options.files)} files failed")
+        note(f"{len(failed)} of {len(uploads)} {'files' if options.each == FILE else 'surfaces'} failed")
     return 1 if failed else 0
+
+
+def _files(options: PushOptions) -> list[_Upload]:
+    """The upload of each file."""
+    return [
+        (
+            _STANDARD_INPUT if name == "-" else name,
+            {"file": name},
+            partial(_uploaded, replace(options, files=(name,))),
+        )
+        for name in options.files
+    ]
+
+
+def _parts(options: PushOptions, along: str) -> list[_Upload]:
+    """The upload of each step or variable of the only file."""
+    file = options.files[0]
+    return [
+        (part.name, {"file": file}, partial(_encoded, options, part)) for part in parts(file, along, options.surface)
+    ]
+
+
+def _encoded(options: PushOptions, part: Part) -> Description:
+    """Encode a step or variable here, and upload it."""
+    with tempfile.TemporaryDirectory(prefix="lodestream-") as folder:
+        container = Path(folder) / "surface.lode"
+        encoding = EncodeOptions(
+            options.files, str(container), part.options, BuildingOptions(None, None, None), json=True
+        )
+        encode_files(encoding, part)
+        wanted = replace(options.surface, quality=Quality(), closed="auto", name=None, format_options={}, nodata=None)
+        sent = replace(wanted, format_name=None)
+        return _uploaded(replace(options, files=(str(container),), surface=sent, local=False))
 
 
 def _filename(options: PushOptions, path: Path) -> str | None:

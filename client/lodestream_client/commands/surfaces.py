@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lodestream.container.series import place_of
+
 from ..requests.states import STATES
 from ..terminal.output import human_size, note, print_json, say_columns
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
@@ -25,13 +27,16 @@ def register(subparsers: Subparsers) -> None:
         run_list,
         "list the surfaces of a server",
         "One line for each: URL, state, shape, size of the container (of the upload, before there is one), name,\n"
-        "owner (where the server tells owners; - if it has none), and why it is not ready.",
+        "series (where there are any: its name, and the number of the step or variable), owner (where the server\n"
+        "tells owners; - if it has none), and why it is not ready. Surfaces of a series stand together, by their\n"
+        "numbers, unless --sort is given.",
     )
     parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
     parser.add_argument(
         "--search",
         metavar="TEXT",
-        help="only those with this text in their name, file names, owner, URL or reason, in upper or lower case",
+        help="only those with this text in their name, series, file names, owner, URL or reason, in upper or lower "
+        "case",
     )
     parser.add_argument("--state", choices=STATES, help="only those in this state")
     parser.add_argument("--sort", choices=tuple(_KEYS), help="order of the lines (default: the server's)")
@@ -45,7 +50,7 @@ def register(subparsers: Subparsers) -> None:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Ask, print one line for each: address, state, shape, bytes, name, owner, and why it is not ready."""
+    """Ask, print one line for each: address, state, shape, bytes, name, series, owner, and why it is not ready."""
     from .. import sync
 
     surfaces = _chosen(sync.list_surfaces(args.url, token=token_of(args)), args)
@@ -67,7 +72,8 @@ def _row(surface: Description, owned: bool) -> tuple[str, ...]:
     shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
     size = human_size(_size(surface)) if _size(surface) is not None else "-"
     owner = str(details.get("owner") or "-") if owned else ""
-    return surface.url, surface.state, shape, size, _name(surface), owner, str(details.get("reason") or "")
+    reason = str(details.get("reason") or "")
+    return surface.url, surface.state, shape, size, _name(surface), _series(surface), owner, reason
 
 
 def _name(surface: Description) -> str:
@@ -102,13 +108,37 @@ def _chosen(surfaces: Sequence[Description], args: argparse.Namespace) -> list[D
     ]
     if args.sort:
         found.sort(key=_KEYS[args.sort])
+    else:
+        found = _together(found)
     return found[::-1] if args.reverse else found
+
+
+def _together(surfaces: Sequence[Description]) -> list[Description]:
+    """The surfaces of a series one after another by their index, where the first of them stands."""
+    first: dict[str, int] = {}
+    places: list[tuple[int, int]] = []
+    for number, surface in enumerate(surfaces):
+        place = place_of(surface.details)
+        places.append((number, 0) if place is None else (first.setdefault(place.name, number), place.index))
+    return [surfaces[number] for number in sorted(range(len(surfaces)), key=places.__getitem__)]
+
+
+def _series(surface: Description) -> str:
+    """The series of a surface, and its number in it, in words; empty: it is in none."""
+    place = place_of(surface.details)
+    return "" if place is None else f"{place.name}, {place.along} {place.index}"
 
 
 def _words(surface: Description) -> list[str]:
     details = surface.details
     names = [str(name) for name in details.get("filenames") or ()]
-    return [surface.url, _name(surface), *names, *(str(details.get(key) or "") for key in ("owner", "reason"))]
+    return [
+        surface.url,
+        _name(surface),
+        _series(surface),
+        *names,
+        *(str(details.get(key) or "") for key in ("owner", "reason")),
+    ]
 
 
 def run_rm(args: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@ import { describe, expect, it } from "vitest";
 import { type ListedSurface, problemOf, Server } from "../src/page/api";
 import { parseConfiguration } from "../src/page/configuration";
 import { matches, nameOf } from "../src/page/names";
+import { seriesOf, stepOf } from "../src/page/series";
 
 const surface: ListedSurface = {
   id: "5f1c0a9b3d7e42a68c10",
@@ -25,6 +26,45 @@ describe("the list", () => {
     expect(nameOf(surface)).toBe("Jacksboro");
     expect(nameOf({ ...surface, name: "" })).toBe("fault_dem.npz");
     expect(nameOf({ ...surface, name: "", filenames: [""] })).toBe(surface.id);
+  });
+});
+
+describe("a series", () => {
+  const step = (index: number, more: object = {}): ListedSurface => ({
+    ...surface,
+    id: `air ${index}`,
+    name: `day air 2001-01-0${index + 1}`,
+    series: { name: "day air", along: "time", index, value: 24 * index, unit: "hours since 2001-01-01" },
+    ...more,
+  });
+
+  it("is of the surfaces that can be shown and have its name, by their place", () => {
+    const others = [
+      surface,
+      step(1, { state: "building" }),
+      step(2, { series: { ...step(2).series, name: "day wind" } }),
+      step(3, { series: { ...step(3).series, along: "variable" } }),
+    ];
+    const found = seriesOf(step(5), [step(7), ...others, step(0), step(5)]);
+    expect(found.map(({ id }) => id)).toEqual(["air 0", "air 5", "air 7"]);
+    expect(seriesOf(surface, [surface, step(0)])).toEqual([]);
+  });
+
+  it("has the newest of two at one place, but always the one that is open", () => {
+    const [old, recent] = [step(0, { id: "old" }), step(0, { id: "recent", created: "2026-02-01T12:00:00.000+00:00" })];
+    for (const all of [
+      [old, recent, step(1)],
+      [recent, old, step(1)],
+    ]) {
+      expect(seriesOf(step(1), all).map(({ id }) => id)).toEqual(["recent", "air 1"]);
+      expect(seriesOf(old, all).map(({ id }) => id)).toEqual(["old", "air 1"]);
+    }
+  });
+
+  it("calls a step by what follows the name of the series", () => {
+    expect(stepOf(step(2))).toBe("2001-01-03");
+    expect(stepOf(step(2, { name: "storm" }))).toBe("storm");
+    expect(stepOf(surface)).toBe("Jacksboro");
   });
 });
 

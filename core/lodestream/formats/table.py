@@ -9,6 +9,7 @@ from typing import Any, BinaryIO
 
 from ..surface import Surface
 from . import bezier, glb, npy, npz, npz_writer, off, text_arrays
+from .member import Member
 from .netcdf import reader as netcdf
 from .netcdf import writer as netcdf_writer
 from .netcdf import zarr_reader, zarr_store
@@ -72,6 +73,9 @@ class Format:
     memory : int
         Bytes that writing takes for each point, beside the surface, about; 0 where it takes some rows at a time, of a
         surface that is in files.
+    members : callable or None
+        Takes a `Source` and what its surfaces lie along, a dimension or ``variable``; returns a list of `Member`. None:
+        a file holds one surface.
     by_block : bool
         Whether writing takes one block at a time: then its memory is that for the points of the largest one.
     """
@@ -81,6 +85,7 @@ class Format:
     sniff: Callable[[bytes, str], bool]
     read: Callable[[Source], Surface] | None = None
     write: Callable[[Surface, BinaryIO], None] | None = None
+    members: Callable[[Source, str], list[Member]] | None = None
     blocks: bool = False
     options: Mapping[str, str] = field(default_factory=dict)
     kinds: tuple[str, ...] = ()
@@ -149,6 +154,7 @@ FORMATS = (
         suffixes=(".nc", ".nc4", ".cdf"),
         sniff=netcdf.sniff,
         read=netcdf.read,
+        members=netcdf.members,
         write=netcdf_writer.write,
         options=netcdf.READ_OPTIONS,
         kinds=netcdf.KINDS,
@@ -160,6 +166,7 @@ FORMATS = (
         sniff=zarr_store.sniff,
         folder=zarr_reader.is_store,
         read=zarr_reader.read,
+        members=zarr_reader.members,
         options={key: text for key, text in netcdf.READ_OPTIONS.items() if key != "resolution"},
         write_beside=zarr_store.write_beside,
     ),

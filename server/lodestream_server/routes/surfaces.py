@@ -12,6 +12,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, Response
 
+from lodestream.container.series import SERIES, place_of
+
 from ..access.access import Caller, anybody
 from ..access.gate import caller_of
 from ..access.scopes import needs
@@ -246,8 +248,11 @@ def _present(record: Record, parts: State, request: Request, *, full: bool) -> d
     state, progress = parts.builder.state(record)
     # What is built again has the figures of the container that was lost.
     info = dict(record.info or {}) if state == "ready" else {}
+    place = place_of(info.get("metadata") or {})
     if not full:
         info = {key: info[key] for key in ("shape", "closed", "bytes") if key in info}
+    if place is not None:
+        info[SERIES] = place.told()
     return {
         "id": record.id,
         "url": f"{_base(request)}/{record.id}",

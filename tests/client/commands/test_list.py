@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from lodestream.container.series import Place, place_of
+
 from ..conftest import Run
 from ..scripted import document, scripted
 
@@ -47,6 +49,55 @@ def test_owners_have_a_column_where_any_is_told(run: Run) -> None:
     ]
     told = json.loads(listed(run, surfaces, "--json")[1])["surfaces"]
     assert [it["owner"] for it in told] == ["survey", None]
+
+
+def step(index: int, name: str = "air") -> dict[str, Any]:
+    return {"name": name, "along": "time", "index": index, "value": 6.0 * index, "unit": "hours since 2001-01-01"}
+
+
+def test_surfaces_of_a_series_stand_together_by_their_index(run: Run) -> None:
+    surfaces = [
+        {**READY, "name": "c", "series": step(2)},
+        {**READY, "name": "other"},
+        {**READY, "name": "a", "series": step(0)},
+        {**READY, "name": "sea", "series": step(0, "sea")},
+        {**READY, "name": "b", "series": step(1)},
+    ]
+    _, stdout = listed(run, surfaces)
+    assert [line.split("700 B  ")[1] for line in stdout.splitlines()] == [
+        "a      air, time 0",
+        "b      air, time 1",
+        "c      air, time 2",
+        "other",
+        "sea    sea, time 0",
+    ]
+    told = json.loads(listed(run, surfaces, "--json")[1])["surfaces"]
+    assert [it["series"]["index"] for it in told if "series" in it] == [0, 1, 2, 0]
+    assert len(listed(run, surfaces, "--search", "AIR, TIME")[1].splitlines()) == 3
+    by_name = listed(run, surfaces, "--sort", "name", "--json")[1]
+    assert [it["name"] for it in json.loads(by_name)["surfaces"]] == ["a", "b", "c", "other", "sea"]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        7,
+        {},
+        {**step(0), "name": ""},
+        {**step(0), "name": "n" * 201},
+        {**step(0), "index": -1},
+        {**step(0), "index": True},
+        {**step(0), "index": "0"},
+        {**step(0), "value": None},
+        {**step(0), "value": float("inf")},
+        {**step(0), "value": float("nan")},
+        {**step(0), "unit": 3},
+        {**step(0), "value": [1]},
+    ],
+)
+def test_what_is_no_place_in_a_series_is_not_shown(wrong: Any) -> None:
+    assert place_of({"series": wrong}) is None
+    assert place_of({"series": step(3)}) == Place("air", "time", 3, 18.0, "hours since 2001-01-01")
 
 
 def test_a_state_that_there_is_not_is_refused_with_those_that_are(run: Run) -> None:

@@ -15,6 +15,18 @@ export interface ListedSurface {
   readonly upload_bytes: number;
   readonly bytes?: number;
   readonly shape?: readonly [number, number] | null;
+  /** Its place in a series: among the steps along a dimension, or the variables, of one file. */
+  readonly series?: Place;
+}
+
+/** A place in a series; surfaces with the same name belong together. */
+export interface Place {
+  readonly name: string;
+  /** The dimension, or `variable`. */
+  readonly along: string;
+  readonly index: number;
+  readonly value: number | string;
+  readonly unit: string;
 }
 
 /** What the server answered in place of what was asked for. */
@@ -69,6 +81,18 @@ export class Server {
       surfaces: ListedSurface[];
       next: string | null;
     };
+  }
+
+  /** All surfaces, page after page. */
+  async all(): Promise<ListedSurface[]> {
+    const surfaces: ListedSurface[] = [];
+    let address: string | null = null;
+    do {
+      const page: { surfaces: ListedSurface[]; next: string | null } = await this.page(address);
+      surfaces.push(...page.surfaces);
+      address = page.next;
+    } while (address !== null);
+    return surfaces;
   }
 
   /** One surface. */

@@ -4,18 +4,22 @@ import { LodestreamView } from "../view";
 import { html, setText } from "../view/dom";
 import { formatBytes, formatNumber } from "../view/format";
 import type { Progress, SurfaceInfo } from "../view/source";
-import { ProblemError, Server } from "./api";
+import { type ListedSurface, ProblemError, Server } from "./api";
 import { configured, type ShownSurface } from "./configuration";
 import { askToken } from "./dialogs";
 import icon from "./icon.svg?url";
 import { Listing } from "./listing";
 import { nameOf } from "./names";
+import { SeriesSlider, seriesOf } from "./series";
 
 const server = new Server(new URL(".", location.href).href);
 const header = html("header");
 let listing: Listing | null = null;
 let view: LodestreamView | null = null;
 let shown: string | null = null;
+let series: SeriesSlider | null = null;
+/** The slider has led here, and keeps the keyboard. */
+let moved = false;
 let asking: Promise<boolean> | null = null;
 
 /** Asks for a token where one is missing or not good; several requests share one question. */
@@ -72,6 +76,7 @@ function open(src: string, name: string, back: boolean): void {
 
 function showList(): void {
   closeAll();
+  series = null; // what is on the server may be other when one is opened again
   document.title = "Lodestream";
   header.replaceChildren(mark(false));
   listing = new Listing(server, allowed);
@@ -104,12 +109,32 @@ async function route(): Promise<void> {
   const path = `v1/surfaces/${encodeURIComponent(id)}`;
   try {
     const surface = await server.look(path);
-    if (asked() === id) open(server.address(surface.url), nameOf(surface), true);
+    if (asked() !== id) return;
+    open(server.address(surface.url), nameOf(surface), true);
+    await showSeries(surface);
   } catch (error) {
     shown = null;
     if (await allowed(error as ProblemError)) return route();
     fail(error);
   }
+}
+
+/** Puts the slider over the surfaces of a series below the header, if an open surface is in one. */
+async function showSeries(surface: ListedSurface): Promise<void> {
+  if (!series?.show(surface.id)) {
+    series = null;
+    if (surface.series === undefined) return;
+    const surfaces = seriesOf(surface, await server.all());
+    if (shown !== surface.id || surfaces.length < 2) return;
+    series = new SeriesSlider(surfaces, ({ id }) => {
+      moved = true;
+      location.hash = `s=${encodeURIComponent(id)}`;
+    });
+    series.show(surface.id);
+  }
+  header.after(series.element);
+  if (moved) series.focus();
+  moved = false;
 }
 
 function fail(error: unknown): void {

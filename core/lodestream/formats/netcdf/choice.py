@@ -17,7 +17,7 @@ from .no_grids import NoGrid, no_grid_of
 from .positions import are_elsewhere
 from .values import raw_values
 
-__all__ = ["Choice", "Found", "choose", "names_in", "others"]
+__all__ = ["Choice", "Found", "choose", "fields", "main_variable", "names_in", "others"]
 
 _REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
 _ANCILLARY = "ancillary_variables"
@@ -99,12 +99,7 @@ def choose(source: Source, dataset: Any) -> Choice:
         When there is nothing to read or more than one way to read it; the message names what there is.
     """
     variables: Mapping[Hashable, Any] = dataset.variables
-    no_grid = no_grid_of(dataset)
-    given = {key: _named(source, variables, key) for key in ("variable", "x", "y") if key in source.options}
-    planar = "variable" not in given and {"x", "y"} <= set(given)
-    main = given["x"] if planar else given.get("variable") or _only(dataset, set(given.values()), no_grid)
-    if no_grid is not None and no_grid.takes(main, variables[main].dims):
-        raise FormatError(no_grid.refusal(main if "variable" in given or planar else ""))
+    main, given, planar = _main(source, dataset)
     index = _index(source, dataset, variables[main].dims)
     dims = _surface_dims(dataset, main, index)
     shape = (int(dataset.sizes[dims[0]]), int(dataset.sizes[dims[1]]))
@@ -126,6 +121,41 @@ def choose(source: Source, dataset: Any) -> Choice:
     )
     heights, notes = None if planar else main, tuple(places.notes)
     return Choice(heights, dims, shape, index, places.x, places.y, tuple(attributes), nbytes, notes)
+
+
+def _main(source: Source, dataset: Any) -> tuple[str, Mapping[str, str], bool]:
+    """The variable whose dimensions count, those that options name by their option, and whether points are planar."""
+    variables = dataset.variables
+    no_grid = no_grid_of(dataset)
+    given = {key: _named(source, variables, key) for key in ("variable", "x", "y") if key in source.options}
+    planar = "variable" not in given and {"x", "y"} <= set(given)
+    main = given["x"] if planar else given.get("variable") or _only(dataset, set(given.values()), no_grid)
+    if no_grid is not None and no_grid.takes(main, variables[main].dims):
+        raise FormatError(no_grid.refusal(main if "variable" in given or planar else ""))
+    return main, given, planar
+
+
+def main_variable(source: Source, dataset: Any) -> tuple[str, Mapping[str, int]]:
+    """Find the variable whose dimensions a surface has, and the places along them that options name.
+
+    Raises
+    ------
+    FormatError, OptionError
+        As `choose`.
+    """
+    main, *_ = _main(source, dataset)
+    return main, _index(source, dataset, dataset.variables[main].dims)
+
+
+def fields(dataset: Any) -> list[str]:
+    """List the variables over surfaces that are no coordinate of another.
+
+    Raises
+    ------
+    FormatError
+        If the file holds no grid.
+    """
+    return _fields(dataset, set(), no_grid_of(dataset))[0]
 
 
 def names_in(names: Any) -> list[str]:
@@ -178,6 +208,20 @@ def _listing(variables: Mapping[Hashable, Any]) -> str:
 
 def _only(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> str:
     """The only variable over a surface that is no coordinate of another."""
+    chosen, wide = _fields(dataset, coordinates, no_grid)
+    if len(chosen) == 1:
+        return chosen[0]
+    variables = dataset.variables
+    if not wide:
+        raise FormatError(f"expected a variable over two dimensions, got {_listing(variables)}")
+    listing = _listing({name: variables[name] for name in chosen or wide})
+    raise FormatError(
+        f"expected one variable over a surface, got {listing}: choose with variable=, or planar points with x= and y="
+    )
+
+
+def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tuple[list[str], list[str]]:
+    """The variables over surfaces: those that are no coordinate of another, and all."""
     variables = dataset.variables
     if no_grid is not None:
         on_grids = {name: it for name, it in variables.items() if not no_grid.takes(str(name), it.dims)}
@@ -193,15 +237,7 @@ def _only(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> str:
         if _numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
     ]
     letters = letters_of(dataset)
-    chosen = [name for name in wide if name not in beside and name not in letters]
-    if len(chosen) == 1:
-        return chosen[0]
-    if not wide:
-        raise FormatError(f"expected a variable over two dimensions, got {_listing(variables)}")
-    listing = _listing({name: variables[name] for name in chosen or wide})
-    raise FormatError(
-        f"expected one variable over a surface, got {listing}: choose with variable=, or planar points with x= and y="
-    )
+    return [name for name in wide if name not in beside and name not in letters], wide
 
 
 def _referred(variable: Any) -> set[str]:

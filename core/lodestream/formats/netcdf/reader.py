@@ -11,17 +11,20 @@ from typing import Any
 
 from ...errors import FormatError, InputError, OptionError, TooLargeError, UnavailableError
 from ...surface import Surface
+from ..member import Member
 from ..notes import listing, warn
 from ..source import Source, check_allowed
 from . import hdf5_guard, vmec
 from .choice import choose, others
 from .dataset import surface_of
+from .members import members_of
 
 __all__ = [
     "KINDS",
     "READ_OPTIONS",
     "check_group",
     "group_of",
+    "members",
     "of_group",
     "parents_of",
     "read",
@@ -75,6 +78,12 @@ def read(source: Source) -> Surface:
     for text in notes:  # said here, for the libraries' own warnings are not shown while the file is open
         warn(text)
     return surface
+
+
+def members(source: Source, along: str) -> list[Member]:
+    """List the surfaces of a file along a dimension, or its variables; see `lodestream.formats.series.members`."""
+    with _opened(source) as (dataset, _):
+        return members_of(source, dataset, along)
 
 
 def of_group(

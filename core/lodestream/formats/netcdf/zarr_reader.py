@@ -16,11 +16,13 @@ from typing import Any
 from ...errors import FormatError, InputError, TooLargeError, UnavailableError
 from ...sources import read_source
 from ...surface import Surface
+from ..member import Member
 from ..notes import listing, warn
 from ..source import Source, number
+from .members import members_of
 from .reader import check_group, group_of, of_group, parents_of, with_parents
 
-__all__ = ["folder_size", "is_store", "read"]
+__all__ = ["folder_size", "is_store", "members", "read"]
 
 #: What a folder has that is a group or an array.
 _HEADS = ("zarr.json", ".zgroup", ".zarray")
@@ -67,10 +69,7 @@ def read(source: Source) -> Surface:
     FormatError
         If the store is not whole, or a file of it lies elsewhere.
     """
-    folder = Path(os.path.realpath(source.path))
-    if _is_variable(folder):
-        source = replace(source, path=folder.parent, options={"variable": folder.name, **source.options})
-    source = replace(source, size=folder_size(source.path))
+    source = _in_group(source)
     notes: list[str] = []
     with _opened(source, notes) as (array, dataset, groups):
         if dataset is None:
@@ -82,6 +81,29 @@ def read(source: Source) -> Surface:
     for text in notes:  # said here, for the libraries' own warnings are not shown while the store is open
         warn(text)
     return surface
+
+
+def members(source: Source, along: str) -> list[Member]:
+    """List the surfaces of a store along a dimension, or its variables; see `lodestream.formats.series.members`.
+
+    Raises
+    ------
+    FormatError
+        If it is a single array.
+    """
+    source = _in_group(source)
+    with _opened(source, []) as (_, dataset, _):
+        if dataset is None:
+            raise FormatError(f"expected a group of variables for each {along}, got a single array")
+        return members_of(source, dataset, along)
+
+
+def _in_group(source: Source) -> Source:
+    """The group in place of one of its variables, which becomes an option."""
+    folder = Path(os.path.realpath(source.path))
+    if _is_variable(folder):
+        source = replace(source, path=folder.parent, options={"variable": folder.name, **source.options})
+    return replace(source, size=folder_size(source.path))
 
 
 def _of_array(source: Source, array: Any) -> Surface:

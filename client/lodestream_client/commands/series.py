@@ -1,0 +1,127 @@
+"""Surfaces of a file that holds several, for ``encode --each`` and ``push --each``: each is read and made by itself."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..requests.local import checked_options
+from .inputs import option_hints
+from .surface_options import SurfaceOptions
+
+if TYPE_CHECKING:
+    from lodestream.formats.member import Member
+    from lodestream.surface import Surface
+
+__all__ = ["FILE", "EachFolder", "EachWord", "Part", "named_files", "parts"]
+
+#: What `push` says where each file is a surface.
+FILE = "file"
+
+_WORD = re.compile(r"\w[\w-]*")
+_UNSAFE = re.compile(r"[^\w.+-]+")
+
+
+class EachWord(argparse.Action):
+    """``--each``, alone or with `FILE`, ``variable`` or the name of a dimension.
+
+    argparse takes any word after it. One that is no name, or the name of a file, is put back before the files.
+    """
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        """Keep the word, or the file that it was."""
+        word = FILE if values is None else str(values)
+        if not option_has_value(word):
+            namespace.first_file = [word]
+            word = FILE
+            _optional(parser, "url")
+        setattr(namespace, self.dest, word)
+
+
+class EachFolder(argparse.Action):
+    """``--each WHAT=FOLDER``, with which there is no OUT."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        """Keep the pair."""
+        setattr(namespace, self.dest, values)
+        _optional(parser, "out")
+
+
+def option_has_value(word: str) -> bool:
+    """Whether a word after ``--each`` says what, and is no file."""
+    return _WORD.fullmatch(word) is not None and not Path(word).exists()
+
+
+def _optional(parser: argparse.ArgumentParser, dest: str) -> None:
+    """Let an argument be absent."""
+    for action in parser._actions:  # argparse has no public way to change one
+        if action.dest == dest:
+            action.required = False
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of the surfaces of a file, and the options that read it."""
+
+    member: Member
+    options: SurfaceOptions
+    series: Mapping[str, Any]
+
+    @property
+    def name(self) -> str:
+        """What its surface is called."""
+        return f"{self.series['name']} {self.label}"
+
+    @property
+    def label(self) -> str:
+        """What it is called among the others."""
+        return self.member.label
+
+    def mark(self, surface: Surface) -> None:
+        """Give a surface its name and its place in the series."""
+        from lodestream.container.series import SERIES
+
+        surface.metadata["name"] = self.name
+        surface.metadata[SERIES] = dict(self.series)
+
+
+def parts(file: str, along: str, options: SurfaceOptions) -> list[Part]:
+    """The surfaces of a file along a dimension, or its variables.
+
+    Raises
+    ------
+    FormatError, OptionError
+        If there are none, or an option does not fit.
+    OSError
+        If the file cannot be opened.
+    """
+    from lodestream.formats.series import members
+
+    with option_hints((file,)):
+        chosen = checked_options(options.format_options)
+        listed = members(file, along, format_name=options.format_name, options=chosen)
+    base = options.name or Path(file).stem
+    return [
+        Part(
+            member,
+            replace(options, name=None, format_options={**options.format_options, **member.options}),
+            member.place(base).told(),
+        )
+        for member in listed
+    ]
+
+
+def named_files(made: Sequence[Part]) -> Iterator[tuple[Part, str]]:
+    """Parts with names of their containers: their labels, with a number where two would have the same."""
+    names = [_UNSAFE.sub("-", part.label).strip("-.") or part.member.along for part in made]
+    for part, name in zip(made, names, strict=True):
+        alone = sum(other.casefold() == name.casefold() for other in names) == 1
+        yield part, f"{name if alone else f'{name}-{part.member.index}'}.lode"

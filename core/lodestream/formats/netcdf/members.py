@@ -1,0 +1,107 @@
+"""The surfaces of a Dataset of xarray along one dimension, or its variables."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...errors import FormatError, OptionError
+from ..member import Member
+from ..source import Source
+from .choice import fields, main_variable
+from .names import is_time, time_of
+
+__all__ = ["VARIABLE", "members_of"]
+
+#: What is said for variables, in place of a dimension.
+VARIABLE = "variable"
+
+#: Units of dates, of which the first that tells all of them is taken.
+_UNITS = ("D", "m", "s", "ms", "us")
+
+
+def members_of(source: Source, dataset: Any, along: str) -> list[Member]:
+    """List them; see `lodestream.formats.series.members`.
+
+    Raises
+    ------
+    FormatError, OptionError
+        If there are none, or another option chooses one of them.
+    """
+    if along == VARIABLE:
+        return _variables(source, dataset)
+    main, chosen = main_variable(source, dataset)
+    dims = [str(dim) for dim in dataset.variables[main].dims]
+    dim = along if along in dims else None
+    if dim is None and along == "time":
+        dim = next((name for name in dims if is_time(dataset, name)), None)
+    if dim is None:
+        raise OptionError(
+            f"expected each {VARIABLE}, or one of the dimensions of {main}, {', '.join(dims)}, got {along!r}"
+        )
+    if sum(dataset.sizes[other] > 1 for other in dims if other != dim) < 2:
+        raise OptionError(f"expected {main} over two more dimensions for each {along}, got {', '.join(dims)}")
+    if dim in chosen:
+        raise OptionError(f"expected no place along {dim} for each {along}, got one by time= or at=")
+    before = str(source.options.get("at", ""))
+    at = f"{before}," if before else ""
+    return [
+        Member({"at": f"{at}{dim}:{index}"}, main, along, index, value, unit, label)
+        for index, (value, unit, label) in enumerate(_steps(dataset, dim))
+    ]
+
+
+def _variables(source: Source, dataset: Any) -> list[Member]:
+    if chosen := {"variable", "x", "y"} & set(source.options):
+        raise OptionError(f"expected no {min(chosen)}= for each variable, got one")
+    names = fields(dataset)
+    if not names:
+        raise FormatError("expected variables over two dimensions, got none")
+    return [
+        Member({"variable": name}, "", VARIABLE, index, name, _unit(dataset.variables[name]), name)
+        for index, name in enumerate(names)
+    ]
+
+
+def _steps(dataset: Any, dim: str) -> list[tuple[float | int | str, str, str]]:
+    """Value, unit and words of each place along a dimension; its number, where there is no coordinate."""
+    count = int(dataset.sizes[dim])
+    numbers: list[tuple[float | int | str, str, str]] = [(index, "", f"{dim} {index}") for index in range(count)]
+    name = (time_of(dataset, dim) if is_time(dataset, dim) else None) or dim
+    if name not in dataset.variables or dataset.variables[name].dims != (dim,):
+        return numbers
+    import xarray
+
+    try:
+        values = xarray.decode_cf(dataset[[name]], decode_times=False)[name].values.tolist()
+    except Exception:  # of attributes that anybody may have written
+        return numbers
+    unit, dates = _unit(dataset.variables[name]), _dates(dataset, name) if is_time(dataset, dim) else None
+    for index, value in enumerate(values):
+        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+        if isinstance(text, str) or (isinstance(text, int | float) and math.isfinite(text)):
+            words = f"{text:g}" if isinstance(text, float) else str(text)
+            numbers[index] = text, unit, dates[index] if dates else f"{words} {unit}".strip()
+    return numbers
+
+
+def _dates(dataset: Any, name: str) -> list[str] | None:
+    """The dates of times in words; None: they are in no calendar that is known."""
+    import xarray
+
+    try:
+        times = xarray.decode_cf(dataset[[name]])[name].values
+    except Exception:  # of dates in any calendar and unit that a file may claim
+        return None
+    if times.dtype.kind == "M":
+        known = times[~np.isnat(times)]
+        unit: Any = next((unit for unit in _UNITS if (known == known.astype(f"M8[{unit}]")).all()), "ns")
+        return [str(text) for text in np.datetime_as_string(times, unit=unit)]
+    return [str(time) for time in times] if times.dtype.kind == "O" else None
+
+
+def _unit(variable: Any) -> str:
+    unit = variable.attrs.get("units")
+    return unit.strip() if isinstance(unit, str) else ""
