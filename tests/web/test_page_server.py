@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
+import lodestream as ls
 from lodestream_client.sync import upload
 
 from .browser import Heard, Tab
@@ -94,6 +95,30 @@ def test_an_address_of_nothing_is_told(tabs: Tabs, shelf: Shelf, heard: Heard) -
     expect(tab.page.get_by_role("alert")).to_be_visible()
     tab.page.get_by_role("link", name="Lodestream").click()
     expect(tab.page.get_by_role("heading", name="Surfaces")).to_be_visible()
+
+
+def test_the_slider_goes_through_the_surfaces_of_a_series(tabs: Tabs, shelf: Shelf) -> None:
+    """By the keyboard, which stays on it; and not where there is no other surface of the series."""
+
+    def step(index: int, name: str) -> str:
+        place = {"name": name, "along": "time", "index": index, "value": 6 * index, "unit": "h"}
+        metadata = {"name": f"{name} at {6 * index} h", "series": place}
+        return upload(shelf.server, ls.Surface(HEIGHTS[:40, :30] + np.float32(index), metadata=metadata)).url
+
+    urls = [step(index, "slid") for index in (2, 0, 1)]
+    tab = tabs(f"{shelf.server}/#s={urls[1].rsplit('/', 1)[1]}")
+    slider, heading = tab.page.get_by_role("slider", name="time", exact=True), tab.page.get_by_role("heading", level=1)
+    expect(tab.page.locator(".series output")).to_have_text("at 0 h (1 of 3)")
+    slider.focus()
+    for index, id_ in ((1, urls[2]), (2, urls[0])):
+        tab.page.keyboard.press("ArrowRight")
+        expect(heading).to_have_text(f"slid at {6 * index} h")
+        expect(tab.page.locator(".series output")).to_have_text(f"at {6 * index} h ({index + 1} of 3)")
+        expect(slider).to_be_focused()
+        assert tab.page.url.endswith(id_.rsplit("/", 1)[1])
+    alone = tabs(f"{shelf.server}/#s={step(0, 'alone').rsplit('/', 1)[1]}")
+    alone.everything()
+    expect(alone.page.locator(".series")).to_have_count(0)
 
 
 def test_a_token_is_asked_for_and_kept_to_oneself(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:
