@@ -60,8 +60,10 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-#: The libraries that read NetCDF, of which a process would take a second to import them.
-_NETCDF = ("scipy.io", "xarray", "cf_xarray", "h5netcdf", "pyproj")
+#: The libraries that read NetCDF, of which a process would take a second to import them. dask is not needed, but xarray
+#: imports it if it is there. pyproj opens its database when it is imported: in a process that is forked then, which
+#: closes all files, it would read another file in place of it.
+_NETCDF = ("scipy.io", "xarray", "cf_xarray", "h5netcdf", "dask.array")
 
 #: The values of ``closed``; `auto` leaves what the file says.
 CLOSED = ("auto", "none", "rows", "cols", "both")

@@ -18,6 +18,7 @@ import httpx
 import numpy as np
 import pytest
 
+import lodestream as ls
 from lodestream.confinement import landlock
 from lodestream_server.builds import jobs, worker
 from lodestream_server.builds.fork_control import ForkServer
@@ -296,6 +297,32 @@ def test_real_formats_are_built_confined(http: httpx.Client, tmp_path: Path) -> 
         made = push(http, path.read_bytes(), filename=path.name)
         assert made["state"] == "ready", (suffix, made["reason"])
         http.delete(made["url"])
+
+
+def test_conventions_of_netcdf_are_read_confined(http: httpx.Client, tmp_path: Path) -> None:
+    """pyproj reads its database there, and the query of an upload chooses a group and attributes."""
+    xarray, pyproj = pytest.importorskip("xarray"), pytest.importorskip("pyproj")
+    pytest.importorskip("h5netcdf")
+    mapping = {"grid_mapping_name": "mercator", "standard_parallel": 20.0, "longitude_of_projection_origin": 10.0}
+    heights = hills(seed=3)
+    axes = {
+        name: (name, np.arange(n) * 3000.0, {"standard_name": f"projection_{name}_coordinate", "units": "m"})
+        for name, n in zip("yx", heights.shape, strict=True)
+    }
+    grid = {"z": (("y", "x"), heights, {"grid_mapping": "crs"}), "crs": ((), 0, mapping)}
+    data = xarray.Dataset(grid | {key: (("y", "x"), heights + k) for k, key in enumerate("uv")}, axes)
+    path = tmp_path / "groups.nc"
+    xarray.DataTree.from_dict({"/day": data, "/night": data}).to_netcdf(path, engine="h5netcdf")
+    made = push(http, path.read_bytes(), filename="groups.nc", group="day", variable="z", attributes="u,v")
+    assert made["state"] == "ready", made["reason"]
+    surface = ls.decode(http.get(made["url"] + "/container", follow_redirects=True).content)
+    np.testing.assert_array_equal(surface.points, heights)
+    for k, key in enumerate("uv"):
+        np.testing.assert_array_equal(surface.attributes[key], heights + k)
+    found = pyproj.CRS.from_wkt(surface.metadata["crs"]).to_cf()
+    assert {key: found[key] for key in mapping} == mapping
+    refused = push(http, path.read_bytes(), filename="groups.nc")
+    assert "there are groups: day, night, choose with group=" in refused["reason"]
 
 
 def test_netcdf_is_built_confined(http: httpx.Client, tmp_path: Path) -> None:

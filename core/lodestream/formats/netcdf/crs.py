@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import UnavailableError
 from .names import associated
 
 __all__ = ["crs_of", "grid_mapping"]
@@ -41,6 +42,11 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
         Name of the variable of the grid mapping.
     notes : list of str
         What pyproj does not understand.
+
+    Raises
+    ------
+    UnavailableError
+        If the CRS needs pyproj, and it is not installed.
     """
     variables = dataset.variables
     mappings = associated(dataset, name)["grid_mapping"] or [_USUAL]
@@ -58,8 +64,13 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
     if "grid_mapping_name" not in attributes:
         unnamed = set(attributes) - {"GeoTransform"}
         return None, None, [f"left out {mapping}, a grid mapping without a name"] if unnamed else []
-    import pyproj
-
+    try:
+        import pyproj
+    except ImportError:
+        raise UnavailableError(
+            "expected pyproj for a CRS in attributes of the CF conventions, which is not installed: install "
+            "lodestream[formats]"
+        ) from None
     try:
         crs = pyproj.CRS.from_cf({key: _plain(value) for key, value in attributes.items()})
     except Exception as error:  # a file may say anything, and pyproj fails in several ways

@@ -214,7 +214,6 @@ def check_libraries() -> None:
     try:
         import cf_xarray  # noqa: F401 - for a better message than xarray's
         import h5netcdf  # noqa: F401
-        import pyproj  # noqa: F401
         import scipy  # noqa: F401
         import xarray  # noqa: F401
     except ImportError:

@@ -140,7 +140,6 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[s
     """
     try:
         import cf_xarray  # noqa: F401
-        import pyproj  # noqa: F401
         import xarray
         import zarr
     except ImportError:
