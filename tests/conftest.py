@@ -33,8 +33,6 @@ LONGEST = (
     "tests/core/grid/test_many_patches.py",
     "tests/core/grid/test_watertight.py",
     "tests/client/stream/test_interrupted.py",
-    "tests/core/decoding/test_fallback.py",
-    "tests/client/test_without_kernels.py",
     "tests/core/decoding/test_decoder.py",
     "tests/kernels/test_sanitizers.py",
     "tests/core/grid/test_topology.py",

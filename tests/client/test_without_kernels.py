@@ -10,19 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.library import library_name
 from lodestream_client import sync
 from tests.patience import PATIENCE
 
-from .conftest import Run
-
 ROOT = Path(__file__).parents[2]
-GOLDEN = ROOT / "tests" / "golden"
-
-SLOW = "Lodestream decodes in plain Python"
 
 
 class Bare:
@@ -62,23 +56,17 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Bare:
     return Bare(tmp_path_factory.mktemp("bare"))
 
 
-@pytest.mark.parametrize("name", ["holes-float32.npy", "cube-sphere-even.obj", "sphere-closed.vts"])
-def test_decode_writes_what_it_writes_with_them_and_says_once_that_it_is_slow(
-    bare: Bare, run: Run, tmp_path: Path, name: str
-) -> None:
-    container, out, wanted = GOLDEN / Path(name).with_suffix(".lode"), tmp_path / name, tmp_path / f"wanted-{name}"
-    told = bare.done("decode", container, out)
-    assert told.count(SLOW) == told.count(library_name()) == 1
-    assert run("decode", container, wanted)[0] == 0
-    assert out.read_bytes() == wanted.read_bytes()
-
-
-def test_decode_takes_every_limit(bare: Bare, run: Run, container_file: Path, tmp_path: Path) -> None:
-    for limit in (("--level", "3"), ("--roi", "5:40,7:30"), ("--until-rms", "9"), ("--max-bytes", "3000")):
-        found, wanted = tmp_path / "found.npy", tmp_path / "wanted.npy"
-        bare.done("decode", container_file, found, *limit)
-        assert run("decode", container_file, wanted, *limit)[0] == 0
-        assert found.read_bytes() == wanted.read_bytes()
+def test_decoding_is_refused(bare: Bare, container_file: Path, surface: str, tmp_path: Path) -> None:
+    out = tmp_path / "out.npy"
+    for command in (
+        ("decode", container_file, out),
+        ("pull", surface, out),
+        ("pull", surface, out, "--transport", "http"),
+    ):
+        assert "decoding is not possible here" in bare.refused(*command)
+        assert not out.exists()
+    code = f"import pathlib, lodestream; lodestream.decode(pathlib.Path({str(container_file)!r}).read_bytes())"
+    assert "UnavailableError: decoding is not possible here" in bare.run("-c", code).stderr
 
 
 def test_what_decodes_nothing_says_nothing(bare: Bare, container_file: Path) -> None:
@@ -87,25 +75,11 @@ def test_what_decodes_nothing_says_nothing(bare: Bare, container_file: Path) -> 
     assert bare.run("-W", "error", "-c", code).stderr == ""
 
 
-@pytest.mark.parametrize("transport", ["ws", "http"])
-def test_pull_ends_with_the_surface(
-    bare: Bare, surface: str, terrain: NDArray[np.float32], tmp_path: Path, transport: str
-) -> None:
-    out = tmp_path / "out.npy"
-    told = bare.done("pull", surface, out, "--transport", transport)
-    assert told.count(SLOW) == 1
-    assert np.array_equal(np.load(out), terrain)
-    bare.done("pull", surface, out, "--until-rms", "5", "--transport", transport)
-    assert 0 < np.sqrt(np.mean((np.load(out) - terrain) ** 2)) <= 5
-
-
 def test_encode_is_refused_before_the_file_is_opened(bare: Bare, tmp_path: Path) -> None:
     assert "encoding is not possible here" in bare.refused("encode", tmp_path / "nowhere.npy", tmp_path / "out.lode")
 
 
-def test_a_file_is_uploaded_and_what_is_in_memory_is_refused(
-    bare: Bare, server: str, terrain_file: Path, tmp_path: Path
-) -> None:
+def test_a_file_is_uploaded_and_what_is_in_memory_is_refused(bare: Bare, server: str, terrain_file: Path) -> None:
     assert bare.done("push", terrain_file, server, "--name", "uploaded without kernels") == ""
     code = f"import numpy; from lodestream_client import sync; sync.upload({server!r}, numpy.ones((9, 9)))"
     told = bare.run("-c", code).stderr

@@ -16,8 +16,7 @@ from .inputs import named
 from .outcome import Outcome, check_grid
 
 if TYPE_CHECKING:
-    from lodestream.decoding.by_blocks import BlocksDecoder
-    from lodestream.decoding.by_rows import RowsDecoder
+    from lodestream.decoding.pieces import PiecewiseDecoder
     from lodestream.planning.byte_ranges import RangeSet
 
     from .decode import DecodeOptions
@@ -55,7 +54,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
     from lodestream.bands.front import default_memory
     from lodestream.container.capacity import Capacity
     from lodestream.container.reader import read_index
-    from lodestream.decoding.by_bands import decoder_by_bands
+    from lodestream.decoding.pieces import PiecewiseDecoder
     from lodestream.planning.byte_ranges import RangeSet
 
     memory = default_memory() if options.memory is None else options.memory
@@ -74,7 +73,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
             header, level = index.header, options.target.level
             if level is not None and level > header.levels:
                 return False  # decoding in one piece tells so
-            decoder = decoder_by_bands(read, index, level)
+            decoder = PiecewiseDecoder(read, index, level)
         except (CorruptStreamError, TruncatedStreamError, TooLargeError):
             return False  # decoding in one piece tells what is wrong with it, and what is left
         check_grid(options.out, header)
@@ -107,9 +106,9 @@ class _Needs:
         Why it is not done by bands; None: it can be.
     """
 
-    def __init__(self, decoder: RowsDecoder | BlocksDecoder, options: DecodeOptions, memory: int) -> None:
+    def __init__(self, decoder: PiecewiseDecoder, options: DecodeOptions, memory: int) -> None:
         from lodestream.container.capacity import memory_limit
-        from lodestream.decoding.by_bands import why_not_by_bands
+        from lodestream.decoding.pieces import why_not_by_pieces
         from lodestream.formats import for_writing, written
         from lodestream.planning.selection import selection_of
 
@@ -130,7 +129,7 @@ class _Needs:
         elif options.partial or replace(options.target, level=None) != Target():
             self.reason = "only the whole surface or a level is, without --partial, limits and --attributes"
         else:
-            self.reason = why_not_by_bands(header, self._limit, decoder.level)
+            self.reason = why_not_by_pieces(header, self._limit, decoder.level)
 
     def whole(self, memory: int) -> bool:
         """Whether it is decoded in one piece: it cannot be by bands, or there is room for it and for its writer."""
@@ -173,7 +172,7 @@ class _Needs:
 
 
 def _decode(
-    decoder: RowsDecoder | BlocksDecoder,
+    decoder: PiecewiseDecoder,
     out: Path,
     memory: int,
     options: DecodeOptions,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.writer import CodedLayer, CodedSegment
-from ..decoding.reconstruction import Values
+from ..decoding.values import Values
 from ..encoding.holes import given_arrays
 from ..encoding.measured import MeasuredLayer, all_passes
 from ..scratch import Scratch

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..container.chunks import chunk_places
 from ..container.model import Header
-from ..decoding.reconstruction import Values
+from ..decoding.values import Values
 from ..encoding.prepared import Prepared
 from ..encoding.residual_encoder import ChunkCoder
 from ..encoding.states import StateReconstructor

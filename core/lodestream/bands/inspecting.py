@@ -1,9 +1,9 @@
-"""Checking a container from an untrusted source that does not fit into memory: values and errors by bands."""
+"""Checking a container from an untrusted source: every section, the index, every value, and the recorded errors."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -11,11 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.digest import little_endian
-from ..container.model import Header
-from ..decoding.by_bands import decoder_by_bands, why_not_by_bands
-from ..decoding.by_blocks import BYTES, BlocksDecoder
-from ..decoding.by_rows import RowsDecoder
-from ..decoding.inspected_sections import Walked, walk
+from ..container.model import Errors, Header
+from ..decoding.inspected_sections import walk
 from ..decoding.inspection import (
     READ,
     Inspection,
@@ -24,27 +21,32 @@ from ..decoding.inspection import (
     check_levels,
     check_values,
     corners_of,
-    inspect_whole,
     states_of,
 )
-from ..decoding.reconstruction import Values
+from ..decoding.level_grids import at_level, level_nodes, with_rules
+from ..decoding.pieces import PiecewiseDecoder, why_not_by_pieces
+from ..decoding.reconstructor import Reconstructor, known_state
+from ..decoding.region import Region
+from ..decoding.values import Values, block_of
+from ..entropy.tiles import Tiles
 from ..errors import CorruptStreamError, TooLargeError
 from ..grid.patches import level_shapes
 from ..library import require
-from ..parallel import spread, threads
-from ..quantization.distortion import originals_of, other_originals
+from ..parallel import spread
+from ..quantization.distortion import Original, coordinate_distances, originals_of, other_originals
 from ..surface import Block, Surface
 from .grid_measuring import BlocksMeasurer
 from .measuring import Figures, RowsMeasurer, distances_of
+from .memory import default_memory
 from .windows import RowsGiven
 
 __all__ = ["inspect"]
 
 #: Bytes that looking a container through takes for each value, in one piece.
-_WHOLE = 24
-#: Of the memory, what decoding a band may take; and points of the levels that are restored as their metadata say.
-_PART, _MOST_POINTS = 4, 1 << 20
-#: How much of it is done when all rows are measured.
+_WHOLE_BYTES = 24
+#: Of the memory, what decoding pieces may take; and points of the levels that are restored as their metadata say.
+_PIECES_SHARE, _MOST_POINTS = 4, 1 << 20
+#: How much of it is done when all pieces are measured.
 _MEASURED = 0.95
 
 
@@ -52,12 +54,14 @@ def inspect(
     file: BinaryIO,
     *,
     max_vertices: int,
-    memory: int,
+    memory: int | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> Inspection:
-    """Check a whole container as `lodestream.decoding.inspection.inspect` does, by bands of rows if it is large.
+    """Check a whole container, and decode it once, piece by piece.
 
-    Of a large one only levels of up to a million points are restored as the metadata say.
+    Nothing is decoded before the header has announced the number of vertices. For an exact container each layer and
+    level is decoded and compared with the complete surface, which takes about as long as measuring them did in the
+    encoder. Only levels of up to a million points are restored as the metadata say.
 
     Parameters
     ----------
@@ -65,8 +69,8 @@ def inspect(
         The container and nothing else; seekable.
     max_vertices : int
         Larger surfaces are refused.
-    memory : int
-        Bytes to work in, about.
+    memory : int, optional
+        Bytes to work in, about; a quarter of what there is if not given.
     progress : callable
         Called from time to time with the fraction done, 0 to 1.
 
@@ -79,39 +83,43 @@ def inspect(
     UnsupportedVersionError
         If this program does not read its version.
     TooLargeError
-        If it has more vertices than allowed, or takes more memory and cannot be decoded by bands.
+        If it has more vertices than allowed, or takes more memory and cannot be decoded by pieces.
     UnavailableError
         If the compiled kernels are missing.
     """
     require("looking a container through")
-    walked = walk(
-        file,
-        max_vertices=max_vertices,
-        keeps=lambda header: _fits(header, memory),
-        progress=lambda part: progress(READ * part),
-    )
-    header = walked.index.header
-    if _fits(header, memory):
-        return inspect_whole(walked, progress)
-    if (reason := why_not_by_bands(header, memory)) is not None:
+    memory = default_memory() if memory is None else memory
+    walked = walk(file, max_vertices=max_vertices, progress=lambda part: progress(READ * part))
+    index, header = walked.index, walked.index.header
+    size = sum(rows * columns for (rows, columns), _ in header.blocks) * header.channels * _WHOLE_BYTES
+    if size > memory and (reason := why_not_by_pieces(header, memory)) is not None:
         raise TooLargeError(
             f"expected a surface that takes at most {memory >> 20:,} MiB to check, got one that takes about "
-            f"{_values(header) * _WHOLE >> 20:,} MiB and cannot be decoded by bands: {reason}"
+            f"{size >> 20:,} MiB and cannot be decoded by pieces: {reason}"
         )
-    return _by_bands(file, walked, memory // _PART, progress)
 
+    def read(offset: int, length: int) -> bytes:
+        file.seek(offset)
+        return file.read(length)
 
-def _values(header: Header) -> int:
-    return sum(rows * columns for (rows, columns), _ in header.blocks) * header.channels
-
-
-def _fits(header: Header, memory: int) -> bool:
-    return _values(header) * _WHOLE <= memory
+    states = list(states_of(walked)) if header.exact else []
+    check_levels(index, lambda level: _level(header, index.metadata_values, level), _MOST_POINTS)
+    decoder = PiecewiseDecoder(read, index)
+    result = _decoded(decoder, states, memory // (_PIECES_SHARE if size > memory else 1), progress)
+    check_values(index, result.holes, result.corners)
+    if index.digest is not None and result.digest != index.digest:
+        problem = f"expected values with the SHA-256 {index.digest}, got {result.digest}"
+        raise CorruptStreamError(problem, header.length)
+    if header.exact:
+        errors = _errors(decoder, result.figures, states, size <= memory)
+        check_errors(walked, errors, lambda part: progress(_MEASURED + (1 - _MEASURED) * part))
+    progress(1.0)
+    return Inspection(index, header.exact)
 
 
 @dataclass(frozen=True)
-class _Found:
-    """What decoding by bands tells: the SHA-256 of all values, holes, corners of parts, and figures if any are."""
+class _Decoded:
+    """What decoding tells: the SHA-256 of all values, holes of each block, corners of parts, and figures if any are."""
 
     digest: str
     holes: tuple[int, ...]
@@ -119,131 +127,93 @@ class _Found:
     figures: list[Figures]
 
 
-def _by_bands(file: BinaryIO, walked: Walked, memory: int, progress: Callable[[float], None]) -> Inspection:
-    def read(offset: int, length: int) -> bytes:
-        file.seek(offset)
-        return file.read(length)
-
-    index, header = walked.index, walked.index.header
-    states = list(states_of(walked)) if header.exact else []
-    check_levels(index, lambda level: _level(header, index.metadata_values, level), _MOST_POINTS)
-    decoder = decoder_by_bands(read, index)
-    if isinstance(decoder, RowsDecoder):
-        found = _of_rows(decoder, states, memory, progress)
-    else:
-        found = _of_blocks(decoder, states, memory, progress)
-    check_values(index, found.holes, found.corners)
-    if index.digest is not None and found.digest != index.digest:
-        problem = f"expected values with the SHA-256 {index.digest}, got {found.digest}"
-        raise CorruptStreamError(problem, header.length)
-    if header.exact:
-        check_errors(walked, _errors(header, found.figures, len(states)), lambda part: None)
-    progress(1.0)
-    return Inspection(index, header.exact)
-
-
-def _of_rows(
-    decoder: RowsDecoder, states: Sequence[NDArray[np.int8]], memory: int, progress: Callable[[float], None]
-) -> _Found:
-    """Decode and measure the rows of the one grid, some at a time."""
-    header, hashed = decoder.header, decoder.index.digest is not None
-    groups, passes = decoder.groups(memory), 1 + (len(header.attributes) if hashed else 0)
-    digest, holes, corners, figures = hashlib.sha256(), 0, list[NDArray[Any]](), list[Figures]()
-    for number, group in enumerate(groups, 1):
-        for rows, band in zip(group, spread(lambda rows: _band(decoder, rows, states), group), strict=True):
-            digest.update(little_endian(band.points))
-            mask = header.masks[0]
-            holes += _holes(band.points, None if mask is None else mask[slice(*rows)])
-            corners += band.corners
-            figures += band.figures
-        progress(READ + (_MEASURED - READ) * number / len(groups) / passes)
-    # An array is hashed whole before the next one, so each attribute takes another pass.
-    for attribute in range(1, passes):
-        for group in groups:
-            for values in spread(decoder.rows, group):
-                digest.update(little_endian(values.arrays[attribute]))
-        progress(READ + (_MEASURED - READ) * (attribute + 1) / passes)
-    return _Found(digest.hexdigest(), (holes,), corners, figures)
-
-
-def _holes(points: NDArray[Any], mask: NDArray[np.bool_] | None) -> int:
-    """Points that are not valid, or not finite, of some of shape (row, column, component)."""
-    count = points.shape[0] * points.shape[1]
-    if points.dtype.kind != "f":
-        return 0 if mask is None else int(count - np.count_nonzero(mask))
-    valid = np.isfinite(points[..., :3]).all(axis=2)
-    return int(count - np.count_nonzero(valid if mask is None else valid & mask))
-
-
 @dataclass(frozen=True)
-class _Band:
-    """What is kept of a band: its points, shape (row, column, component), their corners, and figures if any are."""
+class _Part:
+    """Some rows of a block, or all: points and attributes, shape (row, column, component), and which are valid."""
 
-    points: NDArray[Any]
-    corners: list[NDArray[Any]]
-    figures: list[Figures]
+    arrays: list[NDArray[Any]]
+    mask: NDArray[np.bool_] | None
+
+    @property
+    def holes(self) -> int:
+        """Points that are not valid, or not finite."""
+        points = self.arrays[0]
+        count = points.shape[0] * points.shape[1]
+        if points.dtype.kind != "f":
+            return 0 if self.mask is None else int(count - np.count_nonzero(self.mask))
+        valid = np.isfinite(points[..., :3]).all(axis=2)
+        return int(count - np.count_nonzero(valid if self.mask is None else valid & self.mask))
 
 
-def _band(decoder: RowsDecoder, rows: tuple[int, int], states: Sequence[NDArray[np.int8]]) -> _Band:
-    """Decode some rows, and measure them in these states."""
+def _decoded(
+    decoder: PiecewiseDecoder,
+    states: Sequence[NDArray[np.int8]],
+    memory: int,
+    progress: Callable[[float], None],
+) -> _Decoded:
+    """Decode all pieces, and measure them in these states."""
     header = decoder.header
-    geometry, tiles = decoder.tiles(rows)
-    arrays = decoder.values(geometry, tiles).arrays
-    mask = None if header.masks[0] is None else header.masks[0][slice(*rows)]
-    figures = []
-    if states:
-        given = RowsGiven.of(arrays[0], arrays, mask, header.geometric)
-        measurer = RowsMeasurer(given, header.lattices, header.geometric, header.predictors, geometry, tiles)
-        figures = [measurer.figures(states)]
-    return _Band(arrays[0], corners_of(arrays[0], mask), figures)
-
-
-def _of_blocks(
-    decoder: BlocksDecoder, states: Sequence[NDArray[np.int8]], memory: int, progress: Callable[[float], None]
-) -> _Found:
-    """Decode and measure some blocks at a time: runs of them by several threads, as far as there is memory for all."""
     digest, corners, figures = hashlib.sha256(), list[NDArray[Any]](), list[Figures]()
-    holes, masks = list[int](), decoder.header.masks
-    for together in _together(decoder, memory):
-        for values, own in spread(lambda blocks: _measured(decoder, blocks, states), together):
-            for block, found in values.items():
-                for array in found.arrays:
+    holes, lists = [0] * len(header.blocks), list(decoder.pieces(memory))
+    # An array is hashed whole before the next one, so of bands of rows each attribute takes another pass.
+    divided = lists[0][0].spans is not None and sum(map(len, lists)) > 1
+    passes = 1 + (len(header.attributes) if divided and decoder.index.digest is not None else 0)
+    for number, together in enumerate(lists, 1):
+        for parts, measured in spread(lambda region: _piece(decoder, region, states), together):
+            for block, part in parts.items():
+                for array in part.arrays[:1] if divided else part.arrays:
                     digest.update(little_endian(array))
-                corners += corners_of(found.arrays[0], masks[block])
-                holes.append(_holes(found.arrays[0], masks[block]))
-            figures += own
-        progress(READ + (_MEASURED - READ) * together[-1].stop / len(decoder.header.blocks))
-    return _Found(digest.hexdigest(), tuple(holes), corners, figures)
+                corners += corners_of(part.arrays[0], part.mask)
+                holes[block] += part.holes
+            figures += measured
+        progress(READ + (_MEASURED - READ) * number / len(lists) / passes)
+    for attribute in range(1, passes):
+        for together in lists:
+            for found in spread(decoder.segments.values, together):
+                digest.update(little_endian(found[0].arrays[attribute]))
+        progress(READ + (_MEASURED - READ) * (attribute + 1) / passes)
+    return _Decoded(digest.hexdigest(), tuple(holes), corners, figures)
 
 
-def _together(decoder: BlocksDecoder, memory: int) -> Iterator[list[range]]:
-    """Runs of blocks, as many at a time as there are threads and as fit into memory, but at least one."""
-    found: list[range] = []
-    taken = 0
-    for blocks in decoder.groups(memory // threads()):
-        points = sum(rows * columns for rows, columns in decoder.shapes[blocks.start : blocks.stop])
-        own = points * decoder.header.channels * BYTES
-        if found and (len(found) == threads() or taken + own > memory):
-            yield found
-            found, taken = [], 0
-        found.append(blocks)
-        taken += own
-    yield found
+def _piece(
+    decoder: PiecewiseDecoder, region: Region, states: Sequence[NDArray[np.int8]]
+) -> tuple[dict[int, _Part], list[Figures]]:
+    """Decode a piece, by block, and measure it in these states, if there are any."""
+    header, tiles = decoder.header, decoder.segments.channels(region)
+    values = decoder.segments.values_from(region, tiles)
+    figures = [_figures(header, region, tiles, values, states)] if states else []
+    rows = slice(None) if region.spans is None else slice(*region.spans[0])
+    parts = {}
+    for block, (arrays, mask) in ((block, (own.arrays, header.masks[block])) for block, own in values.items()):
+        mask = None if mask is None else mask[rows]
+        if header.plane is not None:  # never divided
+            heights = Surface(blocks=[block_of(header, arrays, header.closed, mask)])
+            arrays = [with_rules(heights, header, None, header.kept_masks[0]).points, *arrays[1:]]
+        parts[block] = _Part(arrays, mask)
+    return parts, figures
 
 
-def _measured(
-    decoder: BlocksDecoder, blocks: range, states: Sequence[NDArray[np.int8]]
-) -> tuple[dict[int, Values], list[Figures]]:
-    """Decode some blocks, and measure them in these states."""
-    header, tiles, patches = decoder.header, decoder.tiles(blocks), decoder.patches(blocks)
-    values = decoder.values(blocks, tiles)
-    if not states:
-        return values, []
-    points = {block: own.arrays[0] for block, own in values.items()}
-    arrays = {block: own.arrays for block, own in values.items()}
+def _figures(
+    header: Header,
+    region: Region,
+    tiles: Sequence[Tiles],
+    values: Mapping[int, Values],
+    states: Sequence[NDArray[np.int8]],
+) -> Figures:
+    """What a piece tells of the errors of states; ``values`` are those that it has in the end."""
+    if region.spans is not None:
+        mask = None if header.masks[0] is None else header.masks[0][slice(*region.spans[0])]
+        arrays = values[0].arrays
+        given = RowsGiven.of(arrays[0], arrays, mask, header.geometric)
+        return RowsMeasurer(given, header.lattices, header.geometric, header.predictors, region, tiles).figures(states)
+    interfaces = len(header.layout.grids) - len(header.patches)
+    patches = [grid - interfaces for grid in region.grids if grid >= interfaces]
+    every = {block: own.arrays for block, own in values.items()}
+    points = {block: arrays[0] for block, arrays in every.items()}
     coordinates = originals_of(header.arrangement, points, header.masks, patches)
-    others = other_originals(header.arrangement, arrays, header.masks, header.geometric, patches)
-    return values, [BlocksMeasurer(header, tiles, blocks, patches).figures(states, coordinates, others)]
+    others = other_originals(header.arrangement, every, header.masks, header.geometric, patches)
+    blocks = range(min(values), max(values) + 1)
+    return BlocksMeasurer(header, tiles, blocks, patches).figures(states, coordinates, others)
 
 
 def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
@@ -262,12 +232,68 @@ def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
         }
         valid = None if mask is None else np.ones(shape, np.bool_)
         blocks.append(Block(points[..., 0] if header.flat else points, closed, mask=valid, attributes=attributes))
-    return Surface(blocks=blocks, metadata=dict(metadata))
+    surface = Surface(blocks=blocks, metadata=dict(metadata))
+    if level < header.levels:
+        surface = at_level(surface, header, level)
+    if header.plane is not None:
+        values = surface.metadata
+        surface = with_rules(surface, header, None if level == header.levels else level_nodes(header, level)[0])
+        surface.metadata = values
+    return surface
 
 
-def _errors(header: Header, figures: list[Figures], states: int) -> list[Measured]:
-    """The errors of all states of the whole surface."""
-    found = [distances_of(figures, number, header.geometric, header.dtypes) for number in range(states)]
-    if any(one is None for one in found):
+def _errors(
+    decoder: PiecewiseDecoder, figures: list[Figures], states: Sequence[NDArray[np.int8]], fits: bool
+) -> list[Measured]:
+    """The errors of all states of the whole surface; ``fits``: it may be decoded in one piece.
+
+    Raises
+    ------
+    TooLargeError
+        If float64 does not hold the squares of the values, which are then looked at in one piece, and it does not fit.
+    """
+    header = decoder.header
+    found = [distances_of(figures, number, header.geometric, header.dtypes) for number in range(len(states))]
+    if None not in found:
+        return [measured for measured in found if measured is not None]
+    if not fits:
         raise TooLargeError("expected values whose squares float64 holds, in a surface this large, got others")
-    return [one for one in found if one is not None]
+    region = Region.whole(header.layout, header.levels)
+    tiles = decoder.segments.channels(region)
+    values = decoder.segments.values_from(region, tiles)
+    arrays = {block: own.arrays for block, own in values.items()}
+    every = [(originals_of(header.arrangement, {b: own[0] for b, own in arrays.items()}, header.masks), 0)]
+    every += other_originals(header.arrangement, arrays, header.masks, header.geometric) if header.channels > 1 else []
+    return [
+        measured or _exact_errors(header, region, tiles, every, state)
+        for measured, state in zip(found, states, strict=True)
+    ]
+
+
+def _exact_errors(
+    header: Header,
+    region: Region,
+    tiles: Sequence[Tiles],
+    originals: Sequence[tuple[Sequence[Original], int]],
+    state: NDArray[np.int8],
+) -> Measured:
+    """The errors of a state of the whole surface where float64 does not hold the squares of its values."""
+    patches, cells = len(header.patches), list[NDArray[np.float64]]()
+
+    def made(channel: int) -> tuple[list[NDArray[np.int32]], int]:
+        known = known_state(tiles[channel].table, state[:, channel], region.level)
+        coordinate = channel < header.geometric
+        return Reconstructor(region, header.predictors[channel], tiles[channel], coordinate).reconstruct(known)
+
+    errors = list[tuple[float, float]]()
+    for number, (given, component) in enumerate(originals):
+        last = header.geometric + number
+        channels = range(last - 1, last) if number else range(header.geometric)
+        grids = [made(channel) for channel in channels]
+        coordinates = [np.stack([of[-patches:][patch] for of, _ in grids]) for patch in range(patches)]
+        lattices = [header.lattices[channel] for channel in channels]
+        fractions = [fraction for _, fraction in grids]
+        errors += coordinate_distances(given, lattices, coordinates, fractions, component, None if number else cells)
+    distances, *each = errors
+    kinds = each if header.geometric > 1 else errors if len(errors) > 1 else []
+    return Errors(*distances, tuple(kinds)), cells

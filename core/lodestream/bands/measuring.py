@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.fields import told, told_roughly
 from ..container.model import Errors, Header
-from ..decoding.reconstruction import Values
-from ..decoding.rows import KnownState, RowsGeometry, RowsReconstructor, known_state
+from ..decoding.reconstructor import KnownState, Reconstructor, known_state
+from ..decoding.region import Region
+from ..decoding.values import Values
 from ..encoding.prepared import Prepared
 from ..encoding.residual_encoder import ChunkCoder
 from ..entropy.tiles import Tiles
@@ -95,10 +96,10 @@ class RowsMeasurer:
     geometric : int
         Channels that are coordinates.
     predictors : int8, shape (channel, level, axis, 2)
-    geometry : RowsGeometry
-        Of the rows, the first of which is a multiple of `PART_ROWS`.
+    region : Region
+        The rows, the first of which is a multiple of `PART_ROWS`.
     tiles : sequence of Tiles, one for each channel
-        Of the geometry's tiles, see `RowsReconstructor`.
+        Of the region's tiles, see `Reconstructor`.
     """
 
     def __init__(
@@ -107,14 +108,13 @@ class RowsMeasurer:
         lattices: Sequence[Lattice],
         geometric: int,
         predictors: NDArray[np.int8],
-        geometry: RowsGeometry,
+        region: Region,
         tiles: Sequence[Tiles],
     ) -> None:
         self._given, self._lattices, self._geometric = given, lattices, geometric
-        self._predictors, self._geometry, self._tiles = predictors, geometry, tiles
-        (first, last), layout = geometry.rows, geometry.layout
-        self._core = min(geometry.core, window_core(layout))
-        self._shape = last - first, layout.shape(0, layout.levels)[1]
+        self._predictors, self._region, self._tiles = predictors, region, tiles
+        self._core = min(region.core, window_core(region.layout))
+        (self._shape,) = region.shapes
 
     def figures(self, states: Sequence[NDArray[np.int8]]) -> Figures:
         """What the rows tell of the errors of states, int8, shape (tile, channel) each."""
@@ -141,8 +141,7 @@ class RowsMeasurer:
     def _known(self, state: NDArray[np.int8]) -> list[KnownState]:
         """A state, int8, shape (tile, channel), as far as each channel's tiles are concerned."""
         return [
-            known_state(tiles.table, np.ascontiguousarray(state[:, channel]))
-            for channel, tiles in enumerate(self._tiles)
+            known_state(tiles.table, state[:, channel], self._region.level) for channel, tiles in enumerate(self._tiles)
         ]
 
     def _windows(self) -> list[tuple[Span, Span]]:
@@ -151,7 +150,7 @@ class RowsMeasurer:
         down = min(rows, _WINDOW_ROWS)
         points = min(_WINDOW_POINTS, rows * columns // 2)
         across = PART_COLUMNS * max(1, points // (PART_COLUMNS * down))
-        if self._geometry.layout.grids[0].closed[1]:
+        if self._region.layout.grids[0].closed[1]:
             across = columns  # each would be made of all of them
         return [
             ((top, min(top + down, rows)), (left, min(left + across, columns)))
@@ -162,14 +161,14 @@ class RowsMeasurer:
     def _window(self, window: tuple[Span, Span]) -> WindowMeasurer:
         return WindowMeasurer(self._given.window(*window), self._lattices, self._geometric, self._made(window))
 
-    def _made(self, window: tuple[Span, Span]) -> list[RowsReconstructor]:
+    def _made(self, window: tuple[Span, Span]) -> list[Reconstructor]:
         """What reconstructs a window, of each channel."""
         (top, bottom), columns = window
-        first, layout = self._geometry.rows[0], self._geometry.layout
-        geometry = RowsGeometry(layout, (first + top, first + bottom), self._core, columns)
-        return [
-            RowsReconstructor(geometry, own, tiles) for own, tiles in zip(self._predictors, self._tiles, strict=True)
-        ]
+        whole = self._region
+        assert whole.spans is not None
+        first = whole.spans[0][0]
+        region = Region.window(whole.layout, whole.level, (first + top, first + bottom), columns, self._core)
+        return [Reconstructor(region, own, tiles) for own, tiles in zip(self._predictors, self._tiles, strict=True)]
 
     def values(self, state: NDArray[np.int8], kinds: Sequence[tuple[int, np.dtype[Any]]]) -> Values:
         """The rows of all channels in a state, int8, shape (tile, channel), as `to_values` makes them of a block.
@@ -183,9 +182,9 @@ class RowsMeasurer:
             channel, made = 0, self._made(window)
             for array, (components, dtype) in zip(arrays, kinds, strict=True):
                 for component in range(components):
-                    coordinates = made[channel].reconstruct(known[channel])
-                    values = np.empty(coordinates[0].shape, dtype)
-                    store_values(self._lattices[channel], coordinates, values[..., None], 0)
+                    (coordinates,), fraction = made[channel].reconstruct(known[channel])
+                    values = np.empty(coordinates.shape, dtype)
+                    store_values(self._lattices[channel], (coordinates, fraction), values[..., None], 0)
                     array[slice(*window[0]), slice(*window[1]), component] = values
                     channel += 1
 

@@ -9,7 +9,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from ..decoding.rows import RowsGeometry
+from ..decoding.region import Region
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
 from ..entropy.part_table import part_of
 from ..scratch import Room, Scratch
@@ -153,12 +153,13 @@ def measure(folder: str, number: int) -> None:
 def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
     """What measures these rows."""
     layout, predictors = build.prepared.layout, build.scratch.read("predictors")
-    geometry = RowsGeometry(layout, rows, min(_bands(build).core, window_core(layout)))
-    part = part_of(build.table(0), geometry.tiles)
+    columns = 0, layout.shape(0, layout.levels)[1]
+    region = Region.window(layout, layout.levels, rows, columns, min(_bands(build).core, window_core(layout)))
+    part = part_of(build.table(0), region.tiles)
     channels = [known_tiles(build, part, channel) for channel in range(build.channels)]
     prepared = build.prepared
     given, lattices = RowsGiven.prepared(prepared, rows), build.lattices.channels
-    return RowsMeasurer(given, lattices, prepared.geometric, np.array(predictors), geometry, channels)
+    return RowsMeasurer(given, lattices, prepared.geometric, np.array(predictors), region, channels)
 
 
 def _bands(build: Build) -> Bands:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..decoding.rows import KnownState, RowsReconstructor
+from ..decoding.reconstructor import KnownState, Reconstructor
 from ..encoding.holes import given_arrays
 from ..encoding.prepared import Prepared
 from ..grid.layout import Layout
@@ -99,11 +99,11 @@ class WindowMeasurer:
         Of the window.
     lattices, geometric
         As of `RowsMeasurer`.
-    channels : list of RowsReconstructor
+    channels : list of Reconstructor
     """
 
     def __init__(
-        self, given: RowsGiven, lattices: Sequence[Lattice], geometric: int, channels: list[RowsReconstructor]
+        self, given: RowsGiven, lattices: Sequence[Lattice], geometric: int, channels: list[Reconstructor]
     ) -> None:
         self._given, self._lattices, self._geometric, self._channels = given, lattices, geometric, channels
         #: Of the coordinates, then of each other channel: figures in the state before, and whether all is equal.

@@ -20,7 +20,6 @@ from functools import cached_property
 from pathlib import Path
 
 from ..errors import TooLargeError
-from ..library import why_missing
 
 __all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "memory_limit"]
 
@@ -31,9 +30,7 @@ BYTES_PER_VERTEX = 128
 _LEAST = 16 * 1024 * 1024
 
 # Of the memory that this process can have: the surface takes as much, and what is read of its container as well.
-# Plain Python takes up to five times as much for a surface as the compiled kernels, for which this counts.
 _SHARE = 0.4
-_PLAIN_SHARE = 0.08
 
 _COEFFICIENT, _RECONSTRUCTION, _MASKS, _TABLE = 7, 16, 4, 2048
 _EDGE = 12  # rows or columns
@@ -54,14 +51,13 @@ class Capacity:
 
     def __init__(self, max_vertices: int | None = None) -> None:
         self.max_vertices = max_vertices
-        self._share = _SHARE if why_missing() is None else _PLAIN_SHARE
         self._read = 0
 
     @cached_property
     def bytes(self) -> int:
         """Bytes allowed for the surface, and again for what is read; at least `_LEAST`."""
         if self.max_vertices is None:
-            return max(int(memory_limit() * self._share), _LEAST)
+            return max(int(memory_limit() * _SHARE), _LEAST)
         return _LEAST + self.max_vertices * BYTES_PER_VERTEX
 
     def promise(self, vertices: int, grids: Iterable[Extent], *, masked: int, tables: int) -> None:
@@ -115,7 +111,7 @@ class Capacity:
     def _words(self) -> str:
         if self.max_vertices is not None:
             return f"max_vertices={self.max_vertices}, at {BYTES_PER_VERTEX} bytes each"
-        return f"{self._share:.0%} of the available memory"
+        return f"{_SHARE:.0%} of the available memory"
 
 
 def memory_limit() -> int:

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grid.window import samples
+from ..grid.window import samples, spans
 from ..target import Region
 from .model import Header
 
-__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel", "chunks_touched", "first_chunks"]
+__all__ = ["ChunkPlace", "chunk_places", "chunks_of_a_channel", "chunks_touched", "chunks_within", "first_chunks"]
 
 
 class ChunkPlace(NamedTuple):
@@ -75,6 +75,38 @@ def first_chunks(header: Header) -> list[int]:
         kinds = 2 if header.kept and header.kept[block] else 1
         ends.append(ends[-1] + kinds * -(-rows // height) * -(-columns // width) * header.channels)
     return ends
+
+
+def chunks_within(
+    header: Header, block: int, first: int, window: tuple[tuple[int, int], tuple[int, int]]
+) -> Iterator[tuple[int, ChunkPlace]]:
+    """The chunks that a window of a block has, in the order of the file, each with its number in the section.
+
+    Parameters
+    ----------
+    header : Header
+    block : int
+    first : int
+        The number of the block's first chunk, see `first_chunks`.
+    window : ((int, int), (int, int))
+        Rows and columns, half-open, made of whole chunks; along a closed axis they may go on across the seam.
+    """
+    shape = header.blocks[block][0]
+    counts = [-(-length >> exponent) for length, exponent in zip(shape, header.chunk, strict=True)]
+    indices = [
+        sorted({index for start, stop in spans(span, length) for index in range(start >> e, -(-stop >> e))})
+        for span, length, e in zip(window, shape, header.chunk, strict=True)
+    ]
+    for kept in (False, True) if header.kept and header.kept[block] else (False,):
+        for down in indices[0]:
+            for across in indices[1]:
+                rows, columns = (
+                    (index << e, min(index + 1 << e, length))
+                    for index, e, length in zip((down, across), header.chunk, shape, strict=True)
+                )
+                number = first + ((kept * counts[0] + down) * counts[1] + across) * header.channels
+                for channel in range(header.channels):
+                    yield number + channel, ChunkPlace(channel, block, rows, columns, kept)
 
 
 def chunks_of_a_channel(header: Header) -> int:

@@ -18,12 +18,13 @@ from ..container.reader import INDEX_GROWTH, index_from, index_of, read_metadata
 from ..container.slices import Slices, State
 from ..entropy.dequantize import UNANNOUNCED
 from ..errors import CorruptStreamError, InputError, TruncatedStreamError
-from ..library import why_missing
+from ..library import require
 from ..planning.selection import Selection, select, selection_of
 from ..surface import Surface
 from ..target import Region, Target
 from .batches import Coded
-from .reconstruction import Progress, Reconstruction
+from .progress import Progress
+from .segments import SegmentQueue
 from .view import Ending, View
 from .window_state import WindowState
 
@@ -59,6 +60,8 @@ class Decoder:
 
     Raises
     ------
+    UnavailableError
+        If the compiled kernels are missing.
     TooLargeError
         From methods that take bytes: if the header announces a surface that needs more memory than allowed, or if there
         are more bytes than such a surface can have.
@@ -83,6 +86,7 @@ class Decoder:
         max_vertices: int | None = None,
         level: int | None = None,
     ) -> None:
+        require("decoding")
         if isinstance(selection, Target):
             level = selection.level if level is None else level
             selection = selection_of(selection)
@@ -298,7 +302,7 @@ class Decoder:
         region = self._selection.region
         self._window = None if region is None else WindowState(header, region)
         self._progress = Progress(header)
-        self._reconstruction = _reconstruction(header)
+        self._queue = SegmentQueue(header)
         self._level = 0
 
     def _take_masks(self, frame: Frame, header: Header) -> None:
@@ -316,7 +320,7 @@ class Decoder:
         segments = self._progress.advance_all(entries, frame.payload, start, frame.payload_offset)
         finest = entries[-1].tile if entries else 0  # tiles stand by level
         self._level = max(self._level, header.layout.level_of(finest))
-        self._reconstruction.add(segments)
+        self._queue.add(segments)
         last = number + 1 == header.layer_count
         complete = last and not header.corrected
         figures = errors.rms, errors.maximum
@@ -327,7 +331,7 @@ class Decoder:
             raise CorruptStreamError("expected layers, got residual", frame.offset)
         errors, chunks = sections.parse_chunks(frame.payload, frame.payload_offset, header)
         for number, chunk in enumerate(chunks):
-            self._reconstruction.correct(number, *chunk)
+            self._queue.add_chunk(number, *chunk)
         number, figures = len(self.layers), (errors.rms, errors.maximum)
         self._show(State(number, header.levels, frame.end, *figures, True, True, channels=errors.channels))
 
@@ -347,7 +351,7 @@ class Decoder:
             If they are damaged; what came before the residual stays.
         """
         header = self.header
-        if header is None or not (self.complete and header.corrected) or self._reconstruction.dropped:
+        if header is None or not (self.complete and header.corrected) or self._queue.dropped:
             return
         if self._finest is None or self._finest >= header.levels:
             try:
@@ -359,7 +363,7 @@ class Decoder:
     def _show(self, made: State) -> None:
         corrected = made.complete and self.header is not None and self.header.corrected
         window = self._window
-        length, state = self._reconstruction.length, self._progress.snapshot(made.all_layers)
+        length, state = self._queue.length, self._progress.snapshot(made.all_layers)
         self.capacity.take(state.nbytes)
         if self.header is not None and made.whole_level >= 0:
             # The index says that there is nothing more of these levels.
@@ -377,7 +381,7 @@ class Decoder:
             made.bytes,
             *figures,
             made.complete,
-            self._reconstruction,
+            self._queue,
             length,
             state,
             corrected,
@@ -447,27 +451,19 @@ class Decoder:
             if sections.check_of(payload) != item.check:
                 raise CorruptStreamError("expected a segment or chunk to match its CRC, got other bytes", place)
             if isinstance(item, Chunk):
-                self._reconstruction.correct(self._slices.number(item), payload, place)
+                self._queue.add_chunk(self._slices.number(item), payload, place)
                 state = self._slices.hold_chunk(item)
             else:
                 known = bool(self._progress.top[item.tile, item.channel])
                 top = 0 if known else item.top
                 first = self._progress.advance(item.tile, item.channel, top, item.passes, place)
-                self._reconstruction.add([Coded(item.tile, item.channel, first, item.passes, payload, place)])
+                self._queue.add([Coded(item.tile, item.channel, first, item.passes, payload, place)])
                 state = self._slices.hold(item)
             if state is not None:
                 self._show(state)
         frame = self._slices.metadata()
         if frame is not None:
             self._take_metadata(sections.parse_metadata(frame.payload, frame.payload_offset))
-
-
-def _reconstruction(header: Header) -> Reconstruction:
-    if why_missing() is None:
-        return Reconstruction(header)
-    from .fallback import PlainReconstruction
-
-    return PlainReconstruction(header)
 
 
 def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | None = None) -> Surface:

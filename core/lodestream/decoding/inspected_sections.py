@@ -32,7 +32,7 @@ class Walked:
     Attributes
     ----------
     decoder : Decoder
-        With a view for each layer. It has the bytes of the segments only if they were to be kept.
+        With a view for each layer, of which no values are made: it does not keep the bytes of segments.
     index : Index
     windows : WindowErrors or None
         Errors of windows that stand in it.
@@ -58,9 +58,7 @@ class _Found:
     tops: dict[tuple[int, int], int] = field(default_factory=dict)  # of tiles and channels that have been named
 
 
-def walk(
-    file: BinaryIO, *, max_vertices: int, keeps: Callable[[Header], bool], progress: Callable[[float], None]
-) -> Walked:
+def walk(file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None]) -> Walked:
     """Read all sections, check them against each other and the index, and decode no value.
 
     Parameters
@@ -69,8 +67,6 @@ def walk(
         The container and nothing else; seekable.
     max_vertices : int
         Larger surfaces are refused.
-    keeps : callable
-        Whether segments of a container with this header stay in memory, to be decoded.
     progress : callable
         Called with the fraction of the file that was read.
 
@@ -89,7 +85,6 @@ def walk(
     # Its header is held to the number of vertices below; how much memory it may take is for the caller to limit.
     decoder, found = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()
     decoder.feed(_start(file, size))
-    kept = True
     for kind, place in _sections(file, size):
         if _passes(kind, place, size):
             # The decoder checks it as it passes.
@@ -103,12 +98,11 @@ def walk(
         if kind == sections.HEADER and decoder.header is None:
             header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
             _check_size(header, max_vertices)
-            kept = keeps(header)
         decoder.feed(data)
         assert decoder.header is not None  # the decoder takes nothing else first
         _note(found, frame, decoder.header)
-        if not kept and decoder.layers:
-            decoder.layers[-1]._reconstruction.drop()
+        if decoder.layers:
+            decoder.layers[-1]._queue.drop()
         progress(place.end / size)
     decoder.finish()
     assert decoder.index is not None  # the last section

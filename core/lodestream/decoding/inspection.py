@@ -1,31 +1,27 @@
-"""Checking a container from an untrusted source: every section, the index, every value, and the recorded errors."""
+"""What is held against a container from an untrusted source: values, levels, and the recorded errors."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..container.fields import told, told_roughly
-from ..container.model import Errors, Header, Index, LayerRecord
+from ..container.model import Errors, Index, LayerRecord
 from ..coordinates.height_fields import to_xyz
 from ..coordinates.seams import restore
 from ..errors import CorruptStreamError, InputError
-from ..library import require
 from ..planning.window_errors import CELL, WindowErrors, layer_codes
-from ..quantization.distortion import Original, coordinate_distances, originals_of, other_originals
-from ..quantization.lattice import Lattice
 from ..quantization.measure import extent_of
 from ..surface import Surface
-from .inspected_sections import Walked, walk
-from .reconstruction import Coordinates, Reconstruction, initial_state
+from .inspected_sections import Walked
+from .progress import initial_state
 
 __all__ = [
-    "DECODED",
     "READ",
     "Inspection",
     "Measured",
@@ -33,8 +29,6 @@ __all__ = [
     "check_levels",
     "check_values",
     "corners_of",
-    "inspect",
-    "inspect_whole",
     "states_of",
 ]
 
@@ -42,8 +36,8 @@ __all__ = [
 #: are decoded; but who adds up as many squares as a surface may have points in another order finds another last digit.
 _TOLERANCE = 1e-9
 
-#: How much is done when all sections are read, and when the complete surface is decoded.
-READ, DECODED = 0.2, 0.4
+#: How much is done when all sections are read.
+READ = 0.2
 
 #: What the functions that put a surface back where its metadata say may raise when these say something else.
 _UNUSABLE = (InputError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, RecursionError)
@@ -67,61 +61,6 @@ class Inspection:
 
 #: Errors of a state, and the squared distances in cells, one array or none; see `coordinate_distances`.
 Measured = tuple[Errors, list[NDArray[np.float64]]]
-
-
-def inspect(
-    file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None] = lambda fraction: None
-) -> Inspection:
-    """Check a whole container, and decode it once.
-
-    Nothing is decoded before the header has announced the number of vertices. For an exact container each layer and
-    level is decoded and compared with the complete surface, which takes about as long as measuring them did in the
-    encoder.
-
-    Parameters
-    ----------
-    file : binary file
-        The container and nothing else; seekable.
-    max_vertices : int
-        Larger surfaces are refused.
-    progress : callable
-        Called from time to time with the fraction done, 0 to 1.
-
-    Raises
-    ------
-    CorruptStreamError
-        If it is damaged, contradicts itself, or is followed by more bytes; with the offset.
-    TruncatedStreamError
-        If it is cut short; the message names the offset.
-    UnsupportedVersionError
-        If this program does not read its version.
-    TooLargeError
-        If it has more vertices than allowed.
-    UnavailableError
-        If the compiled kernels are missing.
-    """
-    require("looking a container through")
-    walked = walk(
-        file, max_vertices=max_vertices, keeps=lambda header: True, progress=lambda part: progress(READ * part)
-    )
-    return inspect_whole(walked, progress)
-
-
-def inspect_whole(walked: Walked, progress: Callable[[float], None]) -> Inspection:
-    """What `inspect` does once the sections are read, and their segments kept."""
-    decoder, index = walked.decoder, walked.index
-    surface = decoder.surface()
-    corners = [
-        corner for block in surface.blocks for corner in corners_of(block.points.reshape(*block.shape, -1), block.mask)
-    ]
-    check_values(index, tuple(block.holes for block in surface.blocks), corners)
-    progress(DECODED)
-    check_levels(index, lambda level: decoder.surface(level) if level < index.header.levels else surface)
-    if index.header.exact:
-        ruler = _Ruler(index.header, decoder.view()._reconstruction, surface)
-        check_errors(walked, (ruler.measured(state) for state in states_of(walked)), progress)
-    progress(1.0)
-    return Inspection(index, index.header.exact)
 
 
 def check_values(index: Index, holes: tuple[int, ...], corners: Sequence[NDArray[Any]]) -> None:
@@ -222,7 +161,7 @@ def check_errors(walked: Walked, found: Iterable[Measured], progress: Callable[[
     found : iterable of (Errors, list)
         What was measured of each of `states_of`.
     progress : callable
-        Called with the fraction done, of the whole inspection.
+        Called with the fraction done.
 
     Raises
     ------
@@ -238,7 +177,7 @@ def check_errors(walked: Walked, found: Iterable[Measured], progress: Callable[[
         _agree(errors, measured, name, offset)
         if record is not None and windows is not None and index.header.arrangement is None and cells:
             _bound(windows, cells[0], record)
-        progress(DECODED + (1 - DECODED) * number / len(names))
+        progress(number / len(names))
     nothing = Errors(0.0, 0.0, ((0.0, 0.0),) * len(index.levels[-1].channels))
     _agree(index.levels[-1].errors, nothing, "the exact surface", index.index.offset)
 
@@ -262,50 +201,3 @@ def _bound(windows: WindowErrors, cells: NDArray[np.float64], layer: LayerRecord
         raise CorruptStreamError(
             f"expected bounds of the errors of windows in layer {layer.number}, got smaller ones", 0
         )
-
-
-class _Ruler:
-    """Measures reconstructions as the encoder does: on lattice coordinates, each vertex once, holes left out."""
-
-    def __init__(self, header: Header, reconstruction: Reconstruction, surface: Surface) -> None:
-        self._header, self._reconstruction = header, reconstruction
-        arrays: list[list[NDArray[Any]]] = []  # points and attributes, of each block
-        for block in surface.blocks:
-            heights = block.points[..., 2] if header.plane is not None else block.points
-            every = (heights, *block.attributes.values())
-            arrays.append([np.ascontiguousarray(a if a.ndim == 3 else a[..., np.newaxis]) for a in every])
-        masks = [block.mask for block in surface.blocks]
-        self._originals = originals_of(header.arrangement, [own[0] for own in arrays], masks)
-        self._others = other_originals(header.arrangement, arrays, masks, header.geometric)
-
-    def measured(self, state: NDArray[np.int8]) -> Measured:
-        """Errors of a state at full resolution, the residual aside, and its cells."""
-        header, known = self._header, self._reconstruction
-        cells: list[NDArray[np.float64]] = []
-
-        def reconstruction(channel: int) -> Coordinates:
-            return known.reconstruction(known.length, state, header.levels, channel)
-
-        reconstructions = [reconstruction(channel) for channel in range(header.geometric)]
-        lattices = header.lattices[: header.geometric]
-        distances, *found = self._compared(self._originals, lattices, reconstructions, cells=cells)
-        if header.channels > 1:
-            found = found or [distances]
-            for number, (originals, component) in enumerate(self._others, header.geometric):
-                own = header.lattices[number : number + 1]
-                found += self._compared(originals, own, [reconstruction(number)], component)
-        return Errors(*distances, tuple(found)), cells
-
-    def _compared(
-        self,
-        originals: list[Original],
-        lattices: Sequence[Lattice],
-        reconstructions: list[Coordinates],
-        component: int = 0,
-        cells: list[NDArray[np.float64]] | None = None,
-    ) -> list[tuple[float, float]]:
-        interfaces = len(self._header.layout.grids) - len(self._header.patches)
-        patches = range(len(self._header.patches))
-        coordinates = [np.stack([grids[interfaces + k] for grids, _ in reconstructions]) for k in patches]
-        fractions = [fraction for _, fraction in reconstructions]
-        return coordinate_distances(originals, lattices, coordinates, fractions, component, cells)

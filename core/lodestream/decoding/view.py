@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,16 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.digest import values_digest
-from ..coordinates.height_fields import grid_at, to_xyz
 from ..errors import CorruptStreamError, InputError, OptionError
 from ..grid.patches import level_masks
-from ..grid.window import contains, places, taken
+from ..grid.window import contains, places, taken, within
 from ..joints import Nodes
-from ..planning.selection import Selection
-from ..surface import Block, Closed, Surface, finite_block
-from ..target import Region
-from .level_grids import level_nodes, level_positions
-from .reconstruction import Reconstruction, Values
+from ..planning.selection import Selection, restored
+from ..surface import Block, Closed, Surface
+from ..target import Region as Window
+from .level_grids import level_nodes, level_positions, with_rules
+from .region import Region
+from .segments import SegmentQueue
+from .values import Values, block_of
 from .window_metadata import window_closed, window_metadata
 
 __all__ = ["Ending", "View"]
@@ -86,7 +87,7 @@ class View:
     max_error: float
     bound: bool
     complete: bool
-    _reconstruction: Reconstruction = field(repr=False, compare=False)
+    _queue: SegmentQueue = field(repr=False, compare=False)
     _length: int = field(repr=False, compare=False)
     _state: NDArray[np.int8] = field(repr=False, compare=False)
     _corrected: bool = field(repr=False, compare=False)
@@ -104,7 +105,7 @@ class View:
         InputError
             If there are several blocks; use `surface`.
         """
-        return self._shown(self._reconstruction.header.levels).points
+        return self._shown(self._queue.header.levels).points
 
     def prepare(self) -> None:
         """Decode what has come until here, so that the points of this view or a later one are made sooner.
@@ -113,7 +114,7 @@ class View:
         more slowly than it decodes, calls it for each view that it does not show: at the end the last layers alone are
         left. All is decoded once, whenever that is.
         """
-        self._reconstruction.prepare(self._length)
+        self._queue.prepare(self._length)
 
     def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
         """The grid of a coarser level, an array with that level's shape.
@@ -138,7 +139,7 @@ class View:
             raise OptionError(f"expected a block of 0 to {len(surface.blocks) - 1}, got {block}")
         return surface.blocks[block].points
 
-    def window(self, region: Region) -> Surface:
+    def window(self, region: Window) -> Surface:
         """The points of a window at full resolution; costs time and memory for the window only.
 
         Heights whose values lie on a lattice (integers, decimals) are exact in the window as soon as the data that it
@@ -155,7 +156,7 @@ class View:
         OptionError
             If the region is outside the surface, the surface has several blocks, or the view holds another region only.
         """
-        header, shown = self._reconstruction.header, self._selection.region
+        header, shown = self._queue.header, self._selection.region
         selection = Selection(region, self._selection.attributes)
         selection.check(header)
         if shown is not None and not contains(shown, region, header.shape):
@@ -182,7 +183,7 @@ class View:
         CorruptStreamError
             If the SHA-256 of the complete surface is wrong, or no value is finite.
         """
-        header = self._reconstruction.header
+        header = self._queue.header
         shown = header.levels if level is None else level
         surface = self._shown(shown, metadata)
         whole = shown == header.levels and self._selection.region is None
@@ -191,7 +192,7 @@ class View:
 
     def _shown(self, level: int, metadata: Mapping[str, Any] | None = None) -> Surface:
         """`surface`, but for which of its points are one: who asks for points alone need not wait for that."""
-        header, region = self._reconstruction.header, self._selection.region
+        header, region = self._queue.header, self._selection.region
         if not 0 <= level <= header.levels:
             raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
         if region is not None and level != header.levels:
@@ -217,7 +218,7 @@ class View:
             If a chunk of the residual does not hold what it should, or the SHA-256 is wrong.
         """
         try:
-            surface = self._shown(self._reconstruction.header.levels)
+            surface = self._shown(self._queue.header.levels)
         except InputError:
             return  # nothing of this window is valid, which is no damage
         self._ending.verified.append((self._selection, surface))
@@ -236,7 +237,7 @@ class View:
         """What a notebook shows: a small picture, sizes and errors."""
         from ..interop.html import SMALL, view_html
 
-        header, region = self._reconstruction.header, self._selection.region
+        header, region = self._queue.header, self._selection.region
         if region is not None:
             (top, bottom), (left, right) = region
             return view_html(self, self.surface(), [(bottom - top, right - left)])
@@ -247,37 +248,31 @@ class View:
 
     def _blocks(self, level: int) -> list[Block]:
         """All blocks at a level, or the window of the only one; of heights that came with x and y, heights alone."""
-        header, region = self._reconstruction.header, self._selection.region
-        chosen = self._selection.channels(header)
-        if region is None:
-            corrected = self._corrected and level == header.levels
-            grids = self._reconstruction.blocks(self._length, self._state, level, corrected, chosen)
-            masks = level_masks(header.patches, header.layout, level, header.masks)
-            closures: tuple[Closed, ...] = tuple(closed for _, closed in header.blocks)
-        else:
-            grids, masks = [self._window(region, chosen)], [header.masks[0]]
-            if masks[0] is not None:
-                masks = [taken(masks[0], region, header.shape)]
-            closures = (window_closed(header.closed, header.shape, region),)
-        return [self._block(*of) for of in zip(grids, masks, closures, strict=True)]
+        queue, window = self._queue, self._selection.region
+        header, chosen = queue.header, self._selection.channels(queue.header)
+        corrected = self._corrected and level == header.levels
+        masks = level_masks(header.patches, header.layout, level, header.masks)
+        closures: list[Closed] = [closed for _, closed in header.blocks]
+        region = Region.whole(header.layout, level)
+        if window is not None and header.arrangement is None:
+            region = Region.window(header.layout, level, *restored(header, window))
+        # Of a block that meets itself all is made: what its sides share may lie anywhere in it.
+        values = queue.values(self._length, self._state, region, corrected, chosen)
+        if window is not None:
+            around = region.spans or ((0, header.shape[0]), (0, header.shape[1]))
+            values = {0: Values([within(array, around, window, header.shape) for array in values[0].arrays])}
+            masks = [None if mask is None else taken(mask, window, header.shape) for mask in masks]
+            closures = [window_closed(header.closed, header.shape, window)]
+        return [self._block(values[number].arrays, *of) for number, of in enumerate(zip(closures, masks, strict=True))]
 
-    def _block(self, grid: Values, mask: NDArray[np.bool_] | None, closed: Closed) -> Block:
-        """One block: ``grid`` are its points and attributes, (row, column, component) each; ``mask``, (row, column)."""
-        header, selection = self._reconstruction.header, self._selection
-        points, *attributes = grid.arrays
-        named = {
-            kind.name: array if kind.components else array[..., 0]
-            for kind, array in zip(header.attributes, attributes, strict=True)
-            if selection.attributes is None or kind.name in selection.attributes
-        }
+    def _block(self, arrays: Sequence[NDArray[Any]], closed: Closed, mask: NDArray[np.bool_] | None) -> Block:
+        """One block of its points and attributes, shape (row, column, component) each; ``mask``, (row, column)."""
+        header, selection = self._queue.header, self._selection
         if mask is not None and selection.region is None and not mask.any():
-            mask = None  # no node of so coarse a level is valid: it shows what stands under the holes
-        points = points[..., 0] if header.flat else points
+            mask = None  # no node of so coarse a level is valid: the values under the holes are shown
         finite = selection.region is None and not self._corrected and all(own.finite for own in header.lattices)
         try:
-            if finite:
-                return finite_block(points, closed, mask, named)
-            return Block(points, closed, mask=mask, attributes=named)
+            return block_of(header, arrays, closed, mask, selection.attributes, finite)
         except InputError as error:
             if selection.region is not None:
                 raise  # nothing of this window is valid
@@ -285,23 +280,17 @@ class View:
 
     def _positioned(self, surface: Surface, values: dict[str, Any], level: int) -> tuple[Surface, dict[str, Any]]:
         """The surface with the x and y that its heights came with, and the metadata of its level or window."""
-        header, region = self._reconstruction.header, self._selection.region
+        header, region = self._queue.header, self._selection.region
         finest = level == header.levels
         if not finest and len(surface.blocks) == 1 and header.point_channels == 1:
             values = level_positions(values, header, level)
-        if header.plane is not None:
-            rules, whole = header.plane["grid"], finest and region is None
-            shown = {"grid": rules} if whole else grid_at(rules, header.shape, self._nodes(level)[0])
-            surface.metadata.update(shown)
-            try:
-                surface = to_xyz(surface, self._kept(finest))
-            except InputError as error:
-                raise CorruptStreamError(f"expected rules of x and y: {error}", header.length) from None
+        whole = finest and region is None
+        surface = with_rules(surface, header, None if whole else self._nodes(level)[0], self._kept(finest))
         return surface, values if region is None else window_metadata(values, header.shape, region)
 
     def _check_digest(self, surface: Surface, level: int) -> None:
         """Hold the values to the SHA-256 that came with them, where this is the complete surface and it is exact."""
-        header, selection = self._reconstruction.header, self._selection
+        header, selection = self._queue.header, self._selection
         promised = self._ending.promised
         if promised is None or not self.complete or not header.exact or level != header.levels:
             return
@@ -313,7 +302,7 @@ class View:
 
     def _nodes(self, level: int) -> list[Nodes]:
         """Which rows and columns of each block are shown at a level, or in the window."""
-        header, region = self._reconstruction.header, self._selection.region
+        header, region = self._queue.header, self._selection.region
         if region is not None:
             rows, columns = map(places, region, header.shape)
             return [(rows, columns)]
@@ -323,15 +312,6 @@ class View:
         """Which holes of the only block have values."""
         if not (finest and self._corrected):
             return None
-        header, region = self._reconstruction.header, self._selection.region
+        header, region = self._queue.header, self._selection.region
         kept = header.kept_masks[0]
         return kept if kept is None or region is None else taken(kept, region, header.shape)
-
-    def _window(self, region: Region, chosen: NDArray[np.bool_]) -> Values:
-        """Points and attributes of a window of the only block."""
-        header, known = self._reconstruction.header, (self._length, self._state)
-        if header.arrangement is not None:
-            # A block that meets itself: what its sides share may lie anywhere in it.
-            whole = self._reconstruction.blocks(*known, header.levels, self._corrected, chosen)[0]
-            return Values([taken(array, region, header.shape) for array in whole.arrays])
-        return self._reconstruction.window(*known, region, self._corrected, chosen)

@@ -19,7 +19,7 @@ from ..entropy.dequantize import UNANNOUNCED
 from ..planning.selection import Selection
 from ..planning.window_errors import KIND, WindowFigures, parse_window_errors, window_section
 from ..target import Region
-from .reconstruction import initial_state
+from .progress import initial_state
 
 __all__ = ["WindowState"]
 

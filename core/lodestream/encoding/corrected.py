@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ..container.model import Errors, Header
-from ..decoding.reconstruction import to_values
 from .measured import Measured
 from .residual_encoder import chunk_size, encode_chunks
 
@@ -43,10 +42,9 @@ def correct(measured: Measured) -> Corrected:
     It is a stage of its own since the coefficients, which take as much as all values, are of no use to it.
     """
     prepared, header = measured.quantized.prepared, measured.header
-    restored = to_values(header, measured.last, prepared.layout.levels)
-    chunk = chunk_size(prepared, header, restored, measured.coefficient_bytes)
+    chunk = chunk_size(prepared, header, measured.last, measured.coefficient_bytes)
     header = replace(header, chunk=chunk)
-    chunks, exact = encode_chunks(prepared, header, restored)
+    chunks, exact = encode_chunks(prepared, header, measured.last)
     last = remaining_errors(measured.layers[-1].errors, exact, prepared.geometric)
     kept = replace(measured, last=())
     return Corrected(kept, header, (*measured.levels, last), tuple(chunks), tuple(exact))

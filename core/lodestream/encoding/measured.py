@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from ..container.fields import told, told_roughly
 from ..container.model import Errors, Header
-from ..decoding.reconstruction import Coordinates, initial_state, reconstruct_channel
+from ..decoding.progress import initial_state
+from ..decoding.region import Region
+from ..decoding.values import Values, values_of
 from ..entropy.tile_coder import Strings
 from ..parallel import spread, threads
 from ..planning.window_errors import is_divided, layer_codes, no_errors
 from ..quantization.distortion import coordinate_distances
-from ..transform.pyramid import PADDING
 from .allocated import Allocated, State
 from .quantized import Quantized
 from .states import StateReconstructor
@@ -64,8 +65,8 @@ class Measured:
     layers : tuple of MeasuredLayer
     levels : tuple of Errors
         Of the states that hold all levels up to one, but for the last level.
-    last : tuple of Coordinates, one for each channel
-        What a receiver has reconstructed after the last layer.
+    last : tuple of Values, one for each block
+        What a receiver has after the last layer.
     coefficient_bytes : float
         See `Allocated`.
     """
@@ -75,7 +76,7 @@ class Measured:
     strings: Strings
     layers: tuple[MeasuredLayer, ...]
     levels: tuple[Errors, ...]
-    last: tuple[Coordinates, ...]
+    last: tuple[Values, ...]
     coefficient_bytes: float
 
 
@@ -94,12 +95,21 @@ def measure(allocated: Allocated, progress: Callable[[float], None]) -> Measured
     measuring = _Measuring(allocated)
     states = shown_states(header, allocated.states, all_passes([channel.top for channel in quantized.channels]))
     levels = level_states(header)
-    found = measuring.every([*states[:-1], *levels])
-    found[len(states) - 1 : len(states) - 1] = [measuring.errors(states[-1])]
+    found = measuring.every([*states, *levels])
+    del measuring  # and its canvases, before values take as much
     layers = kept_layers(header, allocated.states, found[: len(states)])
     progress(0.75)
-    last, told_levels = measuring.coordinates(states[-1]), tuple(errors for errors, _ in found[len(states) :])
-    return Measured(quantized, header, allocated.strings, tuple(layers), told_levels, last, allocated.coefficient_bytes)
+    told_levels = tuple(errors for errors, _ in found[len(states) :])
+    last = values_of(header, Region.whole(header.layout, header.levels), allocated.tiles, states[-1])
+    return Measured(
+        quantized,
+        header,
+        allocated.strings,
+        tuple(layers),
+        told_levels,
+        tuple(last[block] for block in range(len(header.blocks))),
+        allocated.coefficient_bytes,
+    )
 
 
 def all_passes(tops: Sequence[NDArray[np.int8]]) -> State:
@@ -115,10 +125,6 @@ class _Measuring:
         self._header, self._tiles = allocated.header, allocated.tiles
         self._prepared, self._lattices = quantized.prepared, quantized.lattices.channels
         self._others = quantized.prepared.others_of(None) if len(self._lattices) > 1 else []
-        self._own = self._reconstructor()
-
-    def _reconstructor(self) -> StateReconstructor:
-        return StateReconstructor(self._header, self._tiles)
 
     def every(self, states: Sequence[State]) -> list[Found]:
         """Errors of many states, see `errors`, by several threads: each has canvases of its own."""
@@ -134,19 +140,11 @@ class _Measuring:
                     return
                 found[number] = self.errors(states[number], reconstructor)
 
-        spread(work, [self._own, *(self._reconstructor() for _ in range(together - 1))])
+        spread(work, [StateReconstructor(self._header, self._tiles) for _ in range(together)])
         return [errors for errors in found if errors is not None]
 
-    def errors(self, state: State, reconstructor: StateReconstructor | None = None) -> Found:
-        """Errors of what a receiver shows in this state, as a container tells them, and the distances in cells.
-
-        Parameters
-        ----------
-        state : int8, shape (tile, channel)
-        reconstructor : StateReconstructor, optional
-            By default the one from which `restored` takes the last of these states.
-        """
-        reconstructor = reconstructor or self._own
+    def errors(self, state: State, reconstructor: StateReconstructor) -> Found:
+        """Errors of what a receiver shows in a state, int8, shape (tile, channel), and the distances in cells."""
         prepared, geometric = self._prepared, self._prepared.geometric
         shown = reconstructor.canvases[prepared.interfaces :]
         fractions = [reconstructor.reconstruct(k, k, np.ascontiguousarray(state[:, k])) for k in range(geometric)]
@@ -162,23 +160,6 @@ class _Measuring:
             found += coordinate_distances(originals, [self._lattices[number]], own, [fraction], component)
         channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in found)
         return Errors(told(distances[0]), told(distances[1]), channels), cells
-
-    def coordinates(self, state: State) -> tuple[Coordinates, ...]:
-        """All channels in the state whose errors were measured last.
-
-        The canvases hold it, unless attributes took the place of coordinates.
-        """
-        geometric, channels = self._prepared.geometric, len(self._lattices)
-        shared = geometric if channels == geometric else 0
-        canvases = self._own.canvases
-        known: list[Coordinates] = [([canvas[k, :, :-PADDING] for canvas in canvases], 0) for k in range(shared)]
-        known += [
-            reconstruct_channel(
-                self._header, number, self._tiles[number], state[:, number], self._prepared.layout.levels
-            )
-            for number in range(shared, channels)
-        ]
-        return tuple(known)
 
 
 def shown_states(header: Header, states: Sequence[State], passes: State) -> list[State]:

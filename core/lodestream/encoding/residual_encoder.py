@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
-from ..decoding.reconstruction import Values
+from ..decoding.values import Values
 from ..parallel import spread
 from ..residual import chunk_coder
 from ..surface import Block, Surface

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.model import Header
-from ..decoding.levels import known_levels
+from ..decoding.progress import known_levels
 from ..entropy.tiles import Tiles
 from ..grid.layout import Layout
 from ..transform.lifting import FRACTION_BITS

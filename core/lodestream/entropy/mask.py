@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import kernels
-from ..errors import CorruptStreamError, StreamError
-from ..library import why_missing
+from ..errors import CorruptStreamError
 
 __all__ = ["decode_mask", "encode_mask"]
 
@@ -53,13 +52,6 @@ def decode_mask(data: bytes, shape: tuple[int, int], offset: int) -> NDArray[np.
         When bytes are left over; the data stand at ``offset`` of the container. Bytes missing count as 0.
     """
     rows, columns = shape
-    if why_missing() is not None:
-        from .. import reference
-
-        try:
-            return reference.decode_mask(data, rows, columns)
-        except StreamError as error:
-            raise CorruptStreamError(str(error), offset) from None
     field = _field(rows, columns)
     read = _code(True, rows, columns, field, np.frombuffer(data, np.uint8).copy())
     if len(data) > read:

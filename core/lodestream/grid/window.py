@@ -27,6 +27,7 @@ __all__ = [
     "samples",
     "spans",
     "taken",
+    "within",
 ]
 
 Span = tuple[int, int]
@@ -112,6 +113,27 @@ def taken(array: NDArray[Any], region: Region, shape: Shape, first: Span = (0, 0
         else:
             array = array.take(places(span, length), axis=axis)
     return array
+
+
+def within(array: NDArray[Any], around: Region, region: Region, shape: Shape) -> NDArray[Any]:
+    """The part of an array of a window around another one that belongs to this; a view where it is one piece.
+
+    ``array`` has the shape (row, column, ...) of the window ``around``; ``shape`` is the grid's.
+    """
+    for axis, ((first, last), (start, stop), length) in enumerate(zip(around, region, shape, strict=True)):
+        if last - first == length:  # all of the axis, from wherever: the window may go on from its end to its begin
+            array = _along(array, axis, (start - first) % length, stop - start, length)
+        else:
+            begin = start - first if start >= first else start + length - first
+            array = array[(slice(None),) * axis + (slice(begin, begin + stop - start),)]
+    return array
+
+
+def _along(array: NDArray[Any], axis: int, start: int, count: int, length: int) -> NDArray[Any]:
+    """So many samples of an axis from one on, going on with the first ones; a view where they are one piece."""
+    if start + count <= length:
+        return array[(slice(None),) * axis + (slice(start, start + count),)]
+    return array.take(places((start, start + count), length), axis=axis)
 
 
 def is_whole(region: Region, shape: Shape) -> bool:

@@ -13,7 +13,6 @@ from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
 from ..grid.support import needed_tiles
 from ..grid.window import aligned, check_region, hull
-from ..library import why_missing
 from ..target import Region, Target
 
 __all__ = ["SelectedSlices", "Selection", "restored", "select", "selection_of"]
@@ -83,8 +82,7 @@ class Selection:
         """
         sizes = [kind.itemsize for kind, wanted in zip(header.dtypes, self.channels(header), strict=True) if wanted]
         layout = header.layout
-        # Without the compiled kernels a window is cut out of the whole surface.
-        if self.region is not None and header.arrangement is None and why_missing() is None:
+        if self.region is not None and header.arrangement is None:
             rows, columns = hull(restored(header, self.region), header.shape)
             shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
         elif level is not None and level < layout.levels:

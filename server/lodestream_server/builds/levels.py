@@ -169,7 +169,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     """
     from lodestream import Decoder, Target
     from lodestream.container import read_index
-    from lodestream.decoding.by_bands import decoder_by_bands
+    from lodestream.decoding.pieces import PiecewiseDecoder
     from lodestream.planning.planner import plan
     from lodestream.scratch import Room, Scratch
 
@@ -180,13 +180,13 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
             return file.read(length)
 
         index = read_index(read, os.fstat(file.fileno()).st_size)
-        if _goes_by_bands(index.header, job):
+        if _goes_by_pieces(index.header, job):
             aside = index.header.layout.points(job.level) * sum(dtype.itemsize for dtype in index.header.dtypes)
             if aside >= job.most_bytes:
                 raise FileTooLongError(os.strerror(errno.EFBIG))
             room = Room(lambda: Scratch(job.folder / "values"))
-            rows = decoder_by_bands(read, index, job.level)
-            return rows.surface(room, job.memory // _BAND, lambda fraction: None), aside
+            pieces = PiecewiseDecoder(read, index, job.level)
+            return pieces.surface(room, job.memory // _BAND, lambda fraction: None), aside
         chosen = plan(index, Target(level=job.level))
         decoder = Decoder(level=job.level)
         for place in (*chosen.before, *chosen.ranges, *chosen.after):
@@ -194,15 +194,15 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     return decoder.surface(job.level), 0
 
 
-def _goes_by_bands(header: Header, job: LevelJob) -> bool:
+def _goes_by_pieces(header: Header, job: LevelJob) -> bool:
     """Whether a level is decoded by bands, and written so: it takes much memory in one piece, and can be."""
-    from lodestream.decoding.by_bands import why_not_by_bands
+    from lodestream.decoding.pieces import why_not_by_pieces
     from lodestream.formats import written
 
     if job.level > header.levels:
         return False
     most, whole = job.memory // 2, header.layout.points(job.level) * header.channels * _WHOLE
-    if why_not_by_bands(header, max(most, whole), job.level) is not None:
+    if why_not_by_pieces(header, max(most, whole), job.level) is not None:
         return False
     if (format_ := written(job.format_name)).memory and not format_.by_block:
         return False

@@ -18,7 +18,7 @@ from lodestream.bands import made
 from lodestream.bands.front import goes_by_bands
 from lodestream.bands.inspecting import inspect
 from lodestream.container.reader import read_index
-from lodestream.decoding.by_bands import decoder_by_bands
+from lodestream.decoding.pieces import PiecewiseDecoder
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.scratch import IN_MEMORY
@@ -124,7 +124,7 @@ def _is_known_by_bands(container: bytes, rng: np.random.Generator) -> None:
         return container[offset : offset + length]
 
     expected = ls.decode(container)
-    decoder = decoder_by_bands(read, read_index(read, len(container)))
+    decoder = PiecewiseDecoder(read, read_index(read, len(container)))
     if decoder.header.plane is not None or decoder.header.arrangement is not None:
         return  # see test_several_blocks for what has several grids
     found = decoder.surface(IN_MEMORY, 1, lambda fraction: None)

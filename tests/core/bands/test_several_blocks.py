@@ -22,10 +22,8 @@ from lodestream.bands.grid_runs import GridRuns
 from lodestream.bands.inspecting import inspect
 from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.container.reader import read_index
-from lodestream.decoding.by_bands import decoder_by_bands
-from lodestream.decoding.by_blocks import BlocksDecoder
-from lodestream.decoding.by_rows import RowsDecoder
 from lodestream.decoding.inspection import Inspection
+from lodestream.decoding.pieces import PiecewiseDecoder
 from lodestream.encoding import transformed
 from lodestream.encoding.encoder import encode
 from lodestream.encoding.prepared import prepare
@@ -97,11 +95,11 @@ def test_any_blocks(
     _is_known_by_blocks(whole, seed)
 
 
-def _decoder(container: bytes, level: int | None = None) -> BlocksDecoder | RowsDecoder:
+def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
     def read(offset: int, length: int) -> bytes:
         return container[offset : offset + length]
 
-    return decoder_by_bands(read, read_index(read, len(container)), level)
+    return PiecewiseDecoder(read, read_index(read, len(container)), level)
 
 
 def _is_known_by_blocks(container: bytes, seed: int) -> None:
@@ -125,7 +123,7 @@ def _is_known_by_blocks(container: bytes, seed: int) -> None:
             assert list(own.attributes) == list(other.attributes)
             for name, values in own.attributes.items():
                 assert values.tobytes() == other.attributes[name].tobytes()
-    with mock.patch.object(inspecting, "why_not_by_bands", return_value=None):
+    with mock.patch.object(inspecting, "why_not_by_pieces", return_value=None):
         inspect(io.BytesIO(container), max_vertices=1 << 20, memory=1)
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 import lodestream as ls
+from lodestream.bands.inspecting import inspect
 from lodestream.bands.inspecting import inspect as inspect_by_bands
 from lodestream.container import FrameReader, sections
 from lodestream.container.writer import CodedLayer, CodedSegment, ContainerWriter
-from lodestream.decoding.inspection import inspect
 from lodestream.errors import CorruptStreamError, LodestreamError, UnsupportedVersionError
 from lodestream_server.maintenance.fsck import check_container
 

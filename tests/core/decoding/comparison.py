@@ -2,34 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream import library, reference
-from lodestream.decoding import fallback
+from lodestream import reference
 
 from ..grid.layouts import layouts, tubes
 
-__all__ = ["agree_on", "assert_same", "assert_shown", "surfaces", "without_kernels"]
-
-WHY = "expected a library, got none, as this test wants it"
-
-
-@contextmanager
-def without_kernels() -> Iterator[None]:
-    """As where the library cannot be loaded, of which nothing has been said yet."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(library, "_load", lambda: WHY)
-        fallback._say_so.cache_clear()
-        yield
+__all__ = ["agree_on", "assert_same", "assert_shown", "surfaces"]
 
 
 def assert_same(found: ls.Surface, wanted: ls.Surface) -> None:

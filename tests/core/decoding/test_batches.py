@@ -27,7 +27,7 @@ def segments_of(container: bytes) -> tuple[Header, list[Coded]]:
     decoder = ls.Decoder()
     decoder.feed(container)
     assert decoder.header is not None
-    return decoder.header, list(decoder._reconstruction._queue.values())
+    return decoder.header, list(decoder._queue._waiting.values())
 
 
 def decoded(header: Header, segments: list[Coded], at_once: bool) -> list[Tiles]:

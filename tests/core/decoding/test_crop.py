@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import functools
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.decoding.crop import crop_across_seam, crop_axis, reconstruct_window
-from lodestream.decoding.reconstruction import reconstruct_channel
-from lodestream.entropy.dequantize import UNANNOUNCED
-from lodestream.entropy.tiles import Tiles, TileTable, gather
+from lodestream.decoding.crop import crop_across_seam, crop_axis
 from lodestream.grid.axis import axis_step
-from lodestream.grid.layout import Layout
-from lodestream.grid.support import needed_tiles
 from lodestream.planning.selection import Selection
-from lodestream.target import Region
 from lodestream.transform.lifting import forward_step, inverse_step
-from lodestream.transform.pyramid import allocate, forward
 
 #: What a container does not keep is another matter, see test_losses.
 pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
 
 if TYPE_CHECKING:
-    from lodestream.container.model import Header
+    pass
 
 CLOSURES = [(False, False), (True, False), (False, True), (True, True)]
 
@@ -82,47 +72,6 @@ def test_what_a_step_takes_across_the_seam_gives_what_is_wanted(closed: bool) ->
                 wanted = np.concatenate([every[slice(*span)] for span in found.wanted])
                 assert np.array_equal(wanted, np.take(whole, np.arange(start, stop), 0, mode="wrap"))
                 assert len(every) <= stop - start + 120
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    shape=st.tuples(st.integers(1, 140), st.integers(1, 90)),
-    closed=st.sampled_from(CLOSURES),
-    corners=st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1)),
-    known=st.sampled_from(["all", "levels", "anything"]),
-    seed=st.integers(0, 2**32),
-)
-def test_a_window_of_any_state(
-    shape: tuple[int, int],
-    closed: tuple[bool, bool],
-    corners: tuple[float, float, float, float],
-    known: str,
-    seed: int,
-) -> None:
-    layout = Layout.single(shape, closed, (3, 3))
-    first, second = (
-        sorted(min(int(corner * n), n - 1) for corner in pair)
-        for *pair, n in zip(corners[:2], corners[2:], shape, strict=True)
-    )
-    region: Region = ((first[0], first[1] + 1), (second[0], second[1] + 1))
-    rng = np.random.default_rng(seed)
-    values = allocate(shape)
-    values[...] = rng.integers(-(2**20), 2**20, shape)
-    predictors = forward([values], layout)
-    tiles = Tiles(TileTable.of(layout))
-    flat = gather(tiles.table, [values])
-    tiles.known[:], tiles.sign[:] = np.abs(flat), np.sign(flat)
-    state = np.zeros(len(layout.tiles), np.int8)
-    if known == "levels":
-        state[layout.tiles_of(int(rng.integers(0, layout.levels + 1))).start :] = UNANNOUNCED
-    elif known == "anything":
-        state[:] = rng.choice([0, 1, 2, 7, 16, 31, UNANNOUNCED], state.size)
-    state[~needed_tiles(layout, region)] = 0
-    header = cast("Header", SimpleNamespace(layout=layout, predictors=[predictors], geometric=1))
-    window, fraction = reconstruct_window(header, 0, tiles, state, region)
-    whole, expected = reconstruct_channel(header, 0, tiles, state, layout.levels)
-    assert fraction == expected
-    np.testing.assert_array_equal(window, whole[0][slice(*region[0]), slice(*region[1])])
 
 
 @functools.cache

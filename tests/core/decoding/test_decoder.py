@@ -338,7 +338,7 @@ def test_long_segments_are_windows_of_what_arrived_and_those_of_a_caller_s_buffe
     for given in (container, bytearray(container), memoryview(bytearray(container))):
         decoder = Decoder()
         decoder.feed(given)
-        lent = [s.data.obj for s in decoder._reconstruction._queue.values() if isinstance(s.data, memoryview)]
+        lent = [s.data.obj for s in decoder._queue._waiting.values() if isinstance(s.data, memoryview)]
         assert lent
         assert all(isinstance(data, bytes) for data in lent)
         assert all(data is container for data in lent) == (given is container)

@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import reference
+from lodestream.bands.inspecting import inspect
 from lodestream.container.fields import told_roughly
-from lodestream.decoding import channels
-from lodestream.decoding.by_bands import decoder_by_bands
-from lodestream.decoding.inspection import inspect
-from lodestream.decoding.reconstruction import initial_state
+from lodestream.decoding import values
+from lodestream.decoding.pieces import PiecewiseDecoder
+from lodestream.decoding.progress import initial_state
 from lodestream.decoding.view import View
 from lodestream.encoding import prepared
 from lodestream.entropy.dequantize import UNANNOUNCED
@@ -316,8 +316,9 @@ def unnamed(case: Case) -> bool:
 @given(case=cases(), seed=st.integers(0, 2**32), level=st.integers(0, 9), bands=st.booleans())
 def test_every_state_shows_and_tells_what_the_page_says(case: Case, seed: int, level: int, bands: bool) -> None:
     region = window_of(case, seed)
-    small = 0 if bands else channels._SMALL
-    with patch.object(channels, "_SMALL", small), patch.object(channels, "_SHARED", min(small, channels._SHARED)):
+    small = 0 if bands else values._ONE_CALL_VALUES
+    shared = patch.object(values, "_SHARED_VALUES", min(small, values._SHARED_VALUES))
+    with patch.object(values, "_ONE_CALL_VALUES", small), shared:
         check_states(case, region, level)
         check_planned(case, ls.Target(order="level"))
         check_planned(case, ls.Target())
@@ -334,7 +335,7 @@ def test_units_that_no_layer_names_are_known_once_all_layers_are_there(case: Cas
     for target in (ls.Target(), ls.Target(order="level"), *([ls.Target(region=region)] if region else [])):
         check_planned(case, target)
     assert inspect(io.BytesIO(case.data), max_vertices=10_000).errors_checked
-    decoder = decoder_by_bands(lambda offset, length: case.data[offset : offset + length], index_of(case.data))
+    decoder = PiecewiseDecoder(lambda offset, length: case.data[offset : offset + length], index_of(case.data))
     surface = decoder.surface(Room(lambda: Scratch(tmp_path / "values"), 1 << 30), 1 << 20, lambda fraction: None)
     assert_same(surface, ls.decode(case.data))
 

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.bands.inspecting import inspect
 from lodestream.container import Index, sections
 from lodestream.container.digest import DIGEST
-from lodestream.decoding.inspection import Inspection, inspect
+from lodestream.decoding.inspection import Inspection
 
 from ..container.forgery import (
     index_of,

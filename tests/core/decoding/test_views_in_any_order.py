@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.decoding import channels, reconstruction
+from lodestream.decoding import segments, values
 from lodestream.parallel import VARIABLE
 from tests.core.surfaces import all_large
 
@@ -61,7 +61,7 @@ def test_views_in_any_order(
     large: bool,
 ) -> None:
     rng = np.random.default_rng(seed)
-    with pytest.MonkeyPatch.context() as context, patch.object(reconstruction, "_WORTH", worth):
+    with pytest.MonkeyPatch.context() as context, patch.object(segments, "_WORTH_PREPARING_BYTES", worth):
         context.setenv(VARIABLE, count)
         if large:
             with all_large():
@@ -69,7 +69,7 @@ def test_views_in_any_order(
         else:
             container = ls.encode(surface_of(kind, shape, closed, seed))
         decoder, held = ls.Decoder(), 0
-        with patch.object(channels, "_SMALL", small):
+        with patch.object(values, "_ONE_CALL_VALUES", small):
             while held < len(container):
                 more = int(rng.integers(1, 2 + len(container) // 4))
                 decoder.feed(container[held : held + more])
@@ -90,11 +90,10 @@ def test_what_is_prepared_waits_no_more() -> None:
     container = ls.encode(np.rint(np.random.default_rng(5).normal(0, 99, (150, 150))).astype(np.int16))
     decoder = ls.Decoder()
     views = decoder.feed(container)
-    made = decoder._reconstruction
-    assert made is not None
+    queue = decoder._queue
     views[0].prepare()  # a little
-    assert made._taken == 0
+    assert queue._decoded == 0
     views[-1].prepare()
-    assert made._taken == made.length
-    assert not made._queue
+    assert queue._decoded == queue.length
+    assert not queue._waiting
     np.testing.assert_array_equal(views[-1].points, fresh(container, views[-1].bytes).points)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container.model import Header
-from lodestream.decoding.reconstruction import reconstruct_channel
+from lodestream.decoding.reconstructor import Reconstructor, known_state
+from lodestream.decoding.region import Region
 from lodestream.encoding.states import StateReconstructor
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.entropy.tiles import Tiles, TileTable
@@ -64,7 +65,9 @@ def test_every_state_is_what_it_is_by_itself(layout: Layout, seed: int) -> None:
         state = np.where(changed, rng.choice([0, 0, 0, 1, 4, 7, UNANNOUNCED], state.shape), state).astype(np.int8)
         for place, channel in ((0, 0), (1, 1), (0, 2)):
             fraction = reconstructor.reconstruct(place, channel, np.ascontiguousarray(state[:, channel]))
-            expected = reconstruct_channel(header, channel, channels[channel], state[:, channel], layout.levels)
+            known = known_state(channels[channel].table, state[:, channel], layout.levels)
+            region = Region.whole(layout, layout.levels)
+            expected = Reconstructor(region, predictors, channels[channel], channel < 2).reconstruct(known)
             assert fraction == expected[1]
             first_grid = interfaces if channel == 2 else 0  # interfaces mean nothing to what is no coordinate
             pairs = zip(reconstructor.canvases[first_grid:], expected[0][first_grid:], strict=True)

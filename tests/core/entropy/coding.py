@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lodestream.container import Header
 from lodestream.decoding.batches import Coded
-from lodestream.decoding.reconstruction import Reconstruction
+from lodestream.decoding.segments import SegmentQueue
 from lodestream.entropy.bitplanes import pass_count
 from lodestream.entropy.tile_coder import Channel, TileCoder
 from lodestream.entropy.tiles import TileTable, gather
@@ -99,11 +99,10 @@ def decode_runs(
     layout: Layout, channels: int, coded: Iterable[Coded], state: list[list[int]], large: int = 0
 ) -> list[Ints]:
     """Coefficients after the runs, as they are known when ``state[tile][channel]`` passes remain."""
-    reader = Reconstruction(header_for(layout, channels, large))
+    reader = SegmentQueue(header_for(layout, channels, large))
     reader.add(list(coded))
-    reader._decode(reader.length)
     decoded = []
-    for channel, tiles in enumerate(reader._tiles):
+    for channel, tiles in enumerate(reader.channels(reader.length)):
         coefficients = np.zeros(layout.grids[0].shape, np.int32)
         for tile in range(len(layout.tiles)):
             tiles.spread(tile, state[tile][channel], [coefficients])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lodestream import kernels
 from lodestream.decoding.batches import Coded
-from lodestream.decoding.reconstruction import Reconstruction
+from lodestream.decoding.segments import SegmentQueue
 from lodestream.entropy import bitplanes
 from lodestream.entropy.band_fields import COLUMNS, ROWS
 from lodestream.entropy.bitplanes import pass_count, pass_gains, reconstruction_point
@@ -154,18 +154,18 @@ def test_gains_are_the_squared_errors_of_what_is_known(large: int) -> None:
     layout = Layout.single((25, 18), (False, False), (3, 3))
     table, values = TileTable.of(layout), coefficients((25, 18), 10, 0.7, 10)
     counts = passes_of(layout, values)
-    reader = Reconstruction(header_for(layout, 1, large))
+    reader = SegmentQueue(header_for(layout, 1, large))
     reader.add(encode_runs(layout, [values], [(tile, 0, n - 1, n) for tile, n in enumerate(counts) if n], large))
-    reader._decode(reader.length)
+    (tiles,) = reader.channels(reader.length)
     for tile, count in enumerate(counts):
         if not count:
             continue
         rows = table.of_tile(tile)
         weights = np.arange(1.0, len(rows) + 1)
-        errors = pass_gains(rows, weights, count, gather(table, [values]), reader._tiles[0].early)
+        errors = pass_gains(rows, weights, count, gather(table, [values]), tiles.early)
         for remaining in range(count + 1):
             known = np.zeros(layout.grids[0].shape, np.int32)
-            reader._tiles[0].spread(tile, remaining, [known])
+            tiles.spread(tile, remaining, [known])
             squares = (values.astype(np.int64) - known) ** 2
             bands = layout.tiles[tile].bands
             expected = [

@@ -1,4 +1,4 @@
-"""Containers decoded by bands of rows: the surfaces that they hold."""
+"""Containers decoded piece by piece: the surfaces that they hold."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream.container.reader import read_index
-from lodestream.decoding import by_rows
-from lodestream.decoding.by_bands import decoder_by_bands, why_not_by_bands
-from lodestream.decoding.by_blocks import BlocksDecoder
-from lodestream.decoding.by_rows import RowsDecoder
+from lodestream.decoding import pieces
+from lodestream.decoding.pieces import PiecewiseDecoder, why_not_by_pieces
 from lodestream.scratch import IN_MEMORY, Room, Scratch
 
 from ..bands.test_building import SURFACES
@@ -25,9 +23,9 @@ def _read(container: bytes) -> Callable[[int, int], bytes]:
     return lambda offset, length: container[offset : offset + length]
 
 
-def _decoder(container: bytes, level: int | None = None) -> RowsDecoder | BlocksDecoder:
+def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
     read = _read(container)
-    return decoder_by_bands(read, read_index(read, len(container)), level)
+    return PiecewiseDecoder(read, read_index(read, len(container)), level)
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -64,7 +62,7 @@ def _check_levels(container: bytes) -> None:
     decoder.feed(container)
     for level in range(decoder.header.levels if decoder.header else 0):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(by_rows, "_CORE_POINTS", 300)
+            patch.setattr(pieces, "_CORE_POINTS", 300)
             found = _decoder(container, level).surface(IN_MEMORY, 1, lambda fraction: None)
         expected = decoder.surface(level)
         _check(found, expected)
@@ -129,18 +127,18 @@ def test_damage_is_found() -> None:
         _decoder(bytes(container)).surface(IN_MEMORY, 1, lambda fraction: None)
 
 
-def test_what_cannot_be_decoded_by_rows_says_so() -> None:
+def test_what_cannot_be_decoded_pieces_says_so() -> None:
     heights = SURFACES["integers"][0].points
     rows, columns = np.mgrid[:50, :60].astype(float)
     surface = ls.Surface(np.stack([columns, rows, np.hypot(rows, columns)], axis=-1))
-    reason = why_not_by_bands(_decoder(ls.encode(surface)).header, 1 << 30)
+    reason = why_not_by_pieces(_decoder(ls.encode(surface)).header, 1 << 30)
     assert reason is not None
     assert "rules" in reason
-    assert why_not_by_bands(_decoder(ls.encode(heights)).header, 0) is None
+    assert why_not_by_pieces(_decoder(ls.encode(heights)).header, 0) is None
     header = _decoder(ls.encode(ls.Surface(blocks=[ls.Block(heights), ls.Block(heights[:90])]))).header
     needed = 40 * heights.size
-    assert why_not_by_bands(header, needed) is None
-    assert why_not_by_bands(header, needed - 1) == (
+    assert why_not_by_pieces(header, needed) is None
+    assert why_not_by_pieces(header, needed - 1) == (
         f"its largest block is decoded as a whole, in about {-(-needed >> 20)} MiB"
     )
-    assert why_not_by_bands(header, needed - 1, header.levels - 1) is None
+    assert why_not_by_pieces(header, needed - 1, header.levels - 1) is None

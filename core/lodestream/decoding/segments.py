@@ -1,0 +1,231 @@
+"""Segments and chunks into values: of a container that arrives, or of a complete one that is read from its file."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from threading import Lock
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import Chunk, Header, Index, Segment
+from ..container.sections import check_of
+from ..entropy.bitplanes import pass_count
+from ..entropy.part_table import part_of
+from ..entropy.tiles import Reading, Tiles, TileTable
+from ..errors import CorruptStreamError
+from ..parallel import spread
+from .batches import Coded, batch_length, rounds_of
+from .region import Region
+from .values import Values, mark_holes, restore, values_of
+
+__all__ = ["SegmentQueue", "StoredSegments"]
+
+#: Bytes of segments that are worth decoding before anybody asks for points.
+_WORTH_PREPARING_BYTES = 1 << 13
+
+
+class SegmentQueue:
+    """Decodes segments when values are asked for, in the order in which they were added.
+
+    A *state* is the number of coding passes still to come of every tile and channel: int8, shape (tile, channel), and
+    `UNANNOUNCED` where that is not known. States before what was decoded have their values too: what later passes told
+    is ignored.
+    """
+
+    def __init__(self, header: Header) -> None:
+        self.header = header
+        self._waiting: dict[int, Coded] = {}  # segments that are not decoded yet, by number
+        self._added = self._decoded = self._forgotten = 0
+        self._begun: tuple[int, list[list[Reading]]] = 0, []  # the batch on its way: the number after it, its rounds
+        self._lock = Lock()
+        self._chunks: dict[int, tuple[bytes | memoryview, int]] = {}
+        self._channels: list[Tiles] = []
+        #: Whether what was added is forgotten, see `drop`.
+        self.dropped = False
+
+    @property
+    def length(self) -> int:
+        """Segments added so far."""
+        return self._added
+
+    def add(self, segments: Sequence[Coded]) -> None:
+        """Take segments; nothing is decoded yet."""
+        self._waiting.update(enumerate(segments, self._added))
+        self._added += len(segments)
+
+    def add_chunk(self, number: int, data: bytes | memoryview, offset: int) -> None:
+        """Take a chunk of the residual section, which stands at ``offset``."""
+        if data:
+            self._chunks[number] = data, offset
+
+    def drop(self) -> None:
+        """Forget all that was added and is not decoded: nobody will ask for values."""
+        self._waiting.clear()
+        self._chunks.clear()
+        self.dropped = True
+
+    def prepare(self, length: int) -> None:
+        """Decode the first ``length`` segments, if those that wait are worth the calls that this takes."""
+        with self._lock:
+            size = 0
+            for number in range(self._decoded, length):
+                size += len(self._waiting[number].data)
+                if size >= _WORTH_PREPARING_BYTES:
+                    self._decode(length)
+                    return
+
+    def values(
+        self,
+        length: int,
+        state: NDArray[np.int8],
+        region: Region,
+        corrected: bool = False,
+        chosen: NDArray[np.bool_] | None = None,
+    ) -> dict[int, Values]:
+        """Return the values of a region by block when the first ``length`` segments are known.
+
+        Parameters
+        ----------
+        length : int
+        state : int8, shape (tile, channel)
+        region : Region
+        corrected : bool
+            The residual counts; of the finest level.
+        chosen : bool, shape (channel,), optional
+            Channels that are not chosen mean nothing.
+
+        Raises
+        ------
+        CorruptStreamError
+            If ``corrected`` is asked for and a chunk of the residual section does not fit.
+        """
+        with self._lock:
+            self._decode(length)
+            blocks = values_of(self.header, region, self._channels, state, chosen)
+        if corrected:
+            restore(self.header, region, blocks, self._chunks.get, chosen)
+        mark_holes(self.header, region, blocks, corrected)
+        return blocks
+
+    def channels(self, length: int) -> list[Tiles]:
+        """Return what the first ``length`` segments tell, or more of them, of each channel."""
+        with self._lock:
+            self._decode(length)
+            return self._channels
+
+    def _decode(self, length: int) -> None:
+        """Decode the first ``length`` segments. After an interruption at any place the next call goes on from there."""
+        if not self._channels:
+            self._channels = _channels(self.header, None)
+        while self._decoded < length:
+            if self._begun[0] <= self._decoded:
+                waiting = [self._waiting[number] for number in range(self._decoded, length)]
+                batch = waiting[: batch_length(self.header.layout, waiting)]
+                self._begun = self._decoded + len(batch), rounds_of(self._channels, batch)
+            end, rounds = self._begun
+            for readings in rounds:
+                spread(Reading.run, readings)
+            self._decoded = end
+            while self._forgotten < end:  # and any that an interruption has left
+                self._waiting.pop(self._forgotten, None)
+                self._forgotten += 1
+
+
+class StoredSegments:
+    """Decodes any region of a complete container, whose segments and chunks are read from its file.
+
+    Parameters
+    ----------
+    read : callable (offset, length) -> bytes
+        Of the file.
+    index : Index
+        Of the container, see `read_index`.
+    """
+
+    def __init__(self, read: Callable[[int, int], bytes], index: Index) -> None:
+        self._read, self._index, self.header = read, index, index.header
+        self._reading = Lock()
+        self._segments: dict[int, list[Segment]] = defaultdict(list)
+        for segment in index.segments:
+            self._segments[segment.tile].append(segment)
+        self._complete = np.zeros((len(self.header.layout.tiles), self.header.channels), np.int8)
+
+    def values(self, region: Region) -> dict[int, Values]:
+        """Return the values of a region by block, exact as far as the container is.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment or a chunk is damaged.
+        """
+        return self.values_from(region, self.channels(region))
+
+    def values_from(self, region: Region, channels: Sequence[Tiles]) -> dict[int, Values]:
+        """Return `values` from the ``channels`` of the region.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a chunk is damaged.
+        """
+        corrected = region.level == self.header.levels
+        blocks = values_of(self.header, region, channels, self._complete)
+        if corrected and self._index.chunks:
+            restore(self.header, region, blocks, self._chunk)
+        mark_holes(self.header, region, blocks, corrected)
+        return blocks
+
+    def channels(self, region: Region) -> list[Tiles]:
+        """Decode all segments of the tiles that a region is made of, and return what they tell of each channel.
+
+        Raises
+        ------
+        CorruptStreamError
+            If a segment is damaged.
+        """
+        channels = _channels(self.header, region.coded_tiles)
+        numbers = np.asarray(channels[0].table.members)
+        segments: list[Coded] = []
+        for tile in numbers.tolist():
+            remaining: dict[int, int] = {}
+            for segment in self._segments[tile]:
+                first = remaining.get(segment.channel, pass_count(segment.top))
+                remaining[segment.channel] = first - segment.passes
+                data = self._checked(segment, "segment")
+                segments.append(Coded(tile, segment.channel, first - 1, segment.passes, data, segment.range.offset))
+        segments.sort(key=lambda segment: segment.offset)
+        local = {int(tile): place for place, tile in enumerate(numbers)}
+        while segments:
+            count = batch_length(self.header.layout, segments)
+            batch = [segment._replace(tile=local[segment.tile]) for segment in segments[:count]]
+            for readings in rounds_of(channels, batch):
+                spread(Reading.run, readings)
+            segments = segments[count:]
+        return channels
+
+    def _chunk(self, number: int) -> tuple[bytes, int] | None:
+        chunk = self._index.chunks[number]
+        return (self._checked(chunk, "chunk"), chunk.range.offset) if chunk.range.length else None
+
+    def _checked(self, part: Segment | Chunk, what: str) -> bytes:
+        """The bytes of a segment or a chunk."""
+        with self._reading:
+            data = self._read(part.range.offset, part.range.length)
+        if len(data) != part.range.length or check_of(data) != part.check:
+            raise CorruptStreamError(f"expected a {what} with the checksum that the index tells", part.range.offset)
+        return data
+
+
+def _channels(header: Header, runs: Sequence[range] | None) -> list[Tiles]:
+    """Room for what segments tell of each channel, of all tiles or of some runs of them."""
+    tables = [TileTable.of(header.layout, coordinate) for coordinate in (True, False)]
+    if runs is not None:
+        tables = [part_of(table, runs).table for table in tables]
+    return [
+        Tiles(tables[0], header.quantiser, header.large)
+        if channel < header.geometric
+        else Tiles(tables[1], None, header.large)
+        for channel in range(header.channels)
+    ]
