@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coordinates.height_fields import coordinates
+from ..coordinates.height_fields import coordinates, to_heights
 from ..errors import InputError
 from ..surface import Block, Surface
 
@@ -26,7 +26,7 @@ SMALL = 320
 _LIGHT = 315, 45  # azimuth and altitude in degrees: north-west, as maps have it
 _FLAT = 1e-300  # heights that differ by no more have no relief, and no factor would give them one
 _DEGREES = 360.0  # of a full turn
-_OTHER_UNIT = 10  # so many times higher than wide are surfaces whose z has another unit
+_OTHER_UNIT = 10  # so many times higher than wide are points of x, y, z whose z has another unit
 _FITTED = 0.2  # height of these, in widths of the surface
 _RELIEF = 0.15  # height of the relief for its shading, in widths of the surface
 
@@ -227,7 +227,9 @@ def _lift(surface: Surface) -> float:
     low = np.nanmin([box[0] for box in boxes], axis=0)
     high = np.nanmax([box[1] for box in boxes], axis=0)
     width, height = float(max(high[:2] - low[:2])), float(high[2] - low[2])
-    return _FITTED * width / height if width > 0 and height > _OTHER_UNIT * width else 1.0
+    # Heights that range over more than x and y have another unit than these; z of other points has from ten times on.
+    heights = all(block.points.ndim == 2 for block in surface.blocks) or to_heights(surface, exactly=False) is not None
+    return _FITTED * width / height if width > 0 and height > width * (1 if heights else _OTHER_UNIT) else 1.0
 
 
 def _box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -79,10 +79,19 @@ def test_x_along_the_rows_is_drawn_across() -> None:
 
 def test_heights_of_another_unit_are_fitted(points: Callable[[ls.Surface], NDArray[np.float64]]) -> None:
     x, y = np.meshgrid(np.linspace(0, 3, 20), np.linspace(0, 2, 15))
-    for high, height in ((9000.0, 0.2 * 3), (2.0, 2.0)):
+    for high, height in ((9000.0, 0.2 * 3), (3.1, 0.2 * 3), (2.0, 2.0)):
         drawn = points(ls.Surface(np.stack([x, y, high * x / 3], axis=2)))
         assert np.ptp(drawn[..., 2]) == pytest.approx(height)
         assert np.ptp(drawn[..., 0]) == 3
+
+
+def test_points_that_are_no_heights_are_fitted_from_ten_times_their_width_on(
+    points: Callable[[ls.Surface], NDArray[np.float64]],
+) -> None:
+    x, y = np.meshgrid(np.linspace(0, 3, 20), np.linspace(0, 2, 15))
+    for high, height in ((9000.0, 0.2 * 3), (29.0, 29.0)):
+        drawn = points(ls.Surface(np.stack([x, y + np.sin(3 * x) / 4, high * x / 3], axis=2)))
+        assert np.ptp(drawn[..., 2]) == pytest.approx(height)
 
 
 @pytest.mark.parametrize("angles", [{}, {"angles": [{"channel": 0, "period": 360.0, "low": 0.0}]}])
