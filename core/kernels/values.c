@@ -96,7 +96,7 @@ static const struct {
     {4, 0, UINT32_MAX},
     {8, 0, 0x1p64},
     {4, -(double)FLT_MAX, (double)FLT_MAX},
-    {8, -__builtin_inf(), __builtin_inf()},
+    {8, -DBL_MAX, DBL_MAX},
 };
 
 /* For each type: `to_`, a value within its range into the type, and `seen_`, what that is as a float64; each where it

@@ -270,7 +270,7 @@ class View:
         header, selection = self._queue.header, self._selection
         if mask is not None and selection.region is None and not mask.any():
             mask = None  # no node of so coarse a level is valid: the values under the holes are shown
-        finite = selection.region is None and not self._corrected and all(own.finite for own in header.lattices)
+        finite = selection.region is None and not self._corrected  # the values of a lattice are
         try:
             return block_of(header, arrays, closed, mask, selection.attributes, finite)
         except InputError as error:

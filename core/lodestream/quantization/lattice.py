@@ -66,22 +66,17 @@ class Lattice:
         """Distance between neighbouring values, in their unit."""
         return 1.0 / self.step if self.rule == "decimal" else self.step
 
-    @property
-    def finite(self) -> bool:
-        """Whether values are finite as float64, whichever int32 their coordinates are."""
-        most, origin = 2.0**31, abs(self.origin)
-        return math.isfinite((most + origin) / self.step if self.rule == "decimal" else most * self.step + origin)
-
     def values(self, coordinates: NDArray[np.int32], dtype: np.dtype[Any], fraction: int = 0) -> NDArray[Any]:
         """Values of lattice coordinates over 2**fraction, int32 of any shape, in the given dtype."""
         q = coordinates.astype(np.float64)
         q *= 2.0**-fraction
-        if self.rule == "decimal":
-            q += self.origin
-            q /= self.step
-        else:
-            q *= self.step
-            q += self.origin
+        with np.errstate(over="ignore"):  # the range of the type ends it
+            if self.rule == "decimal":
+                q += self.origin
+                q /= self.step
+            else:
+                q *= self.step
+                q += self.origin
         return to_dtype(q, dtype)
 
     def coordinates(self, values: NDArray[Any], out: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
@@ -104,10 +99,8 @@ class Lattice:
 def to_dtype(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
     """Round float64 values into a dtype: integers to the nearest, clipped to the range of the type."""
     if dtype.kind == "f":
-        if dtype.itemsize < 8:
-            # A reconstruction on its way may overshoot the largest values of the surface.
-            values = np.clip(values, -float(np.finfo(dtype).max), float(np.finfo(dtype).max))
-        return values.astype(dtype, copy=False)
+        # A reconstruction on its way may overshoot the largest values of the surface.
+        return np.clip(values, -float(np.finfo(dtype).max), float(np.finfo(dtype).max)).astype(dtype, copy=False)
     limits = np.iinfo(dtype)
     rounded = np.rint(values)
     if dtype.itemsize < 8:

@@ -85,6 +85,7 @@ def read_masks(payload: bytes, offset: int, kept: bool, sizes: list[tuple[int, i
     holes = []
     for number, (rows, columns) in enumerate(sizes):
         holes.append(fields.varint())
+        fields.require(holes[-1] < rows * columns, "a block has no valid point")
         if holes[-1]:
             masks.valid[number] = _counted(fields, rows, columns, rows * columns - holes[-1])
     for number, (rows, columns) in enumerate(sizes if kept else ()):

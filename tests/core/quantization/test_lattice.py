@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from lodestream.quantization.distortion import store_values
 from lodestream.quantization.lattice import (
     LATTICE_BITS,
     Lattice,
@@ -267,9 +268,17 @@ def with_every_step(values: NDArray[np.float32]) -> Lattice | None:
 @pytest.mark.parametrize("rule", ["affine", "decimal"])
 @pytest.mark.parametrize("origin", [0.0, -1e9, 1e300, -1.7e308])
 @pytest.mark.parametrize("step", [1e-300, 1e-3, 1.0, 1e250, 1e299, 1e308])
-def test_a_lattice_knows_whether_its_values_are_finite(rule: str, origin: float, step: float) -> None:
+def test_values_of_a_lattice_are_finite(rule: str, origin: float, step: float) -> None:
+    q = np.array([[-(2**31), -1, 0, 1, 2**31 - 1]], np.int32)
+    made = np.empty((1, 5, 1))
     lattice = Lattice(rule, origin, step)
-    with np.errstate(over="ignore"):
-        values = lattice.values(np.array([-(2**31), -1, 0, 1, 2**31 - 1], np.int32), np.dtype("f8"))
-    assert np.isfinite(values).all() or not lattice.finite
-    assert lattice.finite == (np.isfinite(values).all() and np.isfinite(abs(values).max() * (1 + 1e-9)))
+    store_values(lattice, (q, 0), made, 0)
+    assert np.isfinite(made).all()
+    np.testing.assert_array_equal(made[..., 0], lattice.values(q, np.dtype("f8")))
+
+
+@pytest.mark.parametrize("lattice", [Lattice("affine", 1.0, 1e308), Lattice("decimal", 0.0, 1e-308)])
+def test_what_overflows_float64_is_its_largest_number(lattice: Lattice) -> None:
+    most = np.finfo(np.float64).max
+    found = lattice.values(np.array([[-7, 1, 9]], np.int32), np.dtype("f8"))
+    np.testing.assert_allclose(found, [[-most, 1e308, most]], rtol=1e-12)
