@@ -1,6 +1,6 @@
-"""Make the golden files anew: ``PYTHONPATH=core python -m tests.golden.generate``.
+"""Make golden files: ``PYTHONPATH=core python -m tests.golden.generate`` writes those that are not there.
 
-Until Lodestream 1.0 this goes with each new version of the format and nothing else; afterwards files are only added.
+What a reader must do does not change, so files are only added. To make one anew, delete it first.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import functools
 import hashlib
 import itertools
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,23 @@ import lodestream as ls
 from lodestream.encoding import allocated, encoder, large_units, prepared, quantized, transformed
 from lodestream.encoding.allocation import assign_layers
 from lodestream.encoding.curves import Curves
+from lodestream.encoding.tiling import WHOLE_TILE, square
 from lodestream.entropy.tile_coder import TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather
+from lodestream.grid.layout import Layout
+from lodestream.planning.window_errors import KIND as WINDOW_ERRORS
+from lodestream.planning.window_errors import serialize_window_errors
+from lodestream.quantization.band_steps import Quantiser
 from lodestream.transform.predictors import COEFFICIENT_BITS
+
+from .rewriting import Parts, chunk_of_differences, chunk_of_offsets, chunk_of_random_offsets
 
 __all__ = ["FOLDER", "Original", "digest", "digests", "expectations", "lines", "originals"]
 
 FOLDER = Path(__file__).parent
 
 Floats = NDArray[np.float64]
+_Maker = Callable[[NDArray[Any]], bytes]
 
 
 @dataclass(frozen=True)
@@ -48,12 +56,15 @@ class Crafted:
         All coefficients are so many times as large, and meet the limits; the exactness section sets the values right.
     ones : int
         The first unit tells so many bit-planes too many; their passes are a segment of four bytes of 255.
+    by_level : bool
+        Each layer holds all passes of a level.
     """
 
     large: bool = False
     tile: tuple[int, int] | None = None
     factor: int = 1
     ones: int = 0
+    by_level: bool = False
 
     @contextlib.contextmanager
     def applied(self) -> Iterator[None]:
@@ -73,6 +84,14 @@ class Crafted:
             first[0] -= 2 * self.ones
             return [first, *states]
 
+        def levels(curves: Curves, layout: Layout, channels: int, *_: Any) -> list[NDArray[Any]]:
+            states = [np.zeros((len(layout.tiles), channels), np.int8) for _ in range(layout.levels + 1)]
+            level = np.array([layout.level_of(tile) for tile in range(len(layout.tiles))])[curves.tile]
+            for number, state in enumerate(states):
+                later = level > number
+                state[curves.tile[later], curves.channel[later]] = curves.counts[later]
+            return states
+
         def coded(coder: TileCoder, tile: int, channel: int, first: int, passes: int, *costs: Any) -> bytes:
             data = code(coder, tile, channel, first, passes, *costs)
             begins = first == 2 * int(coder._channels[channel].top[tile]) - 1
@@ -84,6 +103,7 @@ class Crafted:
                 patch.setattr(large_units, "_MOST", float("inf"))
             if self.tile:
                 patch.setattr(prepared, "tile_exponents", lambda *_: self.tile)
+                patch.setattr(prepared, "square", lambda bits: self.tile if bits == WHOLE_TILE else square(bits))
             if self.factor > 1:
                 patch.setattr(encoder, "COARSER", ())  # no container of fewer bits is tried
                 patch.setattr(transformed, "gather", gathered)
@@ -91,24 +111,32 @@ class Crafted:
                 patch.setattr(quantized, "planes_of", planes)
                 patch.setattr(allocated, "assign_layers", assigned)
                 patch.setattr(TileCoder, "code", coded)
+            if self.by_level:
+                patch.setattr(allocated, "assign_layers", levels)
             yield
 
 
 @dataclass(frozen=True)
 class Original:
-    """A surface, and with what precision or for what error it is encoded."""
+    """A surface, with what precision or for what error it is encoded, and what its container is rewritten to.
+
+    ``detailed``: what is expected has the levels of every layer and the errors of channels too.
+    """
 
     surface: ls.Surface
     precision: str | None = None
     attribute_precision: Mapping[str, str] = field(default_factory=dict)
     rms: str | None = None
     crafted: Crafted = Crafted()
+    rewritten: Callable[[Parts], Parts] | None = None
+    detailed: bool = False
 
     def encode(self) -> bytes:
         """Its container."""
         precisions = dict(self.attribute_precision)
         with self.crafted.applied():
-            return ls.encode(self.surface, self.precision, rms=self.rms, attribute_precision=precisions)
+            container = ls.encode(self.surface, self.precision, rms=self.rms, attribute_precision=precisions)
+        return container if self.rewritten is None else self.rewritten(Parts.of(container)).built()
 
 
 def _wave(rows: int, columns: int) -> Floats:
@@ -165,7 +193,7 @@ def _moebius(rows: int, columns: int) -> Floats:
     return strip
 
 
-def _cut(points: Floats, rows: Sequence[int], columns: Sequence[int]) -> list[Floats]:
+def _cut(points: NDArray[Any], rows: Sequence[int], columns: Sequence[int]) -> list[NDArray[Any]]:
     """Windows between cuts, which have the points at a cut in common."""
     return [
         points[a : b + 1, c : d + 1].copy() for a, b in itertools.pairwise(rows) for c, d in itertools.pairwise(columns)
@@ -440,6 +468,235 @@ def _limits() -> dict[str, Original]:
     }
 
 
+def _of_levels() -> dict[str, Original]:
+    """Levels of states on the way, and containers of which a layer is a level."""
+    widest = np.random.default_rng(2012).choice([-(2**23), 0, 1, 2**23 - 1], (19, 24), p=[0.45, 0.05, 0.05, 0.45])
+    sides = [
+        ls.Block(block, attributes={"speed": np.rint(70 * block[..., 2]).astype(np.int16)})
+        for block in _cut(np.rint(40 * _terrain(10, 17)).astype(np.int16), [0, 9], [0, 6, 16])
+    ]
+    heights = np.rint(90 * _wave(24, 19)).astype(np.int16)
+    return {
+        "levels-blocks": Original(ls.Surface(blocks=sides), detailed=True),
+        "levels-clamps": Original(
+            ls.Surface(widest.astype(np.int32)),
+            crafted=Crafted(factor=40),
+            rewritten=Parts.with_a_layer_for_each_level,
+            detailed=True,
+        ),
+        "levels-heights": Original(ls.Surface(heights), detailed=True),
+        "levels-one-by-one": Original(
+            ls.Surface(np.rint(90 * _torus(20, 11)[..., :2]).astype(np.int16), (True, False)),
+            crafted=Crafted(by_level=True),
+            detailed=True,
+        ),
+        "levels-planes": Original(
+            ls.Surface(widest.astype(np.int32)),
+            rewritten=lambda parts: parts.with_more_planes(2),
+            detailed=True,
+        ),
+        "levels-quantised": Original(ls.Surface(_wave(21, 30)), rms="1e-2d", detailed=True),
+    }
+
+
+def _of_tiles() -> dict[str, Original]:
+    """Groups and tiles of patches and interfaces, in tiles of 16 x 16."""
+    small = Crafted(tile=(4, 4))
+    apart = [np.rint(20 * _terrain(16, 32)).astype(np.int16) + np.int16(2000 * k) for k in range(3)]
+    long = _cut(np.rint(20 * _terrain(57, 9)).astype(np.int16), [0, 56], [0, 4, 8])
+    strip = np.rint(900 * _moebius(12, 32)).astype(np.int16)
+    sides = _cut(np.rint(20 * _terrain(113, 20)).astype(np.int16), [0, 56, 112], [0, 19])
+    column, row = np.meshgrid(np.arange(4), np.arange(520))
+    ribbon = np.stack([7 * column, 3 * row, np.where(row % 130 == 77, 9 + column, 0)], axis=-1).astype(np.int16)
+    return {
+        "tiles-cut": Original(ls.Surface(np.rint(20 * _wave(47, 78)).astype(np.int8)), crafted=small),
+        "tiles-group": Original(_blocks(apart), crafted=small),
+        "tiles-interface": Original(_blocks(long), crafted=small),
+        "tiles-interfaces": Original(_blocks(_cut(ribbon, [0, 519], [0, 1, 2, 3])), crafted=small),
+        "tiles-sides": Original(_blocks(sides), crafted=small),
+        "tiles-stopped": Original(_blocks([strip]), crafted=small),
+        "tiles-stopped-turned": Original(_blocks([np.ascontiguousarray(strip.transpose(1, 0, 2))]), crafted=small),
+    }
+
+
+def _of_patches() -> dict[str, Original]:
+    """Patches whose attributes differ where they meet, attributes that are channels of the points, two lengths."""
+    rng = np.random.default_rng(2013)
+    ground = np.rint(20 * _terrain(21, 61)).astype(np.int16)
+    bricks = [*_cut(ground[:5], [0, 4], [0, 30, 60]), *_cut(ground[4:], [0, 16], [0, 60])]
+    named = [ls.Block(block, attributes={"noise": rng.integers(0, 9, block.shape[:2], np.uint8)}) for block in bricks]
+    four = np.concatenate([ground[:15, :21], rng.integers(0, 99, (15, 21, 1)).astype(np.int16)], axis=-1)
+
+    def of_one_patch(parts: Parts) -> Parts:
+        """Without the finest level of the attribute in the last patch, which is a group by itself there."""
+        return parts.without_unit(len(parts.header.layout.tiles) - 1, 3)
+
+    lengths = [np.rint(90 * _terrain(rows, 3)).astype(np.int16) + np.int16(900 * (rows > 40)) for rows in (60, 24)]
+    quarters = _cut(ground[:13, :17], [0, 6, 12], [0, 8, 16])
+    turns = 2 * np.pi * np.arange(11) / 10
+    loop = np.rint(300 * np.stack([np.cos(turns), np.sin(turns), 0 * turns], axis=-1)).astype(np.int16)
+    loop[-1] = loop[0]
+    cap = (ground[:11, :11] + np.int16(900)).copy()
+    cap[0], cap[:, -1] = loop, loop
+    return {
+        "patches-attributes": Original(
+            ls.Surface(blocks=named), crafted=Crafted(tile=(4, 4)), rewritten=of_one_patch, detailed=True
+        ),
+        "patches-channels": Original(_blocks(_cut(four, [0, 14], [0, 9, 20])), detailed=True),
+        "patches-loop": Original(_blocks([cap])),
+        "patches-order": Original(_blocks([quarters[k] for k in (0, 3, 1, 2)])),
+        "patches-predictors": Original(_blocks(lengths)),
+    }
+
+
+def _of_sections() -> dict[str, Original]:
+    """Sections and pages: optional ones anywhere, many layers, many windows of residual, small masks."""
+
+    def sections(parts: Parts) -> Parts:
+        errors = serialize_window_errors([np.zeros((1, 2), np.uint8)] * len(parts.layers))
+        last = len(parts.layers)
+        places = {0: [(129, b"first")], 2: [(255, b"")], last: [(WINDOW_ERRORS, errors), (200, b"\3\2\5")]}
+        return replace(parts, optional={**places, last + 1: [(129, b"again")]})
+
+    def residual(parts: Parts) -> Parts:
+        raw = [bytes([0, *(n % 256 for n in range(k, k + 256))]) if k % 50 == 7 else b"" for k in range(17 * 17)]
+        sizes = [(min(16, 264 - 16 * i), min(16, 260 - 16 * j)) for i in range(17) for j in range(17)]
+        chunks = [chunk[: 1 + rows * columns] for chunk, (rows, columns) in zip(raw, sizes, strict=True)]
+        return replace(parts, chunks=tuple(chunks)).with_header(chunk=(4, 4))
+
+    sparse = np.zeros((264, 260), np.uint8)
+    sparse[70:80, 100:103] = 9
+    holes = np.rint(40 * _wave(10, 12)).astype(np.int16)
+    lake = np.hypot(*(np.mgrid[:10, :12] - np.array([4, 5])[:, None, None])) < 3
+    holes[lake] = -99
+    named = {"count": np.where(lake, 0, holes % 7 + 1).astype(np.uint8)}
+    return {
+        "sections-layers": Original(
+            ls.Surface(np.rint(20 * _terrain(12, 15)).astype(np.int16)), rewritten=Parts.with_a_layer_for_each_segment
+        ),
+        "sections-masks": Original(
+            ls.Surface(holes, mask=~lake, attributes=named, metadata={"nodata": -99}), detailed=True
+        ),
+        "sections-optional": Original(ls.Surface(_wave(12, 15).astype(np.float32)), rewritten=sections),
+        "sections-pages": Original(ls.Surface(sparse), rewritten=residual),
+    }
+
+
+def _of_strings() -> dict[str, Original]:
+    """Strings of bytes that no encoder writes."""
+    return {
+        "strings-ones": Original(
+            ls.Surface(np.rint(40 * _wave(20, 23)).astype(np.int16)),
+            rewritten=lambda parts: parts.with_segments(lambda s: b"\xff" * 4 if s.passes > 2 else s.data),
+        ),
+        "strings-odd": Original(
+            ls.Surface(np.rint(40 * _wave(26, 70)).astype(np.int16)),
+            crafted=Crafted(large=True),
+            rewritten=lambda parts: parts.with_segments(lambda s: s.data[:-1] if len(s.data) > 9 else s.data),
+        ),
+        "strings-indices": Original(
+            ls.Surface(_wave(21, 30)), rms="1e-2d", rewritten=lambda parts: parts.with_header(large=1)
+        ),
+        "strings-states": Original(
+            ls.Surface(np.rint(40 * _wave(26, 40)).astype(np.int16)),
+            crafted=Crafted(large=True),
+            rewritten=lambda parts: parts.with_segments(
+                lambda s: b"\7\1\0\0" + s.data[4:] if s.begins and parts.header.layout.level_of(s.tile) else s.data
+            ),
+        ),
+        "strings-missing": Original(
+            ls.Surface(np.rint(40 * _wave(20, 23)).astype(np.float32) + np.float32(0.1)),
+            rewritten=lambda parts: parts.without_unit(parts.layers[-1].segments[-1].tile),
+            detailed=True,
+        ),
+    }
+
+
+def _of_values() -> dict[str, Original]:
+    """Lattices and steps at the limits of their types."""
+    heights = np.rint(40 * _wave(12, 15))
+    types: dict[str, tuple[Any, str, float, float]] = {
+        "values-float32": (np.float32, "affine", 0.1, 1 / 3),
+        "values-float32-most": (np.float32, "affine", 0.0, 3e37),
+        "values-float64-most": (np.float64, "affine", 1.0, 1e307),
+        "values-decimal": (np.float64, "decimal", 3.0, 7.0),
+        "values-int64": (np.int64, "affine", 0.0, 2.0**59),
+        "values-uint64": (np.uint64, "affine", 2.0**63, 2.0**59),
+    }
+
+    def with_base(base: int) -> Callable[[Parts], Parts]:
+        return lambda parts: parts.with_header(quantiser=Quantiser(base))
+
+    quantised = ls.Surface(_wave(21, 30))
+    return {
+        name: Original(
+            ls.Surface(np.maximum(heights, 0).astype(dtype)),
+            rewritten=lambda parts, lattice=lattice: parts.with_lattice(*lattice),  # type: ignore[misc]
+        )
+        for name, (dtype, *lattice) in types.items()
+    } | {
+        "values-steps-least": Original(ls.Surface(_wave(40, 33)), rms="1e-2d", rewritten=with_base(1)),
+        "values-steps-most": Original(quantised, rms="2e-4d", rewritten=with_base((1 << 24) - 1)),
+    }
+
+
+def _of_residuals() -> dict[str, Original]:
+    """Chunks of residual of extreme contents, of an attribute: points that are not finite would be holes."""
+    heights = np.rint(40 * _wave(32, 32))
+    rng = np.random.default_rng(2014)
+    wide = [int(n) for n in rng.integers(-(2**62), 2**62, 256)]
+    narrow = [int(n) for n in rng.integers(-40, 40, 256)]
+    medium = [int(n) for n in rng.integers(-4000, 4000, 256)]
+    turns = np.arange(72) / 150
+    offsets = np.concatenate([np.full(40, 0.013), turns, turns, turns[::-1]])
+    infinite = [0x7FF0000000000000, 0x7FF8000000000001, 1]
+
+    def differences(rule: int, argument: int, wanted: list[int], specials: Sequence[int] = ()) -> _Maker:
+        return lambda restored: chunk_of_differences(rule, argument, restored, wanted, specials)
+
+    def random(step: float, bits: int, low: int = 0, high: int = 256) -> _Maker:
+        return lambda restored: chunk_of_random_offsets(restored, step, bits, low, high)
+
+    def listed(restored: NDArray[Any]) -> bytes:
+        return chunk_of_offsets(restored, (np.rint(restored) + offsets).astype(np.float32), 1.0, 30)
+
+    def attribute(
+        dtype: type, lattice: tuple[str, float, float], chunks: list[_Maker], values: Floats = heights
+    ) -> Original:
+        surface = ls.Surface(heights.astype(np.int8), attributes={"extreme": values.astype(dtype)})
+        return Original(surface, rewritten=lambda parts: parts.with_lattice(*lattice).with_chunks(chunks))
+
+    return {
+        "residual-decimals": attribute(
+            np.float64,
+            ("affine", 1.0, 0.37),
+            [
+                differences(2, 15, narrow, infinite),
+                differences(2, 2, wide),
+                differences(1, 3, wide),
+                differences(1, 20, medium, list(range(15))),
+            ],
+        ),
+        "residual-offsets": attribute(
+            np.float32,
+            ("affine", 0.0, 1.0),
+            [listed, random(1.0, 34), random(0.25, 3, 0, 40), random(5e-324, 0, 90, 170)],
+        ),
+        "residual-offsets-far": attribute(
+            np.float32,
+            ("affine", 0.0, 2e37),
+            [random(1e38, 20), random(3e38, 26), random(1e300, 6), random(3e-2, 34)],
+        ),
+        # With this step, places on either side of 2^63 share entries of the memory of differences.
+        "residual-uint64": attribute(
+            np.uint64,
+            ("affine", 2.0**63, 2.0**56 - 80 * 2.0**41),
+            [differences(1, 0, narrow), differences(1, 36, narrow), differences(1, 13, wide), lambda _: b""],
+            heights + 60,
+        ),
+    }
+
+
 @functools.cache
 def originals() -> dict[str, Original]:
     """All that there is a golden file of."""
@@ -453,6 +710,13 @@ def originals() -> dict[str, Original]:
         **_made_for_an_error(),
         **_large(),
         **_limits(),
+        **_of_levels(),
+        **_of_tiles(),
+        **_of_patches(),
+        **_of_sections(),
+        **_of_strings(),
+        **_of_values(),
+        **_of_residuals(),
     }
 
 
@@ -476,14 +740,18 @@ def _kind(array: NDArray[Any]) -> dict[str, Any]:
     return {"type": array.dtype.name, "shape": list(array.shape)}
 
 
-def expectations(container: bytes) -> dict[str, Any]:
-    """What a container decodes to: shapes, types, errors and values of each layer, and the grids of each level."""
+def expectations(container: bytes, detailed: bool = False) -> dict[str, Any]:
+    """What a container decodes to: shapes, types, errors and values of each layer, and the grids of each level.
+
+    ``detailed``: also the coarser levels of each layer, and the errors of channels.
+    """
     decoder = ls.Decoder()
     decoder.feed(container)
     decoder.finish()
     header = decoder.header
     assert header is not None
-    return {
+    plane = header.plane is not None  # x and y of coarser levels are the receiver's to choose
+    found = {
         "blocks": [
             {
                 "closed": list(block.closed),
@@ -503,12 +771,17 @@ def expectations(container: bytes) -> dict[str, Any]:
             }
             for view in decoder.layers
         ],
-        # Where x and y are a rule, those of coarser levels are the receiver's to choose.
         "levels": [
-            digests(decoder.surface(level), header.plane is not None and level < header.levels)
-            for level in range(header.levels + 1)
+            digests(decoder.surface(level), plane and level < header.levels) for level in range(header.levels + 1)
         ],
     }
+    if detailed:
+        found["channels"] = [[list(errors) for errors in view.channels] for view in decoder.layers]
+        found["partial"] = [
+            [digests(view.surface(level), plane) for level in range(header.levels)]
+            for view in decoder.layers[: header.layer_count]
+        ]
+    return found
 
 
 def lines(expected: Mapping[str, Mapping[str, Any]]) -> str:
@@ -524,12 +797,13 @@ def lines(expected: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Write all files."""
+    """Write the files that are not there, and what is expected of all."""
     expected = {}
     for name, original in originals().items():
-        container = original.encode()
-        (FOLDER / f"{name}.lode").write_bytes(container)
-        expected[name] = expectations(container)
+        path = FOLDER / f"{name}.lode"
+        container = path.read_bytes() if path.exists() else original.encode()
+        path.write_bytes(container)
+        expected[name] = expectations(container, original.detailed)
     (FOLDER / "expected.json").write_text(lines(expected))
 
 

@@ -29,7 +29,8 @@ __all__ = ["SCENES", "check", "seeds"]
 
 def _decode(name: str) -> None:
     """A golden file at every layer and level."""
-    if expectations((FOLDER / f"{name}.lode").read_bytes()) != _expected()[name]:
+    expected = _expected()[name]
+    if expectations((FOLDER / f"{name}.lode").read_bytes(), "partial" in expected) != expected:
         raise AssertionError(f"expected {name}.lode to decode to what expected.json says")
 
 

@@ -5,11 +5,19 @@ import type { PointArray, Surface } from "../src/types";
 import { digests, type Expected } from "./golden";
 
 /** What `tests.golden.generate.expectations` tells. */
-export function expectations(kernels: WebAssembly.Module, container: Uint8Array): Expected {
+export function expectations(kernels: WebAssembly.Module, container: Uint8Array, detailed = false): Expected {
   const decoder = new Decoder(kernels);
   decoder.feed(container);
   decoder.finish();
   const header = decoder.header!;
+  const plane = header.plane !== null;
+  const coarser = Array.from({ length: header.levels }, (_, level) => level);
+  const details = {
+    channels: decoder.layers.map((view) => view.channels.map((errors) => [...errors])),
+    partial: decoder.layers
+      .slice(0, header.layerCount)
+      .map((view) => coarser.map((level) => digests(view.surface(level), plane))),
+  };
   return {
     blocks: kinds(decoder.surface()),
     layers: decoder.layers.map((view) => ({
@@ -20,8 +28,9 @@ export function expectations(kernels: WebAssembly.Module, container: Uint8Array)
       sha256: digests(view.surface()),
     })),
     levels: Array.from({ length: header.levels + 1 }, (_, level) =>
-      digests(decoder.surface(level), header.plane !== null && level < header.levels),
+      digests(decoder.surface(level), plane && level < header.levels),
     ),
+    ...(detailed ? details : {}),
   };
 }
 

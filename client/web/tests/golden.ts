@@ -21,6 +21,9 @@ export interface Expected {
   }[];
   layers: { bytes: number; level: number; rms: number; max: number; sha256: string[] }[];
   levels: string[][];
+  /** Of some files: the errors of channels after each layer, and the coarser levels of each layer. */
+  channels?: number[][][];
+  partial?: string[][][];
 }
 
 export const EXPECTED = JSON.parse(readFileSync(join(FOLDER, "expected.json"), "utf8")) as Record<string, Expected>;
