@@ -275,6 +275,25 @@ def _decoders(folder: Path, count: int, seconds: float | None) -> tuple[int, tup
     )
 
 
+def _mutants(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import mutations
+    from .mutants import MUTANTS
+
+    done = list(mutations.survey(MUTANTS[:count], seconds))
+    noticed = [outcome for outcome in done if outcome.file is not None]
+    proved = [outcome for outcome in done if outcome.file is None and outcome.mutant.equivalent]
+    missed = [outcome.mutant.rule for outcome in done if outcome.file is None and not outcome.mutant.equivalent]
+    assert not missed, "\n".join(missed)
+    assert len(noticed) >= 0.97 * len(done), f"{len(noticed)} of {len(done)} mutants fail a golden file"
+    return len(done), (
+        f"{len(noticed)} of {len(done)} mutants fail a golden file; of the others, {len(proved)} are equivalent.",
+        "",
+        "| rule that is changed | golden file that notices it |",
+        "| --- | --- |",
+        *(f"| {outcome.mutant.rule} | {outcome.told} |" for outcome in done),
+    )
+
+
 PARTS = {
     part.name: part
     for part in (
@@ -289,6 +308,7 @@ PARTS = {
             "fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz, continues=True
         ),
         Part("decoders", "The compiled decoder and the reference", "surfaces", 2000, _decoders),
+        Part("mutants", "Rules of the format changed one by one, beside the golden files", "mutants", 160, _mutants),
         Part(
             "kernels",
             "Any calls of the C kernels, under sanitizers",
