@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.metadata import fitted
-from ..coordinates.coordinate_rules import VALUES, evaluate, fit_axis
+from ..coordinates.coordinate_rules import VALUES, bits, evaluate, fit_axis, rounded
 from ..coordinates.seams import merge, unwrap, wrapped
 from ..errors import FormatError
 from ..scratch import IN_MEMORY, Room, rows_at_once
@@ -21,6 +21,9 @@ __all__ = ["Coordinate", "place"]
 
 #: How far a coordinate may be from even spacing, in steps, for the heights to count as a regular lattice.
 _EVEN = 0.01
+
+#: How much shorter than a full turn, relative to it, rounded longitudes of one may be.
+_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -54,11 +57,12 @@ def place(
 ) -> Surface:
     """Put heights over their coordinates.
 
-    Where both coordinates are vectors and evenly spaced, the result is heights with a ``geotransform``, and with
-    ``axes`` where that alone does not say every coordinate bit for bit; otherwise, and where these would be too long
-    for metadata, x, y, z. Longitudes that jump are
-    unwrapped; an axis that goes once around the Earth is closed. A missing height is a hole that keeps its x and y: as
-    one of x, y, z it is NaN.
+    Where both coordinates are vectors of finite values, the result is heights: with a ``geotransform`` where both are
+    evenly spaced, and with ``axes`` where that alone does not say every coordinate bit for bit. It is x, y, z
+    otherwise: of arrays, where the axes would be too long for metadata, where one ends at the value at which it begins,
+    and where longitudes that are not evenly spaced jump or go around the Earth. Longitudes that jump are unwrapped; an
+    axis that goes once around the Earth is closed. A missing height is a hole that keeps its x and y: as one of x, y, z
+    it is NaN.
 
     Parameters
     ----------
@@ -75,15 +79,15 @@ def place(
     """
     extras: dict[str, Any] = {"attributes": attributes or {}}
     values = dict(metadata or {})
-    if x.axis is not None and y.axis == 1 - x.axis:
-        even = [_even(coordinate) for coordinate in (x, y)]
-        rules = _georeference(x, y, even[0], even[1]) if even[0] is not None and even[1] is not None else None
+    lines = [_line(coordinate, closed) for coordinate in (x, y)]
+    if x.axis is not None and y.axis == 1 - x.axis and lines[0] is not None and lines[1] is not None:
+        rules = _georeference(x, y, lines[0], lines[1])
         # Rules that are too long for metadata are no way to say where each point lies: x and y themselves are.
         if rules is not None and not any(name == "axes" for name, _ in fitted(values | rules)[1]):
             surface = Surface(heights, mask=mask, **extras, metadata=values | rules)
-            for coordinate, found in zip((x, y), even, strict=True):
-                if coordinate.degrees and coordinate.axis is not None and found is not None:
-                    surface = close_around(surface, (coordinate.axis, found.step), closed)
+            for coordinate, line in zip((x, y), lines, strict=True):
+                if coordinate.degrees and coordinate.axis is not None and line is not None and line.even:
+                    surface = close_around(surface, (coordinate.axis, line.step), closed)
             return surface
     planes = [_plane(coordinate, heights.shape) for coordinate in (x, y)]
     dtype = np.result_type(*planes, heights, *(() if mask is None else (np.float32,)))
@@ -105,23 +109,33 @@ def place(
 
 
 @dataclass(frozen=True)
-class _Even:
-    """An evenly spaced coordinate: its unwrapped values, what they are nearly, and where they wrap."""
+class _Line:
+    """A coordinate along one axis: its unwrapped values, the line nearest to them, and where they wrap.
+
+    `even` says whether that line is near enough for a regular lattice.
+    """
 
     values: NDArray[Any]
     origin: float
     step: float
     low: float | None
+    even: bool
 
 
-def _even(coordinate: Coordinate) -> _Even | None:
+def _line(coordinate: Coordinate, closed: Closed | None) -> _Line | None:
+    """None for an array over both axes, and where rules cannot take the place of x and y.
+
+    These are values that are not finite, or end where they begin, and uneven longitudes that jump or go around the
+    Earth: they are unwrapped, and closed, as x, y, z.
+    """
     given = coordinate.values
-    if len(given) < 2 or not np.isfinite(given).all():
+    if coordinate.axis is None or len(given) < 2 or not np.isfinite(given).all():
         return None
-    values, low = given, None
-    if coordinate.degrees and given.dtype.kind == "f":
+    values, low, jumps = given, None, False
+    if coordinate.degrees:
         turns = np.rint((np.unwrap(given.astype(np.float64), period=TURN) - given) / TURN)
-        if turns.any():
+        jumps = bool(turns.any())
+        if jumps and given.dtype.kind == "f":
             low = float((given.min() + (given.max() - TURN)) / 2)
             values = given.astype(np.float64) + TURN * turns
             if wrapped(values, TURN, low).astype(given.dtype).tobytes() != given.tobytes():
@@ -129,33 +143,49 @@ def _even(coordinate: Coordinate) -> _Even | None:
     exact = values.astype(np.float64)
     step = float((exact[-1] - exact[0]) / (len(exact) - 1))
     away = np.abs(exact - (exact[0] + step * np.arange(len(exact)))).max()
-    return _Even(values, float(exact[0]), step, low) if step and away <= _EVEN * abs(step) else None
+    even = bool(away <= _EVEN * abs(step))
+    if not step or (not even and (jumps or (coordinate.degrees and _around(exact, coordinate.axis, closed)))):
+        return None
+    return _Line(values, float(exact[0]), step, low, even)
 
 
-def _georeference(x: Coordinate, y: Coordinate, across: _Even, down: _Even) -> dict[str, Any]:
+def _around(longitudes: NDArray[np.float64], axis: int, closed: Closed | None) -> bool:
+    """Whether uneven longitudes, shape (N,), may make their axis a closed one."""
+    if closed is not None and not closed[axis]:
+        return False
+    whole = abs(longitudes[-1] - longitudes[0]) >= TURN * (1 - _ROUNDING)
+    return bool(whole) or encircles(longitudes[None, :], np.zeros((1, len(longitudes))), 1)
+
+
+def _georeference(x: Coordinate, y: Coordinate, across: _Line, down: _Line) -> dict[str, Any] | None:
+    """The metadata that say where heights lie; None where no rules make every coordinate again, bit for bit."""
     dtype = np.result_type(across.values, down.values)
     transform: list[float] = []
     rules: dict[str, Any] = {}
-    for name, even, axis in (("x", across, x.axis), ("y", down, y.axis)):
-        values = even.values.astype(dtype)
+    for name, line, axis in (("x", across, x.axis), ("y", down, y.axis)):
+        values = line.values.astype(dtype)
         rule = fit_axis(values)
         if rule and rule[-1] is True:
             rule = None  # it depends on the number of places, which changes where a seam is merged
         rules[name] = rule or [*values.tolist(), VALUES]
-        origin, step = map(float, rule) if rule and len(rule) == 2 else (even.origin, even.step)
+        # Integers beyond 2**53 are no float64, in which rules are evaluated.
+        if not np.array_equal(bits(rounded(values.astype(np.float64), dtype)), bits(values)):
+            return None
+        origin, step = map(float, rule) if rule and len(rule) == 2 else (line.origin, line.step)
         transform += [origin - step / 2, step, 0.0] if axis == 1 else [origin - step / 2, 0.0, step]
-    found: dict[str, Any] = {"geotransform": transform}
     if dtype != np.float64:
         rules["dtype"] = dtype.name
     if x.axis == 0:
         rules["rows"] = "x"
-    for start, even, axis in ((0, across, x.axis), (3, down, y.axis)):
-        place, still = np.arange(len(even.values), dtype=np.float64), np.zeros((1, 1))
+    # Without even spacing a geotransform says nothing.
+    found: dict[str, Any] = {"geotransform": transform} if across.even and down.even else {"axes": rules}
+    for start, line, axis in ((0, across, x.axis), (3, down, y.axis)):
+        place, still = np.arange(len(line.values), dtype=np.float64), np.zeros((1, 1))
         row, column = (place[:, None], still) if axis == 0 else (still, place[None, :])
         centres = evaluate([*transform[start : start + 3], 0.5], row, column, False)
-        if centres.tobytes() != even.values.astype(np.float64).tobytes():
+        if centres.tobytes() != line.values.astype(np.float64).tobytes():
             found["axes"] = rules
-    lows = [(channel, even.low) for channel, even in enumerate((across, down)) if even.low is not None]
+    lows = [(channel, line.low) for channel, line in enumerate((across, down)) if line.low is not None]
     if lows:
         found["angles"] = [{"channel": channel, "period": TURN, "low": low} for channel, low in lows]
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -172,3 +173,66 @@ def test_a_map_closes_after_one_turn_at_every_level() -> None:
     for level in range(header_of(decoder).levels + 1):
         x = np.asarray(decoder.surface(level).to_pyvista().points[:, 0])
         assert (x.min(), x.max()) == pytest.approx((0, 360))
+
+
+#: How x of W columns, or y of H rows, may be spaced in a file.
+SPACINGS: dict[str, Callable[[int], NDArray[Any]]] = {
+    "even": lambda n: 3.0 * np.arange(n),
+    "growing": lambda n: np.cumsum(1.05 ** np.arange(n)),
+    "falling": lambda n: -(np.arange(n, dtype="f4") ** 1.3),
+    "to and fro": lambda n: np.arange(n) + 4 * np.sin(np.arange(n) / 5.0),
+    "Mercator": lambda n: np.degrees(np.arctan(np.sinh(np.linspace(-2, 2.5, n)))),
+    "numbers": lambda n: np.arange(n, dtype="i4") ** 2 - 700,
+}
+
+UNCONSOLIDATED: dict[str, dict[str, Any]] = {"nc": {}, "zarr": {"consolidated": False}}
+
+
+@pytest.mark.parametrize("suffix", ["nc", "zarr"])
+@pytest.mark.parametrize("order", [("y", "x"), ("x", "y")])
+@pytest.mark.parametrize(
+    ("across", "down"),
+    [("growing", "even"), ("even", "Mercator"), ("to and fro", "falling"), ("numbers", "growing"), ("falling",) * 2],
+)
+def test_uneven_axes_of_files_are_kept_at_every_level(
+    across: str, down: str, order: tuple[str, str], suffix: str, tmp_path: Path
+) -> None:
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("zarr" if suffix == "zarr" else "h5netcdf")
+    sizes = {"y": 53, "x": 78}
+    shape = (sizes[order[0]], sizes[order[1]])
+    heights = np.cumsum(np.random.default_rng(7).normal(size=shape), axis=1).astype("f4")
+    lines = {"x": SPACINGS[across](sizes["x"]), "y": SPACINGS[down](sizes["y"])}
+    source = xarray.Dataset({"z": (order, heights)}, lines)
+    container, path = tmp_path / "a.lode", tmp_path / f"a.{suffix}"
+    if suffix == "zarr":
+        source.to_zarr(path, zarr_format=3, consolidated=False)
+    else:
+        source.to_netcdf(path, engine="h5netcdf")
+    surface = read(path)
+    assert (surface.points.ndim, surface.dtype) == (2, np.float32)
+    container.write_bytes(ls.encode(surface))
+    decoder = decoder_of(surface)
+    for level in range(header_of(decoder).levels + 1):
+        nodes = dict(zip(order, level_nodes(header_of(decoder), level)[0], strict=True))
+        opened = xarray.open_dataset(container, engine="lode", level=level)
+        for dataset in (decoder.surface(level).to_xarray(), opened):
+            for name, values in lines.items():
+                assert dataset[name].dims == (name,)
+                assert dataset[name].values.astype("f8").tobytes() == values[nodes[name]].astype("f8").tobytes()
+        opened.close()
+    written = tmp_path / f"b.{suffix}"
+    write(decoder.surface(), written)
+    with xarray.open_dataset(
+        written, engine="zarr" if suffix == "zarr" else "h5netcdf", **UNCONSOLIDATED[suffix]
+    ) as back:
+        variable = back["z" if "z" in back else "height"]
+        assert variable.values.tobytes() == heights.tobytes()
+        for name, values in lines.items():
+            # Where x runs along the rows, files have x and y over both.
+            wanted = np.broadcast_to(np.expand_dims(values, 1 - order.index(name)), shape)
+            own = back[name].broadcast_like(variable).transpose(*variable.dims)
+            assert back[name].dims == ((name,) if order[0] == "y" else variable.dims)
+            assert own.values.astype("f8").tobytes() == wanted.astype("f8").tobytes()
+            # One type for both axes, and where they have one that is it.
+            assert back[name].dtype == np.result_type(*lines.values())

@@ -107,7 +107,8 @@ def test_npz_gives_heights_their_coordinates(tmp_path: Path) -> None:
     assert surface.metadata["geotransform"] == [1.25, 0.5, 0.0, 9.0, 0.0, -2.0]
     np.savez(tmp_path / "uneven.npz", depth=heights, lon=x**2, lat=y, u=y, v=np.ones((3, 4)))
     surface = formats.read(tmp_path / "uneven.npz", array="depth")
-    np.testing.assert_array_equal(surface.points, np.dstack((*np.meshgrid(x**2, y), heights)))
+    np.testing.assert_array_equal(surface.points, heights)
+    assert surface.metadata["axes"] == {"x": [*(x**2).tolist(), "values"], "y": [8, -2]}
     np.savez(tmp_path / "arrays.npz", z=heights, x=heights + 1, y=heights * 2)
     surface = formats.read(tmp_path / "arrays.npz")
     np.testing.assert_array_equal(surface.points, np.dstack((heights + 1, heights * 2, heights)))

@@ -12,9 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.coordinates.height_fields import coordinates
+from lodestream.coordinates.height_fields import coordinates, to_xyz
 from lodestream.coordinates.seams import restore
 from lodestream.errors import FormatError, FormatWarning, OptionError, SwitchedOffError, UnavailableError
+from lodestream.surface import Surface
 
 xarray = pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
@@ -101,12 +102,70 @@ def test_nearly_even_axes_keep_their_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(coordinates(surface)[0][0], lon)
 
 
-def test_uneven_axes_become_points(tmp_path: Path) -> None:
+def read_over(path: Path, lon: Array, lat: Array, **options: Any) -> Surface:
+    """Heights of `hills` over these longitudes and latitudes, from a file."""
+    z = ("lat", "lon"), hills((len(lat), len(lon)))
+    return formats.read(save(path, {"z": z, "lon": ("lon", lon, EAST), "lat": ("lat", lat, NORTH)}), **options)
+
+
+def test_uneven_axes_are_listed(tmp_path: Path) -> None:
     lon, lat = np.arange(9.0) ** 2, np.arange(6.0)
-    surface = formats.read(
-        save(tmp_path / "a.nc", {"z": (("lat", "lon"), hills()), "lon": ("lon", lon), "lat": ("lat", lat)})
-    )
-    np.testing.assert_array_equal(surface.points, np.dstack((*np.meshgrid(lon, lat), hills())))
+    surface = read_over(tmp_path / "a.nc", lon, lat)
+    np.testing.assert_array_equal(surface.points, hills())
+    assert "geotransform" not in surface.metadata
+    np.testing.assert_array_equal(to_xyz(surface).points, np.dstack((*np.meshgrid(lon, lat), hills())))
+
+
+def test_even_longitudes_over_uneven_latitudes_are_unwrapped_and_closed(tmp_path: Path) -> None:
+    lon, lat = ((np.arange(36) * 10.0 + 180) % 360), np.degrees(np.arcsin(np.linspace(-0.99, 0.99, 15)))
+    surface = read_over(tmp_path / "a.nc", lon, lat)
+    assert (surface.points.ndim, surface.closed) == (2, (False, True))
+    for plane, wanted in zip(coordinates(restore(surface)), np.meshgrid(lon, lat), strict=True):
+        assert plane.tobytes() == wanted.tobytes()
+
+
+AROUND = np.cumsum(np.tile([8.0, 10.0, 12.0, 10.0], 9)) - 8
+
+
+@pytest.mark.parametrize(
+    ("lon", "options", "channels", "closed"),
+    [
+        (AROUND, {}, 3, True),
+        (AROUND, {"closed": "none"}, 1, False),
+        (AROUND[:-9], {}, 1, False),
+        ((AROUND[:-9] + 200) % 360, {}, 3, False),  # they jump
+        (np.append(AROUND[:-9], 0.0), {}, 3, False),  # x ends where it begins
+    ],
+)
+def test_uneven_longitudes_that_go_around_or_jump_become_points(
+    lon: Array, options: dict[str, str], channels: int, closed: bool, tmp_path: Path
+) -> None:
+    lat = np.arange(6.0) ** 2
+    surface = read_over(tmp_path / "a.nc", lon, lat, **options)
+    assert (surface.points.ndim, surface.closed) == (3 if channels == 3 else 2, (False, closed))
+    wanted = np.dstack((*np.meshgrid(lon, lat), hills((6, len(lon)))))
+    np.testing.assert_array_equal(to_xyz(restore(surface)).points, wanted)
+
+
+def test_axes_that_no_metadata_hold_become_points(tmp_path: Path) -> None:
+    lat = np.arange(3.0) ** 2
+    for lon, ndim in (
+        (np.linspace(0, 2, 8000) ** 3, 3),
+        (2**60 + np.arange(9) ** 3, 3),
+        (np.append(np.arange(8.0) ** 2, np.nan), 3),
+        (np.linspace(0, 2, 6000) ** 3, 2),
+    ):
+        z = ("y", "x"), hills((3, len(lon)), np.int64)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of heights without an x
+            surface = formats.read(
+                save(
+                    tmp_path / "a.nc",
+                    {"z": z, "x": ("x", lon), "y": ("y", lat.astype(np.int64) if lon.dtype.kind == "i" else lat)},
+                )
+            )
+        assert surface.points.ndim == ndim
+        np.testing.assert_array_equal(to_xyz(surface).points[1, :, 0], lon)
 
 
 def test_a_variable_without_coordinates_is_heights(tmp_path: Path) -> None:
@@ -222,7 +281,7 @@ def test_times_and_depths_are_chosen_by_name(tmp_path: Path, kind: str) -> None:
     for time, place in (("1", 1), ("-1", 2), ("2001-02", 1), ("2001-01-01T00", 0)):
         surface = formats.read(path, time=time, at=f"depth:{place % 2}")
         np.testing.assert_array_equal(surface.points, values[place, place % 2, 0])
-    section = formats.read(path, at="x:4,depth:0")
+    section = to_xyz(formats.read(path, at="x:4,depth:0"))
     np.testing.assert_array_equal(section.points[..., 2], values[:, 0, 0, :, 4])
     np.testing.assert_array_equal(section.points[:, 3, 1], [0, 31, 59])
     for options, message in (
@@ -278,7 +337,7 @@ def test_coordinates_are_found_by_their_names(tmp_path: Path, x: str, y: str) ->
     surface = formats.read(path)
     np.testing.assert_array_equal(surface.points, np.stack((columns, rows, hills()), axis=-1))
     vectors: Variables = {"z": (("j", "i"), hills()), x: ("i", columns[0]), y: ("j", rows[:, 0])}
-    np.testing.assert_array_equal(formats.read(save(tmp_path / "b.nc", vectors)).points, surface.points)
+    np.testing.assert_array_equal(to_xyz(formats.read(save(tmp_path / "b.nc", vectors))).points, surface.points)
 
 
 @pytest.mark.parametrize(
