@@ -14,7 +14,7 @@ from ..coordinates.coordinate_rules import VALUES, bits, evaluate, fit_axis, rou
 from ..coordinates.seams import merge, unwrap, wrapped
 from ..errors import FormatError
 from ..scratch import IN_MEMORY, Room, rows_at_once
-from ..surface import Closed, Surface
+from ..surface import DTYPES, Closed, Surface
 from .longitudes import TURN, close_around, encircles
 
 __all__ = ["Coordinate", "place"]
@@ -125,7 +125,7 @@ class _Line:
 def _line(coordinate: Coordinate, closed: Closed | None) -> _Line | None:
     """None for an array over both axes, and where rules cannot take the place of x and y.
 
-    These are values that are not finite, or end where they begin, and uneven longitudes that jump or go around the
+    These are values that are not finite, of a type that points cannot have, or that end where they begin, and uneven longitudes that jump or go around the
     Earth: they are unwrapped, and closed, as x, y, z.
     """
     given = coordinate.values
@@ -144,7 +144,8 @@ def _line(coordinate: Coordinate, closed: Closed | None) -> _Line | None:
     step = float((exact[-1] - exact[0]) / (len(exact) - 1))
     away = np.abs(exact - (exact[0] + step * np.arange(len(exact)))).max()
     even = bool(away <= _EVEN * abs(step))
-    if not step or (not even and (jumps or (coordinate.degrees and _around(exact, coordinate.axis, closed)))):
+    around = coordinate.degrees and _around(exact, coordinate.axis, closed)
+    if not step or (not even and (jumps or around or given.dtype.name not in DTYPES)):
         return None
     return _Line(values, float(exact[0]), step, low, even)
 
