@@ -125,8 +125,8 @@ class _Line:
 def _line(coordinate: Coordinate, closed: Closed | None) -> _Line | None:
     """None for an array over both axes, and where rules cannot take the place of x and y.
 
-    These are values that are not finite, of a type that points cannot have, or that end where they begin, and uneven longitudes that jump or go around the
-    Earth: they are unwrapped, and closed, as x, y, z.
+    These are values that are not finite or end where they begin, uneven ones of a type that points cannot have, and
+    uneven longitudes that jump or go around the Earth: they are unwrapped, and closed, as x, y, z.
     """
     given = coordinate.values
     if coordinate.axis is None or len(given) < 2 or not np.isfinite(given).all():
