@@ -355,7 +355,10 @@ class Decoder:
             return
         if self._finest is None or self._finest >= header.levels:
             try:
-                self.layers[-1].verify()
+                if self._ending.digest is None:
+                    self.layers[-1].verify()
+                else:
+                    self.layers[-1].check_digest()
             except CorruptStreamError:
                 self.layers.pop()
                 raise

@@ -221,7 +221,12 @@ class View:
             surface = self._shown(self._queue.header.levels)
         except InputError:
             return  # nothing of this window is valid, which is no damage
-        self._ending.verified.append((self._selection, surface))
+        header, ending = self._queue.header, self._ending
+        whole = self._selection.region is None and self._selection.channels(header).all()
+        if ending.digest is None and header.exact and whole:
+            # The SHA-256 comes after the residual: the values need not be computed again then.
+            ending.digest = values_digest(surface.blocks)
+        ending.verified.append((self._selection, surface))
 
     def _taken(self) -> Surface | None:
         """The complete surface, if `verify` has computed it and nobody has taken it."""
@@ -288,17 +293,27 @@ class View:
         surface = with_rules(surface, header, None if whole else self._nodes(level)[0], self._kept(finest))
         return surface, values if region is None else window_metadata(values, header.shape, region)
 
+    def check_digest(self) -> None:
+        """Hold the SHA-256 that `verify` computed to the one that came with the values, if both are known.
+
+        Raises
+        ------
+        CorruptStreamError
+            If they differ.
+        """
+        promised, digest = self._ending.promised, self._ending.digest
+        if promised is not None and digest is not None and promised != digest:
+            problem = f"expected values with the SHA-256 {promised}, got {digest}"
+            raise CorruptStreamError(problem, self._queue.header.length)
+
     def _check_digest(self, surface: Surface, level: int) -> None:
         """Hold the values to the SHA-256 that came with them, where this is the complete surface and it is exact."""
         header, selection = self._queue.header, self._selection
-        promised = self._ending.promised
-        if promised is None or not self.complete or not header.exact or level != header.levels:
+        if self._ending.promised is None or not self.complete or not header.exact or level != header.levels:
             return
         if selection.region is None and selection.channels(header).all():
-            found = self._ending.digest or values_digest(surface.blocks)
-            self._ending.digest = found
-            if promised != found:
-                raise CorruptStreamError(f"expected values with the SHA-256 {promised}, got {found}", header.length)
+            self._ending.digest = self._ending.digest or values_digest(surface.blocks)
+            self.check_digest()
 
     def _nodes(self, level: int) -> list[Nodes]:
         """Which rows and columns of each block are shown at a level, or in the window."""

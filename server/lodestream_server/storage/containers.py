@@ -33,8 +33,10 @@ _BYTES_KEPT = 64 << 20
 
 # Of an index without its masks and metadata: that of the smallest surface, and the tables of its levels.
 _LEAST_INDEX = 16 << 10
-# How many times its bytes a header takes in memory: a block, with its sides and its grids, has some bytes there.
-_HEADER_GROWTH = 1024
+# How many times its bytes a header takes in memory: joints and rules of x and y are lists of numbers there.
+_HEADER_GROWTH = 64
+# What a block, a patch, an interface or a channel takes, with its sides and its grids at each level.
+_PART_BYTES = 4 << 10
 # How often the bytes of masks are in memory while the index is read.
 _COPIES_OF_MASKS = 4
 
@@ -221,8 +223,30 @@ def index_memory(file: BinaryIO) -> tuple[int, int]:
     header = sections[0][1]
     masks = sections[1][1] if sections[1][0] in (MASKS, KEPT_MASKS) else 0
     # A length that the file does not have is refused when it is read.
-    kept = _LEAST_INDEX + INDEX_GROWTH * index + _HEADER_GROWTH * min(header, tail)
-    return kept, _COPIES_OF_MASKS * min(masks, tail)
+    header = min(header, tail)
+    parts = _parts(file.fileno(), header) * _PART_BYTES
+    return _LEAST_INDEX + INDEX_GROWTH * index + _HEADER_GROWTH * header + parts, _COPIES_OF_MASKS * min(masks, tail)
+
+
+def _parts(handle: int, length: int) -> int:
+    """How many blocks, patches, interfaces and channels the header tells, whose payload has so many bytes.
+
+    0 if it cannot be read: it is refused then when the index is read.
+    """
+    from lodestream.container.frames import section_extent, whole_section
+    from lodestream.container.headers import parse_header
+    from lodestream.container.sections import HEADER, SIGNATURE
+
+    offset = len(SIGNATURE)
+    try:
+        data = _read_from(handle, offset, length + 16)  # and what stands before and behind the payload
+        extent = section_extent(data[:10], offset)
+        frame = whole_section(data[: extent[1]] if extent else data, offset, HEADER)
+        header = parse_header(frame.payload, frame.payload_offset, frame.end)
+    except StreamError:
+        return 0
+    grids = 0 if header.arrangement is None else len(header.arrangement.patches) + len(header.arrangement.interfaces)
+    return len(header.blocks) + grids + header.channels
 
 
 def _read_index(file: BinaryIO) -> Index:

@@ -106,6 +106,15 @@ def test_a_container_whose_index_takes_too_much_is_not_taken(tmp_path: Path, mon
         assert len(kept(tmp_path, "uploads")) == 1
 
 
+def joined(random: np.random.Generator) -> Surface:
+    """Two blocks that touch in scattered points, and have the same scattered holes: long joints, and few parts."""
+    x, y = np.meshgrid(np.arange(200.0), np.arange(200.0))
+    low, high = (np.stack([x, y, np.full_like(x, z)], axis=2) for z in (0, 1))
+    touching, valid = random.random(x.shape) < 0.3, random.random(x.shape) > 0.3
+    high[touching] = low[touching]
+    return Surface(blocks=[Block(low, mask=valid), Block(high, mask=valid)])
+
+
 def surfaces() -> dict[str, bytes]:
     """Containers whose indexes are large in different ways, by name."""
     random = np.random.default_rng(4)
@@ -124,6 +133,7 @@ def surfaces() -> dict[str, bytes]:
         "not finite": encode(spoiled),
         "attributes": encode(Surface(hills(20, 20), attributes={f"a{n}": hills(20, 20, n) for n in range(40)})),
         "blocks": encode(Surface(blocks=cubes)),
+        "joints": encode(joined(random)),
         "metadata": encode(Surface(hills(9, 8), metadata={"words": "word " * 10_000})),
     }
 
