@@ -91,7 +91,7 @@ const target = fc
   .oneof(
     fc.record({ level: integer, order, first: region }, { requiredKeys: [] }),
     fc.record(
-      { untilRms: limit, untilMax: limit, maxBytes: positive, order, region, attributes: fc.array(fc.string()) },
+      { untilRms: limit, untilMax: limit, maxBytes: positive, order, region, attributes: fc.uniqueArray(fc.string()) },
       { requiredKeys: [] },
     ),
   )
