@@ -766,10 +766,10 @@ MUTANTS = (
         "values-float32",
     ),
     Mutant(
-        "8, step 5: a level K is in eighths if F < K",
+        "8, step 1: F counts for a level K of a layer on the way too",
         "decoder",
-        "values_of(q, whole < level, ",
-        "values_of(q, whole < header.finest, ",
+        "whole = self._whole(channel, state, level)",
+        "whole = self._whole(channel, state, level) if level == header.finest else level",
         "levels-heights",
     ),
     Mutant(
