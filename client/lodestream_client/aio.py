@@ -23,7 +23,7 @@ from lodestream.target import Tolerance
 from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Identity, Progress
-from .requests.bodies import Asked, Body, Closure, Parcel, Source, are_files, opened, prepared
+from .requests.bodies import Asked, Body, Closure, Parcel, Source, are_files, check_asked, opened, prepared
 from .requests.calls import Flow
 from .stream.aio_stream import Stream
 from .stream.options import ConnectKeywords, ConnectOptions
@@ -91,6 +91,7 @@ async def upload(
     'ready'
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
+    check_asked(asked)
     ask = not local and are_files(sources)
     read_there = await _run(api.formats_read(url), url, token) if ask else None
     parcel = await _prepared(sources, asked, progress, read_there, local)

@@ -21,7 +21,7 @@ from lodestream.target import Tolerance
 from .requests import api, calls, problems
 from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Identity, Progress
-from .requests.bodies import Asked, Closure, Source, are_files, opened, prepared
+from .requests.bodies import Asked, Closure, Source, are_files, check_asked, opened, prepared
 from .requests.calls import Flow
 from .stream.options import ConnectKeywords, ConnectOptions
 from .stream.sync_stream import Stream
@@ -196,6 +196,7 @@ def upload(
     [2, 2]
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
+    check_asked(asked)
     ask = not local and are_files(sources)
     read_there = _run(api.formats_read(url), url, token) if ask else None
     parcel = prepared(sources, asked, progress, read_there, local)

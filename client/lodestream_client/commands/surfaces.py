@@ -6,8 +6,6 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lodestream.container.series import place_of
-
 from ..requests.states import STATES
 from ..terminal.output import human_size, note, print_json, say_columns
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
@@ -118,6 +116,8 @@ def _together(surfaces: Sequence[Description]) -> list[Description]:
     first: dict[str, int] = {}
     places: list[tuple[int, int]] = []
     for number, surface in enumerate(surfaces):
+        from lodestream.container.series import place_of
+
         place = place_of(surface.details)
         places.append((number, 0) if place is None else (first.setdefault(place.name, number), place.index))
     return [surfaces[number] for number in sorted(range(len(surfaces)), key=places.__getitem__)]
@@ -125,6 +125,8 @@ def _together(surfaces: Sequence[Description]) -> list[Description]:
 
 def _series(surface: Description) -> str:
     """The series of a surface, and its number in it, in words; empty: it is in none."""
+    from lodestream.container.series import place_of
+
     place = place_of(surface.details)
     return "" if place is None else f"{place.name}, {place.along} {place.index}"
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from lodestream.surface import Surface
 
-__all__ = ["Asked", "Body", "Closure", "Parcel", "Source", "are_files", "opened", "prepared"]
+__all__ = ["Asked", "Body", "Closure", "Parcel", "Source", "are_files", "check_asked", "opened", "prepared"]
 
 File: TypeAlias = "str | os.PathLike[str] | BinaryIO | bytes"
 #: What can be uploaded: a file by its name, one that is open, the bytes of one, or a surface in memory: all that
@@ -104,6 +104,17 @@ def are_files(sources: Sequence[Source]) -> bool:
         If a source has another type.
     """
     return bool(sources) and not any(map(in_memory, sources))
+
+
+def check_asked(asked: Asked) -> None:
+    """Refuse options that no server takes, before any is asked.
+
+    Raises
+    ------
+    OptionError
+        If an option has an invalid value, or both a precision and an RMS error are given.
+    """
+    _parameters(asked)
 
 
 def prepared(

@@ -40,7 +40,7 @@ __all__ = ["MEDIA_TYPES", "FileTooLongError", "LevelJob", "MadeLevel", "RefusedL
 #: Raise this with every change by which a level of the same container becomes a file of other bytes: of a writer, of
 #: tags, metadata and overviews, of what decoding gives. Caches, and readers that fetch a file by ranges, take files of
 #: one ETag for the same bytes. A test compares files of this revision.
-_REVISION = 2
+_REVISION = 3
 
 # What else decides about the bytes of some format.
 _LIBRARIES = ("cf-xarray", "h5netcdf", "h5py", "lodestream", "numpy", "pyproj", "rasterio", "scipy", "vtk", "xarray")

@@ -66,7 +66,7 @@ REFUSED: list[tuple[Maker, int, type[InputError], str]] = [
     (many_patches.ply_elements, 100_000, FormatError, "within 1,048,576 bytes"),
     (many_patches.obj_polygon, 100_000, FormatError, "3 or 4 corners"),
     (many_patches.pcd_fields, 100_000, FormatError, "within 65,536 bytes"),
-    (many_patches.bezier_patches, 70_000, FormatError, "from 1 to 65,536"),
+    (many_patches.bezier_patches, 70_000, FormatError, "from 1 to 16,384"),
     (many_patches.geotiff_bands, 65_535, TooLargeError, "at most 4,096 bands"),
     (many_patches.geotiff_items, 100_000, TooLargeError, "bytes of GDAL's metadata"),
     (many_patches.geotiff_images, 25_000, FormatError, "one image"),

@@ -42,7 +42,7 @@ def test_patches_cover_a_block_where_each_cell_is_in_one(seed: int) -> None:
 
 def test_as_many_patches_and_blocks_as_there_may_be_are_read_at_once() -> None:
     """A header of half a megabyte must not keep a reader busy for minutes."""
-    count = 1 << 16
+    count = 1 << 14
     strips = Arrangement(tuple(patch((row, row + 2), (0, 3)) for row in range(count)), ())
     blocks = Arrangement(tuple(whole_patch(number, (3, 3), OPEN) for number in range(count)), ())
     for shapes, arrangement in (((((count + 1, 3), OPEN),), strips), ((((3, 3), OPEN),) * count, blocks)):
