@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from lodestream import page
+from tests.patience import PATIENCE
 
 NOTEBOOK = Path(__file__).parents[3] / "docs" / "notebook.ipynb"
 SERVER = "http://127.0.0.1:8000"
@@ -22,7 +23,7 @@ import nbformat
 from nbclient import NotebookClient
 
 notebook = nbformat.read(sys.argv[1], as_version=4)
-NotebookClient(notebook, timeout=PATIENCE, kernel_name="python3").execute()
+NotebookClient(notebook, timeout=float(sys.argv[2]), kernel_name="python3").execute()
 nbformat.write(notebook, sys.argv[1])
 """
 
@@ -31,7 +32,7 @@ def run(notebook: dict[str, Any], folder: Path, environment: dict[str, str]) -> 
     path = folder / "notebook.ipynb"
     path.write_text(json.dumps(notebook))
     done = subprocess.run(
-        [sys.executable, "-c", _RUN, str(path)],
+        [sys.executable, "-c", _RUN, str(path), str(PATIENCE)],
         cwd=folder,
         env={**environment, "MPLBACKEND": "agg", "JUPYTER_PLATFORM_DIRS": "1"},
         capture_output=True,

@@ -182,7 +182,8 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[s
                         chunks=None,
                         drop_variables=list(unknown),
                     )
-                    return stack.enter_context(dataset)
+                    # A folder lists its members in any order; the same store is to give the same surface.
+                    return stack.enter_context(dataset)[sorted(dataset.variables)]
 
                 yield None, with_parents(opened(name), map(opened, parents_of(name))), groups
     except UnavailableError:
