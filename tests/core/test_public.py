@@ -48,8 +48,8 @@ def modules() -> list[str]:
 def test_every_module_says_what_it_is_and_what_it_exports(name: str) -> None:
     module = importlib.import_module(name)
     assert module.__doc__
-    if (hasattr(module, "__path__") and not hasattr(module, "__all__")) or name.startswith("lodestream.reference."):
-        return  # a package without names of its own; a page as a program, of which only the package exports anything
+    if hasattr(module, "__path__") and not hasattr(module, "__all__"):
+        return  # a package without names of its own
     for each in module.__all__:
         # An alias of types may be there for type checkers only.
         assert hasattr(module, each) or f"    {each}: TypeAlias = " in Path(str(module.__file__)).read_text()
@@ -79,10 +79,9 @@ ERRORS = {*errors.__all__, MessageError.__name__}
 
 
 def sources() -> Iterator[tuple[str, ast.Module]]:
-    """Every module of the core but the reference decoder, a page as a program, which has a form of its own."""
+    """Every module of the core."""
     for path in sorted(SOURCE.parent.rglob("*.py")):
-        if path.parent.name != "reference":
-            yield str(path.relative_to(SOURCE.parent)), ast.parse(path.read_text())
+        yield str(path.relative_to(SOURCE.parent)), ast.parse(path.read_text())
 
 
 def exported(tree: ast.Module) -> Iterator[ast.FunctionDef]:

@@ -1,4 +1,4 @@
-"""What a decoder written like `lodestream.reference` makes of a golden file, beside what `expected.json` says of it."""
+"""What a decoder written like `tests.reference` makes of a golden file, beside what `expected.json` says of it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def compared(decoder: ModuleType, name: str, states: float = math.inf) -> Iterat
     Parameters
     ----------
     decoder : module
-        `lodestream.reference`, or a copy of it.
+        `tests.reference`, or a copy of it.
     name : str
     states : float
         About how many layers are shown, of those that there are; always the first and the last.

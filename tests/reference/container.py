@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ..errors import CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
+from lodestream.errors import CorruptStreamError, TruncatedStreamError, UnsupportedVersionError
+
 from . import limits
 from .fields import Errors, Fields, crc, unpack_map
 from .header import Header, read_header

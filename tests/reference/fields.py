@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from ..errors import CorruptStreamError
+from lodestream.errors import CorruptStreamError
 
 
 class Errors(NamedTuple):

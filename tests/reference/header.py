@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import UnsupportedVersionError
+from lodestream.errors import UnsupportedVersionError
+
 from . import limits
 from .fields import Fields, unpack_map
 from .levels import Axis, Grid, fitted_steps, levels_of

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from ..errors import CorruptStreamError
+from lodestream.errors import CorruptStreamError
+
 from . import limits
 from .container import PAGES, ROOT, Container, Segment, check_optional, read_section, windows_of
 from .fields import Errors, Fields, crc

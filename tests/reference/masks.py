@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import CorruptStreamError
+from lodestream.errors import CorruptStreamError
+
 from .fields import Fields
 from .range_coder import RangeCoder, new_contexts
 

@@ -1,4 +1,4 @@
-"""Two decoders that share nothing, on many random surfaces: the compiled one and `lodestream.reference`."""
+"""Two decoders that share nothing, on many random surfaces: the compiled one and `tests.reference`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream import reference
+from tests import reference
 from tests.core.decoding.comparison import agree_on, surfaces
 
 __all__ = ["Compared", "run"]

@@ -16,7 +16,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
 
-from lodestream import reference
+from tests import reference
 from tests.golden.comparison import EXPECTED, compared, values_of
 
 from .mutants import MUTANTS, Mutant

@@ -22,7 +22,6 @@ from lodestream import (
     StreamError,
     TruncatedStreamError,
     UnsupportedVersionError,
-    reference,
 )
 from lodestream.bands.inspecting import inspect
 from lodestream.container import ByteRange, FrameReader, Index, describe, read_index, read_metadata, sections
@@ -32,6 +31,7 @@ from lodestream.container.model import Errors, OptionalSection
 from lodestream.coordinates.coordinate_rules import evaluate
 from lodestream.planning.planner import plan
 from lodestream.transfer.receiver_state import ReceiverState
+from tests import reference
 
 from ..surfaces import contained, figures, follow, index_of
 from .forgery import with_header, with_index

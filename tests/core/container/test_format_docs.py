@@ -5,9 +5,9 @@ from pathlib import Path
 
 from lodestream.container import limits, metadata, sections
 from lodestream.planning import window_errors
-from lodestream.reference import limits as reference_limits
-from lodestream.reference.container import METADATA_LIMIT
 from lodestream.transform.lifting import TAPS
+from tests.reference import limits as reference_limits
+from tests.reference.container import METADATA_LIMIT
 
 TEXT = (Path(__file__).parents[3] / "docs" / "format.md").read_text()
 

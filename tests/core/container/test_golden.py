@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream import reference
+from tests import reference
 from tests.golden.generate import FOLDER, digests, expectations, lines, originals
 
 EXPECTED: dict[str, Any] = json.loads((FOLDER / "expected.json").read_text())

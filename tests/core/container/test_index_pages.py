@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream import reference
 from lodestream.container import Header, sections
 from lodestream.container import index as container_index
 from lodestream.container.chunks import chunks_of_a_channel
 from lodestream.container.model import Errors
 from lodestream.container.writer import CodedLayer, CodedSegment, write_container
 from lodestream.transform.predictors import default_predictors
+from tests import reference
 
 from ..surfaces import index_of, terrain
 from .forgery import with_index
@@ -66,7 +66,7 @@ def written(seed: int, attribute: bool) -> bytes:
 @pytest.mark.parametrize("seed", range(3))
 def test_an_index_of_several_pages_comes_back(seed: int, attribute: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(container_index, "PAGE", 64)
-    monkeypatch.setattr("lodestream.reference.index.PAGE", 64)
+    monkeypatch.setattr("tests.reference.index.PAGE", 64)
     data = written(seed, attribute)
     index = index_of(data)
     assert [optional.kind for optional in index.optional] == [200, 201]

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream import reference
 from lodestream.bands.inspecting import inspect
 from lodestream.container import Header, describe, headers, limits, sections
 from lodestream.container.frames import index_sections
@@ -28,6 +27,7 @@ from lodestream.quantization.lattice import Lattice
 from lodestream.transfer.range_download import RangeDownload
 from lodestream.transfer.receiver_state import ReceiverState
 from lodestream.transform.predictors import default_predictors
+from tests import reference
 
 from ..surfaces import index_of, terrain
 from ..transfer.test_range_download import File

@@ -1,4 +1,4 @@
-"""Two decoders that share nothing, held to each other: the compiled one and `lodestream.reference`."""
+"""Two decoders that share nothing, held to each other: the compiled one and `tests.reference`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream import reference
+from tests import reference
 
 from ..grid.layouts import layouts, tubes
 

@@ -11,11 +11,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream import reference
 from lodestream.container import sections
 from lodestream.errors import CorruptStreamError
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection
+from tests import reference
 
 from ..container.forgery import index_of, rewritten
 from .comparison import assert_shown

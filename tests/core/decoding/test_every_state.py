@@ -1,4 +1,4 @@
-"""Every state that the index tells, the last one before the residual included, shows what `lodestream.reference` shows.
+"""Every state that the index tells, the last one before the residual included, shows what `tests.reference` shows.
 
 The errors that it tells are those of what it shows. The surfaces have levels without coefficients, and units that no
 layer names: these are known once all layers are there (docs/format.md, section 8, step 1).
@@ -24,7 +24,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream import reference
 from lodestream.bands.inspecting import inspect
 from lodestream.container.fields import told_roughly
 from lodestream.decoding import values
@@ -37,6 +36,7 @@ from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection, select
 from lodestream.scratch import Room, Scratch
 from lodestream.target import Region
+from tests import reference
 
 from ..surfaces import follow, index_of, is_told
 from .comparison import assert_same, assert_shown

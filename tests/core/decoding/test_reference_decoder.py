@@ -5,10 +5,10 @@ import math
 
 import pytest
 
-from lodestream import reference
 from lodestream.errors import CorruptStreamError
-from lodestream.reference import Container, Decoder, Index, decode, read_container, read_index
+from tests import reference
 from tests.golden.comparison import EXPECTED, compared, digests, file_of, values_of
+from tests.reference import Container, Decoder, Index, decode, read_container, read_index
 
 AFFORDED = 30_000  # values that plain Python reconstructs in about a second
 

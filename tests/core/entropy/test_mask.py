@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lodestream.entropy.mask import decode_mask, encode_mask
 from lodestream.errors import CorruptStreamError
-from lodestream.reference import masks as reference
+from tests.reference import masks as reference
 
 Mask = NDArray[np.bool_]
 

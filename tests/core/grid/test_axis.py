@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from lodestream.grid.axis import AxisStep, axis_lengths, axis_step, coarse_length, extension
 
-from ..decoding.reference import refinement_matrix
 from ..transform import lifting_reference as reference
+from ..transform.refinement import refinement_matrix
 
 
 @pytest.mark.parametrize("closed", [False, True])

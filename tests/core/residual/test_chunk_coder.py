@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from lodestream.errors import CorruptStreamError, StreamError
 from lodestream.quantization.lattice import offset_lattice
-from lodestream.reference import residual as reference
 from lodestream.residual.chunk_coder import decode_chunk, encode_chunk
 from lodestream.residual.number_line import PATTERNS, from_line
+from tests.reference import residual as reference
 
 Values = NDArray[Any]
 

@@ -8,7 +8,7 @@ import pytest
 import lodestream as ls
 from lodestream import InputError
 
-from ..decoding.reference import dense_coarsen, refine, surface_refinement_matrix
+from .refinement import dense_coarsen, refine, surface_refinement_matrix
 
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
 #: The filter leaves out less than 1e-18; the rest is rounding, of the filter and of the dense solve.

@@ -15,9 +15,9 @@ from lodestream.grid.axis import AxisStep, axis_step
 from lodestream.transform import lifting
 from lodestream.transform.lifting import CLAMP, TAPS, forward_step, inverse_step
 
-from ..decoding.reference import refinement_matrix
 from . import lifting_reference as reference
 from .lifting_reference import CLOSED, FREE, Ends
+from .refinement import refinement_matrix
 
 LARGEST = 2**24
 #: Every kind of end.

@@ -15,7 +15,8 @@ from scipy.linalg import solveh_banded
 
 from lodestream import InputError, OptionError
 from lodestream.transform import paper
-from tests.core.decoding.reference import dense_coarsen, refine, refinement_matrix, surface_refinement_matrix
+
+from .refinement import dense_coarsen, refine, refinement_matrix, surface_refinement_matrix
 
 Floats = NDArray[np.float64]
 

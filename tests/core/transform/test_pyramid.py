@@ -16,9 +16,9 @@ from lodestream.transform.lifting import CLAMP, TAPS
 from lodestream.transform.predictors import COEFFICIENT_BITS, default_predictors, fitted_steps
 from lodestream.transform.pyramid import allocate, forward, inverse, synthesis_norms
 
-from ..decoding.reference import dense_coarsen
 from ..entropy.coding import effective, shapes_of
 from . import lifting_reference as reference
+from .refinement import dense_coarsen
 
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
 SHAPES = [(1, 2), (2, 1), (1, 40), (3, 3), (4, 9), (6, 5), (17, 17), (24, 31), (57, 1), (60, 52)]
