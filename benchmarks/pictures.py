@@ -46,12 +46,11 @@ class Subject:
     axes: tuple[int, int, int]
     camera: tuple[float, float, float]
     until: tuple[float, float]
-    options: dict[str, Any]
 
 
 SUBJECTS = (
-    Subject("m6_small.fmt", "ONERA M6 wing, 9 blocks", (0, 2, 1), (208.0, 24.0, 0.86), (4e-3, 3e-4), {}),
-    Subject("teapot.bpt", "Utah teapot, 32 blocks", (0, 1, 2), (-62.0, 28.0, 0.92), (2e-2, 1e-3), {"density": "16"}),
+    Subject("m6_small.fmt", "ONERA M6 wing, 9 blocks", (0, 2, 1), (208.0, 24.0, 0.86), (4e-3, 3e-4)),
+    Subject("bamboo_pen.obj", "Bamboo pen holder, 110 blocks", (0, 1, 2), (-62.0, 28.0, 1.02), (2e-2, 1e-3)),
 )
 
 
@@ -67,7 +66,7 @@ def main() -> int:
 
 
 def _moments(subject: Subject) -> tuple[list[NDArray[np.float32]], list[tuple[str, str]]]:
-    container = ls.encode(ls.read(DATA / subject.name, **subject.options))
+    container = ls.encode(ls.read(DATA / subject.name))
     decoder = ls.Decoder()
     views = decoder.feed(container)
     assert decoder.header is not None, "the container is whole"

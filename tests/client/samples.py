@@ -139,11 +139,6 @@ def _cgns(path: Path) -> None:
     shutil.copy(DATA / path.name, path)
 
 
-def _bpt(path: Path) -> None:
-    rows, columns = np.indices((4, 4)).reshape(2, -1)
-    np.savetxt(path, np.stack((columns, rows, rows * columns), axis=1), fmt="%g", header="1\n3 3", comments="")
-
-
 def _plot3d(path: Path) -> None:
     x, y = np.meshgrid(np.arange(9.0), np.arange(6.0))
     blocks = [np.stack((x + 9 * number, y, x * y)) for number in range(2)]
@@ -167,7 +162,6 @@ _MAKERS: dict[str, Callable[[Path], Any]] = {
     "scan.pcd": _pcd,
     "box.vtk": _vtk,
     "plate_surf.cgns": _cgns,
-    "patch.bpt": _bpt,
     "wing.fmt": _plot3d,
     "X.dat": lambda path: np.savetxt(path, torus().points[..., 0]),
     "Y.dat": lambda path: np.savetxt(path, torus().points[..., 1]),

@@ -23,7 +23,6 @@ CASES = [
     (("StructuredGrid.vts",), {"plane": "k0"}, "obj", True),
     (("office.binary.vtk",), {"plane": "j3"}, "glb", False),
     (("corner.cgns",), {}, "ply", False),
-    (("teapot.bpt",), {"density": "4"}, "glb", True),
     (("bun000.ply",), {}, "vts", False),
 ]
 

@@ -1,4 +1,4 @@
-"""xarray, pyvista and zarr find what this distribution offers, by the entry points in pyproject.toml."""
+"""xarray and pyvista find what this distribution offers, by the entry points in pyproject.toml."""
 
 from __future__ import annotations
 
@@ -43,13 +43,3 @@ def test_pyvista_reads_containers(installed: dict[str, str], path: Path) -> None
         "pv.read(sys.argv[1], level=1).n_points)"
     )
     assert run(script, installed, path).startswith("StructuredGrid (50, 40, 1) 1570.0 ")
-
-
-def test_zarr_has_the_codec(installed: dict[str, str], tmp_path: Path) -> None:
-    script = (
-        "import sys, numpy, zarr; values = numpy.arange(10000, dtype='i4').reshape(100, 100) ** 2 % 1000;"
-        "codec = {'name': 'lodestream', 'configuration': {}};"
-        "array = zarr.create_array(sys.argv[1], data=values, chunks=(64, 64), serializer=codec, compressors=None);"
-        "print((zarr.open_array(sys.argv[1])[:] == values).all(), array.metadata.to_dict()['codecs'][0]['name'])"
-    )
-    assert run(script, installed, tmp_path / "a.zarr") == "True lodestream\n"

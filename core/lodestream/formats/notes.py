@@ -23,7 +23,7 @@ _LONGEST_NAME = 60
 
 #: Metadata that are no loss where a format cannot hold them: how a file was read and how its values were stored there.
 _OF_THE_FILE = frozenset(
-    "name format nodata seam turn angles dtype nodes plane volumes density variable encoding notes recognised poles "
+    "name format nodata seam turn angles dtype nodes plane volumes variable encoding notes recognised poles "
     f"types area_or_point {DIGEST}".split()
 )
 

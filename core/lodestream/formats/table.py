@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..surface import Surface
-from . import bezier, glb, npy, npz, npz_writer, off, text_arrays
+from . import glb, npy, npz, npz_writer, off, text_arrays
 from .member import Member
 from .netcdf import reader as netcdf
 from .netcdf import writer as netcdf_writer
@@ -230,7 +230,6 @@ FORMATS = (
         memory=216,
     ),
     Format(name="cgns", suffixes=(".cgns",), sniff=cgns.sniff, read=cgns.read, options=cgns.OPTIONS, process=True),
-    Format(name="bpt", suffixes=(bezier.SUFFIX,), sniff=bezier.sniff, read=bezier.read, options=bezier.OPTIONS),
     Format(
         name="text",
         suffixes=text_arrays.SUFFIXES,

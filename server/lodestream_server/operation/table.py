@@ -38,7 +38,6 @@ FORMATS = (
     "vtk",
     "vts",
     "cgns",
-    "bpt",
     "text",
     "plot3d",
     "lode",
@@ -46,7 +45,7 @@ FORMATS = (
 
 # Rare formats, and formats that almost any text fits: each reader that is off is one less that a hostile file can
 # attack.
-_LEFT_OUT = ("usgs-dem", "bpt", "vmec", "text")
+_LEFT_OUT = ("usgs-dem", "vmec", "text")
 
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 

@@ -116,14 +116,6 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
     ),
     "PLOT3D of words": ("a.fmt", lambda: b"3 3 1\n" + b"1.5\n" * 9999 + b"hill\n", {}, "FormatError", "line 10001: "),
     "PLOT3D of one line": ("a.fmt", lambda: b"3 3 1 " + b"1.5 " * (1 << 19), {}, "FormatError", "line of at most"),
-    "patches at too high a density": (
-        "a.bpt",
-        lambda: b"16000\n" + b"1 1\n0 0 0 1 0 0 0 1 0 1 1 0\n" * 16000,
-        {"density": "16384"},
-        "TooLargeError",
-        "16,000 patches of 16385 x 16385 points",
-    ),
-    "patches that are not there": ("a.bpt", lambda: b"16384\n3 3\n1 2 3\n", {}, "FormatError", "16 control points"),
     "PCD of 2^62 points": (
         "a.pcd",
         lambda: PCD.format(1 << 31, 1 << 31, 1 << 62, "binary").encode(),

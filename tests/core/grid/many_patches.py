@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "bezier_patches",
     "cgns_nodes",
     "esri_rows",
     "geotiff_bands",
@@ -290,11 +289,6 @@ def cgns_nodes(folder: Path, count: int) -> Path:
 def text_lines(folder: Path, count: int) -> Path:
     """Lines of two numbers, with a comment after each."""
     return _written(folder, "lines.txt", "".join(f"{place} 2\n# {place}\n\n" for place in range(count)))
-
-
-def bezier_patches(folder: Path, count: int) -> Path:
-    """So many patches of 2 x 2 control points."""
-    return _written(folder, "patches.bpt", f"{count}\n" + "1 1\n0 0 0\n0 1 0\n1 0 0\n1 1 1\n" * count)
 
 
 def esri_rows(folder: Path, count: int) -> Path:

@@ -168,7 +168,6 @@ def boundary(surface: ls.Surface) -> int:
 FILES: dict[str, dict[str, Any]] = {
     "m6_small.fmt": {},
     "uneven_sphere_large.fmt": {},
-    "teapot.bpt": {"density": "8"},
     "catmark_cube_creases1_level4.obj": {},
     "bamboo_pen.obj": {},
     "capsule.obj": {},

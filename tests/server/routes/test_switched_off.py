@@ -74,7 +74,7 @@ def test_a_name_that_no_format_has_is_refused(value: str | tuple[str, ...]) -> N
 
 @pytest.mark.parametrize(
     ("name", "filename", "body"),
-    [("usgs-dem", "hill.dem", dem), ("bpt", "teapot.bpt", text), ("text", "hill.txt", text)],
+    [("usgs-dem", "hill.dem", dem), ("text", "hill.txt", text)],
 )
 def test_an_upload_of_a_format_that_is_switched_off_is_refused_at_once(
     tmp_path: Path, name: str, filename: str, body: Callable[[], bytes]

@@ -183,7 +183,7 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[s
                         drop_variables=list(unknown),
                     )
                     # A folder lists its members in any order; the same store is to give the same surface.
-                    return stack.enter_context(dataset)[sorted(dataset.variables)]
+                    return stack.enter_context(dataset)[sorted(dataset.variables, key=str)]
 
                 yield None, with_parents(opened(name), map(opened, parents_of(name))), groups
     except UnavailableError:
