@@ -284,6 +284,7 @@ class Surface:
         *,
         attributes: str | Iterable[str] | None = None,
         closed: Closed | None = None,
+        nodata: int | float | str | None = None,
         **options: str,
     ) -> Surface:
         """A surface of an xarray Dataset or DataArray; of a DataTree one block for each node with variables.
@@ -293,13 +294,16 @@ class Surface:
         data : Dataset, DataArray or DataTree
             What has chunks of dask is computed.
         attributes : str or iterable of str, optional
-            Variables that become attributes, as a list or a text with commas; None: all over the same two dimensions.
-            Flags (bool) become 0 and 1 of type uint8. What is no number is left out, with a `FormatWarning`.
+            Variables that become attributes, as a list or a text with commas; None: all over the same two dimensions,
+            which reading a file names in a note. Flags (bool) become 0 and 1 of type uint8. What is no number is left
+            out, with a `FormatWarning`.
         closed : (bool, bool), optional
             Which axes are closed; None: as `to_xarray` left it, or those whose longitudes go around the Earth.
+        nodata : int, float or str, optional
+            A value that marks holes though the Dataset does not say so, as in `lodestream.read`.
         **options
             Those of reading a NetCDF, which decide alike (docs/formats.md): ``variable``, ``x``, ``y``, ``time`` and
-            ``at``.
+            ``at``. A Dataset that was opened from a file, decoded or not, gives the surface that its file gives.
 
         Raises
         ------
@@ -310,7 +314,7 @@ class Surface:
         """
         from .interop.from_xarray import from_xarray
 
-        return from_xarray(data, attributes=attributes, closed=closed, **options)
+        return from_xarray(data, attributes=attributes, closed=closed, nodata=nodata, **options)
 
     def to_pyvista(self) -> pyvista.StructuredGrid | pyvista.MultiBlock:
         """This surface for pyvista (extra ``pyvista``): a StructuredGrid, or a MultiBlock of them for several blocks.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,10 +13,12 @@ from numpy.typing import NDArray
 from ..coordinates.height_fields import coordinates
 from ..errors import FormatError, InputError, OptionError
 from ..formats.netcdf.attribute_texts import TYPES, text_of
-from ..formats.netcdf.choice import Choice, choose, names_in
-from ..formats.netcdf.dataset import attributes_with_limits, surface_of
+from ..formats.netcdf.choice import Choice, choose, names_in, offered, with_attributes
+from ..formats.netcdf.dataset import attributes_with_limits, not_taken, surface_of
+from ..formats.netcdf.names import REFERENCES
 from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces
-from ..formats.notes import listing, warn
+from ..formats.nodata import checked, with_nodata
+from ..formats.notes import warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
 from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed, Surface
@@ -33,9 +34,14 @@ __all__ = ["from_xarray"]
 #: Metadata that are true of a grid of the same shape only.
 _OF_THE_SHAPE = ("seam", "dtype", "angles", *ORDERED)
 
-
 #: Coordinates by which `to_xarray` numbers rows and columns.
 _NUMBERS = ("row", "column")
+
+#: Options of reading a NetCDF that choose something of a Dataset.
+_OPTIONS = ("variable", "x", "y", "time", "at")
+
+#: What says in the encoding of a variable which numbers of its file were missing values.
+_MISSING = ("_FillValue", "missing_value")
 
 
 def from_xarray(
@@ -45,6 +51,7 @@ def from_xarray(
     *,
     attributes: str | Iterable[str] | None = None,
     closed: Closed | None = None,
+    nodata: object = None,
     **options: str,
 ) -> Surface:
     """A surface of a Dataset or DataArray, or of several blocks from a DataTree.
@@ -58,6 +65,17 @@ def from_xarray(
     FormatError, OptionError
         If there is no surface in it.
     """
+    for name in options:
+        if name not in _OPTIONS:
+            raise OptionError(f"expected an option of a Dataset ({', '.join(_OPTIONS)}), got {name!r}")
+    hole = None if nodata is None else checked(nodata)
+    surface = _of_any(data, attributes, closed, room, options)
+    return surface if hole is None else with_nodata(surface, hole, room)
+
+
+def _of_any(
+    data: Any, attributes: str | Iterable[str] | None, closed: Closed | None, room: Room, options: Mapping[str, str]
+) -> Surface:
     xr = require_library("xarray", "xarray")
     if isinstance(data, xr.DataTree):
         nodes = [node.to_dataset() for node in data.subtree if node.data_vars or MARK in node.attrs]
@@ -89,38 +107,35 @@ def _of_dataset(
 ) -> Surface:
     mark = _mark(data)
     wanted = None if attributes is None else names_in(attributes)
-    # A shallow copy with the attributes that a file would have: decoding has moved some of them to the encoding.
     left_out = _left_out(data, mark, options, wanted)
-    whole = xr.Dataset(
-        {
-            name: _as_stored(data[name].variable, room, _places(data[name]), name not in left_out)
-            for name in data.data_vars
-        },
-        {name: _as_stored(variable, room) for name, variable in data.coords.variables.items()},
-        {key: value for key, value in data.attrs.items() if key != MARK},
-    )
-    whole = _numbers(whole, [options["variable"]] if "variable" in options else [])
+    whole = _as_in_a_file(xr, data, left_out, room)
     given = {**_names(whole, mark, options, wanted), **options}
     wraps = None if mark is None else _closed(whole, mark)
-    source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, given, (), wraps, room=room)
+    source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, given, (), closed or wraps, room=room)
     # Attributes of a surface are no coordinates of it, whatever they are called; nor are numbers of rows and columns.
     own = [] if mark is None else [name for name in mark["attributes"] if name not in given.values()]
     numbers = [] if mark is None else [name for name in _NUMBERS if name not in given.values()]
     choice = choose(source, whole.drop_vars([*own, *numbers], errors="ignore"))
-    further = _attributes(whole, choice, wanted)
-    choice = replace(choice, attributes=tuple(dict.fromkeys((*further, *choice.attributes))))
-    read = _numbers(whole, choice.attributes).drop_vars([*numbers, *_no_numbers(whole, choice)], errors="ignore")
-    surface, notes = surface_of(source, read, choice, "xarray")
+    read = whole.drop_vars(numbers, errors="ignore")
+    if wanted is None:
+        further = [*offered(read, choice), *(name for name in own if name in read.variables)]
+        wanted = [name for name in map(str, read.variables) if name in further and name not in choice.attributes]
+        choice = with_attributes(read, choice, wanted)
+        notes = not_taken(read, choice)
+    else:
+        choice, notes = with_attributes(read, choice, wanted), []
+    surface, more = surface_of(source, read, choice, "xarray")
     surface = _placed(surface, whole, choice.heights, room)
-    for text in notes:
-        warn(text)
     metadata = {key: value for key, value in surface.metadata.items() if key not in ("name", "format")}
     names = {} if mark is None else mark["attributes"]
     if mark is not None:
         metadata = _restored(metadata, mark, surface, choice, _in_order(whole, choice))
     beside = {str(names.get(name, name)): values for name, values in surface.attributes.items()}
     wraps = closed or wraps or surface.closed
-    return Surface(surface.points, wraps, mask=surface.mask, attributes=beside, metadata=metadata)
+    surface = Surface(surface.points, wraps, mask=surface.mask, attributes=beside, metadata=metadata)
+    for text in (*notes, *more):
+        warn(text)
+    return surface
 
 
 def _mark(data: Any) -> dict[str, Any] | None:
@@ -140,13 +155,6 @@ def _places(array: Any) -> dict[str, str]:
     return {"coordinates": " ".join(names)} if names else {}
 
 
-def _numbers(whole: Any, names: Iterable[str]) -> Any:
-    """The Dataset with flags of these names as 0 and 1; where it has nothing else, with all of them."""
-    flags = [name for name, values in whole.data_vars.items() if values.dtype.kind == "b"]
-    chosen = [name for name in flags if name in names or len(flags) == len(whole.data_vars)]
-    return whole.assign({name: whole[name].astype(np.uint8) for name in chosen}) if chosen else whole
-
-
 def _left_out(
     data: Any, mark: Mapping[str, Any] | None, options: Mapping[str, str], attributes: list[str] | None
 ) -> set[str]:
@@ -157,51 +165,84 @@ def _left_out(
     return set(map(str, data.data_vars)) - {*named.values(), *attributes}
 
 
-def _as_stored(variable: Any, room: Room, places: Mapping[str, str] | None = None, read: bool = True) -> Any:
-    """A variable with the attributes of its file, and integers where its floats are such with NaN in place of some.
+def _as_in_a_file(xr: Any, data: Any, left_out: Collection[str], room: Room) -> Any:
+    """A shallow copy with values and attributes as a file has them: decoding has moved some to the encoding.
 
-    Floats stay if they are not to be read.
+    Values that are not to be read stay as they are.
     """
-    encoding, values = variable.encoding, variable
-    told = {k: encoding[k] for k in ("grid_mapping", "coordinates") if k in encoding}
-    attrs = {**variable.attrs, **(places or {}), **told, **_unpacked_limits(variable)}
-    fill, dtype = encoding.get("_FillValue"), np.dtype(encoding.get("dtype") or variable.dtype)
+    return xr.Dataset(
+        {
+            name: _as_stored(xr, data[name].variable, room, _places(data[name]), name not in left_out)
+            for name in data.data_vars
+        },
+        {name: _as_stored(xr, variable, room) for name, variable in data.coords.variables.items()},
+        {key: value for key, value in data.attrs.items() if key != MARK},
+    )
+
+
+def _as_stored(xr: Any, variable: Any, room: Room, places: Mapping[str, str] | None = None, read: bool = True) -> Any:
+    """A variable with the attributes of its file: times as numbers, and integers where its floats are such with NaN."""
+    if variable.dtype.kind in "mM" or (variable.ndim < 2 and variable.dtype.kind == "O"):
+        variable = _numbered(xr, variable)
+    encoding = variable.encoding
+    told = {key: encoding[key] for key in REFERENCES if key in encoding}
+    attrs = {**(places or {}), **variable.attrs, **told, **_unpacked_limits(xr, variable)}
+    missing = [number for key in _MISSING for number in np.ravel(encoding.get(key, ())).tolist()]
+    dtype = np.dtype(encoding.get("dtype") or variable.dtype)
     if read and dtype.kind in "iu" and variable.dtype.kind == "f" and not is_packed(encoding):
-        whole = _integers(variable, dtype, fill, room)
+        whole = _integers(variable, _with_sign(dtype, encoding), missing, room)
         if whole is not None:
-            missing = {} if fill is None else {"_FillValue": dtype.type(fill)}
-            return variable.__class__(variable.dims, whole, {**attrs, **missing})
-    copy = values.copy(deep=False)
+            kept = {"_FillValue": whole.dtype.type(missing[0])} if missing else {}
+            return xr.Variable(variable.dims, whole, {**attrs, **kept})
+    copy = variable.to_base_variable().copy(deep=False)
     copy.attrs = attrs
     return copy
 
 
-def _unpacked_limits(variable: Any) -> dict[str, Any]:
+def _numbered(xr: Any, variable: Any) -> Any:
+    """Dates and spans of time as the numbers of a file; other objects as they are."""
+    try:
+        encoded = xr.conventions.encode_cf_variable(variable.to_base_variable())
+    except Exception:  # of objects of any class
+        return variable
+    return encoded if encoded.dtype.kind in "iuf" else variable
+
+
+def _with_sign(dtype: np.dtype[Any], encoding: Mapping[str, Any]) -> np.dtype[Any]:
+    """The type of the values of a file that has integers of it, as ``_Unsigned`` says."""
+    kind = {"true": "u", "false": "i"}.get(str(encoding.get("_Unsigned", "")).lower(), dtype.kind)
+    return np.dtype(f"{kind}{dtype.itemsize}")
+
+
+def _unpacked_limits(xr: Any, variable: Any) -> dict[str, Any]:
     """Limits of values that were packed in a file: they are numbers as stored there if they are integers."""
     encoding = variable.encoding
     if not is_packed(encoding) or is_packed(variable.attrs):
         return {}
     packing = {key: encoding[key] for key in PACKING if key in encoding and key not in ("_FillValue", "missing_value")}
     dtype = np.dtype(encoding.get("dtype") or np.int32)
-    stored = variable.__class__((), np.zeros((), dtype), {**variable.attrs, **packing})
+    stored = xr.Variable((), np.zeros((), dtype), {**variable.attrs, **packing})
     return {key: value for key, value in attributes_with_limits(stored).items() if key in RANGES}
 
 
-def _integers(variable: Any, dtype: np.dtype[Any], fill: Any, room: Room) -> NDArray[Any] | None:
-    """Floats as the integers that they are, NaN as the value that stands for them; None where they are no integers."""
+def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room: Room) -> NDArray[Any] | None:
+    """Floats as the integers that they are, NaN as the first of the missing values; None where they are no integers."""
     limits, result, anything = np.iinfo(dtype), room.empty(variable.shape, dtype), False
+    numbers = [dtype.type(number) for number in missing if limits.min <= number <= limits.max and number == int(number)]
+    if len(numbers) < len(missing):
+        return None
     for window, part in pieces(variable, room):
         values = part.values
         valid = ~np.isnan(values)
         known = values[valid]
-        if fill is None and not valid.all():
+        if not numbers and not valid.all():
             return None
         if known.size and not (limits.min <= known.min() and known.max() <= limits.max):
             return None
         whole = known.astype(dtype)
-        if not (whole == known).all() or (fill is not None and (whole == dtype.type(fill)).any()):
+        if not (whole == known).all() or any((whole == number).any() for number in numbers):
             return None
-        own = np.full(values.shape, 0 if fill is None else fill, dtype)
+        own = np.full(values.shape, numbers[0] if numbers else 0, dtype)
         own[valid] = whole
         result[window] = own
         anything |= bool(known.size)
@@ -244,41 +285,6 @@ def _in_order(whole: Any, choice: Choice) -> bool:
         own is not None and own.dims == (dim,) and np.array_equal(own.values, np.arange(length))
         for own, dim, length in zip(numbers, choice.dims, choice.shape, strict=True)
     )
-
-
-def _attributes(whole: Any, choice: Choice, wanted: list[str] | None) -> tuple[str, ...]:
-    """The other variables over the same dimensions, with or without one of components."""
-    found = []
-    for name in map(str, whole.data_vars):
-        if name == choice.heights or (wanted is not None and name not in wanted):
-            continue
-        variable = whole.variables[name]
-        fits = _fits(variable, choice)
-        if fits and variable.dtype.kind in "iufb":
-            found.append(name)
-        elif fits and wanted is not None:
-            raise OptionError(f"expected attributes of numbers or flags, got {name!r} of {variable.dtype}")
-        elif wanted is not None:
-            dims = [str(dim) for dim in variable.dims if dim not in choice.index]
-            raise OptionError(f"expected attributes over {' and '.join(choice.dims)}, got {name!r} over {dims}")
-    missing = [name for name in wanted or () if name not in whole.data_vars]
-    if missing:
-        raise OptionError(f"expected attributes among {', '.join(map(str, whole.data_vars))}, got {missing[0]!r}")
-    if wanted is None and (left_out := _no_numbers(whole, choice)):
-        warn(f"left out variables that are no numbers: {listing(left_out)}")
-    return tuple(found)
-
-
-def _fits(variable: Any, choice: Choice) -> bool:
-    """Whether a variable lies over the same rows and columns, with or without an axis of components."""
-    dims = [str(dim) for dim in variable.dims if dim not in choice.index]
-    return len(dims) <= 3 and set(dims[:2]) == set(choice.dims)
-
-
-def _no_numbers(whole: Any, choice: Choice) -> list[str]:
-    """Variables over the same rows and columns that are neither numbers nor flags."""
-    variables = {str(name): whole.variables[name] for name in whole.data_vars}
-    return [name for name, it in variables.items() if _fits(it, choice) and it.dtype.kind not in "iufb"]
 
 
 def _placed(surface: Surface, whole: Any, name: str | None, room: Room) -> Surface:

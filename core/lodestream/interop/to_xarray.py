@@ -50,7 +50,8 @@ def _of_block(surface: Surface, block: Block) -> xarray.Dataset:
 
     def given(part: Part) -> tuple[NDArray[Any], dict[str, Any]]:
         values = values_of(block, part)
-        integers = part.attribute is None and values.dtype != grid.dtype
+        # Longitudes that were unwrapped have the type of their file again, and are no integers either.
+        integers = part.attribute is None and grid.dtype.kind in "iu" and values.dtype != grid.dtype
         return values, _packing(block, grid, part) if integers else {}
 
     return dataset(grid, given)

@@ -391,7 +391,7 @@ def test_the_pair_of_the_grid_of_a_variable_is_taken(tmp_path: Path) -> None:
     data["SST"] = (dims, (lon * lat).astype("f4"), {"coordinates": "ULONG ULAT"})
     surface, notes = noted(_netcdf4, data, tmp_path, variable="SST")
     assert_at(surface, lon + 0.02, lat + 0.02)
-    assert notes == ["left out: TLAT, TLONG"]
+    assert notes == ["left out variables of the same grid: TLAT, TLONG; take them with attributes="]
 
 
 # Files that are open

@@ -255,7 +255,7 @@ def test_options_name_the_variable_and_its_coordinates(tmp_path: Path) -> None:
     for options, error, message in (
         ({"variable": "rho"}, OptionError, "variable= one of R, Z, psi, shift, got 'rho'"),
         ({"variable": "shift"}, FormatError, "two dimensions of shift, got x"),
-        ({"variable": "psi", "attributes": "shift"}, OptionError, "attributes= of variables over x and y, got 'shift'"),
+        ({"variable": "psi", "attributes": "shift"}, OptionError, "attributes= of numbers over x and y, got 'shift'"),
         ({"variable": "psi", "time": "0"}, OptionError, "expected no time=, got one: the dimensions are x, y"),
         ({"variable": "psi", "at": "z:0"}, OptionError, "at= with one of x, y, got 'z'"),
         ({"variable": "psi", "resolution": "8x8"}, OptionError, "resolution= for a VMEC file only"),

@@ -241,10 +241,16 @@ def test_flags_become_0_and_1_and_what_is_no_number_is_named() -> None:
     assert list(ls.Surface.from_xarray(data, attributes=["land"]).attributes) == ["land"]
     assert np.array_equal(ls.Surface.from_xarray(data.land).points == 1, values > 0)
     assert ls.Surface.from_xarray(data[["land"]]).dtype == np.uint8
-    with pytest.warns(ls.FormatWarning, match="left out variables that are no numbers: day"):
-        ls.Surface.from_xarray(data.assign(day=(("y", "x"), dates)))
-    with pytest.raises(ls.OptionError, match=r"numbers or flags, got 'day' of datetime64"):
-        ls.Surface.from_xarray(data.assign(day=(("y", "x"), dates)), attributes=["day"])
+    texts = data.assign(word=(("y", "x"), dates.astype(str)))
+    with pytest.warns(ls.FormatWarning, match="left out: word"):
+        ls.Surface.from_xarray(texts)
+    with pytest.raises(ls.OptionError, match=r"of numbers over y and x, got 'word' of <U"):
+        ls.Surface.from_xarray(texts, attributes=["word"])
+    dated = data.assign(day=(("y", "x"), dates))
+    dated.day.encoding["units"] = "days since 2000-12-01"
+    for surface in (ls.Surface.from_xarray(dated), ls.Surface.from_xarray(dated, attributes="day")):
+        assert (surface.attributes["day"] == 31).all()  # as in a file
+        assert surface.metadata["tags"][""]["day#units"] == "days since 2000-12-01"
 
 
 @pytest.mark.parametrize("key", [{"row": slice(None, None, -1)}, {"column": slice(None, None, -1)}, "transposed"])
@@ -346,5 +352,5 @@ def test_attributes_that_are_not_there_or_do_not_fit_are_refused() -> None:
     data = dataset(heights()).assign(line=("x", np.arange(50.0)))
     with pytest.raises(ls.OptionError, match="got 'nothing'"):
         ls.Surface.from_xarray(data, attributes=["nothing"])
-    with pytest.raises(ls.OptionError, match="got 'line' over"):
+    with pytest.raises(ls.OptionError, match="got 'line' of float64 over x"):
         ls.Surface.from_xarray(data, attributes=["line"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import prod
 from typing import Any
 
@@ -12,14 +12,23 @@ import numpy as np
 from ...errors import FormatError, OptionError
 from ..notes import listing
 from ..source import Source
-from .names import associated, is_longitude, is_time, letters_of, mate_of, time_of
+from .names import REFERENCES, associated, is_date, is_longitude, is_time, letters_of, mate_of, time_of
 from .no_grids import NoGrid, no_grid_of
 from .positions import are_elsewhere
-from .values import raw_values
+from .values import is_flag, raw_values
 
-__all__ = ["Choice", "Found", "choose", "fields", "main_variable", "names_in", "others"]
+__all__ = [
+    "Choice",
+    "Found",
+    "choose",
+    "fields",
+    "main_variable",
+    "names_in",
+    "offered",
+    "others",
+    "with_attributes",
+]
 
-_REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
 _ANCILLARY = "ancillary_variables"
 
 #: Names in a refusal: all that a file of a model has, but not thousands.
@@ -106,21 +115,45 @@ def choose(source: Source, dataset: Any) -> Choice:
     index |= {dim: 0 for dim in variables[main].dims if dim not in dims and dim not in index}
     x, y = (_found(dataset, given[key], dims, index) if key in given else None for key in ("x", "y"))
     places = _Places(x, y) if x or y else _conventional(dataset, main, dims, index)
-    attributes = [*dict.fromkeys((*names_in(source.options.get("attributes", ())), *places.beside))]
-    for name in attributes:
-        if (
-            name not in variables
-            or set(_left(variables[name].dims, index)) != set(dims)
-            or not _numeric(variables[name])
-        ):
-            raise OptionError(f"expected attributes= of variables over {dims[0]} and {dims[1]}, got {name!r}")
-    names = {main, *attributes, *(found.name for found in (places.x, places.y) if found)}
-    nbytes = sum(
-        variables[name].dtype.itemsize * prod(dataset.sizes[dim] for dim in variables[name].dims if dim not in index)
-        for name in names
-    )
+    names = (*names_in(source.options.get("attributes", ())), *places.beside)
     heights, notes = None if planar else main, tuple(places.notes)
-    return Choice(heights, dims, shape, index, places.x, places.y, tuple(attributes), nbytes, notes)
+    return with_attributes(dataset, Choice(heights, dims, shape, index, places.x, places.y, (), 0, notes), names)
+
+
+def with_attributes(dataset: Any, choice: Choice, names: Iterable[str]) -> Choice:
+    """Add variables that become attributes to a choice, before those that it has.
+
+    Raises
+    ------
+    OptionError
+        If one is not there, is no number, or does not lie over the rows and columns, with or without components.
+    """
+    variables = dataset.variables
+    attributes = tuple(dict.fromkeys((*names, *choice.attributes)))
+    for name in attributes:
+        if name not in variables:
+            raise OptionError(f"expected attributes= among {_listing(variables)}, got {name!r}")
+        if not _fits(variables[name], choice) or not _numeric(variables[name]):
+            rows, columns = choice.dims
+            over = " and ".join(_left(variables[name].dims, choice.index)) or "none"
+            raise OptionError(
+                f"expected attributes= of numbers over {rows} and {columns}, got {name!r} of {variables[name].dtype} "
+                f"over {over}"
+            )
+    places = (found.name for found in (choice.x, choice.y) if found)
+    read = {name for name in (choice.heights, *attributes, *places) if name is not None}
+    nbytes = sum(
+        variables[name].dtype.itemsize
+        * prod(dataset.sizes[dim] for dim in variables[name].dims if dim not in choice.index)
+        for name in read
+    )
+    return replace(choice, attributes=attributes, nbytes=nbytes)
+
+
+def _fits(variable: Any, choice: Choice) -> bool:
+    """Whether a variable lies over the same rows and columns, with or without an axis of components behind them."""
+    dims = _left(variable.dims, choice.index)
+    return len(dims) <= 3 and set(dims[:2]) == set(choice.dims)
 
 
 def _main(source: Source, dataset: Any) -> tuple[str, Mapping[str, str], bool]:
@@ -177,17 +210,18 @@ def others(dataset: Any, choice: Choice) -> list[str]:
     """Variables over the same two dimensions that are not taken, nor belong to those that are."""
     variables = dataset.variables
     taken = {choice.heights, *choice.attributes, *(found.name for found in (choice.x, choice.y) if found)}
-    letters = letters_of(dataset)
     for variable in variables.values():
         taken |= _referred(variable)
     return [
         str(name)
         for name, variable in variables.items()
-        if str(name) not in taken
-        and _numeric(variable)
-        and set(choice.dims) <= set(map(str, variable.dims))
-        and str(name) not in letters
+        if str(name) not in taken and _numeric(variable) and set(choice.dims) <= set(map(str, variable.dims))
     ]
+
+
+def offered(dataset: Any, choice: Choice) -> list[str]:
+    """Give those of `others` that `with_attributes` takes."""
+    return [name for name in others(dataset, choice) if _fits(dataset.variables[name], choice)]
 
 
 def _named(source: Source, variables: Mapping[Hashable, Any], key: str) -> str:
@@ -198,7 +232,7 @@ def _named(source: Source, variables: Mapping[Hashable, Any], key: str) -> str:
 
 
 def _numeric(variable: Any) -> bool:
-    return variable.dtype.kind in "iuf"
+    return variable.dtype.kind in "iuf" or is_flag(variable)
 
 
 def _listing(variables: Mapping[Hashable, Any]) -> str:
@@ -237,12 +271,14 @@ def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tupl
         if _numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
     ]
     letters = letters_of(dataset)
-    return [name for name in wide if name not in beside and name not in letters], wide
+    free = [name for name in wide if name not in beside and name not in letters]
+    # Flags and dates belong to something else, unless there is nothing else.
+    return [name for name in free if not is_flag(variables[name]) and not is_date(variables[name])] or free, wide
 
 
 def _referred(variable: Any) -> set[str]:
     """Names of variables that belong to one."""
-    return {name for key in _REFERENCES for name in str(variable.attrs.get(key, "")).split()}
+    return {name for key in REFERENCES for name in str(variable.attrs.get(key, "")).split()}
 
 
 def _left(dims: tuple[Hashable, ...], index: Mapping[str, int]) -> tuple[str, ...]:

@@ -19,18 +19,15 @@ from ..notes import listing, survives
 from ..placed import Coordinate, place
 from ..source import Source, number
 from .attribute_texts import TYPES, text_of
-from .choice import Choice, Found, others
+from .choice import Choice, Found, offered, others
 from .crs import crs_of
-from .names import associated, axis_words
+from .names import REFERENCES, associated, axis_words
 from .values import PACKING, RANGES, Values, chosen, is_packed, raw_values, values_of
 
-__all__ = ["attributes_with_limits", "surface_of"]
-
-#: Attributes that refer to other variables.
-_REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
+__all__ = ["attributes_with_limits", "not_taken", "surface_of"]
 
 #: Attributes that say how a file stores values; `Surface` has the values.
-_STORAGE = (*PACKING, *_REFERENCES, "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
+_STORAGE = (*PACKING, *REFERENCES, "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
 
 
 def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[Surface, list[str]]:
@@ -77,6 +74,18 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
         surface = place(heights.array, x, y, mask=heights.valid, **said)
     notes += reader.notes + ([] if heights is None else _without_place(heights, x, y))
     return _closed_fields(source, dataset, choice, surface), notes
+
+
+def not_taken(dataset: Any, choice: Choice) -> list[str]:
+    """Say which variables over the same rows and columns are not taken: which can be attributes, and which not."""
+    possible = offered(dataset, choice)
+    rest = [name for name in others(dataset, choice) if name not in possible]
+    notes = []
+    if possible:
+        notes.append(f"left out variables of the same grid: {listing(possible)}; take them with attributes=")
+    if rest:
+        notes.append(f"left out variables of the same grid over further dimensions: {listing(rest)}")
+    return notes
 
 
 class _Reader:

@@ -9,9 +9,11 @@ from typing import Any
 
 __all__ = [
     "AXIS_WORDS",
+    "REFERENCES",
     "associated",
     "axis_words",
     "is_angle",
+    "is_date",
     "is_east",
     "is_geographic",
     "is_longitude",
@@ -31,7 +33,10 @@ _PLAIN = {
     **dict.fromkeys(("y", "lat", "latitude", "northing"), "y"),
 }
 
-#: Attributes that refer to other variables.
+#: Attributes that refer to other variables, but for ``ancillary_variables``, which are no part of a variable.
+REFERENCES = ("bounds", "coordinates", "grid_mapping", "climatology", "cell_measures", "formula_terms")
+
+#: Those that cf-xarray follows.
 _KINDS = ("coordinates", "grid_mapping", "bounds", "ancillary_variables", "cell_measures")
 
 #: What a surface keeps of what a file says of x and y, as tags ``x#units`` and the like.
@@ -200,14 +205,15 @@ def is_time(dataset: Any, dim: str) -> bool:
 def time_of(dataset: Any, dim: str) -> str | None:
     """The variable with the dates along a dimension: of its own name, or another, such as ``time_centered`` of NEMO."""
     own = dataset.variables.get(dim)
-    if own is not None and own.dims == (dim,) and _is_date(own):
+    if own is not None and own.dims == (dim,) and is_date(own):
         return dim
     if own is not None and not (str(own.attrs.get("axis", "")).upper() == "T" or dim.lower().startswith("time")):
         return None  # the dimension is something else, of which there may be dates too
-    along = [str(name) for name, it in dataset.variables.items() if it.dims == (dim,) and _is_date(it)]
+    along = [str(name) for name, it in dataset.variables.items() if it.dims == (dim,) and is_date(it)]
     named = {word for it in dataset.variables.values() for word in str(it.attrs.get("coordinates", "")).split()}
     return next((name for name in along if name in named), along[0] if along else None)
 
 
-def _is_date(variable: Any) -> bool:
+def is_date(variable: Any) -> bool:
+    """Whether the values of a variable are dates, as numbers since one of them."""
     return variable.dtype.kind in "iuf" and " since " in str(variable.attrs.get("units", ""))

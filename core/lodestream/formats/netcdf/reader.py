@@ -15,8 +15,8 @@ from ..member import Member
 from ..notes import listing, warn
 from ..source import Source, check_allowed
 from . import hdf5_guard, vmec
-from .choice import choose, others
-from .dataset import surface_of
+from .choice import choose
+from .dataset import not_taken, surface_of
 from .members import members_of
 
 __all__ = [
@@ -111,8 +111,7 @@ def of_group(
         if not inner:
             raise
         raise FormatError(f"{error}; there are groups: {listing(inner)}, choose with group=") from None
-    if left_out := others(dataset, choice):
-        notes.append(f"left out variables of the same grid: {listing(left_out)}; take them with attributes=")
+    notes += not_taken(dataset, choice)
     return surface, [*notes, *([f"left out groups: {listing(inner)}"] if inner else [])]
 
 

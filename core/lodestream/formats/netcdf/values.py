@@ -16,7 +16,18 @@ from numpy.typing import NDArray
 from ...scratch import Room
 from ...sources import windows
 
-__all__ = ["PACKING", "RANGES", "Values", "chosen", "is_packed", "limits_of", "pieces", "raw_values", "values_of"]
+__all__ = [
+    "PACKING",
+    "RANGES",
+    "Values",
+    "chosen",
+    "is_flag",
+    "is_packed",
+    "limits_of",
+    "pieces",
+    "raw_values",
+    "values_of",
+]
 
 #: Attributes that say how values are stored.
 PACKING = ("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned")
@@ -86,7 +97,8 @@ def values_of(variable: Any, dims: Sequence[str], room: Room) -> Values:
     valid: NDArray[np.bool_] | None = None
     outside = 0
     for window, part in pieces(variable, room):
-        values, mask, count = _decoded(np.asarray(part.values), variable.attrs)
+        stored = np.asarray(part.values)
+        values, mask, count = _decoded(stored.view(np.uint8) if is_flag(variable) else stored, variable.attrs)
         outside += count
         values, mask = values.transpose(turn), None if mask is None else mask.transpose(turn)
         if window is ...:
@@ -107,6 +119,13 @@ def values_of(variable: Any, dims: Sequence[str], room: Room) -> Values:
 def raw_values(variable: Any) -> NDArray[Any]:
     """Give the values of a small variable as they are stored, of its shape."""
     return _signed(np.asarray(variable.values), variable.attrs)
+
+
+def is_flag(variable: Any) -> bool:
+    """Whether the values of a variable are true or false: in a file integers of 8 bits, of which xarray says so."""
+    return variable.dtype.kind == "b" or (
+        variable.dtype.kind in "iu" and variable.dtype.itemsize == 1 and str(variable.attrs.get("dtype")) == "bool"
+    )
 
 
 def is_packed(attributes: Mapping[str, Any]) -> bool:
