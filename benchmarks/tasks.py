@@ -29,7 +29,7 @@ from lodestream.bands.geometry import Bands
 from lodestream.bands.measuring import BANDS_TOGETHER
 from lodestream.grid.layout import Layout
 from lodestream.kernels import PART_ROWS
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 
 from .measure import note, table
 from .terrain import write_terrain
@@ -216,21 +216,21 @@ class _Recorded(Executor):
 
 def _timed(function: Callable[..., None], *arguments: Any) -> Record:
     read = 0
-    plain = Scratch.read
+    plain = FolderScratch.read
 
-    def counted(scratch: Scratch, name: str) -> NDArray[Any]:
+    def counted(scratch: FolderScratch, name: str) -> NDArray[Any]:
         nonlocal read
         found = plain(scratch, name)
         read += found.nbytes
         return found
 
-    Scratch.read = counted  # type: ignore[method-assign,assignment]
+    FolderScratch.read = counted  # type: ignore[method-assign,assignment]
     try:
         before, started = _bytes_written(), time.perf_counter()
         function(*arguments)
         seconds, written = time.perf_counter() - started, _bytes_written() - before
     finally:
-        Scratch.read = plain  # type: ignore[method-assign]
+        FolderScratch.read = plain  # type: ignore[method-assign]
     return Record(function.__name__, seconds, written, read)
 
 

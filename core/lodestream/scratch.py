@@ -1,4 +1,4 @@
-"""The files of a build: arrays by name in one folder, each written whole or not at all."""
+"""Arrays that the steps of a build leave for each other by name: in memory, or in files of one folder."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import errno
 import math
 import os
 import shutil
+import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -16,7 +19,17 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-__all__ = ["IN_MEMORY", "DamagedError", "Room", "Scratch", "boot_id", "is_made", "rows_at_once"]
+__all__ = [
+    "IN_MEMORY",
+    "DamagedError",
+    "FolderScratch",
+    "MemoryScratch",
+    "Room",
+    "Scratch",
+    "boot_id",
+    "is_made",
+    "rows_at_once",
+]
 
 _SUFFIX = ".npy"
 _UNFINISHED = ".part"
@@ -52,11 +65,80 @@ class DamagedError(ValueError):
     """A file of a scratch folder is not as it was written."""
 
 
-class Scratch:
+class Scratch(ABC):
+    """Arrays by name, of any shape and dtype. Names have parts between slashes.
+
+    An array appears under its name when it is whole, so that a task whose arrays are there is done.
+    """
+
+    @abstractmethod
+    def write(self, name: str, array: NDArray[Any]) -> None:
+        """Keep an array under a name; one that is there already is replaced. The array is not changed any more."""
+
+    @abstractmethod
+    def read(self, name: str) -> NDArray[Any]:
+        """The array of this name, of the shape that it was written with, not to be changed.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is none.
+        """
+
+    @abstractmethod
+    def those_of(self, names: Iterable[str]) -> set[str]:
+        """Those of these names that arrays have."""
+
+    @abstractmethod
+    def remove(self, name: str) -> None:
+        """Forget an array, if it is there, or all whose names begin with this and a slash."""
+
+    @abstractmethod
+    def temporary(self, least: int) -> AbstractContextManager[Room]:
+        """Where one task alone puts arrays while it is at work; a file is worth it for ``least`` bytes."""
+
+    def has(self, name: str) -> bool:
+        """Whether an array has this name."""
+        return bool(self.those_of([name]))
+
+
+class MemoryScratch(Scratch):
+    """Arrays by name in the memory of this process, for the threads of one build."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def write(self, name: str, array: NDArray[Any]) -> None:
+        """Keep an array; a part of another one is copied, so that the rest of that one is not kept with it."""
+        kept = np.array(array) if array.base is not None else np.asarray(array)
+        kept.flags.writeable = False
+        self._arrays[name] = kept
+
+    def read(self, name: str) -> NDArray[Any]:
+        """The array of this name, the one that was kept."""
+        try:
+            return self._arrays[name]
+        except KeyError:
+            raise FileNotFoundError(f"expected an array {name}, there is none") from None
+
+    def those_of(self, names: Iterable[str]) -> set[str]:
+        """Those of these names that arrays have."""
+        return self._arrays.keys() & set(names)
+
+    def remove(self, name: str) -> None:
+        """Forget an array, if it is there, or all whose names begin with this and a slash."""
+        for kept in [kept for kept in self._arrays if kept == name or kept.startswith(f"{name}/")]:
+            del self._arrays[kept]
+
+    def temporary(self, least: int) -> AbstractContextManager[Room]:
+        """Memory, whatever ``least`` is."""
+        return nullcontext(IN_MEMORY)
+
+
+class FolderScratch(Scratch):
     """Arrays by name, in a folder that every worker of a build sees.
 
-    A file appears under its name when it is whole, so that a task whose files are there is done, and a build that was
-    cut goes on with those that are missing. Names have parts between slashes, which become folders.
+    A build that was cut goes on with the files that are missing. Parts of names become folders.
 
     Parameters
     ----------
@@ -157,9 +239,16 @@ class Scratch:
             raise
         return array
 
-    def has(self, name: str) -> bool:
-        """Whether an array has this name."""
-        return bool(self.those_of([name]))
+    @contextmanager
+    def temporary(self, least: int) -> Iterator[Room]:
+        """Where one task alone puts arrays while it is at work: those of ``least`` bytes or more are in files."""
+        with ExitStack() as stack:
+
+            @cache
+            def files() -> FolderScratch:
+                return FolderScratch(stack.enter_context(tempfile.TemporaryDirectory(prefix="task-", dir=self.folder)))
+
+            yield Room(files, least)
 
     def those_of(self, names: Iterable[str]) -> set[str]:
         """Those of these names that arrays have.
@@ -243,14 +332,16 @@ class Room:
     Parameters
     ----------
     scratch : callable or None
-        Gives the folder, a `Scratch`. None: all arrays are in memory.
+        Gives the folder, a `FolderScratch`. None: all arrays are in memory.
     least : int
         Arrays of fewer bytes are in memory, up to so many bytes in all, those included that are gone meanwhile.
     memory : int, optional
         Bytes that may be taken for what cannot go into files, where somebody has said so.
     """
 
-    def __init__(self, scratch: Callable[[], Scratch] | None = None, least: int = 0, memory: int | None = None) -> None:
+    def __init__(
+        self, scratch: Callable[[], FolderScratch] | None = None, least: int = 0, memory: int | None = None
+    ) -> None:
         self._scratch, self._least, self.memory = scratch, least, memory
         self._count = self._small = self._filed = 0
         self._common: tuple[NDArray[np.uint8], int] = np.zeros(0, np.uint8), 0  # a file, and how much of it is taken

@@ -181,10 +181,10 @@ def _decode(
     seen: RangeSet,
 ) -> None:
     from lodestream.bands.folders import passing_folder
-    from lodestream.scratch import Room, Scratch
+    from lodestream.scratch import Room, FolderScratch
 
     with passing_folder(out, (_VALUES, _FILE)) as folder:
-        surface = decoder.surface(Room(lambda: Scratch(folder / _VALUES), memory // _PART), memory, progress)
+        surface = decoder.surface(Room(lambda: FolderScratch(folder / _VALUES), memory // _PART), memory, progress)
         index, last = decoder.index, decoder.index.levels[decoder.level]
         finest = decoder.level == decoder.header.levels
         outcome = Outcome(

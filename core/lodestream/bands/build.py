@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import os
+import pickle
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from threading import Lock
 
+import numpy as np
+
 from ..container.model import Header
 from ..encoding.lattice_coordinates import Lattices
 from ..encoding.prepared import Prepared
 from ..entropy.tiles import TileTable
-from ..scratch import Scratch
+from ..scratch import FolderScratch, Scratch
 from .geometry import CORE_POINTS, Bands
 from .grid_runs import GridRuns
 from .references import dump, load
@@ -22,7 +25,7 @@ __all__ = ["Build"]
 #: Builds that a process has open at most.
 _MOST = 2
 
-_FILE, _HEADER = "build.pickle", "header.pickle"
+_FILE, _HEADER = "build.pickle", "header"
 
 
 @dataclass(frozen=True)
@@ -71,14 +74,20 @@ class Build:
         """Of the surface, attributes included."""
         return len(self.lattices.channels)
 
+    @property
+    def folder(self) -> str:
+        """Where other processes open this; it is in files."""
+        assert isinstance(self.scratch, FolderScratch)
+        return str(self.scratch.folder)
+
     def save(self, flush: bool = False) -> None:
         """Write what other processes need to open this; with ``flush``, also those of other machines."""
         facts = _Facts(self.prepared, self.lattices, self.points, self._core_points)
-        dump(facts, self.scratch.folder / _FILE, flush)
+        dump(facts, Path(self.folder) / _FILE, flush)
 
     def save_header(self, header: Header) -> None:
         """Write the header, with the size of chunks, for the tasks that code the residual."""
-        dump(header, self.scratch.folder / _HEADER)
+        self.scratch.write(_HEADER, np.frombuffer(pickle.dumps(header, pickle.HIGHEST_PROTOCOL), np.uint8))
 
     def stored_header(self) -> Header:
         """What `save_header` wrote.
@@ -88,7 +97,7 @@ class Build:
         FileNotFoundError
             If it has written nothing yet.
         """
-        header: Header = load(self.scratch.folder / _HEADER)
+        header: Header = pickle.loads(self.scratch.read(_HEADER).data)
         return header
 
     @staticmethod
@@ -112,7 +121,7 @@ class Build:
     def close(self) -> None:
         """Let this process forget the build: maps of files that were removed take their room on the disk."""
         with _LOCK:
-            _OPENED.pop(str(self.scratch.folder), None)
+            _OPENED.pop(self.folder, None)
 
 
 #: The builds that this process works on, by folder, with the state of their files.
@@ -129,6 +138,7 @@ def _opened(folder: str, state: tuple[int, ...]) -> Build:
             while len(_OPENED) >= _MOST:
                 del _OPENED[next(iter(_OPENED))]
             facts: _Facts = load(Path(folder) / _FILE)
-            build = Build(Scratch(folder, make=False), facts.prepared, facts.lattices, facts.points, facts.core_points)
+            scratch = FolderScratch(folder, make=False)
+            build = Build(scratch, facts.prepared, facts.lattices, facts.points, facts.core_points)
             known = _OPENED[folder] = state, build
         return known[1]

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from ..scratch import Scratch
+from .build import Build
 
 __all__ = ["Execution", "Task"]
 
@@ -22,10 +23,10 @@ class Task:
     Attributes
     ----------
     done : str
-        The name of the file in the scratch folder that the function writes last.
+        The name of the array in the build's scratch that the function writes last.
     function : callable
-        At the top level of a module. It is given the folder, a str, then the arguments, and returns nothing: what it
-        finds is in files, which appear when they are whole.
+        At the top level of a module. It is given the build, then the arguments, and returns nothing: what it finds is
+        in the build's scratch.
     arguments : tuple of int
     """
 
@@ -39,16 +40,16 @@ class Execution:
 
     Parameters
     ----------
-    scratch : Scratch
-        Where the tasks' files are.
+    build : Build
+        What the tasks work on.
     executor : concurrent.futures.Executor or None
-        None: threads of this process.
+        None: threads of this process. Else the build must have been saved in its folder, where each task opens it.
     threads : int
         How many of these, 1 or more.
     """
 
-    def __init__(self, scratch: Scratch, executor: Executor | None = None, threads: int = 1) -> None:
-        self._scratch, self._executor, self._threads = scratch, executor, threads
+    def __init__(self, build: Build, executor: Executor | None = None, threads: int = 1) -> None:
+        self._build, self._executor, self._threads = build, executor, threads
 
     def carry_out(self, tasks: Sequence[Task], progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Carry out the tasks of one phase that are not done yet.
@@ -66,28 +67,33 @@ class Execution:
             threads and processes of this machine. A task that a Dask worker has begun may end later, as may one of a
             worker that was given up: no task may write other values into a file that another task has written.
         """
-        found = self._scratch.those_of(task.done for task in tasks)
+        found = self._build.scratch.those_of(task.done for task in tasks)
         left = [task for task in tasks if task.done not in found]
         done = len(tasks) - len(left)
-        folder = str(self._scratch.folder)
-        if self._executor is None and self._threads == 1:
+        if self._executor is not None:
+            folder = self._build.folder
+            self._wait(lambda task: partial(_in_folder, folder, task), self._executor, left, done, progress)
+        elif self._threads == 1:
             for number, task in enumerate(left, done + 1):
-                task.function(folder, *task.arguments)
+                task.function(self._build, *task.arguments)
                 progress(number / len(tasks))
-        elif self._executor is None:
-            with ThreadPoolExecutor(self._threads, "lodestream-bands") as own:
-                self._wait(own, folder, left, done, progress)
         else:
-            self._wait(self._executor, folder, left, done, progress)
+            with ThreadPoolExecutor(self._threads, "lodestream-bands") as own:
+                self._wait(lambda task: partial(task.function, self._build, *task.arguments), own, left, done, progress)
 
+    @staticmethod
     def _wait(
-        self, executor: Executor, folder: str, tasks: Sequence[Task], done: int, progress: Callable[[float], None]
+        call: Callable[[Task], Callable[[], None]],
+        executor: Executor,
+        tasks: Sequence[Task],
+        done: int,
+        progress: Callable[[float], None],
     ) -> None:
         pending: set[Future[Any]] = set()
         total = done + len(tasks)
         try:
             for task in tasks:
-                pending.add(executor.submit(task.function, folder, *task.arguments))
+                pending.add(executor.submit(call(task)))
             while pending:
                 ended, pending = wait(pending, _LOOK, FIRST_EXCEPTION)
                 for future in ended:
@@ -99,3 +105,8 @@ class Execution:
                 future.cancel()
             # The files of a task that is still at work should not come after what its caller does next.
             wait([future for future in pending if not future.cancelled()])
+
+
+def _in_folder(folder: str, task: Task) -> None:
+    """Carry out a task of the build that was saved in a folder; for executors, whose workers may be other machines."""
+    task.function(Build.open(folder), *task.arguments)

@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ..errors import InputError
-from ..scratch import Scratch
+from ..scratch import FolderScratch
 
 try:
     import fcntl
@@ -72,7 +72,7 @@ class Folder:
     ) -> None:
         self._stack, self._scratch, self._out = stack, scratch, out
         self._folder: Path | None = None
-        self._copies: Scratch | None = None
+        self._copies: FolderScratch | None = None
         if scratch is not None and out is not None and Path(scratch).resolve() == Path(out).resolve().parent:
             raise InputError(f"expected a scratch folder of its own, got {scratch}, which {Path(out).name} goes to")
 
@@ -89,12 +89,12 @@ class Folder:
                 self._folder = self._stack.enter_context(build_folder(folder, (_SOURCE, TASKS), named))
         return self._folder
 
-    def copies(self) -> Scratch:
+    def copies(self) -> FolderScratch:
         """Where all copies of this call go of what is read once; those of a call before are removed."""
         if self._copies is None:
             folder = self.open() / _SOURCE
             remove(folder)
-            self._copies = Scratch(folder / secrets.token_hex(8))
+            self._copies = FolderScratch(folder / secrets.token_hex(8))
         return self._copies
 
 

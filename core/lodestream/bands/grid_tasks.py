@@ -19,16 +19,15 @@ from .stored import CORE, name_of_fit, rules_of, write_measured
 __all__ = ["coordinates", "core", "first_step", "interfaces", "measure", "second_step"]
 
 
-def interfaces(folder: str, channel: int) -> None:
+def interfaces(build: Build, channel: int) -> None:
     """Lattice coordinates of all interfaces of a channel."""
-    build = Build.open(folder)
     found = coordinates_of_interfaces(build.prepared, channel, build.lattices.channels[channel])
     build.scratch.write(f"interfaces/{channel}", np.concatenate([np.zeros(0, np.int32), *found]))
 
 
-def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
+def coordinates(build: Build, channel: int, fit: int, piece: int) -> None:
     """Lattice coordinates of a run of grids at the finest level; ``fit`` as in `core`."""
-    build, runs = _opened(folder)
+    runs = _runs(build)
     layout, prepared = build.prepared.layout, build.prepared
     grids = runs.samples(layout.levels)[piece]
     lengths = [grid.shape[0] for grid in layout.grids[: prepared.interfaces]]
@@ -46,9 +45,9 @@ def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
     _write_lines(build, "columns", (channel, fit, layout.levels, piece), arrays, grids, 0)
 
 
-def first_step(folder: str, channel: int, fit: int, level: int, piece: int) -> None:
+def first_step(build: Build, channel: int, fit: int, level: int, piece: int) -> None:
     """The step along the rows' axis of a run of grids; ``fit`` as in `core`."""
-    build, runs = _opened(folder)
+    runs = _runs(build)
     grids, layout = runs.of(level)[piece].grids, build.prepared.layout
     name = name_of_fit("samples", channel, fit, level)
     arrays = transform.read_grids(build.scratch, name, runs, level, grids)
@@ -57,12 +56,12 @@ def first_step(folder: str, channel: int, fit: int, level: int, piece: int) -> N
     _write_lines(build, "rows", (channel, fit, level, piece), arrays, grids, 1)
 
 
-def second_step(folder: str, channel: int, fit: int, level: int, piece: int) -> None:
+def second_step(build: Build, channel: int, fit: int, level: int, piece: int) -> None:
     """The step along the columns' axis of a run of grids: its coefficients, and samples of the level below.
 
     ``fit`` as in `core`.
     """
-    build, runs = _opened(folder)
+    runs = _runs(build)
     run, layout = runs.of(level)[piece], build.prepared.layout
     stepped = build.scratch.read(name_of_fit("halves", channel, fit, level, piece))
     arrays = transform.separated(stepped, [layout.shape(grid, level) for grid in run.grids])
@@ -79,9 +78,9 @@ def second_step(folder: str, channel: int, fit: int, level: int, piece: int) -> 
     _write_lines(build, "columns", (channel, fit, level - 1, piece), nodes, run.grids, 0)
 
 
-def core(folder: str, channel: int, fit: int) -> None:
+def core(build: Build, channel: int, fit: int) -> None:
     """The levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
-    build, runs = _opened(folder)
+    runs = _runs(build)
     layout, grids = build.prepared.layout, range(len(build.prepared.layout.grids))
     name = name_of_fit("samples", channel, fit, runs.core)
     arrays = transform.read_grids(build.scratch, name, runs, runs.core, grids)
@@ -93,19 +92,17 @@ def core(folder: str, channel: int, fit: int) -> None:
     build.scratch.write(name_of_fit("core-rules", channel, fit), predictors)
 
 
-def measure(folder: str, number: int) -> None:
+def measure(build: Build, number: int) -> None:
     """Measure the patches of some blocks in all states, and code the residual of these blocks."""
-    build = Build.open(folder)
     header = build.stored_header()
     blocks = blocks_of_run(build.prepared, build.points)[number]
     figures, chunks, exact = measured(build, header, blocks)
     write_measured(build, number, figures, chunks, [], exact)
 
 
-def _opened(folder: str) -> tuple[Build, GridRuns]:
-    build = Build.open(folder)
+def _runs(build: Build) -> GridRuns:
     assert isinstance(build.pieces, GridRuns)
-    return build, build.pieces
+    return build.pieces
 
 
 def _write_lines(

@@ -22,7 +22,7 @@ from ..encoding.prepared import Prepared, prepare
 from ..errors import InputError
 from ..parallel import threads
 from ..quality import Quality
-from ..scratch import DamagedError, Room, Scratch, boot_id, is_made
+from ..scratch import DamagedError, FolderScratch, Room, boot_id, is_made
 from ..surface import Surface
 from .build import Build
 from .building import Building, OutOfRangeError
@@ -118,24 +118,24 @@ class Made:
                 remove(path)
         begun, surface = own.exists(), self._surface
         try:
-            made = self._container(Scratch(own))
+            made = self._container(FolderScratch(own))
         except DamagedError:
             if not begun:
                 raise
             remove(own)  # the machine failed, not only the build
             self._surface = surface
-            made = self._container(Scratch(own))
+            made = self._container(FolderScratch(own))
         for path_, state in zip(paths, states, strict=True):
             if file_state(path_) != state:
                 raise InputError(f"expected {path_} to stay as it is until it is encoded, it was changed meanwhile")
         return made
 
-    def _container(self, scratch: Scratch) -> Path | None:
-        self._surface = self._in_files(Scratch(scratch.folder / "surface"))
+    def _container(self, scratch: FolderScratch) -> Path | None:
+        self._surface = self._in_files(FolderScratch(scratch.folder / "surface"))
         # Not the files of the build that was cut: a late task of it could read them while they are written.
         remove(scratch.folder / "prepared")
         prepared_files = scratch.folder / "prepared" / uuid4().hex
-        room = Room(lambda: Scratch(prepared_files), 0 if self._executor is not None else _IN_A_FILE)
+        room = Room(lambda: FolderScratch(prepared_files), 0 if self._executor is not None else _IN_A_FILE)
         prepared = prepare(self._surface, self._quality, room)
         if prepared.arrangement is not None and self._executor is None:
             # No patch is divided.
@@ -155,7 +155,7 @@ class Made:
         self._progress(1.0)
         return best
 
-    def _in_files(self, files: Scratch) -> Surface:
+    def _in_files(self, files: FolderScratch) -> Surface:
         """The surface with all arrays in files, which tasks open: what is in memory would go to each of them."""
 
         # Copied, not made anew: that would look at all values, and put another mask into memory.
@@ -176,14 +176,15 @@ class Made:
         surface.joints = None  # the values say again which points are one
         return surface
 
-    def _stream(self, scratch: Scratch, prepared: Prepared, bits: int | None, room: Room) -> Path:
+    def _stream(self, scratch: FolderScratch, prepared: Prepared, bits: int | None, room: Room) -> Path:
         name = "exact" if bits is None else f"bits-{bits}"
         path = scratch.folder / f"{name}.lode"
         if not path.exists():
-            own = Scratch(scratch.folder / name)
+            own = FolderScratch(scratch.folder / name)
             build = Build(own, prepared, exact_lattices(prepared, bits, room), self._points, self._core)
-            build.save(flush=self._executor is not None)
-            execution = Execution(own, self._executor, self._threads)
+            if self._executor is not None:
+                build.save(flush=True)
+            execution = Execution(build, self._executor, self._threads)
             try:
                 with replacing(path) as unfinished, unfinished.open("wb") as file:
                     Building(build, execution, self._progress).write(file)
@@ -215,7 +216,7 @@ class Made:
         return json.dumps(said)
 
 
-def _kept(files: Scratch, name: str, arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
+def _kept(files: FolderScratch, name: str, arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
     """Arrays of one dtype and any shapes, those in memory as parts of one file: a process may have so many open."""
     left = [number for number, array in enumerate(arrays) if root_of(array) is None]
     if not left:

@@ -10,7 +10,7 @@ from typing import Any
 from .. import __version__
 from ..errors import InputError
 from ..formats import read
-from ..scratch import Scratch, boot_id
+from ..scratch import FolderScratch, boot_id
 from ..surface import Surface
 from .front import default_memory
 from .memory import WHOLE
@@ -65,12 +65,12 @@ def read_into(
         found = _found(folder, key)
         if found is not None:
             return found
-        Scratch(folder).clear()
+        FolderScratch(folder).clear()
     limit = default_memory() if memory is None else memory
     first, *more = paths
     room = CopyRoom(
-        lambda: Scratch(folder),
-        lambda: Scratch(folder).folder,
+        lambda: FolderScratch(folder),
+        lambda: FolderScratch(folder).folder,
         limit // _PART,
         lambda values: by_bands and values * WHOLE > limit,
         memory,
@@ -81,9 +81,9 @@ def read_into(
             raise InputError(f"expected {path} to stay as it is until it is read, it was changed meanwhile")
     if not folder.exists() or surface.joints is not None:
         return surface
-    save_surface(surface, Scratch(folder))
+    save_surface(surface, FolderScratch(folder))
     (folder / _KEY).write_text(key)
-    return load_surface(Scratch(folder)) or surface
+    return load_surface(FolderScratch(folder)) or surface
 
 
 def _found(folder: Path, key: str) -> Surface | None:
@@ -91,6 +91,6 @@ def _found(folder: Path, key: str) -> Surface | None:
     if (folder / _KEY).read_text(errors="replace") != key:
         return None
     try:
-        return load_surface(Scratch(folder))
+        return load_surface(FolderScratch(folder))
     except InputError:
         return None

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..errors import TooLargeError
-from ..scratch import Room, Scratch
+from ..scratch import FolderScratch, Room
 from .folders import TASKS
 
 __all__ = ["FOR_A_VALUE", "CopyRoom", "check_room"]
@@ -31,7 +31,7 @@ def check_room(folder: Path, needed: int) -> None:
     TooLargeError
         If it has not.
     """
-    free = shutil.disk_usage(folder).free + Scratch(folder / TASKS, make=False).size()
+    free = shutil.disk_usage(folder).free + FolderScratch(folder / TASKS, make=False).size()
     if free < needed:
         raise TooLargeError(
             f"expected {needed >> 20:,} MiB of room in {folder} for the files of a build by bands, "
@@ -45,7 +45,7 @@ class CopyRoom(Room):
     Parameters
     ----------
     scratch : callable
-        Gives the folder of the copies, a `Scratch`.
+        Gives the folder of the copies, a `FolderScratch`.
     folder : callable
         Gives the folder of the build.
     least : int
@@ -58,7 +58,7 @@ class CopyRoom(Room):
 
     def __init__(
         self,
-        scratch: Callable[[], Scratch],
+        scratch: Callable[[], FolderScratch],
         folder: Callable[[], Path],
         least: int,
         by_bands: Callable[[int], bool],

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from ..scratch import Scratch, rows_at_once
+from ..scratch import FolderScratch, rows_at_once
 from ..surface import DTYPES, Block, Surface
 from .references import root_of
 
@@ -30,7 +30,7 @@ _OTHERS = RecursionError, OverflowError, msgpack.UnpackException
 _Place = tuple[str, int, str, tuple[int, ...]]
 
 
-def save_surface(surface: Surface, scratch: Scratch) -> None:
+def save_surface(surface: Surface, scratch: FolderScratch) -> None:
     """Write a surface of any size into a folder; arrays that lie in files of the folder already stay there.
 
     The others share a file for each dtype, since a process may have only so many files open. Which points of the
@@ -66,7 +66,7 @@ def save_surface(surface: Surface, scratch: Scratch) -> None:
     temporary.replace(scratch.folder / _FILE)
 
 
-def load_surface(scratch: Scratch) -> Surface | None:
+def load_surface(scratch: FolderScratch) -> Surface | None:
     """The surface that `save_surface` wrote into a folder, its arrays memory-mapped; None: it has written none.
 
     Raises
@@ -99,7 +99,7 @@ def load_surface(scratch: Scratch) -> Surface | None:
 class _Files:
     """Files of a folder, each mapped once."""
 
-    def __init__(self, scratch: Scratch) -> None:
+    def __init__(self, scratch: FolderScratch) -> None:
         self._scratch = scratch
         self._known: dict[str, NDArray[np.uint8]] = {}
 
@@ -145,7 +145,7 @@ def _read(place: Any, files: _Files) -> NDArray[Any]:
     return array
 
 
-def _place_of(array: NDArray[Any], scratch: Scratch) -> _Place | None:
+def _place_of(array: NDArray[Any], scratch: FolderScratch) -> _Place | None:
     """Where an array lies in a file of this folder; None: in none, or in another order."""
     root = root_of(array)
     if root is None or not array.flags.c_contiguous:

@@ -1,18 +1,15 @@
-"""The tasks of a build: each reads files of the scratch folder, or the surface, and leaves files there.
+"""The tasks of a build: each reads arrays of its scratch, or the surface, and leaves arrays there.
 
-A task is called with the folder, then with numbers. The file that it writes last tells that it is done.
+A task is called with the build, then with numbers. The array that it writes last tells that it is done.
 """
 
 from __future__ import annotations
-
-from uuid import uuid4
 
 import numpy as np
 
 from ..decoding.region import Region
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
 from ..entropy.part_table import part_of
-from ..scratch import Room, Scratch
 from ..transform.pyramid import empty
 from . import forward
 from .build import Build
@@ -55,29 +52,23 @@ def sample_pieces(build: Build, level: int) -> list[tuple[int, int]]:
     return _bands(build).samples(level)
 
 
-def coordinates(folder: str, channel: int, fit: int, piece: int) -> None:
+def coordinates(build: Build, channel: int, fit: int, piece: int) -> None:
     """Lattice coordinates of a piece of the finest level; ``fit`` as in `core`."""
-    build = Build.open(folder)
     layout = build.prepared.layout
     rows = sample_pieces(build, layout.levels)[piece]
     shape = rows[1] - rows[0], layout.shape(0, layout.levels)[1]
-    # A strip with holes may be larger than a band.
-    own = Scratch(build.scratch.folder / "strips" / uuid4().hex, make=build.prepared.surface.blocks[0].mask is not None)
-    room = Room(lambda: own, _IN_A_FILE)
-    try:
-        samples = room.empty(shape, np.int32) if own.folder.exists() else empty(shape)
+    with build.scratch.temporary(_IN_A_FILE) as room:
+        # A strip with holes may be larger than a band.
+        samples = empty(shape) if build.prepared.surface.blocks[0].mask is None else room.empty(shape, np.int32)
         coordinates_of_strip(build.prepared, channel, build.lattices.channels[channel], rows, samples, room)
         build.scratch.write(name_of_fit("samples", channel, fit, layout.levels, piece), samples)
         build.scratch.write(
             name_of_fit("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples)
         )
-    finally:
-        own.clear()
 
 
-def first_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:
+def first_step(build: Build, channel: int, fit: int, level: int, band: int) -> None:
     """The step along the rows' axis of a band; ``fit`` as in `core`."""
-    build = Build.open(folder)
     layout, own = build.prepared.layout, _bands(build).of(level)[band]
     predictors = rules_of(build, channel, fit, level, [0])
     name = name_of_fit("samples", channel, fit, level)
@@ -88,12 +79,11 @@ def first_step(folder: str, channel: int, fit: int, level: int, band: int) -> No
     build.scratch.write(name_of_fit("details", channel, fit, level, band), details)
 
 
-def second_step(folder: str, channel: int, fit: int, level: int, band: int) -> None:
+def second_step(build: Build, channel: int, fit: int, level: int, band: int) -> None:
     """The step along the columns' axis of a band: its coefficients, and samples of the level below.
 
     ``fit`` as in `core`.
     """
-    build = Build.open(folder)
     layout, own = build.prepared.layout, _bands(build).of(level)[band]
     stepped = np.array(build.scratch.read(name_of_fit("halves", channel, fit, level, band)))
     predictors = rules_of(build, channel, fit, level, [1])
@@ -104,9 +94,8 @@ def second_step(folder: str, channel: int, fit: int, level: int, band: int) -> N
     build.scratch.write(name_of_fit("columns", channel, fit, level - 1, band), forward.sampled_columns(nodes))
 
 
-def core(folder: str, channel: int, fit: int) -> None:
+def core(build: Build, channel: int, fit: int) -> None:
     """The levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
-    build = Build.open(folder)
     bands, layout = _bands(build), build.prepared.layout
     samples = empty(layout.shape(0, bands.core))
     pieces = sample_pieces(build, bands.core)
@@ -118,17 +107,15 @@ def core(folder: str, channel: int, fit: int) -> None:
     build.scratch.write(name_of_fit("core-rules", channel, fit), predictors)
 
 
-def code(folder: str, channel: int, level: int, band: int) -> None:
+def code(build: Build, channel: int, level: int, band: int) -> None:
     """Code the units of a band, or of the core, whole."""
-    build = Build.open(folder)
     found = code_units(_units(build, channel, level, band))
     for kind in ("bits", "gains", "early", "strings", "ends"):
         build.scratch.write(name_of(kind, channel, level, band), getattr(found, kind))
 
 
-def segments(folder: str, channel: int, level: int, band: int) -> None:
+def segments(build: Build, channel: int, level: int, band: int) -> None:
     """Code the small units of a band, or of the core, layer after layer."""
-    build = Build.open(folder)
     units = _units(build, channel, level, band)
     states = build.scratch.read("kept-states")[:, units.tiles.start : units.tiles.stop, channel]
     start = np.maximum(2 * units.tops - 1, 0).astype(np.int8)
@@ -138,9 +125,8 @@ def segments(folder: str, channel: int, level: int, band: int) -> None:
     build.scratch.write(name_of("lengths", channel, level, band), lengths)
 
 
-def measure(folder: str, number: int) -> None:
+def measure(build: Build, number: int) -> None:
     """Measure some rows in all states, and code their residual."""
-    build = Build.open(folder)
     header = build.stored_header()
     rows = measured_rows(build.prepared, header.chunk, build.points)[number]
     measurer = measurer_of(build, rows)

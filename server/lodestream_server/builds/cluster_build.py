@@ -92,13 +92,13 @@ def _build(task: ClusterJob) -> Built | Refused:
     from lodestream import encode
     from lodestream.bands.cluster import executor_of
     from lodestream.bands.stored_surface import load_surface
-    from lodestream.scratch import Scratch
+    from lodestream.scratch import FolderScratch
 
     from .stored_quality import without_quality
 
     job = task.job
     keep_parsed(job)
-    surface = load_surface(Scratch(job.parsed))
+    surface = load_surface(FolderScratch(job.parsed))
     if surface is None:
         raise InputError("expected a parsed surface, got none")
     vertices = sum(block.shape[0] * block.shape[1] for block in surface.blocks)

@@ -171,7 +171,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     from lodestream.container import read_index
     from lodestream.decoding.pieces import PiecewiseDecoder
     from lodestream.planning.planner import plan
-    from lodestream.scratch import Room, Scratch
+    from lodestream.scratch import Room, FolderScratch
 
     with job.container.open("rb") as file:
 
@@ -184,7 +184,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
             aside = index.header.layout.points(job.level) * sum(dtype.itemsize for dtype in index.header.dtypes)
             if aside >= job.most_bytes:
                 raise FileTooLongError(os.strerror(errno.EFBIG))
-            room = Room(lambda: Scratch(job.folder / "values"))
+            room = Room(lambda: FolderScratch(job.folder / "values"))
             pieces = PiecewiseDecoder(read, index, job.level)
             return pieces.surface(room, job.memory // _BAND, lambda fraction: None), aside
         chosen = plan(index, Target(level=job.level))

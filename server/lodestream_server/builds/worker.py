@@ -311,7 +311,7 @@ def _build(job: Job) -> Built | Parsed:
     from lodestream.bands.front import goes_by_bands
     from lodestream.bands.stored_surface import save_surface
     from lodestream.formats import check_allowed
-    from lodestream.scratch import Scratch
+    from lodestream.scratch import FolderScratch
 
     path = job.container
     if finished.is_container(job.files[0]):
@@ -328,7 +328,7 @@ def _build(job: Job) -> Built | Parsed:
         warnings.simplefilter("ignore", FormatWarning)  # it stands in the notes
         if goes_by_bands(surface, quality, job.room):
             if job.shared:
-                save_surface(surface, Scratch(job.parsed))
+                save_surface(surface, FolderScratch(job.parsed))
                 return Parsed(sum(block.shape[0] * block.shape[1] for block in surface.blocks))
             made = job.folder / _MADE
             encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.scratch / BANDS)
@@ -353,7 +353,7 @@ def moved(made: Path, path: Path) -> str:
 def _read(job: Job, options: dict[str, str]) -> Surface:
     from lodestream.encoding.losses import at_holes
     from lodestream.formats import read
-    from lodestream.scratch import Room, Scratch
+    from lodestream.scratch import Room, FolderScratch
 
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always", FormatWarning)
@@ -363,7 +363,7 @@ def _read(job: Job, options: dict[str, str]) -> Surface:
             max_vertices=job.max_vertices,
             filename=job.filename or UNNAMED,
             allowed=job.allowed,
-            room=Room(lambda: Scratch(job.parsed), job.room // _PART),
+            room=Room(lambda: FolderScratch(job.parsed), job.room // _PART),
             **options,
         )
     said = [str(warning.message) for warning in found if warning.category is FormatWarning]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -21,21 +22,24 @@ from lodestream.encoding.encoder import encode
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch, MemoryScratch, Scratch
 from lodestream.surface import Surface
 
 from ..surfaces import terrain
 
 
 def built(surface: Surface, points: int, core_points: int, threads: int = 1, **quality: Any) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        return _built(FolderScratch(folder), surface, points, core_points, threads, **quality)
+
+
+def _built(
+    scratch: Scratch, surface: Surface, points: int, core_points: int, threads: int = 1, **quality: Any
+) -> bytes:
     out = io.BytesIO()
     prepared = prepare(surface, Quality.of(**quality))
-    with tempfile.TemporaryDirectory() as folder:
-        scratch = Scratch(folder)
-        made = Build(scratch, prepared, exact_lattices(prepared), points, core_points)
-        made.save()
-        Building(made, Execution(scratch, None, threads), lambda fraction: None).write(out)
-        made.close()
+    made = Build(scratch, prepared, exact_lattices(prepared), points, core_points)
+    Building(made, Execution(made, None, threads), lambda fraction: None).write(out)
     return out.getvalue()
 
 
@@ -98,6 +102,9 @@ def test_bands_give_the_bytes_of_one_piece(name: str, points: int, core_points: 
     surface, quality = SURFACES[name]
     whole = encode(surface, **quality)
     assert built(surface, points, core_points, threads=1 + points % 2, **quality) == whole
+    # One piece or several, with one thread or two.
+    for size, core, threads in ((points, core_points, 2 - points % 2), (1 << 22, 1 << 30, 1)):
+        assert _built(MemoryScratch(), surface, size, core, threads, **quality) == whole
 
 
 def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,7 +114,7 @@ def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.Monke
     code, late = Building._code, list[Path]()
 
     def after_late_tasks(self: Building) -> None:
-        folder = self._build.scratch.folder
+        folder = Path(self._build.folder)
         for kind in ("coefficients", "planes", "rules", "core-rules"):
             for path in sorted((folder / f"plain-{kind}").rglob("*.npy")):
                 own = str(path.relative_to(folder).with_suffix("")).removeprefix("plain-")
@@ -126,14 +133,14 @@ def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.Monke
 def test_builds_whose_folders_are_gone_are_forgotten(tmp_path: Path) -> None:
     def saved(name: str) -> Build:
         prepared = prepare(Surface(_heights((20, 30))), Quality())
-        made = Build(Scratch(tmp_path / name), prepared, exact_lattices(prepared), 1000)
+        made = Build(FolderScratch(tmp_path / name), prepared, exact_lattices(prepared), 1000)
         made.save()
         opened = Build.open(str(tmp_path / name))
         assert Build.open(str(tmp_path / name)) is opened
         return made
 
     first = saved("first")
-    first.scratch.clear()
+    shutil.rmtree(first.folder)
     second = saved("second")
     assert list(build._OPENED) == [str(tmp_path / "second")]
     second.save()

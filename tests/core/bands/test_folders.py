@@ -18,7 +18,7 @@ import pytest
 from lodestream.bands import folders
 from lodestream.bands.folders import build_folder, passing_folder, remove, replacing
 from lodestream.errors import InputError
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 
 ENTRIES = ("tasks",)
 
@@ -197,7 +197,7 @@ def test_file_systems_without_locks_will_do(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_a_late_task_leaves_nothing(tmp_path: Path) -> None:
-    late = Scratch(tmp_path / "tasks")
+    late = FolderScratch(tmp_path / "tasks")
     with late.writing("a/b") as path:
         path.write_bytes(b"x")
     remove(tmp_path / "tasks")

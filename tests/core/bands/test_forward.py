@@ -25,7 +25,7 @@ from lodestream.entropy.part_table import flat_span
 from lodestream.entropy.tile_coder import planes_of
 from lodestream.entropy.tiles import TileTable, gather
 from lodestream.grid.layout import Layout
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 from lodestream.transform.predictors import default_predictors
 from lodestream.transform.pyramid import copied, forward
 
@@ -38,7 +38,7 @@ class _Found(NamedTuple):
     planes: NDArray[np.int8]
 
 
-def _by_bands(samples: NDArray[np.int32], layout: Layout, bands: Bands, fit: bool, scratch: Scratch) -> _Found:
+def _by_bands(samples: NDArray[np.int32], layout: Layout, bands: Bands, fit: bool, scratch: FolderScratch) -> _Found:
     """The whole transform as a build does it, one task after another."""
     table, predictors = TileTable.of(layout), default_predictors(layout)
     found = _Found(predictors, np.zeros(table.size, np.int32), np.zeros(len(layout.tiles), np.int8))
@@ -102,7 +102,7 @@ def test_bands_make_the_coefficients_of_the_whole(
     predictors = forward([whole], layout, fit)
     flat = gather(table, [whole])
     with tempfile.TemporaryDirectory() as folder:
-        found = _by_bands(samples, layout, Bands(layout, points, core), fit, Scratch(folder))
+        found = _by_bands(samples, layout, Bands(layout, points, core), fit, FolderScratch(folder))
     assert np.array_equal(found.predictors, predictors)
     assert np.array_equal(found.flat, flat)
     assert found.planes.tolist() == [planes_of(table, flat, number) for number in range(len(layout.tiles))]

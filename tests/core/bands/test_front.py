@@ -19,7 +19,7 @@ from lodestream.bands import front, made, references, tasks
 from lodestream.bands.memory import checked_memory
 from lodestream.bands.references import root_of
 from lodestream.encoding.prepared import prepare
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 
 from ..surfaces import terrain
 
@@ -300,13 +300,13 @@ def test_changes_in_a_map_that_are_not_in_its_file_are_encoded(tmp_path: Path) -
 
 
 def test_arrays_in_files_are_not_copied_for_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written, write = list[str](), Scratch.write
+    written, write = list[str](), FolderScratch.write
 
-    def spy(self: Scratch, name: str, array: NDArray[Any]) -> None:
+    def spy(self: FolderScratch, name: str, array: NDArray[Any]) -> None:
         written.append(str(self.folder))
         write(self, name, array)
 
-    monkeypatch.setattr(Scratch, "write", spy)
+    monkeypatch.setattr(FolderScratch, "write", spy)
     mapped = _mapped(tmp_path / "heights.npy", _heights().points)
     with ThreadPoolExecutor(1) as executor:
         assert ls.encode(mapped, executor=executor, memory=LITTLE) == ls.encode(np.array(mapped))

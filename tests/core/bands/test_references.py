@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lodestream.bands import references
 from lodestream.bands.references import dump, load, root_of
 from lodestream.errors import UnavailableError
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 from lodestream.surface import Surface
 
 
@@ -24,7 +24,7 @@ class _Pair:
 
 
 def test_maps_and_views_of_them_are_references(tmp_path: Path) -> None:
-    scratch = Scratch(tmp_path / "files")
+    scratch = FolderScratch(tmp_path / "files")
     whole = np.arange(100_000, dtype=np.float32).reshape(100, 500, 2)
     scratch.write("whole", whole)
     mapped = scratch.read("whole")
@@ -40,7 +40,7 @@ def test_maps_and_views_of_them_are_references(tmp_path: Path) -> None:
 
 
 def test_a_surface_is_a_reference(tmp_path: Path) -> None:
-    scratch = Scratch(tmp_path)
+    scratch = FolderScratch(tmp_path)
     scratch.write("heights", np.arange(200_000, dtype=np.int16).reshape(400, 500))
     surface = Surface(scratch.read("heights"), metadata={"name": "hill"})
     dump(surface, tmp_path / "surface")
@@ -51,7 +51,7 @@ def test_a_surface_is_a_reference(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_gone_is_missed(tmp_path: Path) -> None:
-    scratch = Scratch(tmp_path)
+    scratch = FolderScratch(tmp_path)
     scratch.write("heights", np.ones(50_000))
     dump(scratch.read("heights"), tmp_path / "object")
     scratch.remove("heights")

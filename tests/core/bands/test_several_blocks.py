@@ -29,7 +29,7 @@ from lodestream.encoding.encoder import encode
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.residual import chunk_coder
-from lodestream.scratch import IN_MEMORY, Room, Scratch
+from lodestream.scratch import IN_MEMORY, FolderScratch, Room
 from lodestream.surface import Block, Surface
 
 from ..container.forgery import with_layer_errors
@@ -219,7 +219,7 @@ def test_many_blocks_take_few_files(tmp_path: Path) -> None:
     try:
         with ThreadPoolExecutor(1) as executor:
             ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, executor=executor)
-        found = _decoder(expected).surface(Room(lambda: Scratch(tmp_path / "room")), 1, lambda fraction: None)
+        found = _decoder(expected).surface(Room(lambda: FolderScratch(tmp_path / "room")), 1, lambda fraction: None)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert (tmp_path / "a.lode").read_bytes() == expected

@@ -10,7 +10,7 @@ import pytest
 
 from lodestream.bands.stored_surface import load_surface, save_surface
 from lodestream.errors import InputError
-from lodestream.scratch import Room, Scratch
+from lodestream.scratch import FolderScratch, Room
 from lodestream.surface import Block, Surface
 
 
@@ -37,7 +37,7 @@ def test_a_surface_comes_back(tmp_path: Path, holes: bool) -> None:
     attributes = {"speed": np.arange(600).reshape(20, 30), "a/b": np.ones((20, 30, 2), np.float64)}
     block = Block(points, (False, True), mask=mask, attributes=attributes)
     surface = Surface(blocks=[block, block], metadata={"name": "two", "crs": "here"})
-    scratch = Scratch(tmp_path)
+    scratch = FolderScratch(tmp_path)
     assert load_surface(scratch) is None
     save_surface(surface, scratch)
     again = load_surface(scratch)
@@ -46,7 +46,7 @@ def test_a_surface_comes_back(tmp_path: Path, holes: bool) -> None:
 
 
 def test_files_of_the_folder_stay(tmp_path: Path) -> None:
-    scratch = Scratch(tmp_path)
+    scratch = FolderScratch(tmp_path)
     heights = scratch.empty("heights", (50, 60), np.int16)
     heights[...] = np.arange(3000).reshape(50, 60)
     save_surface(Surface(heights), scratch)
@@ -59,21 +59,21 @@ def test_files_of_the_folder_stay(tmp_path: Path) -> None:
 
 
 def test_many_arrays_take_few_files(tmp_path: Path) -> None:
-    rng, room = np.random.default_rng(2), Room(lambda: Scratch(tmp_path))
+    rng, room = np.random.default_rng(2), Room(lambda: FolderScratch(tmp_path))
     blocks = []
     for number in range(60):
         points = room.empty((4, 5), np.float32) if number % 2 else np.empty((4, 5), np.float32)
         points[...] = rng.normal(size=(4, 5))
         blocks.append(Block(points, attributes={"a": rng.integers(0, 9, (4, 5))}))
     surface = Surface(blocks=blocks)
-    save_surface(surface, Scratch(tmp_path))
+    save_surface(surface, FolderScratch(tmp_path))
     assert len(list(tmp_path.rglob("*.npy"))) < 24
-    again = load_surface(Scratch(tmp_path))
+    again = load_surface(FolderScratch(tmp_path))
     assert again is not None
     _same(surface, again)
-    save_surface(again, Scratch(tmp_path))  # all of it lies there
+    save_surface(again, FolderScratch(tmp_path))  # all of it lies there
     assert len(list(tmp_path.rglob("*.npy"))) < 24
-    found = load_surface(Scratch(tmp_path))
+    found = load_surface(FolderScratch(tmp_path))
     assert found is not None
     _same(surface, found)
 
@@ -119,7 +119,7 @@ def _described(place: object, metadata: object = None) -> bytes:
     ],
 )
 def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None:
-    scratch = Scratch(tmp_path / "folder")
+    scratch = FolderScratch(tmp_path / "folder")
     np.save(tmp_path / "x.npy", np.ones((3, 3)))
     scratch.write("text", np.array([["a", "b"], ["c", "d"]]))
     scratch.write("ok", np.ones((3, 3)))
@@ -133,7 +133,7 @@ def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None
 
 
 def test_masks_have_nothing_but_0_and_1(tmp_path: Path) -> None:
-    scratch = Scratch(tmp_path)
+    scratch = FolderScratch(tmp_path)
     save_surface(Surface(np.zeros((4, 5)), mask=np.eye(4, 5) == 0), scratch)
     path = next(tmp_path.rglob("bool-*.npy"))
     data = bytearray(path.read_bytes())

@@ -34,7 +34,7 @@ from lodestream.encoding import prepared
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection, select
-from lodestream.scratch import Room, Scratch
+from lodestream.scratch import FolderScratch, Room
 from lodestream.target import Region
 from tests import reference
 
@@ -336,7 +336,7 @@ def test_units_that_no_layer_names_are_known_once_all_layers_are_there(case: Cas
         check_planned(case, target)
     assert inspect(io.BytesIO(case.data), max_vertices=10_000).errors_checked
     decoder = PiecewiseDecoder(lambda offset, length: case.data[offset : offset + length], index_of(case.data))
-    surface = decoder.surface(Room(lambda: Scratch(tmp_path / "values"), 1 << 30), 1 << 20, lambda fraction: None)
+    surface = decoder.surface(Room(lambda: FolderScratch(tmp_path / "values"), 1 << 30), 1 << 20, lambda fraction: None)
     assert_same(surface, ls.decode(case.data))
 
 

@@ -14,7 +14,7 @@ import lodestream as ls
 from lodestream.container.reader import read_index
 from lodestream.decoding import pieces
 from lodestream.decoding.pieces import PiecewiseDecoder, why_not_by_pieces
-from lodestream.scratch import IN_MEMORY, Room, Scratch
+from lodestream.scratch import IN_MEMORY, FolderScratch, Room
 
 from ..bands.test_building import SURFACES
 
@@ -37,7 +37,7 @@ def test_rows_make_the_surface(name: str, memory: int, tmp_path: Path) -> None:
     expected = ls.decode(container)
     if decoder.header.plane is not None:
         pytest.skip("x and y are made of rules")
-    room = IN_MEMORY if memory == 1 else Room(lambda: Scratch(tmp_path), 1)
+    room = IN_MEMORY if memory == 1 else Room(lambda: FolderScratch(tmp_path), 1)
     _check(decoder.surface(room, memory, told.append), expected)
     assert told == sorted(told)
     assert told[-1] == 1.0

@@ -13,7 +13,7 @@ import lodestream as ls
 from lodestream import scratch
 from lodestream.bands.references import root_of
 from lodestream.formats.raster import gdal
-from lodestream.scratch import Room, Scratch
+from lodestream.scratch import FolderScratch, Room
 
 
 def _write(path: Path, kind: str) -> None:
@@ -100,7 +100,7 @@ def test_what_is_read_is_the_same(tmp_path: Path, kind: str, monkeypatch: pytest
     monkeypatch.setattr(gdal, "_TILE_ROWS", 100)
     monkeypatch.setattr(gdal, "_AT_ONCE", 1)
     monkeypatch.setattr(scratch, "_AT_ONCE", 700)
-    surface = ls.read(path, room=Room(lambda: Scratch(tmp_path / "room"), 1), **options)
+    surface = ls.read(path, room=Room(lambda: FolderScratch(tmp_path / "room"), 1), **options)
     assert surface.metadata == expected.metadata
     for found, own in zip(surface.blocks, expected.blocks, strict=True):
         assert found.closed == own.closed
@@ -120,12 +120,12 @@ def test_what_is_read_is_the_same(tmp_path: Path, kind: str, monkeypatch: pytest
 def test_small_arrays_make_no_folder(tmp_path: Path) -> None:
     path = tmp_path / "surface.npy"
     _write(path, "npy")
-    ls.read(path, room=Room(lambda: Scratch(tmp_path / "room"), 1 << 30))
+    ls.read(path, room=Room(lambda: FolderScratch(tmp_path / "room"), 1 << 30))
     assert not (tmp_path / "room").exists()
 
 
 def test_an_empty_array_is_in_no_file(tmp_path: Path) -> None:
-    made = Room(lambda: Scratch(tmp_path / "room"), 0).empty((0, 3), np.float64)
+    made = Room(lambda: FolderScratch(tmp_path / "room"), 0).empty((0, 3), np.float64)
     assert made.shape == (0, 3)
     assert made.dtype == np.dtype(np.float64)
     assert not scratch.is_made(made)
@@ -137,6 +137,6 @@ def test_there_is_no_limit_of_vertices_where_there_is_room(tmp_path: Path, monke
     monkeypatch.setattr("lodestream.formats.reading.DEFAULT_MAX_VERTICES", 1000)
     with pytest.raises(ls.TooLargeError):
         ls.read(path)
-    assert ls.read(path, room=Room(lambda: Scratch(tmp_path / "room"), 1)).shape == (1300, 70)
+    assert ls.read(path, room=Room(lambda: FolderScratch(tmp_path / "room"), 1)).shape == (1300, 70)
     with pytest.raises(ls.TooLargeError):
-        ls.read(path, room=Room(lambda: Scratch(tmp_path / "room"), 1), max_vertices=1000)
+        ls.read(path, room=Room(lambda: FolderScratch(tmp_path / "room"), 1), max_vertices=1000)

@@ -24,7 +24,7 @@ from lodestream.bands.references import root_of
 from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError, UnavailableError
 from lodestream.formats.vtk import grids, xml_files
 from lodestream.mesh.cells import unpack_cells
-from lodestream.scratch import Room, Scratch
+from lodestream.scratch import FolderScratch, Room
 
 pytest.importorskip("vtkmodules")
 
@@ -332,7 +332,7 @@ def test_what_is_mapped_is_what_vtk_reads(
     tmp_path: Path, plane: str, order: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _raw(tmp_path / "g.vts", order)
-    room = Room(lambda: Scratch(tmp_path / "room"), 1)
+    room = Room(lambda: FolderScratch(tmp_path / "room"), 1)
     with monkeypatch.context() as context:
         context.setattr(grids, "_SCRIPT", None)  # VTK is not asked
         found = formats.read(tmp_path / "g.vts", plane=plane, room=room)

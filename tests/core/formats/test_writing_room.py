@@ -16,14 +16,14 @@ import re, sys, threading
 from pathlib import Path
 import numpy as np
 import lodestream as ls
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 
 def anonymous():
     return int(re.search(r"RssAnon:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) * 1024
 
 folder, dtype, suffix, rows, columns = *sys.argv[1:4], *map(int, sys.argv[4:])
 ls.write(ls.Surface(np.ones((2, 2), dtype)), f"{folder}/small.{suffix}")  # loads what writing needs
-scratch = Scratch(f"{folder}/arrays")
+scratch = FolderScratch(f"{folder}/arrays")
 heights = scratch.empty("heights", (rows, columns), dtype)
 heights[:100] = 7
 mask = scratch.empty("mask", (rows, columns), bool)

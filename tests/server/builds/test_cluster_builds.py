@@ -26,7 +26,7 @@ from pydantic import TypeAdapter
 
 import lodestream as ls
 from lodestream.bands import cluster as clusters
-from lodestream.scratch import Scratch
+from lodestream.scratch import FolderScratch
 from lodestream_server import running_server
 from lodestream_server.builds import cluster_build, jobs, worker
 from lodestream_server.builds.answers import ProcessDiedError, UnforeseenError
@@ -158,7 +158,7 @@ def test_what_is_unreadable_or_missing_or_too_large_is_refused(job: worker.Job, 
 
     smaller = worker.Job(job.files, None, None, "auto", {}, 1000, job.folder, shared=True)
     assert reason(smaller) == "expected at most 1,000 vertices, got 90,000"
-    Scratch(job.parsed).clear()
+    FolderScratch(job.parsed).clear()
     assert reason(job) == "expected a folder of arrays, got none at read"
     job.parsed.mkdir()
     assert reason(job) == "expected a parsed surface, got none"
