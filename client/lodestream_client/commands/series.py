@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,9 @@ FILE = "file"
 
 _WORD = re.compile(r"\w[\w-]*")
 _UNSAFE = re.compile(r"[^\w.+-]+")
+
+#: Most characters of a label in the name of a file, which may have 255 bytes.
+_LONGEST_NAME = 50
 
 
 class EachWord(argparse.Action):
@@ -120,8 +124,16 @@ def parts(file: str, along: str, options: SurfaceOptions) -> list[Part]:
 
 
 def named_files(made: Sequence[Part]) -> Iterator[tuple[Part, str]]:
-    """Parts with names of their containers: their labels, with a number where two would have the same."""
-    names = [_UNSAFE.sub("-", part.label).strip("-.") or part.member.along for part in made]
+    """Parts with names of their containers: their labels. Where two would have the same, all end in their numbers."""
+    names = [_file_name(part) for part in made]
+    # Some file systems take two spellings of a letter, or a large and a small one, for the same.
+    if len({unicodedata.normalize("NFC", name).casefold() for name in names}) < len(names):
+        names = [f"{name}-{part.member.index}" for part, name in zip(made, names, strict=True)]
     for part, name in zip(made, names, strict=True):
-        alone = sum(other.casefold() == name.casefold() for other in names) == 1
-        yield part, f"{name if alone else f'{name}-{part.member.index}'}.lode"
+        yield part, f"{name}.lode"
+
+
+def _file_name(part: Part) -> str:
+    """The label without what a name of a file cannot have, but with its minus sign."""
+    name = _UNSAFE.sub("-", part.label[:_LONGEST_NAME]).strip("-.")
+    return f"-{name}" if name and part.label.startswith("-") else name or part.member.along

@@ -182,9 +182,7 @@ class SyncIO:
     def _leave(self, how: HangUp) -> None:
         """Close what is open, but for what was asked for ahead."""
         if self._socket is not None and (how.abort or how.over):
-            # What was sent is still delivered; closing a WebSocket would first wait for the other side's close frame.
-            with suppress(OSError):
-                self._socket.socket.shutdown(socket.SHUT_RDWR)
+            _cut(self._socket)
         self._socket, self._answer, self._body = None, None, iter(())
         self._opened.close()
 
@@ -193,6 +191,20 @@ class SyncIO:
         self.hang_up(how)
         if self._client is not None:
             self._client.close()
+
+
+def _cut(connection: ClientConnection) -> None:
+    """End a connection without waiting for the other side's close frame. What was sent is still delivered."""
+    from websockets.exceptions import ConnectionClosed
+
+    with suppress(OSError):
+        # Not that of its class: TLS would end with it, and what has arrived would be read as it was encrypted.
+        socket.socket.shutdown(connection.socket, socket.SHUT_RDWR)
+    # The library's thread may hold what it has just read. It takes what has arrived and ends; if the connection were
+    # closed before, it would find the end of the stream behind it, and print that as an error of its own.
+    with suppress(ConnectionClosed):
+        while True:
+            connection.recv(decode=False)
 
 
 def _close(coming: Future[httpx.Response]) -> None:

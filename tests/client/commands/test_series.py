@@ -111,6 +111,39 @@ def test_steps_along_any_dimension_with_or_without_a_coordinate(run: Run, tmp_pa
         assert sorted(path.stem for path in folder.iterdir()) == expected
 
 
+@pytest.mark.parametrize(
+    ("places", "names"),
+    [
+        ([-5.0, 5.0, 0.0], ["-5-m", "5-m", "0-m"]),
+        ([-5, 5, 0], ["-5-m", "5-m", "0-m"]),
+        ([-0.5, 0.5, -1e-7], ["-0.5-m", "0.5-m", "-1e-07-m"]),
+        ([1000000.1, 1000000.2, -1000000.1], ["1000000.1-m", "1000000.2-m", "-1000000.1-m"]),
+        (["-", "-5", "5"], ["level", "-5-m", "5-m"]),
+        # Names that are the same for a file system; steps that have the same value.
+        (["A b", "a-b", "c"], ["A-b-m-0", "a-b-m-1", "c-m-2"]),
+        (["a", "a", "a (0)"], ["a-m-0", "a-m-1", "a-0-m"]),
+        (["\u00e9", "e\u0301", "c"], None),
+        (["x" * 150 + "1", "x" * 150 + "2", "c"], None),
+    ],
+)
+def test_no_step_has_the_name_of_another(run: Run, tmp_path: Path, places: list[Any], names: list[str] | None) -> None:
+    file, folder = tmp_path / "levels.nc", tmp_path / "levels"
+    unit = {} if places[0] == "-" else {"units": "m"}
+    level = ("level", places, unit)
+    xarray.Dataset({"t": (("level", "row", "column"), values(1))}, coords={"level": level}).to_netcdf(file)
+    code, _, stderr = run("encode", file, "--each", f"level={folder}")
+    assert (code, stderr.count(" points, ")) == (0, 3), stderr
+    surfaces = decoded(folder)
+    for index, surface in enumerate(surfaces):
+        np.testing.assert_array_equal(heights(surface), values(1)[index])
+        assert surface.metadata["series"]["value"] == places[index]
+    assert len({surface.metadata["name"] for surface in surfaces}) == 3
+    if names is not None:
+        assert sorted(path.stem for path in folder.iterdir()) == sorted(
+            name.removesuffix("" if unit else "-m") for name in names
+        )
+
+
 def test_times_without_readable_dates_are_numbers_with_their_unit(run: Run, tmp_path: Path) -> None:
     file, folder = tmp_path / "model.nc", tmp_path / "steps"
     time = ("time", [29.0, 59.0], {"units": "months ago", "axis": "T"})
@@ -124,7 +157,11 @@ def test_times_without_readable_dates_are_numbers_with_their_unit(run: Run, tmp_
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--each", "depth=D"), "expected each variable, or one of the dimensions of air, time, lat, lon, got 'depth'"),
+        (
+            ("--each", "depth=D"),
+            "expected variable, or a dimension of the file: time (3), lat (12), lon (17); got 'depth'",
+        ),
+        (("--each", "lat_bnds=D"), "got 'lat_bnds'"),
         (("--each", "time=D", "-o", "time=1"), "expected no place along time for each time, got one by -o time= or"),
         (("--each", "lat=D"), None),
         (("--each", "variable=D", "-o", "variable=air"), "expected no -o variable= for each variable"),
@@ -145,6 +182,27 @@ def test_what_has_no_such_steps_is_refused_with_those_that_there_are(
     code, _, stderr = run("encode", file, *given)
     assert code == 1
     assert words in stderr
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_dimension_that_another_variable_has_is_refused_with_those_of_this_one(
+    run: Run, dataset: xarray.Dataset, tmp_path: Path
+) -> None:
+    file, url = tmp_path / "day.nc", "http://127.0.0.1:1"
+    dataset["ice"] = (("member", *dataset["air"].dims), values(1)[None].repeat(2, axis=0))
+    dataset.to_netcdf(file)
+    words = "expected variable, or a dimension of {}; got {!r}"
+    listed = "time (3), lat (12), lon (17)"
+    for given, of in (
+        (("depth",), f"the file: {listed}, member (2)"),  # whichever of its variables is meant
+        (("member", "-o", "variable=air"), f"air: {listed}"),
+    ):
+        for command in (
+            ["push", file, url, "--each", given[0]],
+            ["encode", file, "--each", f"{given[0]}={tmp_path / 'D'}"],
+        ):
+            code, _, stderr = run(*command, *given[1:])
+            assert (code, words.format(of, given[0]) in stderr) == (1, True), stderr
     assert list(tmp_path.iterdir()) == [file]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,14 @@ from .names import is_time, time_of
 
 __all__ = ["VARIABLE", "members_of"]
 
+#: Value, unit and words of a step.
+_Step = tuple[float | int | str, str, str]
+
 #: What is said for variables, in place of a dimension.
 VARIABLE = "variable"
+
+#: Dimensions in a refusal.
+_MOST_DIMENSIONS = 50
 
 #: Units of dates, of which the first that tells all of them is taken.
 _UNITS = ("D", "m", "s", "ms", "us")
@@ -32,15 +39,10 @@ def members_of(source: Source, dataset: Any, along: str) -> list[Member]:
     """
     if along == VARIABLE:
         return _variables(source, dataset)
+    _dimension(dataset, along, [str(dim) for dim in dataset.sizes], "the file")
     main, chosen = main_variable(source, dataset)
     dims = [str(dim) for dim in dataset.variables[main].dims]
-    dim = along if along in dims else None
-    if dim is None and along == "time":
-        dim = next((name for name in dims if is_time(dataset, name)), None)
-    if dim is None:
-        raise OptionError(
-            f"expected each {VARIABLE}, or one of the dimensions of {main}, {', '.join(dims)}, got {along!r}"
-        )
+    dim = _dimension(dataset, along, dims, main)
     if sum(dataset.sizes[other] > 1 for other in dims if other != dim) < 2:
         raise OptionError(f"expected {main} over two more dimensions for each {along}, got {', '.join(dims)}")
     if dim in chosen:
@@ -49,8 +51,19 @@ def members_of(source: Source, dataset: Any, along: str) -> list[Member]:
     at = f"{before}," if before else ""
     return [
         Member({"at": f"{at}{dim}:{index}"}, main, along, index, value, unit, label)
-        for index, (value, unit, label) in enumerate(_steps(dataset, dim))
+        for index, (value, unit, label) in enumerate(_told_apart(_steps(dataset, dim)))
     ]
+
+
+def _dimension(dataset: Any, along: str, dims: list[str], of: str) -> str:
+    """The dimension that is meant."""
+    times = (dim for dim in dims if along == "time" and is_time(dataset, dim))
+    dim = along if along in dims else next(times, None)
+    if dim is None:
+        listed = ", ".join(f"{name} ({dataset.sizes[name]})" for name in dims[:_MOST_DIMENSIONS])
+        more = ", ..." * (len(dims) > _MOST_DIMENSIONS)
+        raise OptionError(f"expected {VARIABLE}, or a dimension of {of}: {listed or 'none'}{more}; got {along!r}")
+    return dim
 
 
 def _variables(source: Source, dataset: Any) -> list[Member]:
@@ -65,10 +78,19 @@ def _variables(source: Source, dataset: Any) -> list[Member]:
     ]
 
 
-def _steps(dataset: Any, dim: str) -> list[tuple[float | int | str, str, str]]:
+def _told_apart(steps: list[_Step]) -> list[_Step]:
+    """Steps whose words are different: those that are not get their number too."""
+    counts = Counter(words for *_, words in steps)
+    return [
+        (value, unit, words if counts[words] == 1 else f"{words} ({index})")
+        for index, (value, unit, words) in enumerate(steps)
+    ]
+
+
+def _steps(dataset: Any, dim: str) -> list[_Step]:
     """Value, unit and words of each place along a dimension; its number, where there is no coordinate."""
     count = int(dataset.sizes[dim])
-    numbers: list[tuple[float | int | str, str, str]] = [(index, "", f"{dim} {index}") for index in range(count)]
+    numbers: list[_Step] = [(index, "", f"{dim} {index}") for index in range(count)]
     name = (time_of(dataset, dim) if is_time(dataset, dim) else None) or dim
     if name not in dataset.variables or dataset.variables[name].dims != (dim,):
         return numbers
@@ -79,12 +101,19 @@ def _steps(dataset: Any, dim: str) -> list[tuple[float | int | str, str, str]]:
     except Exception:  # of attributes that anybody may have written
         return numbers
     unit, dates = _unit(dataset.variables[name]), _dates(dataset, name) if is_time(dataset, dim) else None
+    digits = _digits([value for value in values if isinstance(value, float)])
     for index, value in enumerate(values):
         text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
         if isinstance(text, str) or (isinstance(text, int | float) and math.isfinite(text)):
-            words = f"{text:g}" if isinstance(text, float) else str(text)
+            words = f"{text:.{digits}g}" if isinstance(text, float) else str(text)
             numbers[index] = text, unit, dates[index] if dates else f"{words} {unit}".strip()
     return numbers
+
+
+def _digits(values: list[float]) -> int:
+    """How many digits tell numbers from each other."""
+    different = len(set(values))
+    return next((digits for digits in (6, 9, 12) if len({f"{value:.{digits}g}" for value in values}) >= different), 17)
 
 
 def _dates(dataset: Any, name: str) -> list[str] | None:
