@@ -91,13 +91,14 @@ class Watch:
         self._next: _State | None = None
         self._thread: Thread | None = None
         self._failed: Exception | None = None
+        self._over = False  # the last state is drawn next, which no other is to hold back
 
     def __enter__(self) -> Watch:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         with self._lock:
-            self._next, thread = None, self._thread
+            self._over, self._next, thread = True, None, self._thread
         if thread is not None:
             thread.join()
         if kind is None:
@@ -142,7 +143,7 @@ class Watch:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FormatWarning)
             write_surface(view.surface(self._target.level, metadata), self._out)
-        if self._drawing is not None:
+        if self._drawing is not None and not self._over:
             self._drawing.offer(view, layout, metadata)
         within = "at most " if view.bound else ""
         note(f"{self._out}: {human_size(view.bytes)}, level {view.level}, RMS error {within}{view.rms:.4g}")

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lodestream.errors import LodestreamError, UnavailableError
@@ -24,6 +25,9 @@ from .pictures import Picture, write_png
 if TYPE_CHECKING:
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
+
+    # Bytes of a state, whether it is complete, and what the surface is called.
+    _State = tuple[int, bool, str]
 
 __all__ = ["Drawing", "command"]
 
@@ -50,6 +54,8 @@ class Drawing:
         self._path = path
         self._name = name
         self._window = window
+        self._sent: _State | None = None
+        self._next = 0.0  # when a picture that nobody waits for may begin
 
     def __enter__(self) -> Drawing:
         # A session of its own: Ctrl-C in a terminal is handled here, and ends the process with the block.
@@ -73,12 +79,16 @@ class Drawing:
                 _close(self._process.stdin)
 
     def offer(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
-        """Have a state drawn, unless another one is being drawn; if one could not be, `draw` raises that."""
-        if self._answer.done() and self._answer.exception() is None:
+        """Have a state drawn, unless another one is being drawn, or has been just now.
+
+        Between two pictures passes as long as the first one took. So at most half of a processor draws, and the last
+        picture waits for another one less often. If a picture could not be drawn, `draw` raises that.
+        """
+        if self._answer.done() and self._answer.exception() is None and monotonic() >= self._next:
             self._send(view, layout, metadata)
 
     def draw(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
-        """Draw a state after the one that is being drawn, and wait for it.
+        """Draw a state after the one that is being drawn, unless it is that one, and wait for it.
 
         Raises
         ------
@@ -86,23 +96,31 @@ class Drawing:
             If it, or an earlier one, could not be drawn or written.
         """
         self._answer.result()
-        self._send(view, layout, metadata)
-        self._answer.result()
+        if self._sent != self._state(view, metadata):
+            self._send(view, layout, metadata)
+            self._answer.result()
+
+    def _state(self, view: View, metadata: Mapping[str, Any]) -> _State:
+        """What one picture of a stream is told from another by."""
+        name = metadata.get("name")
+        return view.bytes, view.complete, name if isinstance(name, str) else self._name
 
     def _send(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
-        name = metadata.get("name")
-        called = name if isinstance(name, str) else self._name
+        self._sent = self._state(view, metadata)
+        *_, called = self._sent
         picture = Picture.of(view, None if self._window else layout, called)
         self._answer = self._thread.submit(self._drawn, picture)
 
     def _drawn(self, picture: Picture) -> None:
         assert self._process.stdin is not None
+        began = monotonic()
         try:
             pickle.dump(picture, self._process.stdin, pickle.HIGHEST_PROTOCOL)
             self._process.stdin.flush()
         except OSError:  # it has ended
             raise self._ended() from None
         self._received()
+        self._next = 2 * monotonic() - began
 
     def _received(self) -> None:
         """Wait for an answer of the process, and write the picture if it is one."""

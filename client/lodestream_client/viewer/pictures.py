@@ -129,7 +129,8 @@ class Picture:
         # What a file or a server calls itself is no formula.
         figure.suptitle(self.title, fontsize=11, parse_math=False)
         file = io.BytesIO()
-        figure.savefig(file, format="png")
+        # Packing it tighter takes as long as drawing it, for a tenth of its bytes.
+        figure.savefig(file, format="png", pil_kwargs={"compress_level": 1})
         return file.getvalue()
 
 

@@ -8,7 +8,7 @@ import signal
 import sys
 from itertools import pairwise
 from pathlib import Path
-from threading import Event
+from threading import Event, Thread
 from time import sleep
 
 import numpy as np
@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import lodestream as ls
+from lodestream.decoding.view import View
 from lodestream.formats import write
+from lodestream.grid.layout import Layout
 from lodestream_client import sync
 from lodestream_client.commands import watching
 from lodestream_client.commands.outcome import write_surface
@@ -254,6 +256,93 @@ def test_the_process_draws_what_is_drawn_here(tmp_path: Path, terrain: Terrain) 
         for view in (views[3], views[-1]):
             process.draw(view, layout, {})
             assert path.read_bytes() == Picture.of(view, layout, "hill").png()
+
+
+class Pictures:
+    """What a `Drawing` sends to its process: the sizes of the states, in their order."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.sizes = list[int]()
+        make = Picture.of
+
+        def of(view: View, layout: Layout | None, name: str) -> Picture:
+            self.sizes.append(view.bytes)
+            return make(view, layout, name)
+
+        monkeypatch.setattr(Picture, "of", of)
+
+
+def test_the_last_state_is_drawn_once(
+    run: Run, surface: str, tmp_path: Path, terrain: Terrain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder, drawn = ls.Decoder(), Pictures(monkeypatch)
+    views = decoder.feed(ls.encode(terrain))
+    assert decoder.header is not None
+    with drawing.Drawing(tmp_path / "out.png", "hill", window=False) as process:
+        process._answer.result()
+        process.offer(views[3], decoder.header.layout, {})
+        process.draw(views[3], decoder.header.layout, {})
+        assert drawn.sizes == [views[3].bytes]
+        process.draw(views[3], decoder.header.layout, {"name": "another"})
+        process.draw(views[-1], decoder.header.layout, {"name": "another"})
+        assert drawn.sizes == [views[3].bytes, views[3].bytes, views[-1].bytes]
+    # A stream that stops before its end: its last state has been offered when the pull is over, or not.
+    drawn.sizes.clear()
+    picture = tmp_path / "out.png"
+    assert run("pull", surface, tmp_path / "a.npy", "--picture", picture, "--watch", "--until-rms", "5", *SLOW)[0] == 0
+    assert len(set(drawn.sizes)) == len(drawn.sizes)
+    assert drawn.sizes == sorted(drawn.sizes)
+
+
+def test_pictures_that_nobody_waits_for_take_half_of_the_time(
+    tmp_path: Path, terrain: Terrain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder, drawn, now = ls.Decoder(), Pictures(monkeypatch), [0.0]
+    views = decoder.feed(ls.encode(terrain))
+    assert decoder.header is not None
+    layout = decoder.header.layout
+
+    def later(png: bytes, path: Path) -> None:
+        now[0] += 5
+
+    monkeypatch.setattr(drawing, "monotonic", lambda: now[0])
+    monkeypatch.setattr(drawing, "write_png", later)
+    with drawing.Drawing(tmp_path / "out.png", "hill", window=False) as process:
+        process._answer.result()
+        for number, (time, offered) in enumerate([(0, True), (9.5, False), (10, True), (19, False), (20, True)]):
+            now[0] = float(time)
+            before = len(drawn.sizes)
+            process.offer(views[number], layout, {})
+            process._answer.result()
+            assert len(drawn.sizes) - before == offered
+        process.draw(views[-1], layout, {})  # at once
+    assert drawn.sizes == [views[number].bytes for number in (0, 2, 4, -1)]
+
+
+def test_what_is_written_when_the_stream_is_over_is_not_drawn(
+    tmp_path: Path, terrain: Terrain, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last picture is next, and would wait for it."""
+    decoder = ls.Decoder()
+    views = decoder.feed(ls.encode(terrain))
+    assert decoder.header is not None
+    begun, go_on, written, offered = Event(), Event(), list[str](), list[int]()
+
+    def blocked(state: ls.Surface, path: str) -> None:
+        begun.set()
+        assert go_on.wait(PATIENCE)
+        written.append(path)
+
+    monkeypatch.setattr(watching, "write_surface", blocked)
+    process = drawing.Drawing(tmp_path / "out.png", "hill", window=False)
+    monkeypatch.setattr(process, "offer", lambda view, *_: offered.append(view.bytes))
+    with watching.Watch(str(tmp_path / "out.npy"), process, ls.Target(), dict) as watch:
+        watch.write(views[0], decoder.header.layout)
+        assert begun.wait(PATIENCE)
+        thread = watch._thread
+        assert thread is not None
+        monkeypatch.setattr(thread, "join", lambda: (go_on.set(), Thread.join(thread)))
+    assert (len(written), offered) == (1, [])
 
 
 def test_an_out_that_cannot_be_replaced_ends_it(
