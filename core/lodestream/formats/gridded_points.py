@@ -30,8 +30,12 @@ _Z = ("z", "height", "elevation", "elev", "altitude", "alt", "depth", "h")
 
 #: Nodes of the grid for each point: more are points that only happen to share some coordinates.
 _MOST_NODES = 16
-#: How far differences of an axis may be from multiples of its step.
-_OFF = 1e-3
+#: Steps of an axis that may be longer than the others, where the others say that it is even.
+_MOST_GAPS = 0.25
+#: How far coordinates of an axis may be from multiples of its step, in steps: they are rounded as texts.
+_OFF = 1e-2
+#: Places of an axis, with those that are missing, that are counted.
+_MOST_PLACES = 2**52
 
 Vector = NDArray[np.float64]
 
@@ -163,8 +167,8 @@ def _axes(x: Vector, y: Vector) -> tuple[_Axis, _Axis]:
             f"expected a grid along x and y, got {number(count)} points x y z with {number(len(across))} values of x "
             f"and {number(len(down))} of y{_HINT}"
         )
-    if prod(sizes) > count:
-        across, down = _without_gaps(across), _without_gaps(down)
+    whole = prod(sizes) == count
+    across, down = _without_gaps(across, "x", whole), _without_gaps(down, "y", whole)
     # One of them changes slowly, and only ever rises or falls; the other runs through it again and again.
     x_order, y_order = _order(x), _order(y)
     if y_order:
@@ -203,17 +207,41 @@ def _direction(quick: Vector, slow: Vector) -> int:
     return int(np.sign(rising))
 
 
-def _without_gaps(values: Vector) -> Vector:
-    """An axis of rising values with those that are missing between multiples of its step, if it is even otherwise."""
-    step = float(np.diff(values).min())
-    multiples = (values - values[0]) / step
-    places = np.rint(multiples)
-    size = int(places[-1]) + 1
-    if np.abs(multiples - places).max() > _OFF or size >= 2 * len(values) or size == len(values):
+def _without_gaps(values: Vector, name: str, whole: bool) -> Vector:
+    """An axis of rising values with those that are missing between multiples of its step, if it is even otherwise.
+
+    Parameters
+    ----------
+    values : float64 array of shape (N,), N >= 2
+    name : "x" or "y"
+        For notes.
+    whole : bool
+        Each node of the grid has a point: then most steps must be the smallest one, since uneven axes too are often
+        whole numbers.
+    """
+    steps = np.diff(values)
+    # Their mean, since coordinates are rounded: 0.333 and 0.334 in turn are one step.
+    step = float(steps[steps < 1.5 * steps.min()].mean())
+    with np.errstate(over="ignore"):
+        multiples = np.rint(steps / step)
+    if not multiples.sum() < _MOST_PLACES or multiples.sum() == len(steps):
         return values
-    whole: Vector = values[0] + (values[-1] - values[0]) / (size - 1) * np.arange(size)
-    whole[places.astype(np.intp)] = values
-    return whole
+    places = np.concatenate(([0], np.cumsum(multiples).astype(np.intp)))
+    size = int(places[-1]) + 1
+    step = float(values[-1] - values[0]) / (size - 1)
+    if np.abs(values - values[0] - step * places).max() > _OFF * step:
+        return values
+    gaps = np.count_nonzero(multiples > 1)
+    if size >= 2 * len(values) or (whole and gaps > _MOST_GAPS * len(steps)):
+        warn(f"{name} is uneven: {number(len(values))} of {number(size)} places with a step of {step:.4g} have points")
+        return values
+    warn(
+        f"{number(size - len(values))} of {number(size)} places along {name}, with a step of {step:.4g}, have no "
+        "points, and are holes"
+    )
+    axis: Vector = values[0] + step * np.arange(size)
+    axis[places] = values
+    return axis
 
 
 def _check_repeated(

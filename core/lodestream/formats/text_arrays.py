@@ -36,6 +36,11 @@ _POINTS_SUFFIX = ".xyz"
 _NUMBER = rb"[-+]?(?:(?:\d++(?:\.\d*+)?|\.\d++)(?:e[-+]?\d++)?|nan|inf)"
 _BETWEEN = rb"(?:[ \t]*+[,;][ \t]*+|[ \t]++)"
 _LINE = re.compile(rb"[ \t]*+" + _NUMBER + rb"(?:" + _BETWEEN + _NUMBER + rb")*+[ \t,;]*", re.IGNORECASE)
+_MARKED = rb'"[ \t]*+' + _NUMBER + rb'[ \t]*+"'
+_MARKED_COMMA = rb'"[ \t]*+(?:' + _NUMBER + rb'|[-+]?\d*+,\d++)[ \t]*+"'
+#: Numbers that are all in quotation marks; a comma in one is a decimal point only where semicolons stand between them.
+_QUOTED = re.compile(_MARKED + rb"(?:" + _BETWEEN + _MARKED + rb")*+", re.IGNORECASE)
+_QUOTED_COMMAS = re.compile(_MARKED_COMMA + rb"(?:[ \t]*+;[ \t]*+" + _MARKED_COMMA + rb")*+", re.IGNORECASE)
 _NAME = re.compile(r"[^\W\d][^,;\"]{0,60}")
 
 _HEAD = 4096  # bytes that are looked at to know a format
@@ -44,8 +49,8 @@ _MOST_FILES = 3
 _LINES_AT_ONCE = 1 << 16
 _MARK = b"\xef\xbb\xbf"  # that of UTF-8
 
-#: A line that begins so is a comment, and so is the rest of a line behind #.
-_COMMENT = (b"#", b"%", b"!", b"//")
+#: A line that begins so is a comment, and so is the rest of a line behind #. GMT begins a segment by >.
+_COMMENT = (b"#", b"%", b"!", b"//", b">")
 
 #: Lines of which the first two columns are looked at, so that a few heights are not taken for x and y.
 _FEWEST_POINTS = 16
@@ -85,12 +90,16 @@ def sniff(head: bytes, suffix: str) -> bool:
     lines = [line for line in map(_stripped, head.removeprefix(_MARK).splitlines(keepends=True)) if line]
     if lines and len(head) >= _HEAD and not head.endswith((b"\n", b"\r")):
         lines[-1] = re.split(rb"[ \t,;](?=[^ \t,;]*$)", lines[-1])[0]  # cut, perhaps within a number
-    if lines and _LINE.fullmatch(lines[0]) is None and len(lines) > 1:
+    if lines and not _has_numbers(lines[0]) and len(lines) > 1:
         names, numbers = (_words(line, _delimiter(lines[1])) for line in lines[:2])
-        if len(names) < 3 or len(names) != len(numbers) or not all(map(_NAME.fullmatch, names)):
+        if (
+            len(names) < 3
+            or (b'"' not in lines[1] and len(names) != len(numbers))
+            or not all(map(_NAME.fullmatch, names))
+        ):
             return False
         lines = lines[1:]
-    if not lines or _LINE.fullmatch(lines[0]) is None:
+    if not lines or not _has_numbers(lines[0]):
         return False
     return suffix != _POINTS_SUFFIX or _begins_with_points(lines, whole=len(head) < _HEAD)
 
@@ -196,9 +205,16 @@ def _lines(file: IO[bytes]) -> Iterator[bytes]:
 
 
 def _stripped(line: bytes) -> bytes:
-    """A line without comment and white space at its ends."""
+    """A line without comment, white space at its ends, and quotation marks around all of its numbers."""
     text = line.strip()
-    return b"" if text.startswith(_COMMENT) else text.split(b"#")[0].rstrip()
+    text = b"" if text.startswith(_COMMENT) else text.split(b"#")[0].rstrip()
+    quoted = text.startswith(b'"') and (_QUOTED.fullmatch(text) or _QUOTED_COMMAS.fullmatch(text))
+    return text.replace(b'"', b"") if quoted else text
+
+
+def _has_numbers(text: bytes) -> bool:
+    """Whether a line is one of numbers, or would be without its quotation marks: the reader says what these mean."""
+    return _LINE.fullmatch(text.replace(b'"', b"")) is not None
 
 
 def _delimiter(line: bytes) -> str | None:
@@ -213,7 +229,7 @@ def _words(line: bytes, delimiter: str | None) -> list[str]:
 
 def _layout(path: Path) -> _Layout:
     """Go through a file for the layout of its numbers."""
-    rows, columns = 0, 0
+    rows, columns, quoted = 0, 0, False
     delimiter: str | None = None
     names: tuple[str, ...] = ()
     heading, comment = b"", b""
@@ -231,11 +247,24 @@ def _layout(path: Path) -> _Layout:
                 delimiter = _delimiter(text)
                 columns = len(text.split(delimiter.encode() if delimiter else None))
                 names = _names(heading, comment, columns, delimiter)
+                quoted = b'"' in line
+            # A few in quotation marks are names of rows or columns, as R writes them.
+            if b'"' in text or quoted != (b'"' in line):
+                raise _quotes(line)
             rows += 1
     if heading and not names:
+        if _has_numbers(heading):
+            raise _quotes(heading)
         words = heading[:60].decode("utf-8", "replace")
         raise FormatError(f"expected numbers in the first line, or a name for each column, got {words!r}")
     return _Layout(delimiter, rows, columns, names, bool(heading))
+
+
+def _quotes(line: bytes) -> FormatError:
+    return FormatError(
+        "expected quotation marks around all numbers or none, and no comma within them where commas stand between "
+        f"them, got {line.strip()[:60].decode('utf-8', 'replace')!r}"
+    )
 
 
 def _names(heading: bytes, comment: bytes, columns: int, delimiter: str | None) -> tuple[str, ...]:

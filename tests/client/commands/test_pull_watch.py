@@ -341,7 +341,12 @@ def test_what_is_written_when_the_stream_is_over_is_not_drawn(
         assert begun.wait(PATIENCE)
         thread = watch._thread
         assert thread is not None
-        monkeypatch.setattr(thread, "join", lambda: (go_on.set(), Thread.join(thread)))
+
+        def joined() -> None:
+            go_on.set()
+            Thread.join(thread)
+
+        monkeypatch.setattr(thread, "join", joined)
     assert (len(written), offered) == (1, [])
 
 

@@ -117,6 +117,95 @@ def test_nodes_without_a_line_are_holes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(places_of(ls.decode(ls.encode(surface))), sorted_points(points[~missing]))
 
 
+@pytest.mark.parametrize("digits", [10, 3])
+@pytest.mark.parametrize(("rows", "columns"), [((7,), ()), ((7, 8, 20), (3,)), ((), (10, 11, 12, 30)), ((38,), (1,))])
+def test_rows_and_columns_that_no_line_has_are_holes_with_a_note(
+    tmp_path: Path, rows: tuple[int, ...], columns: tuple[int, ...], digits: int
+) -> None:
+    points = nodes()
+    points[..., :2] = np.round((points[..., :2] - points[0, 0, :2]) / 3, digits)
+    missing = np.zeros((ROWS, COLUMNS), bool)
+    missing[list(rows)] = missing[:, list(columns)] = True
+    surface, notes = read(tmp_path / "a.csv", lines_of(points[~missing], ","))
+    assert surface.mask is not None
+    np.testing.assert_array_equal(surface.mask, ~missing)
+    np.testing.assert_array_equal(surface.points[surface.mask], points[~missing][:, 2])
+    step = "0.3333"
+    expected = [
+        f"{len(lost)} of {size} places along {name}, with a step of {step}, have no points, and are holes"
+        for name, lost, size in (("x", columns, COLUMNS), ("y", rows, ROWS))
+        if lost
+    ]
+    assert notes == expected
+    np.testing.assert_allclose(places_of(surface), sorted_points(points[~missing]), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("y", "words"),
+    [
+        ([0.0, 10, 20, 30, 50, 75, 100, 150], None),
+        ([0.0, 10, 20, 30, 50, 100], "y is uneven: 6 of 11 places with a step of 10 have points"),
+        ([0.0, 1, 2, 3, 4, 5, 1e12], "y is uneven: 7 of 1,000,000,000,001 places with a step of 1 have points"),
+        ([0.0, 1, 3, 4, 6, 7, 9], "y is uneven: 7 of 10 places with a step of 1 have points"),
+        ([0.0, 5e-324, 1e300], None),
+    ],
+)
+def test_uneven_axes_keep_their_rows_and_say_so_where_they_may_lack_some(
+    tmp_path: Path, y: list[float], words: str | None
+) -> None:
+    x, rows = np.meshgrid(np.arange(9.0), y)
+    points = np.stack((x, rows, np.sin(x + rows)), axis=-1)
+    text = "".join(f"{x} {y} {z}\n" for x, y, z in points.reshape(-1, 3))
+    surface, notes = read(tmp_path / "a.txt", text)
+    assert (surface.shape, surface.mask, notes) == ((len(y), 9), None, [words] if words else [])
+    np.testing.assert_array_equal(places_of(surface), sorted_points(points))
+
+
+def quoted(points: Array, separator: str, comma: str = ".") -> str:
+    return "".join(
+        separator.join(f'"{value:.10g}"'.replace(".", comma) for value in point) + "\n"
+        for point in points.reshape(-1, 3)
+    )
+
+
+@pytest.mark.parametrize("names", ["", '"x","y","z"\n', "x,y,z\n"])
+@pytest.mark.parametrize(
+    ("separator", "comma"), [(",", "."), (", ", "."), (" ", "."), ("\t", "."), (";", "."), (";", ",")]
+)
+def test_numbers_in_quotation_marks_are_numbers(tmp_path: Path, names: str, separator: str, comma: str) -> None:
+    points = nodes()
+    text = names.replace(",", separator) + quoted(points, separator, comma)
+    surface, notes = read(tmp_path / "a.csv", text)
+    assert (surface.shape, notes) == ((ROWS, COLUMNS), [])
+    np.testing.assert_array_equal(surface.points, points[..., 2])
+    np.testing.assert_array_equal(places_of(surface), sorted_points(points))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"1,5","2,5","3,5"\n"1,5","3,5","3,5"\n',  # decimal points or thousands
+        '"1" 0.5 0.7\n"2" 0.5 0.7\n',  # names of rows, as R writes them
+        '"0.5" "1.5" "2.5"\n1 2 3\n1 2 4\n',  # numbers that are names of columns
+        '1,2,3\n"1",3,3\n',
+        'x,y,z\n"1,5","2,5","3,5"\n',
+    ],
+)
+def test_other_quotation_marks_are_refused_as_such(tmp_path: Path, text: str) -> None:
+    with pytest.raises(FormatError, match="expected quotation marks around all numbers or none"):
+        read(tmp_path / "a.csv", text)
+
+
+def test_headers_of_segments_are_comments(tmp_path: Path) -> None:
+    points = nodes()
+    text = "".join(f"> -Z{number}\n" + lines_of(row, "\t") for number, row in enumerate(points))
+    for head in ("", "# @VGMT1.0 @GMULTIPOINT\n"):
+        surface, notes = read(tmp_path / "a.txt", head + text)
+        assert (surface.shape, notes) == ((ROWS, COLUMNS), [])
+        np.testing.assert_array_equal(surface.points, points[..., 2])
+        np.testing.assert_array_equal(places_of(surface), sorted_points(points))
+
+
 def test_a_height_of_nan_is_a_hole(tmp_path: Path) -> None:
     points = nodes()
     points[3, 4, 2] = np.nan
