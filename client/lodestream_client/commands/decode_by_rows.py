@@ -181,7 +181,7 @@ def _decode(
     seen: RangeSet,
 ) -> None:
     from lodestream.bands.folders import passing_folder
-    from lodestream.scratch import Room, FolderScratch
+    from lodestream.scratch import FolderScratch, Room
 
     with passing_folder(out, (_VALUES, _FILE)) as folder:
         surface = decoder.surface(Room(lambda: FolderScratch(folder / _VALUES), memory // _PART), memory, progress)

@@ -171,7 +171,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     from lodestream.container import read_index
     from lodestream.decoding.pieces import PiecewiseDecoder
     from lodestream.planning.planner import plan
-    from lodestream.scratch import Room, FolderScratch
+    from lodestream.scratch import FolderScratch, Room
 
     with job.container.open("rb") as file:
 

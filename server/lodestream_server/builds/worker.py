@@ -353,7 +353,7 @@ def moved(made: Path, path: Path) -> str:
 def _read(job: Job, options: dict[str, str]) -> Surface:
     from lodestream.encoding.losses import at_holes
     from lodestream.formats import read
-    from lodestream.scratch import Room, FolderScratch
+    from lodestream.scratch import FolderScratch, Room
 
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always", FormatWarning)
