@@ -133,7 +133,7 @@ class WindowMeasurer:
         if before is not None and all(self._channels[channel].is_shown(state[channel]) for channel in channels):
             return before
         fractions = [self._channels[channel].reconstruct(state[channel])[1] for channel in channels]
-        frames = [self._channels[channel].frame for channel in channels]
+        frames = [self._channels[channel].frames[0] for channel in channels]
         canvas = frames[0][None] if len(frames) == 1 else np.stack(frames)
         lattices = self._lattices[channels.start : channels.stop]
         found = compared(original, lattices, canvas, fractions, first)

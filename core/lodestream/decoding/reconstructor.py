@@ -106,7 +106,6 @@ class Reconstructor:
                 self._levels.append(_Level(step, array, copies, predictors, tiles.table))
                 nodes, wanted = array, [list(step.rows.crop.wanted), list(step.columns.crop.wanted)]
             self._shown = [nodes[slice(*rows), slice(*columns)] for rows, columns in product(*wanted)]
-            self._frame = nodes, wanted[0][0], wanted[1][0]
         self._columns = len(wanted[1]) if region.core_spans is not None else 1
         #: Of the core and of each level above it: the tiles that count, by their numbers in the table.
         self._used = [np.arange(tiles.table.tiles_from(region.core + 1)), *(level.tiles for level in self._levels)]
@@ -139,14 +138,17 @@ class Reconstructor:
         return [np.block(cells)], fraction
 
     @property
-    def frame(self) -> Grid:
-        """What was made last of a window that crosses no seam, in one piece: more columns, which mean nothing, follow.
+    def frames(self) -> list[Grid]:
+        """What was made last of each grid, in one piece: more columns, which mean nothing, follow.
 
-        int32, shape (row, column and `PADDING` or more).
+        int32, shape (row, column and `PADDING` or more); of a window only where it crosses no seam.
         """
-        array, rows, columns = self._frame
-        pitch = array.strides[0] // array.itemsize
-        return np.lib.stride_tricks.as_strided(array[rows[0] :, columns[0] :], (rows[1] - rows[0], pitch))
+        if len(self._shown) > 1 and self._region.spans is not None:
+            raise ValueError("expected a window that crosses no seam")
+        return [
+            np.lib.stride_tricks.as_strided(array, (len(array), array.strides[0] // array.itemsize))
+            for array in self._shown
+        ]
 
     def is_shown(self, state: KnownState) -> bool:
         """Whether the state before shows the same."""

@@ -112,6 +112,12 @@ def measure(allocated: Allocated, progress: Callable[[float], None]) -> Measured
     )
 
 
+def _told(errors: Errors) -> Errors:
+    """Errors as a container tells them."""
+    channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in errors.channels)
+    return Errors(told(errors.rms), told(errors.maximum), channels)
+
+
 def all_passes(tops: Sequence[NDArray[np.int8]]) -> State:
     """Passes of every tile and channel, int8, shape (tile, channel), from their bit-planes, shape (tile,)."""
     return np.stack([np.maximum(2 * top - 1, 0) for top in tops], axis=1).astype(np.int8)

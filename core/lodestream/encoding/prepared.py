@@ -15,6 +15,8 @@ from ..container import limits
 from ..container.model import AttributeKind, JointChanges
 from ..container.shape import serialize_extras
 from ..coordinates.height_fields import to_heights
+from ..decoding.measurer import Comparison, comparisons
+from ..decoding.region import Region
 from ..grid.connectivity import Arrangement, Patch, whole_patch
 from ..grid.layout import Layout
 from ..grid.multiblock import grids_of, shared_points
@@ -119,6 +121,19 @@ class Prepared:
         blocks = self.surface.blocks
         arrays = [given_arrays(block) for block in blocks]
         return other_originals(self.arrangement, arrays, [block.mask for block in blocks], self.geometric, chosen)
+
+    def comparisons(self, region: Region) -> list[Comparison]:
+        """What the channels of a region are compared with: of all blocks or some, or of rows of the only one."""
+        rows = slice(None) if region.spans is None else slice(*region.spans[0])
+        blocks = self.surface.blocks
+        return comparisons(
+            region,
+            self.arrangement,
+            self.geometric,
+            [own[0][rows] for own in self.arrays],
+            [[array[rows] for array in given_arrays(block)] for block in blocks],
+            [None if block.mask is None else block.mask[rows] for block in blocks],
+        )
 
     @property
     def kept(self) -> list[NDArray[np.bool_] | None]:

@@ -18,6 +18,7 @@ from .lattice import Lattice
 from .measure import distances
 
 __all__ = [
+    "ByBlock",
     "Original",
     "coordinate_distances",
     "distance_figures",
@@ -142,21 +143,24 @@ def other_originals(
     patches = None if arrangement is None else arrangement.patches
     if patches is not None and chosen is not None:
         patches = tuple(patches[number] for number in chosen)
+    every = arrays[patches[0].block if patches else 0]
+    if sum(array.shape[2] for array in every) == geometric:
+        return []
     if patches is None:
         valid = [masks[0]]
     else:
         own = [(patch, masks[patch.block]) for patch in patches]
         valid = [None if mask is None else stored(patch, mask) for patch, mask in own]
     found = []
-    for number, array in enumerate(arrays[patches[0].block if patches else 0]):
+    for number, array in enumerate(every):
         first = 0 if number else geometric
         if first == array.shape[2]:
             continue
         points = [array] if patches is None else [stored(patch, arrays[patch.block][number]) for patch in patches]
         points = [np.ascontiguousarray(values) for values in points]
         for channel in range(first, array.shape[2]):
-            every = zip(points, valid, strict=True)
-            found.append(([Original(values, _finite(values[..., channel], mask)) for values, mask in every], channel))
+            pairs = zip(points, valid, strict=True)
+            found.append(([Original(values, _finite(values[..., channel], mask)) for values, mask in pairs], channel))
     return found
 
 

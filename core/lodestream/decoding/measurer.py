@@ -1,0 +1,408 @@
+"""Errors of states over a region of the surface: what a receiver shows in each of them, beside what was given.
+
+What regions tell is put together for the whole surface: sums are those of cells, which are added up exactly, so it does
+not matter how the surface was divided.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..container.model import Errors, Header
+from ..entropy.tiles import Tiles
+from ..grid.connectivity import Arrangement
+from ..kernels import PART_COLUMNS, PART_ROWS
+from ..parallel import spread, threads
+from ..quantization.distortion import (
+    ByBlock,
+    Original,
+    coordinate_distances,
+    distance_figures,
+    errors_of_figures,
+    originals_of,
+    other_originals,
+    store_values,
+)
+from ..quantization.lattice import Lattice
+from .reconstructor import Grid, KnownState, Reconstructor, known_state
+from .region import Region, Span, core_level
+
+__all__ = [
+    "CORE_POINTS",
+    "Comparison",
+    "Figures",
+    "Measured",
+    "Measurer",
+    "comparisons",
+    "distances_of",
+    "patches_of",
+]
+
+State = NDArray[np.int8]
+
+#: Rows, and columns, of the windows that are measured one after another, about. Levels are made with 26 points more on
+#: every side, which speaks against smaller windows; memory and the processor's cache speak against larger ones.
+_WINDOW_SIDE = 1024
+#: Grids of at most so many points together are made whole, by one call for all levels; more than one grid always.
+_WHOLE_POINTS = _WINDOW_SIDE**2
+#: Levels of at most so many points are made whole for each window: windows of them would be no smaller.
+CORE_POINTS = 1 << 14
+
+#: Errors of a state, and the squared distances in cells, one array or none; see `coordinate_distances`.
+Measured = tuple[Errors, list[NDArray[np.float64]]]
+
+
+class Comparison(NamedTuple):
+    """Channels that are compared together with what was given.
+
+    Attributes
+    ----------
+    originals : sequence of Original
+        One for each patch.
+    channels : range
+        Their numbers in the surface; at most three.
+    first : int
+        The number of the first one among the channels of the originals' points.
+    """
+
+    originals: Sequence[Original]
+    channels: range
+    first: int
+
+    @property
+    def kinds(self) -> int:
+        """Kinds of distances: of all channels together, and where there are several, of each by itself."""
+        return 1 + len(self.channels) if len(self.channels) > 1 else 1
+
+
+def comparisons(
+    region: Region,
+    arrangement: Arrangement | None,
+    geometric: int,
+    points: ByBlock[NDArray[Any]],
+    arrays: ByBlock[Sequence[NDArray[Any]]],
+    masks: ByBlock[NDArray[np.bool_] | None],
+) -> list[Comparison]:
+    """What the channels of a region are compared with: the coordinates, then each other channel.
+
+    Parameters
+    ----------
+    region : Region
+    arrangement : Arrangement or None
+    geometric : int
+        Channels that are coordinates.
+    points : for each block of the region, shape (row, column, channel)
+        The values of coordinates, finite. Of rows these alone, as in what follows.
+    arrays : for each block its points, then its attributes, shape (row, column, channel)
+    masks : for each block bool, shape (row, column), or None
+        True where a point is valid.
+    """
+    patches = None if arrangement is None else patches_of(region)
+    coordinates = originals_of(arrangement, points, masks, patches)
+    others = other_originals(arrangement, arrays, masks, geometric, patches)
+    return [
+        Comparison(coordinates, range(geometric), 0),
+        *(Comparison(own, range(k, k + 1), first) for k, (own, first) in enumerate(others, geometric)),
+    ]
+
+
+def patches_of(region: Region) -> list[int]:
+    """The patches that are made, by their numbers: interfaces come before them in the layout."""
+    interfaces = sum(grid.interface for grid in region.layout.grids)
+    return [grid - interfaces for grid in region.grids if grid >= interfaces]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a region tells of the errors of some states.
+
+    Attributes
+    ----------
+    squares : float64, shape (state, row of cells, column of cells, kind, 2)
+        See `distance_figures`: of the coordinates, then of each other channel. Where there are several grids each patch
+        is a row of cells with one cell in it.
+    equal : bool, shape (state, kind)
+        Whether all values are as given, where the squares of their differences are all 0.
+    counts : int64, shape (comparison,)
+        Points that are compared: of the coordinates, then of each other channel.
+    """
+
+    squares: NDArray[np.float64]
+    equal: NDArray[np.bool_]
+    counts: NDArray[np.int64]
+
+
+class _Window(NamedTuple):
+    """A part of the region that is made at once.
+
+    ``patches`` are its patches among those of the region, ``cells`` its rows and columns among the region's cells, and
+    ``within``, where the only grid is divided, its rows and columns among the region's.
+    """
+
+    region: Region
+    patches: slice
+    cells: tuple[slice, slice]
+    within: tuple[slice, slice] | None = None
+
+
+class Measurer:
+    """Measures a region of the finest level in many states.
+
+    Parameters
+    ----------
+    header : Header
+        Of which the layout, the lattices, the predictors, the dtypes and the number of coordinates count.
+    region : Region
+        All of the surface, some of its grids, or rows, the first of which is a multiple of `PART_ROWS`.
+    tiles : sequence of Tiles, one for each channel
+        All that is known in the end, see `Reconstructor`.
+    compared : sequence of Comparison
+        Of the region's patches.
+    """
+
+    def __init__(self, header: Header, region: Region, tiles: Sequence[Tiles], compared: Sequence[Comparison]) -> None:
+        self._header, self._region, self._tiles, self._compared = header, region, tiles, compared
+        self._patches = len(patches_of(region))
+
+    def errors(self, states: Sequence[State]) -> list[Measured]:
+        """Errors of states, int8, shape (tile, channel) each, where the region is the whole surface."""
+        figures = [self.figures(states)]
+        return [
+            distances_of(self._header, figures, number) or self.exact_errors(state)
+            for number, state in enumerate(states)
+        ]
+
+    def figures(self, states: Sequence[State]) -> Figures:
+        """What the region tells of the errors of states, int8, shape (tile, channel) each."""
+        known = [self._known(state) for state in states]
+        kinds = sum(compared.kinds for compared in self._compared)
+        squares = np.empty((len(states), *self._cells, kinds, 2))
+        windows = self._windows()
+        count = max(1, min(-(-threads() // len(windows)), len(states)))
+        bounds = [len(states) * number // count for number in range(count + 1)]
+
+        def measure(work: tuple[_Window, Span]) -> tuple[Span, NDArray[np.bool_]]:
+            window, (start, stop) = work
+            equal = np.empty((stop - start, kinds), np.bool_)
+            measuring = _WindowMeasurer(self._header, window, self._tiles, self._compared)
+            for number in range(start, stop):
+                squares[number, *window.cells], equal[number - start] = measuring.measure(known[number])
+            return (start, stop), equal
+
+        equal = np.ones((len(states), kinds), np.bool_)
+        for (start, stop), same in spread(measure, product(windows, pairwise(bounds))):
+            equal[start:stop] &= same
+        counts = [sum(original.count for original in compared.originals) for compared in self._compared]
+        return Figures(squares, equal, np.array(counts, np.int64))
+
+    def exact_errors(self, state: State) -> Measured:
+        """Errors of a state of the whole surface, also where float64 does not hold the squares of its values."""
+        cells, found = list[NDArray[np.float64]](), list[tuple[float, float]]()
+        known = self._known(state)
+        for number, (originals, channels, first) in enumerate(self._compared):
+            made = [self._reconstructor(channel).reconstruct(known[channel]) for channel in channels]
+            grids = zip(*(arrays[-self._patches :] for arrays, _ in made), strict=True)
+            found += coordinate_distances(
+                originals,
+                [self._header.lattices[channel] for channel in channels],
+                [np.stack(coordinates) for coordinates in grids],
+                [fraction for _, fraction in made],
+                first,
+                None if number else cells,
+            )
+        return _errors(found, self._header.geometric), cells
+
+    def _reconstructor(self, channel: int) -> Reconstructor:
+        return Reconstructor(
+            self._region, self._header.predictors[channel], self._tiles[channel], channel < self._header.geometric
+        )
+
+    def _known(self, state: State) -> list[KnownState]:
+        """A state, int8, shape (tile, channel), as far as each channel's tiles are concerned."""
+        return [
+            known_state(tiles.table, state[:, channel], self._region.level) for channel, tiles in enumerate(self._tiles)
+        ]
+
+    @property
+    def _cells(self) -> tuple[int, int]:
+        """Rows and columns of cells."""
+        if len(self._region.layout.grids) > 1:
+            return self._patches, 1
+        ((rows, columns),) = self._region.shapes
+        return -(-rows // PART_ROWS), -(-columns // PART_COLUMNS)
+
+    def _windows(self) -> list[_Window]:
+        """The parts of the region that are made one after another: windows of the only grid, or runs of patches."""
+        region, layout = self._region, self._region.layout
+        every, points = slice(None), sum(rows * columns for rows, columns in region.shapes[-self._patches :])
+        if region.spans is None and points <= _WHOLE_POINTS:
+            return [_Window(region, every, (every, every))]
+        if len(layout.grids) > 1:
+            return list(self._runs_of_patches())
+        ((rows, columns),) = region.shapes
+        core = min(region.core, core_level(layout, region.level, CORE_POINTS))
+        top, left = (0, 0) if region.spans is None else (region.spans[0][0], region.spans[1][0])
+        across = [(0, columns)]
+        if not layout.grids[0].closed[1]:  # each would be made of all of them
+            across = list(_stretches(columns, PART_COLUMNS))
+        windows = []
+        for (a, b), (c, d) in product(_stretches(rows, PART_ROWS), across):
+            part = Region.window(layout, region.level, (top + a, top + b), (left + c, left + d), core)
+            cells = slice(a // PART_ROWS, -(-b // PART_ROWS)), slice(c // PART_COLUMNS, -(-d // PART_COLUMNS))
+            windows.append(_Window(part, every, cells, (slice(a, b), slice(c, d))))
+        return windows
+
+    def _runs_of_patches(self) -> Iterator[_Window]:
+        region, shapes = self._region, self._region.shapes[-self._patches :]
+        grids, first, points = region.grids[-self._patches :], 0, 0
+        for patch, (rows, columns) in enumerate([*shapes, (_WHOLE_POINTS, 1)]):
+            if patch > first and points + rows * columns > _WHOLE_POINTS:
+                run = slice(first, patch)
+                yield _Window(Region.of_grids(region.layout, region.level, grids[run]), run, (run, slice(None)))
+                first, points = patch, 0
+            points += rows * columns
+
+
+def _stretches(length: int, unit: int) -> Iterator[Span]:
+    """An axis in stretches of whole cells of so many samples, as long as windows are."""
+    cells, count = -(-length // unit), max(1, round(length / _WINDOW_SIDE))
+    for start, stop in pairwise(unit * (cells * number // count) for number in range(count + 1)):
+        yield start, min(stop, length)
+
+
+class _WindowMeasurer:
+    """Measures a window in one state after another: what a state shares with the one before is not measured again."""
+
+    def __init__(self, header: Header, window: _Window, tiles: Sequence[Tiles], compared: Sequence[Comparison]) -> None:
+        self._lattices, self._is_one_grid = header.lattices, len(header.layout.grids) == 1
+        self._compared = [_cut(comparison, window) for comparison in compared]
+        self._patches = len(self._compared[0].originals)
+        # Channels that are compared by themselves are made anew for each state, unless levels of a window are shared.
+        room = np.empty(window.region.size, np.int32) if window.within is None and len(compared) > 1 else None
+        self._channels = [
+            Reconstructor(
+                window.region, predictors, own, channel < header.geometric, None if channel < header.geometric else room
+            )
+            for channel, (predictors, own) in enumerate(zip(header.predictors, tiles, strict=True))
+        ]
+        #: Of each comparison its figures in the state before, and whether all is equal.
+        self._before: list[tuple[NDArray[np.float64], NDArray[np.bool_]] | None] = [None] * len(compared)
+
+    def measure(self, state: Sequence[KnownState]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Sums and largest of the squared distances in a state of each channel; see `Figures`, of one state.
+
+        Returns
+        -------
+        float64, shape (row of cells, column of cells, kind, 2), and bool, shape (kind,)
+        """
+        squares, equal = zip(*(self._figures(number, state) for number in range(len(self._compared))), strict=True)
+        return np.concatenate(squares, axis=2), np.concatenate(equal)
+
+    def _figures(self, number: int, state: Sequence[KnownState]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        before, (originals, channels, first) = self._before[number], self._compared[number]
+        if before is not None and all(self._channels[channel].is_shown(state[channel]) for channel in channels):
+            return before
+        fractions = [self._channels[channel].reconstruct(state[channel])[1] for channel in channels]
+        frames = [self._channels[channel].frames[-self._patches :] for channel in channels]
+        lattices = [self._lattices[channel] for channel in channels]
+        figures = [
+            _compared(original, lattices, _stacked([own[patch] for own in frames]), fractions, first)
+            for patch, original in enumerate(originals)
+        ]
+        squares, equal = zip(*figures, strict=True)
+        cells = squares[0] if self._is_one_grid else np.array([[_one_cell(own)] for own in squares])
+        found = cells, np.all(equal, axis=0)
+        self._before[number] = found
+        return found
+
+
+def _cut(comparison: Comparison, window: _Window) -> Comparison:
+    """What a window is compared with."""
+    originals = comparison.originals[window.patches]
+    if window.within is not None:
+        points, counted = originals[0].points, originals[0].counted
+        counted = None if counted is None else np.ascontiguousarray(counted[window.within])
+        originals = [Original(np.ascontiguousarray(points[window.within]), counted)]
+    return comparison._replace(originals=originals)
+
+
+def _stacked(frames: Sequence[Grid]) -> NDArray[np.int32]:
+    return frames[0][np.newaxis] if len(frames) == 1 else np.stack(frames)
+
+
+def _one_cell(squares: NDArray[np.float64]) -> list[tuple[float, float]]:
+    """The sum and the largest of each kind over all cells of a patch."""
+    return [(math.fsum(own[..., 0].flat), float(own[..., 1].max())) for own in np.moveaxis(squares, 2, 0)]
+
+
+def _compared(
+    original: Original, lattices: Sequence[Lattice], canvas: NDArray[np.int32], fractions: Sequence[int], channel: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """`distance_figures`, and of each kind whether all values are equal: known where the squares are all 0.
+
+    Parameters are those of `distance_figures`; ``canvas`` are its coordinates, int32, shape (channel, row, column).
+
+    Returns
+    -------
+    float64, shape (row of cells, column of cells, kind, 2), and bool, shape (kind,)
+    """
+    squares = distance_figures(original, lattices, canvas, fractions, channel)
+    equal = np.zeros(squares.shape[2], np.bool_)
+    if original.points.dtype.kind == "f" and original.points.dtype.itemsize == 8 and not squares[..., 1].any():
+        # Squares of the smallest differences vanish: only a look at the values tells that there are none.
+        columns = original.points.shape[1]
+        same = np.empty((*original.points.shape[:2], len(lattices)), original.points.dtype)
+        for number, (lattice, fraction) in enumerate(zip(lattices, fractions, strict=True)):
+            store_values(lattice, (canvas[number, :, :columns], fraction), same, number)
+        wanted = original.points[..., channel : channel + len(lattices)]
+        chosen = slice(None) if original.counted is None else original.counted
+        equal[:] = np.array_equal(wanted[chosen], same[chosen])
+    return squares, equal
+
+
+def distances_of(header: Header, figures: Sequence[Figures], state: int) -> Measured | None:
+    """Errors of the whole surface in a state, and the distances in cells.
+
+    Parameters
+    ----------
+    header : Header
+    figures : sequence of Figures
+        Of all regions in their order.
+    state : int
+        Which of the states.
+
+    Returns
+    -------
+    (Errors, list of float64 arrays, shape (row of cells, column of cells, 2)) or None
+        None: float64 does not hold the squares.
+    """
+    geometric, found, cells = header.geometric, list[tuple[float, float]](), list[NDArray[np.float64]]()
+    first = 0
+    for comparison, count in enumerate(np.sum([part.counts for part in figures], axis=0).tolist()):
+        kinds = 1 + geometric if comparison == 0 and geometric > 1 else 1
+        span = slice(first, first + kinds)
+        first += kinds
+        squares = np.concatenate([part.squares[state, :, :, span] for part in figures])
+        dtype = header.dtypes[comparison + geometric - 1 if comparison else 0]
+        errors = errors_of_figures([squares], count, dtype) if count else [(0.0, 0.0)] * kinds
+        if errors is None:
+            if not all(part.equal[state, span].all() for part in figures):
+                return None
+            errors = [(0.0, 0.0)] * kinds
+        elif comparison == 0 and errors[0][1]:
+            cells = [squares[..., 0, :]]
+        found += errors
+    return _errors(found, geometric), cells
+
+
+def _errors(found: Sequence[tuple[float, float]], geometric: int) -> Errors:
+    """Errors from those of each kind: of all coordinates together, then of each of several channels."""
+    distances, *channels = found
+    return Errors(*distances, tuple(channels if geometric > 1 else found if len(found) > 1 else ()))
