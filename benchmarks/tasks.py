@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 import lodestream
 from lodestream.bands.geometry import Bands
-from lodestream.bands.measuring import BANDS_TOGETHER
+from lodestream.bands.measuring import RUNS_TOGETHER
 from lodestream.grid.layout import Layout
 from lodestream.kernels import PART_ROWS
 from lodestream.scratch import FolderScratch
@@ -177,7 +177,7 @@ def _tasks_of(side: int) -> Iterator[tuple[str, int, float]]:
             yield name, own, layout.points(level) / own
     core = layout.points(bands.core)
     yield from (("core", 1, core), ("code", 1, core), ("segments", 1, core))
-    rows = PART_ROWS * max(1, BANDS_TOGETHER * _POINTS // (PART_ROWS * side))
+    rows = PART_ROWS * max(1, RUNS_TOGETHER * _POINTS // (PART_ROWS * side))
     runs = math.ceil(side / rows)
     yield "measure", runs, side**2 / runs
 

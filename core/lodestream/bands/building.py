@@ -14,23 +14,23 @@ from ..container.codecs import needed_codecs
 from ..container.digest import DIGEST
 from ..container.model import Errors, Header
 from ..container.writer import ContainerWriter
+from ..decoding.measurer import Figures, distances_of
 from ..encoding.allocation import assign_layers
 from ..encoding.corrected import remaining_errors
 from ..encoding.curves import Curves
 from ..encoding.header import header_of
 from ..encoding.large_units import candidate, worth
-from ..encoding.measured import MeasuredLayer, all_passes, kept_layers, level_states, shown_states
+from ..encoding.measured import MeasuredLayer, all_passes, kept_layers, level_states, shown_states, told_errors
 from ..encoding.residual_encoder import chunk_sample, chunk_size
 from ..encoding.transformed import band_weights
 from ..encoding.written import window_section_of
 from ..planning.window_errors import KIND as WINDOW_ERRORS
-from . import grid_tasks, tasks
+from . import tasks
 from .assembling import Chunks, coded_layers, returned_digest
 from .build import Build
 from .coding import parents_of, sizes_of_unit
 from .executing import Execution, Task
-from .grid_measuring import blocks_of_run
-from .measuring import Figures, ValuesOfRows, errors_of, kinds_of, measured_rows
+from .measuring import ValuesOfRows, last_values, measured_runs
 from .stored import name_of, pieces_of, read_tiles, transformed
 from .transforming import planes_of_channel, transforming
 
@@ -167,25 +167,17 @@ class Building:
 
     # Errors and residual.
 
-    @property
-    def _is_one_grid(self) -> bool:
-        return self._build.prepared.arrangement is None
-
     def _measure(self) -> None:
         if not self._scratch.has("chunk"):
             self._scratch.write("chunk", np.array(self._chunk()))
         rows, columns = (int(exponent) for exponent in self._read("chunk"))
         self._build.save_header(replace(self._header, chunk=(rows, columns)))
-        measure = tasks.measure if self._is_one_grid else grid_tasks.measure
-        self._carry_out(_SHARES[2], [Task(f"exact/{k}", measure, (k,)) for k in range(self._runs)])
+        self._carry_out(_SHARES[2], [Task(f"exact/{k}", tasks.measure, (k,)) for k in range(self._runs)])
 
     @property
     def _runs(self) -> int:
         """How many runs of rows, or of blocks, are measured."""
-        if not self._is_one_grid:
-            return len(blocks_of_run(self._build.prepared, self._build.points))
-        rows, columns = (int(exponent) for exponent in self._read("chunk"))
-        return len(measured_rows(self._build.prepared, (rows, columns), self._build.points))
+        return len(measured_runs(self._build.stored_header(), self._build.points))
 
     def _chunk(self) -> tuple[int, int]:
         """See `chunk_size`."""
@@ -193,10 +185,8 @@ class Building:
         if len(prepared.chunks) == 1:
             return prepared.chunks[0]
         rows = chunk_sample(prepared, header.shape)[0]
-        measurer = tasks.measurer_of(self._build, rows)
-        values = measurer.values(np.array(self._read("last-state")), kinds_of(prepared))
-        coefficients = float(self._read("coefficient-bytes"))
-        return chunk_size(prepared, header, [ValuesOfRows(values, rows[0])], coefficients)
+        values = ValuesOfRows(last_values(self._build, header, rows), rows[0])
+        return chunk_size(prepared, header, [values], float(self._read("coefficient-bytes")))
 
     def _measured(self) -> tuple[list[MeasuredLayer], list[Errors], list[bool]]:
         """The layers that are kept, the errors of all levels, and of each channel whether it is exact."""
@@ -207,17 +197,17 @@ class Building:
         ]
         layers = list(self._read("layers"))
         states = len(self._read("states"))
-        found = []
+        measured = []
         for state in range(states):
-            errors = errors_of(figures, state, prepared.geometric, self._header.dtypes)
-            if errors is None:
+            distances = distances_of(self._header, figures, state)
+            if distances is None:
                 raise OutOfRangeError
-            found.append(errors)
-        kept = kept_layers(self._header, layers, found[: len(layers)])
+            measured.append((told_errors(distances[0]), distances[1]))
+        kept = kept_layers(self._header, layers, measured[: len(layers)])
         whole = np.all([self._read(f"exact/{k}") for k in range(count)], axis=0)
         exact = [bool(channel) for channel in whole]
         last = remaining_errors(kept[-1].errors, exact, prepared.geometric)
-        return kept, [*(errors for errors, _ in found[len(layers) :]), last], exact
+        return kept, [*(errors for errors, _ in measured[len(layers) :]), last], exact
 
     # The container.
 

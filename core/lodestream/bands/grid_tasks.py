@@ -12,11 +12,10 @@ from ..transform.predictors import INTERFACES
 from ..transform.pyramid import empty, forward
 from . import grid_transform as transform
 from .build import Build
-from .grid_measuring import blocks_of_run, measured
 from .grid_runs import GridRuns
-from .stored import CORE, name_of_fit, rules_of, write_measured
+from .stored import CORE, name_of_fit, rules_of
 
-__all__ = ["coordinates", "core", "first_step", "interfaces", "measure", "second_step"]
+__all__ = ["coordinates", "core", "first_step", "interfaces", "second_step"]
 
 
 def interfaces(build: Build, channel: int) -> None:
@@ -90,14 +89,6 @@ def core(build: Build, channel: int, fit: int) -> None:
     build.scratch.write(name_of_fit("planes", channel, fit, runs.core, CORE), planes)
     build.scratch.write(name_of_fit("largest", channel, fit, runs.core, CORE), np.array(transform.largest_of(arrays)))
     build.scratch.write(name_of_fit("core-rules", channel, fit), predictors)
-
-
-def measure(build: Build, number: int) -> None:
-    """Measure the patches of some blocks in all states, and code the residual of these blocks."""
-    header = build.stored_header()
-    blocks = blocks_of_run(build.prepared, build.points)[number]
-    figures, chunks, exact = measured(build, header, blocks)
-    write_measured(build, number, figures, chunks, [], exact)
 
 
 def _runs(build: Build) -> GridRuns:

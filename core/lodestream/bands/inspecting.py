@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.digest import little_endian
-from ..container.model import Errors, Header
+from ..container.model import Header
 from ..decoding.inspected_sections import walk
 from ..decoding.inspection import (
     READ,
     Inspection,
-    Measured,
     check_errors,
     check_levels,
     check_values,
@@ -24,8 +23,8 @@ from ..decoding.inspection import (
     states_of,
 )
 from ..decoding.level_grids import at_level, level_nodes, with_rules
+from ..decoding.measurer import Figures, Measured, Measurer, comparisons, distances_of
 from ..decoding.pieces import PiecewiseDecoder, why_not_by_pieces
-from ..decoding.reconstructor import Reconstructor, known_state
 from ..decoding.region import Region
 from ..decoding.values import Values, block_of
 from ..entropy.tiles import Tiles
@@ -33,12 +32,8 @@ from ..errors import CorruptStreamError, TooLargeError
 from ..grid.patches import level_shapes
 from ..library import require
 from ..parallel import spread
-from ..quantization.distortion import Original, coordinate_distances, originals_of, other_originals
 from ..surface import Block, Surface
-from .grid_measuring import BlocksMeasurer
-from .measuring import Figures, RowsMeasurer, distances_of
 from .memory import default_memory
-from .windows import RowsGiven
 
 __all__ = ["inspect"]
 
@@ -181,7 +176,7 @@ def _piece(
     """Decode a piece, by block, and measure it in these states, if there are any."""
     header, tiles = decoder.header, decoder.segments.channels(region)
     values = decoder.segments.values_from(region, tiles)
-    figures = [_figures(header, region, tiles, values, states)] if states else []
+    figures = [_measurer(header, region, tiles, values).figures(states)] if states else []
     rows = slice(None) if region.spans is None else slice(*region.spans[0])
     parts = {}
     for block, (arrays, mask) in ((block, (own.arrays, header.masks[block])) for block, own in values.items()):
@@ -193,27 +188,14 @@ def _piece(
     return parts, figures
 
 
-def _figures(
-    header: Header,
-    region: Region,
-    tiles: Sequence[Tiles],
-    values: Mapping[int, Values],
-    states: Sequence[NDArray[np.int8]],
-) -> Figures:
-    """What a piece tells of the errors of states; ``values`` are those that it has in the end."""
-    if region.spans is not None:
-        mask = None if header.masks[0] is None else header.masks[0][slice(*region.spans[0])]
-        arrays = values[0].arrays
-        given = RowsGiven.of(arrays[0], arrays, mask, header.geometric)
-        return RowsMeasurer(given, header.lattices, header.geometric, header.predictors, region, tiles).figures(states)
-    interfaces = len(header.layout.grids) - len(header.patches)
-    patches = [grid - interfaces for grid in region.grids if grid >= interfaces]
-    every = {block: own.arrays for block, own in values.items()}
-    points = {block: arrays[0] for block, arrays in every.items()}
-    coordinates = originals_of(header.arrangement, points, header.masks, patches)
-    others = other_originals(header.arrangement, every, header.masks, header.geometric, patches)
-    blocks = range(min(values), max(values) + 1)
-    return BlocksMeasurer(header, tiles, blocks, patches).figures(states, coordinates, others)
+def _measurer(header: Header, region: Region, tiles: Sequence[Tiles], values: Mapping[int, Values]) -> Measurer:
+    """What measures a region, whose values in the end are these."""
+    rows = slice(None) if region.spans is None else slice(*region.spans[0])
+    arrays = {block: own.arrays for block, own in values.items()}
+    points = {block: own[0] for block, own in arrays.items()}
+    masks = [None if mask is None else mask[rows] for mask in header.masks]
+    compared = comparisons(region, header.arrangement, header.geometric, points, arrays, masks)
+    return Measurer(header, region, tiles, compared)
 
 
 def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
@@ -253,47 +235,12 @@ def _errors(
         If float64 does not hold the squares of the values, which are then looked at in one piece, and it does not fit.
     """
     header = decoder.header
-    found = [distances_of(figures, number, header.geometric, header.dtypes) for number in range(len(states))]
-    if None not in found:
-        return [measured for measured in found if measured is not None]
+    measured = [distances_of(header, figures, number) for number in range(len(states))]
+    if None not in measured:
+        return [distances for distances in measured if distances is not None]
     if not fits:
         raise TooLargeError("expected values whose squares float64 holds, in a surface this large, got others")
     region = Region.whole(header.layout, header.levels)
     tiles = decoder.segments.channels(region)
-    values = decoder.segments.values_from(region, tiles)
-    arrays = {block: own.arrays for block, own in values.items()}
-    every = [(originals_of(header.arrangement, {b: own[0] for b, own in arrays.items()}, header.masks), 0)]
-    every += other_originals(header.arrangement, arrays, header.masks, header.geometric) if header.channels > 1 else []
-    return [
-        measured or _exact_errors(header, region, tiles, every, state)
-        for measured, state in zip(found, states, strict=True)
-    ]
-
-
-def _exact_errors(
-    header: Header,
-    region: Region,
-    tiles: Sequence[Tiles],
-    originals: Sequence[tuple[Sequence[Original], int]],
-    state: NDArray[np.int8],
-) -> Measured:
-    """The errors of a state of the whole surface where float64 does not hold the squares of its values."""
-    patches, cells = len(header.patches), list[NDArray[np.float64]]()
-
-    def made(channel: int) -> tuple[list[NDArray[np.int32]], int]:
-        known = known_state(tiles[channel].table, state[:, channel], region.level)
-        coordinate = channel < header.geometric
-        return Reconstructor(region, header.predictors[channel], tiles[channel], coordinate).reconstruct(known)
-
-    errors = list[tuple[float, float]]()
-    for number, (given, component) in enumerate(originals):
-        last = header.geometric + number
-        channels = range(last - 1, last) if number else range(header.geometric)
-        grids = [made(channel) for channel in channels]
-        coordinates = [np.stack([of[-patches:][patch] for of, _ in grids]) for patch in range(patches)]
-        lattices = [header.lattices[channel] for channel in channels]
-        fractions = [fraction for _, fraction in grids]
-        errors += coordinate_distances(given, lattices, coordinates, fractions, component, None if number else cells)
-    distances, *each = errors
-    kinds = each if header.geometric > 1 else errors if len(errors) > 1 else []
-    return Errors(*distances, tuple(kinds)), cells
+    measurer = _measurer(header, region, tiles, decoder.segments.values_from(region, tiles))
+    return [distances or measurer.exact_errors(state) for distances, state in zip(measured, states, strict=True)]

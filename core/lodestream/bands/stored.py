@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..decoding.measurer import Figures
 from ..entropy.part_table import Part, flat_span
 from ..entropy.tiles import Tiles
 from ..transform.predictors import default_predictors
 from .build import Build
-from .measuring import Figures
 
 __all__ = [
     "CORE",

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..decoding.region import Region
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
-from ..entropy.part_table import part_of
 from ..transform.pyramid import empty
-from . import forward
+from . import forward, measuring
 from .build import Build
 from .coding import Units, code_segments, code_units, parents_of
 from .geometry import Bands
-from .measuring import RowsMeasurer, chunks_of_rows, kinds_of, measured_rows
+from .measuring import measured_runs
 from .stored import (
     CORE,
-    known_tiles,
     name_of,
     name_of_fit,
     read_tiles,
@@ -26,7 +23,6 @@ from .stored import (
     transformed,
     write_measured,
 )
-from .windows import RowsGiven, window_core
 
 __all__ = [
     "code",
@@ -34,7 +30,6 @@ __all__ = [
     "core",
     "first_step",
     "measure",
-    "measurer_of",
     "sample_pieces",
     "second_step",
     "segments",
@@ -126,26 +121,10 @@ def segments(build: Build, channel: int, level: int, band: int) -> None:
 
 
 def measure(build: Build, number: int) -> None:
-    """Measure some rows in all states, and code their residual."""
+    """Measure a run of rows, or of blocks, in all states, and code its residual."""
     header = build.stored_header()
-    rows = measured_rows(build.prepared, header.chunk, build.points)[number]
-    measurer = measurer_of(build, rows)
-    figures = measurer.figures(list(np.array(build.scratch.read("states"))))
-    last = np.array(build.scratch.read("last-state"))
-    chunks, kept, exact = chunks_of_rows(build.prepared, header, measurer.values(last, kinds_of(build.prepared)), rows)
-    write_measured(build, number, figures, chunks, kept, exact)
-
-
-def measurer_of(build: Build, rows: tuple[int, int]) -> RowsMeasurer:
-    """What measures these rows."""
-    layout, predictors = build.prepared.layout, build.scratch.read("predictors")
-    columns = 0, layout.shape(0, layout.levels)[1]
-    region = Region.window(layout, layout.levels, rows, columns, min(_bands(build).core, window_core(layout)))
-    part = part_of(build.table(0), region.tiles)
-    channels = [known_tiles(build, part, channel) for channel in range(build.channels)]
-    prepared = build.prepared
-    given, lattices = RowsGiven.prepared(prepared, rows), build.lattices.channels
-    return RowsMeasurer(given, lattices, prepared.geometric, np.array(predictors), region, channels)
+    figures, residual = measuring.measure(build, header, measured_runs(header, build.points)[number])
+    write_measured(build, number, figures, residual.chunks, residual.kept, residual.exact)
 
 
 def _bands(build: Build) -> Bands:

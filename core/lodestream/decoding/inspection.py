@@ -19,12 +19,12 @@ from ..planning.window_errors import CELL, WindowErrors, layer_codes
 from ..quantization.measure import extent_of
 from ..surface import Surface
 from .inspected_sections import Walked
+from .measurer import Measured
 from .progress import initial_state
 
 __all__ = [
     "READ",
     "Inspection",
-    "Measured",
     "check_errors",
     "check_levels",
     "check_values",
@@ -57,10 +57,6 @@ class Inspection:
 
     index: Index
     errors_checked: bool
-
-
-#: Errors of a state, and the squared distances in cells, one array or none; see `coordinate_distances`.
-Measured = tuple[Errors, list[NDArray[np.float64]]]
 
 
 def check_values(index: Index, holes: tuple[int, ...], corners: Sequence[NDArray[Any]]) -> None:

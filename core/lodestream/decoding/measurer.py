@@ -203,7 +203,10 @@ class Measurer:
         return Figures(squares, equal, np.array(counts, np.int64))
 
     def exact_errors(self, state: State) -> Measured:
-        """Errors of a state of the whole surface, also where float64 does not hold the squares of its values."""
+        """Errors of a state, int8, shape (tile, channel), of the whole surface.
+
+        They are found also where float64 does not hold the squares of its values.
+        """
         cells, found = list[NDArray[np.float64]](), list[tuple[float, float]]()
         known = self._known(state)
         for number, (originals, channels, first) in enumerate(self._compared):

@@ -23,7 +23,7 @@ from ..grid.multiblock import grids_of, shared_points
 from ..joints import Groups
 from ..mesh.joining import change_of
 from ..quality import Quality
-from ..quantization.distortion import Original, originals_of, other_originals
+from ..quantization.distortion import Original, originals_of
 from ..quantization.lattice import find_lattice
 from ..quantization.lattice_choice import DEFAULT_DIVISIONS, choose_lattices
 from ..quantization.lattice_depth import default_divisions
@@ -106,21 +106,8 @@ class Prepared:
     @cached_property
     def originals(self) -> tuple[Original, ...]:
         """What the coordinates of each patch are compared with."""
-        return tuple(self.originals_of(None))
-
-    def originals_of(self, chosen: Sequence[int] | None) -> list[Original]:
-        """The same of some patches, by their numbers; None: of all."""
         masks = [block.mask for block in self.surface.blocks]
-        return originals_of(self.arrangement, [own[0] for own in self.arrays], masks, chosen)
-
-    def others_of(self, chosen: Sequence[int] | None) -> list[tuple[list[Original], int]]:
-        """What the channels that are no coordinates are compared with, of some patches; None: of all.
-
-        Of each channel what `other_originals` says of it.
-        """
-        blocks = self.surface.blocks
-        arrays = [given_arrays(block) for block in blocks]
-        return other_originals(self.arrangement, arrays, [block.mask for block in blocks], self.geometric, chosen)
+        return tuple(originals_of(self.arrangement, [own[0] for own in self.arrays], masks))
 
     def comparisons(self, region: Region) -> list[Comparison]:
         """What the channels of a region are compared with: of all blocks or some, or of rows of the only one."""

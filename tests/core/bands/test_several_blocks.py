@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.bands import grid_tasks, inspecting, made, tasks, transforming
-from lodestream.bands.grid_measuring import blocks_of_run
 from lodestream.bands.grid_runs import GridRuns
 from lodestream.bands.inspecting import inspect
+from lodestream.bands.measuring import measured_runs
 from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.container.reader import read_index
 from lodestream.decoding.inspection import Inspection
@@ -33,6 +33,7 @@ from lodestream.scratch import IN_MEMORY, FolderScratch, Room
 from lodestream.surface import Block, Surface
 
 from ..container.forgery import with_layer_errors
+from ..surfaces import index_of
 from .block_surfaces import KINDS, block_surface
 from .test_building import built
 
@@ -259,8 +260,9 @@ def test_many_small_blocks_go_together() -> None:
     surface = _plates()
     prepared = prepare(surface, Quality())
     points = sum(block.shape[0] * block.shape[1] for block in surface.blocks)
-    assert blocks_of_run(prepared, points) == [range(len(surface.blocks))]
-    assert blocks_of_run(prepared, 1) == [range(k, k + 1) for k in range(len(surface.blocks))]
+    header = index_of(ls.encode(surface)).header
+    assert measured_runs(header, points) == [range(len(surface.blocks))]
+    assert measured_runs(header, 1) == [range(k, k + 1) for k in range(len(surface.blocks))]
     runs, together = (GridRuns(prepared.layout, size, 600) for size in (1, 2 * points))
     for level in runs.levels:
         assert [run.tiles.start for run in runs.of(level)[1:]] == [run.tiles.stop for run in runs.of(level)[:-1]]
@@ -272,7 +274,7 @@ def test_many_small_blocks_go_together() -> None:
 def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     surface = _plates()
     expected, calls = ls.encode(surface), [0]
-    step, measure = grid_tasks.second_step, grid_tasks.measure
+    step, measure = grid_tasks.second_step, tasks.measure
 
     def counted(*arguments: Any) -> None:
         calls[0] += 1
@@ -282,13 +284,13 @@ def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(grid_tasks, "second_step", counted)
-    monkeypatch.setattr(grid_tasks, "measure", cut)
+    monkeypatch.setattr(tasks, "measure", cut)
     monkeypatch.setattr(made, "_FEWEST", 1)
     with pytest.raises(KeyboardInterrupt):
         ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, scratch=tmp_path / "scratch")
     before = calls[0]
     assert before > 0
-    monkeypatch.setattr(grid_tasks, "measure", measure)
+    monkeypatch.setattr(tasks, "measure", measure)
     ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, scratch=tmp_path / "scratch")
     assert calls[0] == before, "what was transformed is not transformed again"
     assert (tmp_path / "a.lode").read_bytes() == expected

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.container.model import Header
 from lodestream.decoding.reconstructor import Reconstructor, known_state
 from lodestream.decoding.region import Region
-from lodestream.encoding.states import StateReconstructor
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.grid.layout import Grid, Layout, Source
@@ -54,8 +51,8 @@ def test_every_state_is_what_it_is_by_itself(layout: Layout, seed: int) -> None:
         tiles.early[:] = rng.integers(0, 13, tiles.early.size)
     predictors = default_predictors(layout)
     predictors[...] = rng.integers(-20, 30, predictors.shape)
-    header: Any = SimpleNamespace(layout=layout, predictors=[predictors] * 3, geometric=2)
-    reconstructor = StateReconstructor(cast("Header", header), channels)
+    region = Region.whole(layout, layout.levels)
+    reconstructors = [Reconstructor(region, predictors, tiles, channel < 2) for channel, tiles in enumerate(channels)]
     interfaces = sum(grid.interface for grid in layout.grids)
     state = np.full((len(layout.tiles), 3), UNANNOUNCED, np.int8)
     for _ in range(6):
@@ -63,16 +60,19 @@ def test_every_state_is_what_it_is_by_itself(layout: Layout, seed: int) -> None:
         changed = rng.random(state.shape) < 0.5
         changed[:first] = False
         state = np.where(changed, rng.choice([0, 0, 0, 1, 4, 7, UNANNOUNCED], state.shape), state).astype(np.int8)
-        for place, channel in ((0, 0), (1, 1), (0, 2)):
-            fraction = reconstructor.reconstruct(place, channel, np.ascontiguousarray(state[:, channel]))
-            known = known_state(channels[channel].table, state[:, channel], layout.levels)
-            region = Region.whole(layout, layout.levels)
-            expected = Reconstructor(region, predictors, channels[channel], channel < 2).reconstruct(known)
+        for channel, tiles in enumerate(channels):
+            known = known_state(tiles.table, state[:, channel], layout.levels)
+            grids, fraction = reconstructors[channel].reconstruct(known)
+            expected = Reconstructor(region, predictors, tiles, channel < 2).reconstruct(known)
             assert fraction == expected[1]
             first_grid = interfaces if channel == 2 else 0  # interfaces mean nothing to what is no coordinate
-            pairs = zip(reconstructor.canvases[first_grid:], expected[0][first_grid:], strict=True)
-            for canvas, whole in pairs:
-                np.testing.assert_array_equal(canvas[place, : whole.shape[0], : whole.shape[1]], whole)
+            frames = reconstructors[channel].frames
+            for grid, frame, alone in zip(
+                grids[first_grid:], frames[first_grid:], expected[0][first_grid:], strict=True
+            ):
+                np.testing.assert_array_equal(grid, alone)
+                np.testing.assert_array_equal(frame[:, : alone.shape[1]], alone)
+                assert frame.flags.c_contiguous
 
 
 def _surfaces() -> dict[str, tuple[ls.Surface, dict[str, Any]]]:
