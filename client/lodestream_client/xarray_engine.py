@@ -1,7 +1,7 @@
 """``xarray.open_dataset(..., engine="lode")``: containers in files, on web servers and on Lodestream servers, lazily.
 
-What is indexed is decoded as an exact window of the surface, so only the bytes that the window needs are read. Of a
-coarser level, and of several blocks, everything is decoded at the first access.
+What is indexed is decoded as a window of the surface, or of a coarser level of it, so only the bytes that the window
+needs are read. Of several blocks everything is decoded at the first access.
 """
 
 from __future__ import annotations
@@ -25,14 +25,15 @@ from lodestream.container import read_index
 from lodestream.container.capacity import Capacity
 from lodestream.container.model import ByteRange, Header
 from lodestream.decoding.decoder import Decoder, View
-from lodestream.decoding.level_grids import level_positions
+from lodestream.decoding.level_grids import level_nodes, level_positions
 from lodestream.decoding.window_metadata import window_closed, window_metadata
 from lodestream.errors import InputError, LodestreamError, OptionError, named
-from lodestream.grid.window import taken
+from lodestream.grid.patches import level_masks
+from lodestream.grid.window import spanning, taken
 from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
 from lodestream.planning.planner import plan
-from lodestream.planning.selection import Selection
+from lodestream.planning.selection import region_at, selection_of
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target, check_integer
 
@@ -81,8 +82,8 @@ class LodeBackend(BackendEntrypoint):
         level : int, optional
             A coarser level; None: full resolution.
         region : ((int, int), (int, int)), optional
-            This window only, of the full grid: rows and columns, half-open. Along a closed axis it may go on across the
-            seam, as columns 350:370 of 360.
+            This window only: rows and columns, half-open, of the full grid at any level. Along a closed axis it may go
+            on across the seam, as columns 350:370 of 360.
         block : int, optional
             Of several blocks, the one to open; `open_datatree` opens all.
         token : str, optional
@@ -93,8 +94,7 @@ class LodeBackend(BackendEntrypoint):
         Raises
         ------
         OptionError
-            If a level, region or block is not there, there are several blocks and none is chosen, or a level and a
-            region are.
+            If a level, region or block is not there, or there are several blocks and none is chosen.
         StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
             If the container is damaged or too large, or cannot be had. A note of the error names the file.
         """
@@ -211,12 +211,9 @@ class Container:
         OptionError
             If there is no such level or window.
         """
-        if region is not None:
-            Selection(Target(level=level, region=region).region).check(self.header)
-        finest = self.header.levels
-        if level is not None and not 0 <= (level := check_integer("a level", level)) <= finest:
-            raise OptionError(f"expected a level of 0 to {finest}, got {level}")
-        level = finest if level is None else level
+        selection = selection_of(Target(level=level, region=region))
+        selection.check(self.header)
+        finest, level = self.header.levels, selection.finest(self.header)
         grid = self._grid(level, block, region)
 
         def lazily(part: Part) -> tuple[Any, dict[str, Any]]:
@@ -257,12 +254,13 @@ class Container:
             if known is None:
                 one = self.whole(level, ()).blocks[block]
                 return Grid.of(one, metadata)
-            if header.point_channels == 1:
+            if region is None and header.point_channels == 1:
                 metadata = level_positions(metadata, header, level)
             shape = known
         if region is not None:
-            metadata, closed = window_metadata(metadata, shape, region), window_closed(closed, shape, region)
-            shape = region[0][1] - region[0][0], region[1][1] - region[1][0]
+            metadata, inside = window_metadata(metadata, header, region, level), region_at(header, region, level)
+            closed = window_closed(closed, shape, inside)
+            shape = inside[0][1] - inside[0][0], inside[1][1] - inside[1][0]
         attributes = tuple((kind.name, kind.dtype, kind.components) for kind in header.attributes)
         channels = 3 if header.plane is not None else 0 if header.flat else header.point_channels
         return Grid(shape, closed, channels, header.dtype, attributes, header.masked, metadata)
@@ -276,14 +274,17 @@ class Container:
                 self._levels[key] = self._decoded(target).surface(level)
             return self._levels[key]
 
-    def window(self, region: Region, attributes: tuple[str, ...]) -> Block:
-        """A window of the only block at full resolution, exact, with these attributes; it has a valid point."""
-        key = region, attributes
+    def window(self, level: int, region: Region, attributes: tuple[str, ...]) -> Block:
+        """A window of the only block at a level, with these attributes; it has a valid point.
+
+        ``region`` has rows and columns of the full grid.
+        """
+        key = level, region, attributes
         with self._lock:
             if key in self._windows:
                 self._windows.move_to_end(key)
                 return self._windows[key].blocks[0]
-        found = self._decoded(Target(region=region, attributes=attributes)).surface()
+        found = self._decoded(Target(level=level, region=region, attributes=attributes)).surface()
         with self._lock:
             self._windows[key] = found
             while len(self._windows) > _WINDOWS:
@@ -336,7 +337,16 @@ class _Lazy(BackendArray):
         self, container: Container, part: Part, grid: Grid, level: int, block: int, region: Region | None
     ) -> None:
         self._container, self._part, self._level, self._block = container, part, level, block
-        self._first = (0, 0) if region is None else (region[0][0], region[1][0])
+        self._first, self._mask = (0, 0), None
+        if len(container.header.blocks) == 1:
+            header = container.header
+            self._nodes = level_nodes(header, level)[0]
+            (mask,) = level_masks(header.patches, header.layout, level, header.masks)
+            # If no node of a level is valid, the values under the holes are shown.
+            self._mask = mask if mask is not None and mask.any() else None
+            if region is not None:
+                (top, _), (left, _) = region_at(header, region, level)
+                self._first = top, left
         components = {name: count for name, _, count in grid.attributes}
         width = components.get(part.attribute, 0) if part.attribute is not None else 0
         self.shape = (*grid.shape, width) if width else grid.shape
@@ -348,35 +358,39 @@ class _Lazy(BackendArray):
     def _taken(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
         """Values at numbers and slices along each axis."""
         header, names = self._container.header, () if self._part.attribute is None else (self._part.attribute,)
-        if self._level < header.levels or len(header.blocks) > 1:
+        if len(header.blocks) > 1:
             return np.array(values_of(self._container.whole(self._level, names).blocks[self._block], self._part)[key])
         (rows, row), (columns, column) = (_span(at, n) for at, n in zip(key[:2], self.shape[:2], strict=True))
         if rows[0] == rows[1] or columns[0] == columns[1]:
             return np.empty((rows[1] - rows[0], columns[1] - columns[0], *self.shape[2:]), self.dtype)[
                 row, column, *key[2:]
             ]
-        spans = zip(self._first, (rows, columns), header.shape, strict=True)
+        shape = len(self._nodes[0]), len(self._nodes[1])
+        spans = zip(self._first, (rows, columns), shape, strict=True)
         rows, columns = (((first + start) % n, (first + start) % n + stop - start) for first, (start, stop), n in spans)
-        around = self._around((rows, columns))
-        values = values_of(self._container.window(around, names), self._part)
+        around = self._around((rows, columns), shape)
+        window = spanning(around, header.shape, self._nodes)
+        values = values_of(self._container.window(self._level, window, names), self._part)
         (top, _), (left, _) = around
         cut = values[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]
         return np.array(cut[row, column, *key[2:]])  # a copy, since others take theirs from the same window
 
-    def _around(self, region: Region) -> Region:
-        """A region that is a surface: it has two points or more, one of them valid, of which there is one somewhere."""
-        header, by = self._container.header, 0
-        mask = header.masks[0]
+    def _around(self, region: Region, shape: tuple[int, int]) -> Region:
+        """A window of the level that is a surface: it has two points or more, one of them valid.
+
+        ``shape`` is that of the level, which has such points.
+        """
+        mask, by = self._mask, 0
         while True:
             # One that crosses the seam grows at its end, until it has the whole axis.
             rows, columns = (
                 (max(start - by, 0), min(stop + by, length))
                 if stop <= length
                 else (start, min(stop + by, start + length))
-                for (start, stop), length in zip(region, header.shape, strict=True)
+                for (start, stop), length in zip(region, shape, strict=True)
             )
             enough = (rows[1] - rows[0]) * (columns[1] - columns[0]) > 1
-            if enough and (mask is None or taken(mask, (rows, columns), header.shape).any()):
+            if enough and (mask is None or taken(mask, (rows, columns), shape).any()):
                 return rows, columns
             by = 2 * by + 1
 

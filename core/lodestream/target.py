@@ -152,7 +152,8 @@ class Target:
         the end of a level.
     region : ((int, int), (int, int)) or None
         Only this window: rows and columns, half-open, in full-resolution indices. Along a closed axis it may go on
-        across the seam: of 360 columns, 350:370 are the last ten and the first ten.
+        across the seam: of 360 columns, 350:370 are the last ten and the first ten. With a level, the window is that of
+        the level: its points that stand in the region, which is the same place at every level.
     attributes : tuple of str or None
         Names of the attributes to include; None: all.
     first : ((int, int), (int, int)) or None
@@ -162,7 +163,7 @@ class Target:
     ------
     OptionError
         If a value is not allowed, an attribute is named twice, or two contradict each other: a level and other limits,
-        a level or errors of channels and a region, errors of channels and of the whole surface.
+        errors of channels and a region, errors of channels and of the whole surface.
 
     Examples
     --------
@@ -202,8 +203,6 @@ class Target:
         if self.order not in ("quality", "level"):
             raise OptionError(f"expected order quality or level, got {self.order!r}")
         if self.region is not None:
-            if self.level is not None:
-                raise OptionError("expected either a level or a region, got both")
             check_spans(self.region)
         if self.first is not None:
             check_spans(self.first)

@@ -61,8 +61,9 @@ What all commands have in common:
   may go on across the seam: of 360 columns, `--roi 10:20,350:370` takes the last ten and then the first ten. Its
   geotransform or axes go on beyond the seam, so that longitudes do not jump. `--attributes speed,kind`
   decodes only these attributes, `--attributes none` only the points. `pull` transfers only what they need. They can be
-  combined with each other and with the limits. `--roi` cannot be combined with `--level`, nor with errors of channels
-  (NAME=E), because a container has bounds of the errors of windows only for all channels together.
+  combined with each other and with the limits. `--level K --roi 100:220,300:460` is the same place at level K: the
+  level's points that stand in rows 100 to 219 and columns 300 to 459. `--roi` cannot be combined with errors of
+  channels (NAME=E), because a container has bounds of the errors of windows only for all channels together.
 - Until a window is exact, its errors are upper bounds: `--until-rms E` and `--until-max E` stop where the error inside
   is certainly at most the limit. `info` shows errors of the whole surface only.
 - With `--json` they print `bytes` (of the surface, comparable with the layers of `info`), `wire_bytes` (everything that

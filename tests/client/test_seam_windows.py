@@ -103,7 +103,7 @@ def test_xarray_opens_it_as_a_dataset(container: Path, served: str, globe: ls.Su
             # Longitudes go on beyond the seam.
             assert data.x.values.tolist() == list(range(350, 370))
             assert data.y.values.tolist() == [59.5 - row for row in range(10, 20)]
-    with pytest.raises(ls.OptionError, match="either a level or a region"):
+    with pytest.raises(ls.OptionError, match="points of level 1"):
         xarray.open_dataset(container, engine="lode", region=REGION, level=1)
     with pytest.raises(ls.OptionError, match="expected columns within"):
         xarray.open_dataset(container, engine="lode", region=((0, 9), (350, 711)))

@@ -121,6 +121,53 @@ def test_a_window_reads_a_part_of_the_file(original: ls.Surface, tmp_path: Path)
         assert len(server.requests) == before
 
 
+def test_a_window_of_a_level_reads_what_it_needs_alone(tmp_path: Path) -> None:
+    x = np.mgrid[:2048, :2048][1]
+    rough = (np.random.default_rng(1).normal(0, 30, x.shape) + x).round().astype("i2")
+    data = ls.encode(rough)
+    (tmp_path / "large.lode").write_bytes(data)
+    decoder = ls.Decoder()
+    decoder.feed(data)
+    assert decoder.header is not None
+    level = decoder.header.levels - 1
+    whole = decoder.points_at(level)
+    with files.ranged(tmp_path) as server:
+
+        def read(rows: slice, columns: slice, **options: Any) -> tuple[NDArray[Any], int]:
+            """What is indexed, and the bytes of the file that were read for it after opening."""
+            found, before = opened(f"{server.url}/large.lode", **options), len(server.requests)
+            values = found.z.isel(y=rows, x=columns).values
+            asked = [told for method, told in server.requests[before:] if method == "GET" and told]
+            return values, sum(int(last) - int(first) + 1 for first, last in (told[6:].split("-") for told in asked))
+
+        window, size = read(slice(500, 550), slice(150, 210), level=level)
+        assert np.array_equal(window, whole[500:550, 150:210])
+        everything, size_of_level = read(slice(None), slice(None), level=level)
+        assert np.array_equal(everything, whole)
+        _, size_of_finest = read(slice(1000, 1100), slice(300, 420))
+        assert 0 < size < size_of_level / 3
+        assert size < 0.8 * size_of_finest
+        # The same place by the full grid's rows and columns.
+        same, size_of_region = read(slice(None), slice(None), level=level, region=((1000, 1100), (300, 420)))
+        assert np.array_equal(same, window)
+        assert size_of_region == size
+
+
+@pytest.mark.parametrize("level", [5, 7])
+@pytest.mark.parametrize("key", [*KEYS[:3], (5, slice(0, 50)), (slice(None), -1)])
+def test_whatever_is_indexed_of_a_level_is_the_levels_own(path: Path, level: int, key: Any) -> None:
+    decoder = ls.Decoder()
+    decoder.feed(path.read_bytes())
+    wanted = decoder.surface(level).to_xarray()
+    assert isinstance(wanted, xr.Dataset)
+    with opened(path, level=level) as found:
+        for name in ("z", "speed", "wind"):
+            xr.testing.assert_equal(found[name][key], wanted[name][key])
+        region = (40, 300), (100, 500)
+    with opened(path, level=level, region=region) as found:
+        xr.testing.assert_allclose(found.load(), decoder.view().window(region, level).to_xarray())
+
+
 def test_a_served_surface_with_and_without_a_level(server: str, original: ls.Surface, path: Path) -> None:
     url = sync.upload(server, path).url
     wanted = original.to_xarray()

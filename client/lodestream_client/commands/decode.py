@@ -144,10 +144,9 @@ class _Job:
     ) -> None:
         from lodestream.decoding.decoder import Decoder
         from lodestream.planning.byte_ranges import RangeSet
-        from lodestream.planning.selection import selection_of
 
         target = options.target
-        self.decoder: Decoder = Decoder(selection_of(target), max_vertices=options.max_vertices, level=target.level)
+        self.decoder: Decoder = Decoder(target, max_vertices=options.max_vertices)
         self.ended = "complete"
         self.view: View | None = None  # where it ended, if more has been fed
         self.read = RangeSet()  # what was read; the header and the index more than once

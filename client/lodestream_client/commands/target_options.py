@@ -41,7 +41,7 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
         type=parse_region,
         metavar="R0:R1,C0:C1",
         help="this window only: rows R0 to R1 - 1 and columns C0 to C1 - 1 of the full grid, across the seam of a "
-        "closed axis too; OUT is the window, and E is the error in it",
+        "closed axis too; OUT is the window, or with --level K the points of level K in it; E is the error in it",
     )
     group.add_argument(
         "--attributes",

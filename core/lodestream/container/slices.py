@@ -51,10 +51,21 @@ class Slices:
         Those that are wanted, by their number.
     whole : bool
         They are all of the container.
+    level : int or None
+        The finest level of the segments that are wanted; None: full resolution. A layer that has finer ones is then no
+        state.
     """
 
-    def __init__(self, index: Index, segments: Sequence[Segment], chunks: Mapping[int, Chunk], whole: bool) -> None:
+    def __init__(
+        self,
+        index: Index,
+        segments: Sequence[Segment],
+        chunks: Mapping[int, Chunk],
+        whole: bool,
+        level: int | None = None,
+    ) -> None:
         self._index, self._whole = index, whole
+        self._level = index.header.levels if level is None else level
         numbered = {chunk.range.offset: number for number, chunk in chunks.items()}
         self._numbers: Mapping[int, int] = numbered
         items: list[Segment | Chunk] = [*segments, *chunks.values()]
@@ -81,7 +92,7 @@ class Slices:
         self._levels = [self._level_of[s.tile] for s in segments]
         self._layer_level = _running_levels([s.layer for s in segments], self._levels, len(index.layers))
         self._by_layer = _Groups([s.layer for s in segments], len(index.layers))
-        self._by_level = _Groups(self._levels, len(index.levels))
+        self._by_level = _Groups(self._levels, self._level + 1)
 
     def continue_file(self, position: int) -> None:
         """Begin where a file was read in its order as far as a section that ends at ``position``.
@@ -107,7 +118,7 @@ class Slices:
             ]
             self._near = (
                 _Groups([layer for layer, _ in missing], len(self._index.layers)),
-                _Groups([level for _, level in missing], len(self._index.levels)),
+                _Groups([level for _, level in missing], self._level + 1),
             )
         self._reached = self._groups_reached()
 
@@ -182,8 +193,9 @@ class Slices:
     def state(self) -> State | None:
         """The state that is complete now, if it is one; the first ones may need no segment at all."""
         risen = self._risen()
-        layer = self._by_layer.whole(self._received)
-        if layer is not None:
+        layer, level = (groups.whole(self._received) for groups in (self._by_layer, self._by_level))
+        ended = level == self._level < self._index.header.levels
+        if layer is not None and self._index.layers[layer].level <= self._level and not ended:
             record = self._index.layers[layer]
             last = layer == len(self._index.layers) - 1
             if last and not self._chunks:
@@ -192,7 +204,6 @@ class Slices:
             finest = self._layer_level[layer]
             known = record.errors
             return State(layer, finest, size, *known[:2], False, last, channels=known.channels)
-        level = self._by_level.whole(self._received)
         if level is not None and level < self._index.header.levels and not self._in_file:
             known = self._index.levels[level].errors
             return State(level, level, self._bytes, *known[:2], False, False, level, channels=known.channels)

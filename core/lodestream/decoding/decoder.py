@@ -55,8 +55,8 @@ class Decoder:
         Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
         as fits this process's memory.
     level : int or None
-        The finest level that the caller will use; None: that of a target, else the whole surface. Only memory for this
-        level is then counted.
+        The finest level that the caller will use; None: that of the selection, else full resolution. Only memory for
+        this level is then counted, and a window is that of this level.
 
     Raises
     ------
@@ -88,10 +88,9 @@ class Decoder:
     ) -> None:
         require("decoding")
         if isinstance(selection, Target):
-            level = selection.level if level is None else level
             selection = selection_of(selection)
-        self._selection = selection or Selection()
-        self._finest = level
+        selection = selection or Selection()
+        self._selection = selection if level is None else replace(selection, level=level)
         self.capacity = Capacity(max_vertices)
         self.header: Header | None = None
         self._index: Index | None = None
@@ -294,13 +293,12 @@ class Decoder:
             raise CorruptStreamError("expected one header, got a second", frame.offset)
         self.header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
         self._selection.check(self.header)
-        self._selection.check_size(self.header, self.capacity, self._finest)
+        self._selection.check_size(self.header, self.capacity)
         if not self.header.masked:
             self._begin(self.header)
 
     def _begin(self, header: Header) -> None:
-        region = self._selection.region
-        self._window = None if region is None else WindowState(header, region)
+        self._window = None if self._selection.region is None else WindowState(header, self._selection)
         self._progress = Progress(header)
         self._queue = SegmentQueue(header)
         self._level = 0
@@ -353,7 +351,7 @@ class Decoder:
         header = self.header
         if header is None or not (self.complete and header.corrected) or self._queue.dropped:
             return
-        if self._finest is None or self._finest >= header.levels:
+        if self._selection.finest(header) == header.levels:
             try:
                 if self._ending.digest is None:
                     self.layers[-1].verify()
@@ -428,7 +426,8 @@ class Decoder:
             chosen = select(index, self._selection)
             if self._window is not None:
                 self._window.follow(index)
-            self._slices = Slices(index, chosen.segments, chosen.chunks, chosen.whole)
+            finest = None if self._window is None else self._selection.finest(self.header)
+            self._slices = Slices(index, chosen.segments, chosen.chunks, chosen.whole, finest)
             if self.layers or self._frames.partial:
                 # The file was read in its own order so far, and is not any more.
                 self._slices.continue_file(self._frames.position)

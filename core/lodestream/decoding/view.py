@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from ..container.digest import values_digest
 from ..errors import CorruptStreamError, InputError, OptionError
 from ..grid.patches import level_masks
-from ..grid.window import contains, places, taken, within
+from ..grid.window import contains, taken, within
 from ..joints import Nodes
-from ..planning.selection import Selection, restored
+from ..planning.selection import Selection, region_at, restored
 from ..surface import Block, Closed, Surface
 from ..target import Region as Window
+from ..target import check_integer
 from .level_grids import level_nodes, level_positions, with_rules
 from .region import Region
 from .segments import SegmentQueue
 from .values import Values, block_of
-from .window_metadata import window_closed, window_metadata
+from .window_metadata import positions, window_closed, window_metadata
 
 __all__ = ["Ending", "View"]
 
@@ -105,7 +106,13 @@ class View:
         InputError
             If there are several blocks; use `surface`.
         """
-        return self._shown(self._queue.header.levels).points
+        return self._shown(self._finest).points
+
+    @property
+    def _finest(self) -> int:
+        """The finest level that can be shown: of a window the one that was asked for."""
+        header, selection = self._queue.header, self._selection
+        return header.levels if selection.region is None else selection.finest(header)
 
     def prepare(self) -> None:
         """Decode what has come until here, so that the points of this view or a later one are made sooner.
@@ -139,30 +146,41 @@ class View:
             raise OptionError(f"expected a block of 0 to {len(surface.blocks) - 1}, got {block}")
         return surface.blocks[block].points
 
-    def window(self, region: Window) -> Surface:
-        """The points of a window at full resolution; costs time and memory for the window only.
+    def window(self, region: Window, level: int | None = None) -> Surface:
+        """The points of a window, at full resolution or at a coarser level; costs time and memory for the window only.
 
-        Heights whose values lie on a lattice (integers, decimals) are exact in the window as soon as the data that it
-        needs have arrived. `points` is exact only when everything has arrived.
+        At full resolution, heights whose values lie on a lattice (integers, decimals) are exact in the window as soon
+        as the data that it needs have arrived. `points` is exact only when everything has arrived. The window of a
+        coarser level is always cut out of that level's grid, bit for bit as `surface` gives it.
 
         Parameters
         ----------
         region : ((int, int), (int, int))
-            Rows and columns, half-open, in full-resolution indices; along a closed axis they may go on across the seam,
-            as columns 350:370 of 360.
+            Rows and columns, half-open, in full-resolution indices at any level; along a closed axis they may go on
+            across the seam, as columns 350:370 of 360.
+        level : int, optional
+            Of a coarser level, the window is its points that stand in the region. None: full resolution, or the finest
+            level of a window that was received at a coarser one.
 
         Raises
         ------
         OptionError
-            If the region is outside the surface, the surface has several blocks, or the view holds another region only.
+            If the region is outside the surface or has no point of the level, the surface has several blocks, the view
+            holds another region only, or there is no such level.
         """
         header, shown = self._queue.header, self._selection.region
-        selection = Selection(region, self._selection.attributes)
+        finest = self._finest
+        level = finest if level is None else check_integer("a level", level)
+        if not 0 <= level <= finest:
+            raise OptionError(f"expected a level of 0 to {finest}, got {level}")
+        selection = Selection(region, self._selection.attributes, level)
         selection.check(header)
         if shown is not None and not contains(shown, region, header.shape):
             raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
-        state = self._state.copy()
-        state[~selection.tiles(header)] = 0
+        state = self._state
+        if level == header.levels:
+            state = state.copy()
+            state[~selection.tiles(header)] = 0
         return replace(self, _selection=selection, _state=state).surface()
 
     def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
@@ -171,8 +189,9 @@ class View:
         Parameters
         ----------
         level : int, optional
-            A level; None: full resolution. The geotransform of a coarser level spans the same area. Files of the
-            finest level repeat the rows and columns that the source repeats, files of coarser ones do not.
+            A level; None: full resolution, or the finest level of a window that was received at a coarser one. The
+            geotransform of a coarser level spans the same area. Files of the finest level repeat the rows and columns
+            that the source repeats, files of coarser ones do not.
         metadata : mapping, optional
             Used instead of the container's metadata, which may not have arrived yet.
 
@@ -184,7 +203,7 @@ class View:
             If the SHA-256 of the complete surface is wrong, or no value is finite.
         """
         header = self._queue.header
-        shown = header.levels if level is None else level
+        shown = self._finest if level is None else level
         surface = self._shown(shown, metadata)
         whole = shown == header.levels and self._selection.region is None
         surface.joints = header.joints if whole else header.joints.at(self._nodes(shown))
@@ -192,11 +211,9 @@ class View:
 
     def _shown(self, level: int, metadata: Mapping[str, Any] | None = None) -> Surface:
         """`surface`, but for which of its points are one: who asks for points alone need not wait for that."""
-        header, region = self._queue.header, self._selection.region
-        if not 0 <= level <= header.levels:
-            raise OptionError(f"expected a level of 0 to {header.levels}, got {level}")
-        if region is not None and level != header.levels:
-            raise OptionError(f"expected the finest level, {header.levels}, for a window, got {level}")
+        header = self._queue.header
+        if not 0 <= level <= self._finest:
+            raise OptionError(f"expected a level of 0 to {self._finest}, got {level}")
         values = dict(self._metadata if metadata is None else metadata)
         if level != header.levels:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
@@ -204,7 +221,7 @@ class View:
         if kept is None:
             surface, values = self._positioned(Surface(blocks=self._blocks(level)), values, level)
         else:
-            surface, values = kept, values if region is None else window_metadata(values, header.shape, region)
+            surface, values = kept, self._placed_metadata(values, level)
         self._check_digest(surface, level)
         surface.metadata = values
         return surface
@@ -244,8 +261,8 @@ class View:
 
         header, region = self._queue.header, self._selection.region
         if region is not None:
-            (top, bottom), (left, right) = region
-            return view_html(self, self.surface(), [(bottom - top, right - left)])
+            window = self.surface()
+            return view_html(self, window, [window.blocks[0].shape])
         layout = header.layout
         widest = [max(max(layout.shape(g, level)) for g in range(len(layout.grids))) for level in range(layout.levels)]
         level = next((level for level, width in enumerate(widest) if width >= SMALL), None)
@@ -257,24 +274,25 @@ class View:
         header, chosen = queue.header, self._selection.channels(queue.header)
         corrected = self._corrected and level == header.levels
         masks = level_masks(header.patches, header.layout, level, header.masks)
+        if level < header.levels:  # if no node of a level is valid, the values under the holes are shown
+            masks = [mask if mask is None or mask.any() else None for mask in masks]
         closures: list[Closed] = [closed for _, closed in header.blocks]
         region = Region.whole(header.layout, level)
         if window is not None and header.arrangement is None:
-            region = Region.window(header.layout, level, *restored(header, window))
+            region = Region.window(header.layout, level, *restored(header, window, level))
         # Of a block that meets itself all is made: what its sides share may lie anywhere in it.
         values = queue.values(self._length, self._state, region, corrected, chosen)
         if window is not None:
-            around = region.spans or ((0, header.shape[0]), (0, header.shape[1]))
-            values = {0: Values([within(array, around, window, header.shape) for array in values[0].arrays])}
-            masks = [None if mask is None else taken(mask, window, header.shape) for mask in masks]
-            closures = [window_closed(header.closed, header.shape, window)]
+            shape, inside = header.level_shape(level) or header.shape, region_at(header, window, level)
+            around = region.spans or ((0, shape[0]), (0, shape[1]))
+            values = {0: Values([within(array, around, inside, shape) for array in values[0].arrays])}
+            masks = [None if mask is None else taken(mask, inside, shape) for mask in masks]
+            closures = [window_closed(header.closed, shape, inside)]
         return [self._block(values[number].arrays, *of) for number, of in enumerate(zip(closures, masks, strict=True))]
 
     def _block(self, arrays: Sequence[NDArray[Any]], closed: Closed, mask: NDArray[np.bool_] | None) -> Block:
         """One block of its points and attributes, shape (row, column, component) each; ``mask``, (row, column)."""
         header, selection = self._queue.header, self._selection
-        if mask is not None and selection.region is None and not mask.any():
-            mask = None  # no node of so coarse a level is valid: the values under the holes are shown
         finite = selection.region is None and not self._corrected  # the values of a lattice are
         try:
             return block_of(header, arrays, closed, mask, selection.attributes, finite)
@@ -287,11 +305,18 @@ class View:
         """The surface with the x and y that its heights came with, and the metadata of its level or window."""
         header, region = self._queue.header, self._selection.region
         finest = level == header.levels
-        if not finest and len(surface.blocks) == 1 and header.point_channels == 1:
-            values = level_positions(values, header, level)
         whole = finest and region is None
         surface = with_rules(surface, header, None if whole else self._nodes(level)[0], self._kept(finest))
-        return surface, values if region is None else window_metadata(values, header.shape, region)
+        return surface, self._placed_metadata(values, level)
+
+    def _placed_metadata(self, values: dict[str, Any], level: int) -> dict[str, Any]:
+        """The metadata of the grid of a level, or of the window of it, from those of the whole surface."""
+        header, region = self._queue.header, self._selection.region
+        if region is not None:
+            return window_metadata(values, header, region, level)
+        if level < header.levels and len(header.blocks) == 1 and header.point_channels == 1:
+            return level_positions(values, header, level)
+        return values
 
     def check_digest(self) -> None:
         """Hold the SHA-256 that `verify` computed to the one that came with the values, if both are known.
@@ -319,7 +344,8 @@ class View:
         """Which rows and columns of each block are shown at a level, or in the window."""
         header, region = self._queue.header, self._selection.region
         if region is not None:
-            rows, columns = map(places, region, header.shape)
+            lines = zip(positions(header, region, level), header.shape, strict=True)
+            rows, columns = (line % length for line, length in lines)
             return [(rows, columns)]
         return level_nodes(header, level)
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..container.model import Header
 from ..coordinates.height_fields import axes_at
+from ..planning.selection import region_at
 from ..surface import Closed
 from ..target import Region
+from .level_grids import level_nodes, level_positions
 
-__all__ = ["window_closed", "window_metadata"]
+__all__ = ["positions", "window_closed", "window_metadata"]
 
 
 def window_closed(closed: Closed, shape: tuple[int, int], region: Region) -> Closed:
@@ -21,17 +25,57 @@ def window_closed(closed: Closed, shape: tuple[int, int], region: Region) -> Clo
     return rows, columns
 
 
-def window_metadata(metadata: dict[str, Any], shape: tuple[int, int], region: Region) -> dict[str, Any]:
-    """Metadata of a window of a surface of this shape: a geotransform, or axes, move with it.
+def window_metadata(metadata: dict[str, Any], header: Header, region: Region, level: int) -> dict[str, Any]:
+    """Metadata of a window of a level: a geotransform with its nodes, or axes, move with it.
 
-    Across the seam of a closed axis both go on, beyond the end of the surface.
+    Across the seam of a closed axis all go on, beyond the end of the surface.
+
+    Parameters
+    ----------
+    metadata : dict
+        Of the whole surface, of one block.
+    header : Header
+    region : ((int, int), (int, int))
+        Rows and columns, half-open, in full-resolution indices.
+    level : int
     """
-    (top, _), (left, _) = region
-    values = {key: value for key, value in metadata.items() if key not in ("seam", "turn", "poles")}
+    placed = metadata
+    if level < header.levels and header.point_channels == 1:
+        placed = level_positions(metadata, header, level)
+    values = {key: value for key, value in placed.items() if key not in ("seam", "turn", "poles", "nodes")}
+    shape, inside = header.level_shape(level) or header.shape, region_at(header, region, level)
+    (top, _), (left, _) = inside
+    lines = [_line(*of) for of in zip(placed.get("nodes") or (None, None), inside, shape, strict=True)]
+    if any(lines):
+        values["nodes"] = lines
     if (transform := values.get("geotransform")) is not None:
         x0, x_column, x_row, y0, y_column, y_row = transform
         x0, y0 = x0 + left * x_column + top * x_row, y0 + left * y_column + top * y_row
         values["geotransform"] = [x0, x_column, x_row, y0, y_column, y_row]
     if "axes" in values:
-        values["axes"] = axes_at(values["axes"], shape, [np.arange(*span) for span in region])
+        # Of the whole surface: a step of a level across the seam may be shorter than the others.
+        values["axes"] = axes_at(metadata["axes"], header.shape, positions(header, region, level))
     return values
+
+
+def positions(header: Header, region: Region, level: int) -> list[NDArray[np.int64]]:
+    """The rows and columns of the surface at which those of a window of a level stand.
+
+    int64, shape (row,) and (column,). Across the seam of a closed axis they go on beyond its end.
+    """
+    found = []
+    for line, (start, _), span, length in zip(
+        level_nodes(header, level)[0], region, region_at(header, region, level), header.shape, strict=True
+    ):
+        places = line[np.arange(*span) % len(line)]
+        found.append(np.where(places < start, places + length, places))
+    return found
+
+
+def _line(nodes: list[float] | None, span: tuple[int, int], length: int) -> list[float] | None:
+    """Where the rows or columns of a window stand, in steps of the even grid from its first; None where evenly."""
+    if nodes is None:
+        return None
+    places = np.arange(*span)
+    line = np.asarray(nodes, np.float64)[places % length] + places // length * length - span[0]
+    return None if np.array_equal(line, places - span[0]) else line.tolist()

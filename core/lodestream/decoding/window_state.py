@@ -18,7 +18,6 @@ from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
 from ..planning.selection import Selection
 from ..planning.window_errors import KIND, WindowFigures, parse_window_errors, window_section
-from ..target import Region
 from .progress import initial_state
 
 __all__ = ["WindowState"]
@@ -31,14 +30,16 @@ class WindowState:
     ----------
     header : Header
         With its masks.
-    region : ((int, int), (int, int))
-        Rows and columns, half-open.
+    selection : Selection
+        With a region.
     """
 
-    def __init__(self, header: Header, region: Region) -> None:
-        self._header, self._region = header, region
-        self._figures = WindowFigures(header, region)
-        self._outside = ~Selection(region).tiles(header)
+    def __init__(self, header: Header, selection: Selection) -> None:
+        if selection.region is None:
+            raise ValueError("expected a selection with a region, got none")
+        self._header, self._region = header, selection.region
+        self._figures = WindowFigures(header, selection.region)
+        self._outside = ~selection.tiles(header)
         self._section = bytearray()
         self._index: Index | None = None
         self._known_from: NDArray[np.int64] | None = None

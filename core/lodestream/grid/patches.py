@@ -49,13 +49,9 @@ def _node_positions(grid: Grid, axis: int, above: int) -> NDArray[np.int64]:
 
 def level_positions(own: Numbered, count: int, layout: Layout, level: int, shape: Shape) -> Positions:
     """Which rows and columns of a block of this shape, and of these of ``count`` patches, stand at a level's nodes."""
-    rows: set[int] = set()
-    columns: set[int] = set()
-    for number, patch in own:
-        down, right = patch_positions(patch, layout, level, number, count, shape)
-        rows.update(down.tolist())
-        columns.update(right.tolist())
-    return np.array(sorted(rows), np.int64), np.array(sorted(columns), np.int64)
+    positions = [patch_positions(patch, layout, level, number, count, shape) for number, patch in own]
+    rows, columns = (np.unique(np.concatenate(lines)) for lines in zip(*positions, strict=True))
+    return rows, columns
 
 
 def patch_positions(patch: Patch, layout: Layout, level: int, number: int, count: int, shape: Shape) -> Positions:

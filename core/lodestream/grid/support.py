@@ -26,29 +26,41 @@ _PREDICT = np.arange(-2, 4)
 Mask = NDArray[np.bool_]
 
 
-def needed_tiles(layout: Layout, region: Region) -> Mask:
-    """Which tiles of a surface of one grid the points of a window need, parents included; bool, shape (tile,).
+def needed_tiles(layout: Layout, region: Region, level: int) -> Mask:
+    """Which tiles of a surface of one grid the points of a window of a level need, parents included.
 
     Parents are there because the contexts of a tile's segments look at them.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of one grid.
+    region : ((int, int), (int, int))
+        Rows and columns of the level, half-open.
+    level : int
+
+    Returns
+    -------
+    bool, shape (tile,)
     """
-    arrays, shape = layout.tile_arrays, layout.grids[0].shape
+    arrays, shape = layout.tile_arrays, layout.shape(0, level)
     wanted = [samples(span, length) for span, length in zip(region, shape, strict=True)]
     # Along each axis how many coefficients are needed before each one, nodes first, details after them: level after
     # level from the finest one, and where a level begins.
     before: tuple[list[NDArray[np.int64]], ...] = [], []
-    begins = np.zeros((2, layout.levels + 2), np.int64)
-    for level in range(layout.levels, -1, -1):
+    begins = np.zeros((2, level + 2), np.int64)
+    for coarser in range(level, -1, -1):
         for axis in range(2):
             line = wanted[axis]
-            if level:
-                step = layout.steps(0, level)[axis]
+            if coarser:
+                step = layout.steps(0, coarser)[axis]
                 line = coefficients_needed(line, step)
                 wanted[axis] = line[: step.coarse]
             before[axis].append(np.append(0, line.cumsum()))
-            begins[axis, level] = begins[axis, level + 1] + line.size + 1
+            begins[axis, coarser] = begins[axis, coarser + 1] + line.size + 1
     needed = np.zeros(arrays.count, np.bool_)
     rows, columns = (np.concatenate(counts) for counts in before)
-    for run in runs_of(arrays.count):
+    for run in runs_of(layout.tiles_of(level).stop):
         bands = arrays.bands(np.arange(run.start, run.stop), True)
         own = np.ones(len(bands.tile), np.bool_)
         for axis, counts in enumerate((rows, columns)):
@@ -56,8 +68,8 @@ def needed_tiles(layout: Layout, region: Region) -> Mask:
             own &= counts[first + bands.shape[:, axis]] > counts[first]
         needed[run.start + bands.tile[own]] = True
     needed[0] = True
-    for level in range(layout.levels, 1, -1):
-        tiles = layout.tiles_of(level)
+    for coarser in range(level, 1, -1):
+        tiles = layout.tiles_of(coarser)
         needed[arrays.parents(tiles.start + needed[tiles.start : tiles.stop].nonzero()[0])] = True
     return needed
 

@@ -18,6 +18,7 @@ from ..target import Region
 
 __all__ = [
     "aligned",
+    "among",
     "check_region",
     "contains",
     "hull",
@@ -25,6 +26,7 @@ __all__ = [
     "meets",
     "places",
     "samples",
+    "spanning",
     "spans",
     "taken",
     "within",
@@ -94,6 +96,51 @@ def aligned(region: Region, shape: Shape, sizes: Sequence[int]) -> Region:
         end = turn + min(-(-(stop - turn) // size) * size, length)
         rounded.append((0, length) if end - begin >= length else (begin, end))
     return rounded[0], rounded[1]
+
+
+def among(region: Region, shape: Shape, nodes: Sequence[NDArray[np.int64]]) -> Region | None:
+    """The window of a coarser grid that has the points of it that stand in a window of this one; None if none does.
+
+    Parameters
+    ----------
+    region : ((int, int), (int, int))
+        Rows and columns, half-open, of this grid.
+    shape : (int, int)
+        Of this grid.
+    nodes : two int64 arrays, shape (row,) and (column,)
+        The rows and the columns of this grid at which those of the coarser one stand, increasing.
+
+    Returns
+    -------
+    ((int, int), (int, int)) or None
+        Rows and columns, half-open, of the coarser grid; across its seam where ``region`` crosses this one's.
+    """
+    found = []
+    for span, length, line in zip(region, shape, nodes, strict=True):
+        parts = [np.searchsorted(line, part).tolist() for part in spans(span, length)]
+        count, start = sum(stop - start for start, stop in parts), parts[0][0]
+        if not count:
+            return None
+        start = 0 if start == len(line) else start  # the first one stands beyond the seam
+        found.append((start, start + count))
+    return found[0], found[1]
+
+
+def spanning(window: Region, shape: Shape, nodes: Sequence[NDArray[np.int64]]) -> Region:
+    """The smallest window of this grid that has the points of a window of a coarser one; undoes `among`.
+
+    Parameters
+    ----------
+    window : ((int, int), (int, int))
+        Rows and columns, half-open, of the coarser grid.
+    shape, nodes
+        As of `among`.
+    """
+    found = []
+    for (start, stop), length, line in zip(window, shape, nodes, strict=True):
+        turns, last = divmod(stop - 1, len(line))
+        found.append((int(line[start]), int(line[last]) + 1 + turns * length))
+    return found[0], found[1]
 
 
 def hull(region: Region, shape: Shape) -> Region:

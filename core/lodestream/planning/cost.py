@@ -44,6 +44,9 @@ def plan_cost(index: Index, target: Target, ranges: int, *, bounded: bool = Fals
         steps += len(index.segments)
     if target.region is not None or target.first is not None:
         steps += header.tables // _AT_ONCE
+    if target.region is not None and target.level is not None:
+        # Which rows and columns of the level stand in the region.
+        steps += 4 * len(header.patches) + sum(header.blocks[0][0]) // _AT_ONCE
     if selected:
         steps += len(index.chunks) + header.channels + len(target.attributes or ())
     if target.first is not None:

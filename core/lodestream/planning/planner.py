@@ -153,9 +153,7 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
     """A window, or some attributes only: segments in file order or level by level, then chunks of residual."""
     chosen = select(index, selection_of(target))
     levels, within = index.header.layout.tile_levels.data, _figures(index, target.region, windows, bounded)
-    finest = index.header.levels if target.level is None else target.level
-    if finest > index.header.levels:
-        raise OptionError(f"expected a level of 0 to {index.header.levels}, got {finest}")
+    finest = selection_of(target).finest(index.header)
     segments = [s for s in chosen.segments if levels[s.tile] <= finest]
     if target.order == "level":
         segments.sort(key=lambda segment: levels[segment.tile])
@@ -176,11 +174,11 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
         elif after is None or after.layer > segment.layer:
             # Layers of which nothing is wanted are there as well.
             record = index.layers[-1 if after is None else after.layer - 1]
-            if target.level is None or level <= target.level:
+            if record.level <= finest:
                 marks.append(Mark(size, record.number, level, size, *within(record.errors, record.number)))
     if finest < index.header.levels:
         state = index.levels[finest]
-        last, ended = Mark(size, finest, finest, size, *state.errors), "level"
+        last, ended = Mark(size, finest, finest, size, *within(state.errors)), "level"
     else:
         for chunk in chosen.chunks.values():
             _append(ranges, chunk.range)

@@ -11,11 +11,12 @@ from ..container.capacity import Capacity
 from ..container.chunks import chunks_touched
 from ..container.model import Chunk, Header, Index, Segment
 from ..errors import OptionError
+from ..grid.patches import level_positions
 from ..grid.support import needed_tiles
-from ..grid.window import aligned, check_region, hull
+from ..grid.window import aligned, among, check_region, hull
 from ..target import Region, Target
 
-__all__ = ["SelectedSlices", "Selection", "restored", "select", "selection_of"]
+__all__ = ["SelectedSlices", "Selection", "region_at", "restored", "select", "selection_of"]
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,9 @@ class Selection:
         go on across the seam, as columns 350:370 of 360. None: all.
     attributes : tuple of str or None
         Names of attributes. None: all.
+    level : int or None
+        The finest level that is wanted; None: full resolution. The window is then that of this level: its points that
+        stand in the region.
 
     Examples
     --------
@@ -37,23 +41,30 @@ class Selection:
     >>> views = decoder.feed(pathlib.Path("terrain.lode").read_bytes())
     >>> decoder.surface().shape
     (40, 40)
+    >>> decoder.view().window(((10, 50), (20, 60)), level=5).shape
+    (10, 10)
     """
 
     region: Region | None = None
     attributes: tuple[str, ...] | None = None
+    level: int | None = None
 
     def check(self, header: Header) -> None:
-        """Refuse a region or attributes that the surface does not have.
+        """Refuse a region, a level or attributes that the surface does not have.
 
         Raises
         ------
         OptionError
-            If the region is not inside the surface, or there is no such attribute.
+            If the region is not inside the surface, or has no point of the level, or there is no such level or
+            attribute.
         """
+        if self.level is not None and not 0 <= self.level <= header.levels:
+            raise OptionError(f"expected a level of 0 to {header.levels}, got {self.level}")
         if self.region is not None:
             if len(header.blocks) > 1:
                 raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
             check_region(self.region, *header.blocks[0])
+            region_at(header, self.region, self.finest(header))
         names = dict.fromkeys(kind.name for kind in header.attributes)
         for name in self.attributes or ():
             if name not in names:
@@ -66,26 +77,23 @@ class Selection:
             chosen += [self.attributes is None or kind.name in names] * kind.channels
         return np.array(chosen)
 
-    def check_size(self, header: Header, capacity: Capacity, level: int | None = None) -> None:
-        """Refuse what takes more memory than there may be.
+    def finest(self, header: Header) -> int:
+        """The finest level that is wanted."""
+        return header.levels if self.level is None else self.level
 
-        Parameters
-        ----------
-        header : Header
-        capacity : Capacity
-        level : int or None
-            The finest level that is wanted, if not all of them.
+    def check_size(self, header: Header, capacity: Capacity) -> None:
+        """Refuse what takes more memory than there may be.
 
         Raises
         ------
         TooLargeError
         """
         sizes = [kind.itemsize for kind, wanted in zip(header.dtypes, self.channels(header), strict=True) if wanted]
-        layout = header.layout
+        layout, level = header.layout, self.finest(header)
         if self.region is not None and header.arrangement is None:
-            rows, columns = hull(restored(header, self.region), header.shape)
+            rows, columns = hull(restored(header, self.region, level), layout.shape(0, level))
             shapes = [(rows[1] - rows[0], columns[1] - columns[0])]
-        elif level is not None and level < layout.levels:
+        elif level < layout.levels:
             shapes = [layout.shape(grid, level) for grid in range(len(layout.grids))]
         else:
             shapes = [shape for shape, _ in header.blocks]
@@ -97,20 +105,49 @@ class Selection:
         """Which tiles are wanted: bool, shape (tile,)."""
         if self.region is None:
             return np.ones(len(header.layout.tiles), np.bool_)
+        level = self.finest(header)
         if header.arrangement is not None:
             # A block that meets itself: what is shared may lie on the other side.
-            return np.ones(len(header.layout.tiles), np.bool_)
-        return needed_tiles(header.layout, restored(header, self.region))
+            return np.arange(len(header.layout.tiles)) < header.layout.tiles_of(level).stop
+        return needed_tiles(header.layout, restored(header, self.region, level), level)
 
 
-def restored(header: Header, region: Region) -> Region:
-    """What has to be decoded for a region of the only block: a chunk of residual restores all of its own window."""
-    return aligned(region, header.shape, [1 << exponent for exponent in header.chunk]) if header.corrected else region
+def region_at(header: Header, region: Region, level: int) -> Region:
+    """The rows and columns of a level of the only block that stand in a region, half-open.
+
+    Along a closed axis they may go on across the seam, as those of the region.
+
+    Raises
+    ------
+    OptionError
+        If none does.
+    """
+    if level == header.levels:
+        return region
+    nodes = level_positions(header.block_patches[0], len(header.patches), header.layout, level, header.shape)
+    window = among(region, header.shape, nodes)
+    if window is None:
+        (top, bottom), (left, right) = region
+        raise OptionError(
+            f"expected a region with points of level {level}, got rows {top}:{bottom}, columns {left}:{right}, where "
+            "that level has none: ask for a larger region or for a finer level"
+        )
+    return window
+
+
+def restored(header: Header, region: Region, level: int) -> Region:
+    """Rows and columns of a level that have to be decoded for a region of the only block.
+
+    At full resolution a chunk of the residual restores all of its own window.
+    """
+    if level == header.levels and header.corrected:
+        return aligned(region, header.shape, [1 << exponent for exponent in header.chunk])
+    return region_at(header, region, level)
 
 
 def selection_of(target: Target) -> Selection:
     """The selection in a target."""
-    return Selection(target.region, target.attributes)
+    return Selection(target.region, target.attributes, target.level)
 
 
 @dataclass(frozen=True)
@@ -139,6 +176,7 @@ def select(index: Index, selection: Selection) -> SelectedSlices:
         return SelectedSlices(index.segments, {k: p for k, p in enumerate(index.chunks) if p.range.length}, True)
     tiles, channels = selection.tiles(header), selection.channels(header)
     segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
-    numbers = np.flatnonzero(chunks_touched(header, selection.region, channels)).tolist() if index.chunks else ()
+    corrected = index.chunks and (selection.region is None or selection.finest(header) == header.levels)
+    numbers = np.flatnonzero(chunks_touched(header, selection.region, channels)).tolist() if corrected else ()
     chunks = {number: index.chunks[number] for number in numbers if index.chunks[number].range.length}
     return SelectedSlices(segments, chunks, False)

@@ -156,10 +156,9 @@ class ReceiverState:
     ) -> None:
         # The decoder loads the kernels: whoever only imports this module does not pay for it.
         from ..decoding.decoder import Decoder
-        from ..planning.selection import selection_of
 
         self.target = Target() if target is None else target
-        self.decoder: Decoder = Decoder(selection_of(self.target), max_vertices=max_vertices, level=self.target.level)
+        self.decoder: Decoder = Decoder(self.target, max_vertices=max_vertices)
         self.cached = RangeSet() if store is None else store.ranges.copy()
         self.container = container
         self.size = size
@@ -442,7 +441,6 @@ class ReceiverState:
         from ..container import ByteRange, index_from
         from ..container.reader import INDEX_GROWTH
         from ..decoding.decoder import Decoder
-        from ..planning.selection import selection_of
 
         store = self._store
         if store is None or not self._service or not all(store.ranges.covers(*place) for place in self._needed()):
@@ -453,9 +451,7 @@ class ReceiverState:
         header = self.decoder.header
         if header is None:
             # Only to read the header: the real decoder must be fed in the order that is not known yet.
-            scratch = Decoder(
-                selection_of(self.target), max_vertices=self.decoder.capacity.max_vertices, level=self.target.level
-            )
+            scratch = Decoder(self.target, max_vertices=self.decoder.capacity.max_vertices)
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header
         if header is None or (header.masked and not header.holes):

@@ -42,6 +42,7 @@ def every_target(index: Index) -> Iterator[Target]:
             near = ((0, min(header.shape[0], 4)), (0, min(header.shape[1], 5)))
             yield Target(region=near, order=order)
             yield Target(region=near, first=near, order=order)
+            yield from (Target(region=near, level=level, order=order) for level in range(header.levels + 1))
             yield Target(first=near, order=order)
 
 

@@ -161,7 +161,7 @@ def test_what_is_not_needed_has_no_part_in_a_window_across_the_seam(
     values[...] = rng.integers(-(2**20), 2**20, shape)
     original = values.copy()
     predictors = forward([values], layout)
-    needed = needed_tiles(layout, region)
+    needed = needed_tiles(layout, region, layout.levels)
     for number, tile in enumerate(layout.tiles):
         for band in tile.bands:
             if not needed[number]:
