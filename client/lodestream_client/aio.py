@@ -71,7 +71,7 @@ async def upload(
     rms: Tolerance | float | str | None = None,
     closed: Closure = "auto",
     name: str | None = None,
-    options: Mapping[str, str] | None = None,
+    options: Mapping[str, str | Sequence[str]] | None = None,
     wait: bool = True,
     progress: Progress | None = None,
     token: str | None = None,

@@ -13,7 +13,7 @@ Examples
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
@@ -121,7 +121,7 @@ def upload(
     rms: Tolerance | float | str | None = None,
     closed: Closure = "auto",
     name: str | None = None,
-    options: Mapping[str, str] | None = None,
+    options: Mapping[str, str | Sequence[str]] | None = None,
     wait: bool = True,
     progress: Progress | None = None,
     token: str | None = None,
@@ -148,8 +148,8 @@ def upload(
         Closed axes of the grid; auto: as the file or the surface in memory says.
     name : str or None
         Name of the surface.
-    options : mapping of str to str
-        Options of the file's format.
+    options : mapping of str to str or list of str
+        Options of the file's format, such as ``{"attributes": ["speed", "kind"]}``.
     wait : bool
         Whether to wait until the surface is ready to be streamed.
     progress : callable or None

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 from .errors import OptionError
+from .text import names_in
 
 __all__ = ["ChannelLimit", "Limit", "Limits", "Order", "Region", "Target", "Tolerance", "check_integer", "check_spans"]
 
@@ -155,7 +156,7 @@ class Target:
         across the seam: of 360 columns, 350:370 are the last ten and the first ten. With a level, the window is that of
         the level: its points that stand in the region, which is the same place at every level.
     attributes : tuple of str or None
-        Names of the attributes to include; None: all.
+        Names of the attributes to include, also given as a list or a text with commas; None: all.
     first : ((int, int), (int, int)) or None
         The data that this region needs come first, then the rest; rows and columns as in `region`.
 
@@ -206,6 +207,8 @@ class Target:
             check_spans(self.region)
         if self.first is not None:
             check_spans(self.first)
+        if self.attributes is not None:
+            object.__setattr__(self, "attributes", tuple(names_in(self.attributes)))
         if self.attributes is not None and len(set(self.attributes)) < len(self.attributes):
             name = next(name for name, count in Counter(self.attributes).items() if count > 1)
             raise OptionError(f"expected each attribute once, got {name[:80]!r} twice")

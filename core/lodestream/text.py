@@ -1,10 +1,33 @@
-"""Making text from files and servers safe to print."""
+"""Making text from files and servers safe to print; names in a text."""
 
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Iterable
 
-__all__ = ["printable"]
+from .errors import OptionError
+
+__all__ = ["names_in", "printable"]
+
+
+def names_in(names: object) -> list[str]:
+    """Split the value of an option that names attributes or variables: a text with commas, or several names.
+
+    Raises
+    ------
+    OptionError
+        If it is neither.
+
+    Examples
+    --------
+    >>> names_in("speed, kind"), names_in(("speed", "kind"))
+    (['speed', 'kind'], ['speed', 'kind'])
+    """
+    if isinstance(names, str):
+        return [name.strip() for name in names.split(",") if name.strip()]
+    if not isinstance(names, Iterable):
+        raise OptionError(f"expected attributes as names or a text with commas, got {type(names).__name__}")
+    return [str(name) for name in names]
 
 
 def printable(text: str) -> str:

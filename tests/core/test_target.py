@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lodestream import OptionError, Target, Tolerance
+from lodestream import OptionError, Selection, Target, Tolerance
 
 
 @pytest.mark.parametrize(
@@ -116,3 +116,11 @@ def test_no_errors_of_channels_are_no_limit() -> None:
 def test_errors_that_make_no_sense_are_refused(limits: dict[str, Any], expected: str) -> None:
     with pytest.raises(OptionError, match=expected):
         Target(**limits)
+
+
+@pytest.mark.parametrize("names", [("speed", "kind"), ["speed", "kind"], "speed,kind", "speed, kind"])
+def test_attributes_are_names_or_a_text_with_commas(names: Any) -> None:
+    assert Target(attributes=names).attributes == ("speed", "kind")
+    assert Selection(attributes=names).attributes == ("speed", "kind")
+    with pytest.raises(OptionError, match="expected attributes as names or a text with commas, got int"):
+        Target(attributes=3)  # type: ignore[arg-type]

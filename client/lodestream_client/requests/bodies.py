@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -233,5 +233,6 @@ def _parameters(asked: Asked) -> dict[str, str | list[str]]:
     for key, value in asked.options.items():
         if key in ("precision", "rms", "closed", "nodata", "name", "filename"):
             raise OptionError(f"{key} is not an option of a format")
-        parameters[key] = value
+        # A list, as of attributes, is a text with commas in a query.
+        parameters[key] = value if isinstance(value, str) or not isinstance(value, Iterable) else ",".join(value)
     return parameters

@@ -29,7 +29,7 @@ _NO_OPTIONS = (
 )
 
 
-def checked_options(options: Mapping[str, str]) -> dict[str, Any]:
+def checked_options(options: Mapping[str, str | Sequence[str]]) -> dict[str, Any]:
     """Return options of a format as keywords of `lodestream.read`.
 
     Raises

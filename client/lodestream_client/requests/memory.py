@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
@@ -39,7 +39,7 @@ class Asked:
     rms: Tolerance | float | str | None = None
     closed: Closure = "auto"
     name: str | None = None
-    options: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, str | Sequence[str]] = field(default_factory=dict)
     attribute_precision: Mapping[str, Tolerance | float | str] = field(default_factory=dict)
     filename: str | None = None
     nodata: float | str | None = None

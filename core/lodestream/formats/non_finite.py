@@ -10,8 +10,8 @@ from .source import number
 
 __all__ = ["note_infinities"]
 
-#: Formats of which an infinite coordinate is a value like any other.
-_HOLDING = ("npy", "geotiff", "cog")
+#: Formats of which an infinite coordinate is a value like any other, as is NaN.
+_HOLDING = ("npy", "geotiff", "cog", "netcdf", "zarr")
 
 
 def note_infinities(surface: Surface, format_name: str) -> None:

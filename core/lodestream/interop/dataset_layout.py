@@ -20,7 +20,8 @@ from ..coordinates.height_fields import coordinates
 from ..coordinates.seams import wrapped
 from ..errors import FormatError
 from ..formats.netcdf.attribute_texts import attributes_of
-from ..formats.netcdf.values import PACKING, RANGES
+from ..formats.netcdf.single_numbers import SCALARS, numbers_in
+from ..formats.netcdf.values import PACKING
 from ..formats.notes import survives, warn
 from ..surface import DTYPES, Block, Closed, Surface
 
@@ -35,6 +36,8 @@ __all__ = [
     "is_ordered",
     "mark_of",
     "parts_of",
+    "said_of",
+    "single_of",
     "values_of",
 ]
 
@@ -154,7 +157,7 @@ def parts_of(grid: Grid) -> list[Part]:
     name = grid.metadata.get("variable")
     heights = _free(name if isinstance(name, str) and name else "z", taken)
     unit = grid.metadata.get("unit")
-    attrs = _said(grid.metadata, heights) | ({"units": unit} if isinstance(unit, str) else {})
+    attrs = said_of(grid.metadata, heights) | ({"units": unit} if isinstance(unit, str) else {})
     if not grid.channels:
         parts.append(Part(heights, dims, dtype, attrs=attrs))
     elif grid.channels > 2:
@@ -163,7 +166,7 @@ def parts_of(grid: Grid) -> list[Part]:
     for own, kind, components in grid.attributes:
         label = _free(own, taken)
         shape = (*dims, _free(f"{label}_component", taken)) if components else dims
-        parts.append(Part(label, shape, kind, attribute=own, attrs=_said(grid.metadata, own)))
+        parts.append(Part(label, shape, kind, attribute=own, attrs=said_of(grid.metadata, own)))
     letters = "xy" if grid.channels else ""
     angles = _angles(grid.metadata)
     return parts + [Part(it, dims, dtype, k, coordinate=True, angle=angles.get(k)) for k, it in enumerate(letters)]
@@ -216,14 +219,9 @@ def _free(name: str, taken: set[str]) -> str:
     return name
 
 
-def _said(metadata: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """What tags of a NetCDF say of one variable; limits of valid values that are no numbers say nothing."""
-    found = attributes_of(metadata, name)
-    return {
-        key: value
-        for key, value in found.items()
-        if key not in _OF_THE_FILE and not (key in RANGES and isinstance(value, str))
-    }
+def said_of(metadata: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """What tags of a NetCDF say of one variable."""
+    return {key: value for key, value in attributes_of(metadata, name).items() if key not in _OF_THE_FILE}
 
 
 @dataclass(frozen=True)
@@ -297,8 +295,22 @@ def mark_of(grid: Grid, parts: Sequence[Part]) -> str:
         warn(f"the Dataset is made without {', '.join(lost)}, which JSON cannot hold")
     mark = {"shape": list(grid.shape), "closed": list(grid.closed), "dims": list(grid.dims)}
     mark |= {"variable": heights, "attributes": names}
+    rest = {key: value for key, value in _scalars(grid).items() if key not in single_of(grid, parts)}
+    metadata = {key: value for key, value in metadata.items() if key != SCALARS} | ({SCALARS: rest} if rest else {})
     tags = _other_tags(grid, parts)
     return json.dumps(mark | {"metadata": metadata | ({"tags": tags} if tags else {})})
+
+
+def single_of(grid: Grid, parts: Sequence[Part]) -> dict[str, float | int]:
+    """The single numbers that are coordinates of a Dataset: those whose names nothing else has."""
+    taken = {*grid.dims, "x", "y", "xc", "yc", "row", "column", "spatial_ref"}
+    taken |= {name for part in parts for name in (part.name, part.attribute or part.name, *part.dims)}
+    return {name: number for name, number in numbers_in(grid.metadata).items() if name not in taken}
+
+
+def _scalars(grid: Grid) -> Mapping[str, Any]:
+    scalars = grid.metadata.get(SCALARS)
+    return scalars if isinstance(scalars, Mapping) else {}
 
 
 def in_json(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
@@ -319,8 +331,8 @@ def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
     tags = grid.metadata.get("tags")
     if not isinstance(tags, Mapping):
         return {}
-    names = [part.attribute or part.name for part in parts if not part.coordinate]
-    told = {f"{name}#{key}" for name in names for key in _said(grid.metadata, name)}
+    names = [*(part.attribute or part.name for part in parts if not part.coordinate), *single_of(grid, parts)]
+    told = {f"{name}#{key}" for name in names for key in said_of(grid.metadata, name)}
     texts = tags.get("")
     plain = texts
     if isinstance(texts, Mapping):

@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 from ..coordinates.height_fields import coordinates
 from ..errors import FormatError, InputError, OptionError
 from ..formats.netcdf.attribute_texts import TYPES, text_of
-from ..formats.netcdf.choice import Choice, choose, names_in, offered, with_attributes
+from ..formats.netcdf.choice import Choice, choose, offered, with_attributes
 from ..formats.netcdf.dataset import attributes_with_limits, not_taken, surface_of
 from ..formats.netcdf.names import REFERENCES
+from ..formats.netcdf.single_numbers import SCALARS
 from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces
 from ..formats.nodata import checked, with_nodata
 from ..formats.notes import warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
 from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import Closed, Surface
+from ..text import names_in
 from .dataset_layout import MARK, ORDERED, Grid
 from .optional import require_library
 from .to_xarray import axis_attributes
@@ -39,6 +41,9 @@ _NUMBERS = ("row", "column")
 
 #: Options of reading a NetCDF that choose something of a Dataset.
 _OPTIONS = ("variable", "x", "y", "time", "at")
+
+#: What a file says of dates.
+_OF_DATES = ("units", "calendar")
 
 #: What says in the encoding of a variable which numbers of its file were missing values.
 _MISSING = ("_FillValue", "missing_value")
@@ -151,7 +156,7 @@ def _mark(data: Any) -> dict[str, Any] | None:
 
 def _places(array: Any) -> dict[str, str]:
     """What a file would say of the coordinates of an array that are none of its dimensions."""
-    names = [str(name) for name, own in array.coords.items() if own.ndim and name not in array.dims]
+    names = [str(name) for name in array.coords if name not in array.dims]
     return {"coordinates": " ".join(names)} if names else {}
 
 
@@ -205,7 +210,12 @@ def _numbered(xr: Any, variable: Any) -> Any:
         encoded = xr.conventions.encode_cf_variable(variable.to_base_variable())
     except Exception:  # of objects of any class
         return variable
-    return encoded if encoded.dtype.kind in "iuf" else variable
+    if encoded.dtype.kind not in "iuf":
+        return variable
+    if "units" in variable.encoding:  # then xarray has read it, and writes unit and calendar in words of its own
+        words = {key: variable.encoding[key] for key in _OF_DATES if variable.encoding.get(key) is not None}
+        encoded.attrs = {key: it for key, it in encoded.attrs.items() if key not in _OF_DATES} | words
+    return encoded
 
 
 def _with_sign(dtype: np.dtype[Any], encoding: Mapping[str, Any]) -> np.dtype[Any]:
@@ -344,6 +354,8 @@ def _restored(
         gone |= {*ORDERED, "seam"} if "turn" in kept else set(ORDERED)
     kept = {key: value for key, value in kept.items() if key not in gone}
     tags = kept.pop("tags", {})
+    if isinstance(kept.get(SCALARS), dict):
+        kept[SCALARS] = {**kept[SCALARS], **metadata.get(SCALARS, {})}
     result = {**metadata, **kept}
     told = tags.get("", {}) if isinstance(tags, dict) else {}
     texts = {**metadata.get("tags", {}).get("", {}), **(told if isinstance(told, dict) else {})}

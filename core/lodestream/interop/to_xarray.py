@@ -13,7 +13,7 @@ from ..formats.netcdf.attribute_texts import attributes_of
 from ..formats.netcdf.crs import grid_mapping
 from ..formats.netcdf.names import axis_words, is_east, is_geographic, is_rotated
 from ..surface import Block, Surface
-from .dataset_layout import MARK, Grid, Part, axes_of, is_ordered, mark_of, parts_of, values_of
+from .dataset_layout import MARK, Grid, Part, axes_of, is_ordered, mark_of, parts_of, said_of, single_of, values_of
 from .optional import require_library
 
 if TYPE_CHECKING:
@@ -83,6 +83,8 @@ def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> 
     if mapping:
         said = {"crs": grid.metadata.get("crs"), "geotransform": _transform(grid.metadata)}
         places["spatial_ref"] = xr.Variable((), np.int64(0), grid_mapping(said))
+    for name, number in single_of(grid, parts).items():
+        places[name] = xr.Variable((), number, said_of(grid.metadata, name))
     attrs = attributes_of(grid.metadata, "NC_GLOBAL")
     attrs |= {MARK: mark_of(grid, parts)}
     found: xarray.Dataset = xr.Dataset(variables, places, attrs)

@@ -15,6 +15,7 @@ from ..grid.patches import level_positions
 from ..grid.support import needed_tiles
 from ..grid.window import aligned, among, check_region, hull
 from ..target import Region, Target
+from ..text import names_in
 
 __all__ = ["SelectedSlices", "Selection", "region_at", "restored", "select", "selection_of"]
 
@@ -29,7 +30,7 @@ class Selection:
         A window of the points: rows and columns, half-open, in full-resolution indices; along a closed axis it may
         go on across the seam, as columns 350:370 of 360. None: all.
     attributes : tuple of str or None
-        Names of attributes. None: all.
+        Names of attributes, also given as a list or a text with commas. None: all.
     level : int or None
         The finest level that is wanted; None: full resolution. The window is then that of this level: its points that
         stand in the region.
@@ -48,6 +49,10 @@ class Selection:
     region: Region | None = None
     attributes: tuple[str, ...] | None = None
     level: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.attributes is not None:
+            object.__setattr__(self, "attributes", tuple(names_in(self.attributes)))
 
     def check(self, header: Header) -> None:
         """Refuse a region, a level or attributes that the surface does not have.

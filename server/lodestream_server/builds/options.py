@@ -62,6 +62,9 @@ class SurfaceOptions:
             if key == "precision":
                 precisions.append(value)
                 continue
+            if key == "attributes" and key in values:
+                values[key] += f",{value}"  # a list, as of the text with commas
+                continue
             if key in values:
                 raise OptionError(f"expected {key[:80]!a} once, got it twice")
             values[key] = value

@@ -161,3 +161,27 @@ def test_push(run: Run, plain: str, text: Path) -> None:
     np.testing.assert_array_equal(values_of(stdout.strip()).points, HEIGHTS)
     code, stdout, stderr = run("push", "--each", text, text.with_suffix(".npy"), plain)
     assert (code, stderr.count(NOTE), len(stdout.splitlines())) == (0, 1, 2), stderr
+
+
+@pytest.mark.parametrize("given", [["speed", "kind"], ("speed", "kind"), "speed,kind"])
+@pytest.mark.parametrize("local", [False, True])
+def test_attributes_of_an_upload_are_a_list_or_a_text(plain: str, tmp_path: Path, given: object, local: bool) -> None:
+    xarray = pytest.importorskip("xarray")
+    values = np.add.outer(np.arange(9.0), np.arange(7.0))
+    names = ("z", "speed", "kind", "rest")
+    data = {name: (("y", "x"), values + number) for number, name in enumerate(names)}
+    xarray.Dataset(data).to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    options = {"variable": "z", "attributes": given}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FormatWarning)  # of the rest
+        remote = sync.upload(plain, tmp_path / "a.nc", options=options, local=local)  # type: ignore[arg-type]
+    surface = values_of(remote.url)
+    assert list(surface.attributes) == ["speed", "kind"]
+    np.testing.assert_array_equal(surface.attributes["kind"], values + 2)
+
+
+def test_attributes_of_a_query_may_be_said_one_by_one() -> None:
+    from lodestream_server.builds.options import SurfaceOptions
+
+    query = [("attributes", "speed,kind"), ("variable", "z"), ("attributes", "rest")]
+    assert SurfaceOptions.parse(query).chosen == {"variable": "z", "attributes": "speed,kind,rest"}

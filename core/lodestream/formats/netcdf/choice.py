@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FormatError, OptionError
+from ...text import names_in
 from ..notes import listing
 from ..source import Source
 from .names import REFERENCES, associated, is_date, is_longitude, is_time, letters_of, mate_of, time_of
@@ -23,7 +24,6 @@ __all__ = [
     "choose",
     "fields",
     "main_variable",
-    "names_in",
     "offered",
     "others",
     "with_attributes",
@@ -189,21 +189,6 @@ def fields(dataset: Any) -> list[str]:
         If the file holds no grid.
     """
     return _fields(dataset, set(), no_grid_of(dataset))[0]
-
-
-def names_in(names: Any) -> list[str]:
-    """Split the value of an option that names variables: a text with commas, or several names.
-
-    Raises
-    ------
-    OptionError
-        If it is neither.
-    """
-    if isinstance(names, str):
-        return [name.strip() for name in names.split(",") if name.strip()]
-    if not isinstance(names, Iterable):
-        raise OptionError(f"expected attributes as names or a text with commas, got {type(names).__name__}")
-    return [str(name) for name in names]
 
 
 def others(dataset: Any, choice: Choice) -> list[str]:

@@ -76,11 +76,7 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
     except Exception as error:  # a file may say anything, and pyproj fails in several ways
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         return None, None, [f"left out the grid mapping {mapping}, which pyproj does not understand: {reason}"]
-    notes = []
-    if attributes["grid_mapping_name"] == "geostationary" and any(_in_radians(variables, it) for it in places):
-        height = _plain(attributes.get("perspective_point_height"))
-        notes.append(f"x and y are angles in radians; metres of the CRS are {height} times as many")
-    return str(crs.to_wkt()), mapping, notes
+    return str(crs.to_wkt()), mapping, []
 
 
 def grid_mapping(metadata: Mapping[str, Any]) -> dict[str, Any]:
@@ -102,10 +98,6 @@ def _said_by_cf(wkt: str) -> dict[str, Any]:
     except Exception:  # pyproj is not installed, or whoever made the surface may have written anything
         return {}
     return {key: np.array(value) if isinstance(value, tuple) else value for key, value in attributes.items()}
-
-
-def _in_radians(variables: Mapping[str, Any], name: str) -> bool:
-    return str(variables[name].attrs.get("units", "")).lower() in ("rad", "radian", "radians")
 
 
 def _plain(value: Any) -> Any:

@@ -21,8 +21,10 @@ from ..source import Source, number
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, Found, offered, others
 from .crs import crs_of
-from .names import REFERENCES, associated, axis_words
-from .values import PACKING, RANGES, Values, chosen, is_packed, raw_values, values_of
+from .names import REFERENCES, associated, axis_words, is_grid_mapping
+from .single_numbers import SCALARS, names_of_single, number_of
+from .units import Conversion, conversions_of
+from .values import PACKING, RANGES, Values, chosen, is_packed, no_limits, raw_values, values_of
 
 __all__ = ["attributes_with_limits", "not_taken", "surface_of"]
 
@@ -57,9 +59,12 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
         If it is no surface.
     """
     source.check_array(choice.shape, np.dtype(np.float64))
-    metadata, notes = _metadata(source, dataset, choice, format_name)
+    metadata, notes, conversions = _metadata(source, dataset, choice, format_name)
     reader = _Reader(source, dataset, choice)
-    axes = [None if found is None else reader.coordinate(found) for found in (choice.x, choice.y)]
+    axes = [
+        None if found is None else reader.coordinate(found, conversions.get(letter))
+        for letter, found in (("x", choice.x), ("y", choice.y))
+    ]
     x, y = (axis or Coordinate(np.arange(choice.shape[1 - k]), 1 - k) for k, axis in enumerate(axes))
     heights = None if choice.heights is None else reader.values(choice.heights, choice.dims)
     attributes = {name: reader.attribute(name, heights) for name in choice.attributes}
@@ -98,14 +103,23 @@ class _Reader:
     def values(self, name: str, dims: Sequence[str]) -> Values:
         """The values of a variable over these dimensions."""
         values = values_of(chosen(self._dataset.variables[name], self._choice.index), dims, self._source.room)
+        for key in no_limits(self._dataset.variables[name].attrs):
+            text = text_of(self._dataset.variables[name].attrs[key])[0]
+            self.notes.append(f"{key} of {name} masks nothing, since it is no number or pair of numbers: {text[:40]!r}")
         if values.outside:
             self.notes.append(f"{number(values.outside)} values of {name} are outside its valid range, and missing")
         return values
 
-    def coordinate(self, found: Found) -> Coordinate:
-        """A coordinate, NaN where it is missing."""
-        values = self.values(found.name, found.dims)
-        return Coordinate(_with_nan(values, self._source.room), found.axis, found.degrees)
+    def coordinate(self, found: Found, conversion: Conversion | None = None) -> Coordinate:
+        """A coordinate in the unit of the CRS, NaN where it is missing."""
+        room = self._source.room
+        values = _with_nan(self.values(found.name, found.dims), room)
+        if conversion is not None:
+            converted = room.empty(values.shape, np.dtype(np.float64))
+            for rows in rows_at_once(values.shape):
+                converted[rows] = values[rows].astype(np.float64) * conversion.factor
+            values = converted
+        return Coordinate(values, found.axis, found.degrees)
 
     def attribute(self, name: str, heights: Values | None) -> NDArray[Any]:
         """Further values of the points: integers become floats with NaN where some are missing at valid points."""
@@ -147,8 +161,10 @@ def _without_place(heights: Values, x: Coordinate, y: Coordinate) -> list[str]:
     return [f"{number(count)} values have no x or y: they are holes until a stream is complete"] if count else []
 
 
-def _metadata(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[dict[str, Any], list[str]]:
-    """What the file says of itself and of the variables that are read; and notes.
+def _metadata(
+    source: Source, dataset: Any, choice: Choice, format_name: str
+) -> tuple[dict[str, Any], list[str], dict[str, Conversion]]:
+    """What the file says of itself and of the variables that are read; notes; how x and y are converted.
 
     Tags have the names that GDAL has for attributes of files. Coordinates are x and y, whatever the file calls them;
     what the CRS says of them already is left out.
@@ -158,7 +174,9 @@ def _metadata(source: Source, dataset: Any, choice: Choice, format_name: str) ->
     found = {letter: it.name for letter, it in (("x", choice.x), ("y", choice.y)) if it is not None}
     places = [*found.values()]
     crs, mapping, more = crs_of(dataset, main or places[0], places)
-    notes += more
+    units = {letter: variables[name].attrs.get("units") for letter, name in found.items()}
+    conversions, converted = conversions_of(units, crs)
+    notes += [*more, *converted]
     told: dict[str, Any] = {}
     if main is not None:
         told["variable"] = main
@@ -166,7 +184,8 @@ def _metadata(source: Source, dataset: Any, choice: Choice, format_name: str) ->
             told["unit"] = unit
     if crs is not None:
         told["crs"] = crs
-    said: dict[str, Any] = {f"NC_GLOBAL#{key}": value for key, value in dataset.attrs.items()}
+    # Names of coordinates are no attribute of a surface, which has its own.
+    said: dict[str, Any] = {f"NC_GLOBAL#{key}": it for key, it in dataset.attrs.items() if key not in REFERENCES}
     for name in (*([main] if main else []), *choice.attributes):
         attributes = attributes_with_limits(variables[name])
         if name == main and "unit" in told:
@@ -175,17 +194,26 @@ def _metadata(source: Source, dataset: Any, choice: Choice, format_name: str) ->
     for letter, name in found.items():
         usual = {**axis_words(letter, crs), "axis": letter.upper()}
         attributes = attributes_with_limits(variables[name])
+        if letter in conversions:
+            attributes = {key: it for key, it in attributes.items() if key not in (*RANGES, "actual_range")}
+            attributes["units"] = conversions[letter].unit
         said |= {f"{letter}#{key}": value for key, value in attributes.items() if not _same(value, usual.get(key))}
+    single = [name for name in names_of_single(dataset, choice) if name != mapping]
+    numbers = {name: number for name in single if (number := number_of(dataset, name, choice)) is not None}
+    if numbers:
+        told[SCALARS] = numbers
+    for name in numbers:
+        said |= {f"{name}#{key}": value for key, value in attributes_with_limits(variables[name]).items()}
     texts = {name: text_of(value) for name, value in said.items()}
     if texts:
         metadata["tags"] = {"": {name: text for name, (text, _) in texts.items()}}
     if types := {name: kind for name, (_, kind) in texts.items() if kind is not None}:
         metadata[TYPES] = types
     metadata |= told
-    taken = {main, *choice.attributes, *places, mapping}
-    if left_out := _left_out(dataset, choice, taken):
+    taken = {main, *choice.attributes, *places, *numbers, mapping}
+    if left_out := _left_out(dataset, choice, taken, single):
         notes.append(f"left out: {listing(left_out)}")
-    return metadata, notes
+    return metadata, notes, conversions
 
 
 def _same(value: Any, usual: Any) -> bool:
@@ -211,18 +239,20 @@ def attributes_with_limits(variable: Any) -> dict[str, Any]:
     return attributes
 
 
-def _left_out(dataset: Any, choice: Choice, taken: set[str | None]) -> list[str]:
+def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequence[str]) -> list[str]:
     """Variables that say something of the values or of where they lie, and are neither taken nor offered as attributes.
 
-    These are bounds, areas and others along rows or columns, and those that the variable names as its coordinates: a
-    time, a depth.
+    These are bounds, areas and others along rows or columns; those that the variable names as its coordinates; and of
+    coordinates with one value those that are no numbers, and bounds.
     """
     variables = dataset.variables
     known = {*others(dataset, choice), *taken, *choice.dims}
     named = associated(dataset, choice.heights)["coordinates"] if choice.heights else []
+    bounds = [str(variables[name].attrs.get("bounds", "")) for name in single]
     along = [str(name) for name, it in variables.items() if set(choice.dims) & set(it.dims)]
-    left_out = [name for name in dict.fromkeys((*along, *named)) if name not in known]
-    return [name for name in left_out if not set(variables[name].dims) & set(choice.index)]
+    left_out = [name for name in dict.fromkeys((*along, *named)) if not set(variables[name].dims) & set(choice.index)]
+    left_out += [name for name in (*single, *bounds) if name in variables]
+    return [name for name in dict.fromkeys(left_out) if name not in known and not is_grid_mapping(variables[name])]
 
 
 def _closed_fields(source: Source, dataset: Any, choice: Choice, surface: Surface) -> Surface:

@@ -16,6 +16,8 @@ __all__ = [
     "is_date",
     "is_east",
     "is_geographic",
+    "is_geographic_coordinate",
+    "is_grid_mapping",
     "is_longitude",
     "is_rotated",
     "is_time",
@@ -183,6 +185,17 @@ def is_east(units: Any) -> bool:
 def is_angle(attributes: Mapping[str, Any]) -> bool:
     """Whether the units of a coordinate are degrees."""
     return str(attributes.get("units", "")).strip().lower().startswith("deg")
+
+
+def is_geographic_coordinate(variable: Any) -> bool:
+    """Whether a variable that is x or y is a longitude or latitude, by its standard name or its unit, an angle."""
+    standard, units = (str(variable.attrs.get(key, "")).strip().lower() for key in ("standard_name", "units"))
+    return standard in ("longitude", "latitude") or units.startswith(("deg", "rad"))
+
+
+def is_grid_mapping(variable: Any) -> bool:
+    """Whether a variable says a CRS, or where the cells of a raster lie."""
+    return bool({"crs_wkt", "spatial_ref", "grid_mapping_name", "GeoTransform"} & set(variable.attrs))
 
 
 def is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from .names import letters_of
+from .names import is_geographic_coordinate, letters_of
 
 __all__ = ["NoGrid", "no_grid_of"]
 
@@ -83,7 +83,7 @@ def no_grid_of(dataset: Any) -> NoGrid | None:
             return NoGrid("a HEALPix map, whose cells are no grid", frozenset(cells))
     tables = set(_tables(variables))
     if not tables:
-        return None
+        return _scattered(dataset)
     # A table runs over the cells, or edges, of a mesh. Its columns, the corners of one, are of no other variable.
     dims = {str(dim) for name in tables for dim in variables[name].dims} | _lists_of_points(dataset)
     known = {str(variable.attrs.get("cf_role", "")) for variable in variables.values()}
@@ -92,6 +92,33 @@ def no_grid_of(dataset: Any) -> NoGrid | None:
     dims |= {str(it.dims[-1]) for it in lists if it.dims and it.ndim == 1}
     words = f"{_MESH} (UGRID)" if "mesh_topology" in known else _MESH
     return NoGrid(words, frozenset(dims), frozenset(tables))
+
+
+def _scattered(dataset: Any) -> NoGrid | None:
+    """Variables over a dimension along which there is both a longitude and a latitude, as of ICON; None: none is so.
+
+    Longitudes and latitudes over that dimension and another are those of a grid, which the others belong to.
+    """
+    variables = {str(name): variable for name, variable in dataset.variables.items()}
+    cells = {
+        str(it.dims[-1])
+        for it in variables.values()
+        if it.ndim and str(it.attrs.get("CDI_grid_type", "")).lower() == "unstructured"
+    }
+    letters = {
+        name: letter for name, letter in letters_of(dataset).items() if is_geographic_coordinate(variables[name])
+    }
+    on_grids = [{letters[name]: set(map(str, variables[name].dims))} for name in letters if variables[name].ndim > 1]
+    gridded = {letter: set().union(*(dims[letter] for dims in on_grids if letter in dims)) for letter in ("x", "y")}
+    lists: dict[str, set[str]] = {}
+    for name, letter in letters.items():
+        if variables[name].ndim == 1:
+            lists.setdefault(str(variables[name].dims[0]), set()).add(letter)
+    points = {dim for dim, both in lists.items() if len(both) == 2 and dim not in gridded["x"] & gridded["y"]}
+    if cells:
+        return NoGrid(_MESH, frozenset(cells | points))
+    words = f"a list of points, of which each has its longitude and latitude along {', '.join(sorted(points))}"
+    return NoGrid(words, frozenset(points)) if points else None
 
 
 def _tables(variables: dict[str, Any]) -> Iterator[str]:

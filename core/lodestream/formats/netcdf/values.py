@@ -24,6 +24,7 @@ __all__ = [
     "is_flag",
     "is_packed",
     "limits_of",
+    "no_limits",
     "pieces",
     "raw_values",
     "values_of",
@@ -145,6 +146,16 @@ def limits_of(attributes: Mapping[str, Any]) -> tuple[Any, Any]:
         for key, limit in (("valid_min", low), ("valid_max", high))
     )
     return low, high
+
+
+def no_limits(attributes: Mapping[str, Any]) -> list[str]:
+    """Find the limits of valid values that are no numbers, or not as many as they should be."""
+    counts = dict.fromkeys(RANGES, 1) | {"valid_range": 2}
+    return [
+        key
+        for key, count in counts.items()
+        if key in attributes and ((it := np.ravel(attributes[key])).dtype.kind not in "iuf" or it.size != count)
+    ]
 
 
 def _number(attributes: Mapping[str, Any], key: str, default: float) -> float:

@@ -21,11 +21,12 @@ from ..notes import listing, metadata_left_out, warn, warn_left_out
 from .attribute_texts import TYPES, value_of
 from .crs import grid_mapping
 from .names import AXIS_WORDS, axis_words, is_geographic, is_rotated
+from .single_numbers import SCALARS, numbers_in
 
 __all__ = ["Contents", "Variable", "contents_of", "strips"]
 
 _PLACE = ("geotransform", "grid", "axes")
-_HELD = (*_PLACE, "crs", "unit", "tags", TYPES, "nodata", "variable")
+_HELD = (*_PLACE, "crs", "unit", "tags", TYPES, "nodata", "variable", SCALARS)
 
 #: What our own variables say; a tag of the same name is left out.
 _OURS = frozenset(
@@ -47,6 +48,9 @@ _OURS = frozenset(
         "_Unsigned",
     ]
 )
+
+#: What a variable of a single number says of itself all the same.
+_OF_NUMBERS = ("units", "standard_name", "axis")
 
 #: The name of a file's own attributes among GDAL's.
 _GLOBAL = "NC_GLOBAL"
@@ -110,6 +114,9 @@ def contents_of(surface: Surface, title: str) -> Contents:
     names = _Names(surface)
     variables = _variables(surface, names, title)
     closed = ["closure"] * any(surface.closed)
+    scalars = surface.metadata.get(SCALARS)
+    rest = [name for name in scalars if name not in names.numbers] if isinstance(scalars, Mapping) else []
+    closed += [f"single numbers (scalars: {listing(rest)})"] if rest else []
     lost = _add_tags(surface, names, variables)
     warn_left_out(title, [*closed, *lost, *metadata_left_out(surface, _HELD)])
     if names.changed:
@@ -121,7 +128,8 @@ def contents_of(surface: Surface, title: str) -> Contents:
     if len(variables[axes[0]].dims if axes else ()) == 2 and not any(
         "coordinates" in variable.attributes for variable in variables.values()
     ):
-        attributes["coordinates"] = " ".join(sorted(axes))  # by which xarray knows them where no variable names them
+        # by which xarray knows them where no variable names them
+        attributes["coordinates"] = " ".join((*sorted(axes), *names.numbers.values()))
     return Contents(variables, attributes)
 
 
@@ -156,6 +164,7 @@ class _Names:
         self._taken = {self.x, self.y, "crs"}
         self.main = self.new(str(surface.metadata.get("variable") or "height"))
         self.attributes = {name: self.new(name) for name in surface.attributes}
+        self.numbers = {name: self.new(name) for name in numbers_in(surface.metadata)}
 
     def new(self, name: str) -> str:
         """A name like this one that is still free."""
@@ -170,7 +179,11 @@ class _Names:
 
 def _variables(surface: Surface, names: _Names, title: str) -> dict[str, Variable]:
     """Each variable by its name, coordinates first."""
-    points, mask, metadata, shape = surface.points, surface.mask, surface.metadata, surface.shape
+    points, metadata, shape = surface.points, surface.metadata, surface.shape
+    kept = surface.blocks[0].kept
+    # Holes that are missing in part, such as land, have the rest; of heights, x and y are known everywhere.
+    known = surface.mask if surface.mask is None or kept is None else surface.mask | kept
+    placed = None if points.ndim == 2 else known
     variables: dict[str, Variable] = {}
     planes = _planes(surface)
     flat = points.ndim == 2
@@ -183,15 +196,15 @@ def _variables(surface: Surface, names: _Names, title: str) -> dict[str, Variabl
         if even and line is not None:
             variables[name] = _whole((dims[axis],), line, {**said, "axis": letter.upper()})
         else:
-            variables[name] = _filled(Variable(dims, shape, dtype, rows, said), mask, title)
-    beside = {"coordinates": f"{names.y} {names.x}"} if planes and not even else {}
+            variables[name] = _filled(Variable(dims, shape, dtype, rows, said), placed, title)
+    beside: dict[str, Any] = {}
     if metadata.get("crs"):
         beside["grid_mapping"] = "crs"
         variables["crs"] = _whole((), np.array(0, np.int32), _mapping(surface))
     if points.ndim == 2 or points.shape[2] > 2:
         heights = points if points.ndim == 2 else points[..., 2]
         said = {"units": metadata["unit"]} if isinstance(metadata.get("unit"), str) else {}
-        main = _filled(_whole(dims, heights, said), mask, title, metadata.get("nodata"))
+        main = _filled(_whole(dims, heights, said), known, title, metadata.get("nodata"))
         others = [*names.attributes.values()]
         main.attributes |= {"ancillary_variables": " ".join(others)} if others else {}
         variables[names.main] = main
@@ -200,9 +213,15 @@ def _variables(surface: Surface, names: _Names, title: str) -> dict[str, Variabl
     for name, array in surface.attributes.items():
         own = names.attributes[name]
         variables[own] = _whole((*dims, f"{own}_component")[: array.ndim], array)
+    numbers = numbers_in(metadata)
+    places = [names.y, names.x] if planes and not even else []
+    if places or numbers:
+        beside["coordinates"] = " ".join((*places, *(names.numbers[name] for name in numbers)))
     for name, variable in variables.items():
         if variable.dims[:2] == dims and name not in (names.x, names.y):
             variable.attributes.update(beside)
+    for name, number in numbers.items():
+        variables[names.numbers[name]] = _whole((), np.array(number))
     return variables
 
 
@@ -240,17 +259,22 @@ def _line(rows: Rows, shape: tuple[int, int], axis: int) -> NDArray[Any] | None:
     return np.concatenate(found)
 
 
-def _filled(variable: Variable, mask: NDArray[np.bool_] | None, title: str, nodata: Any = None) -> Variable:
-    """A variable with the values of holes replaced."""
-    if mask is None:
+def _filled(variable: Variable, known: NDArray[np.bool_] | None, title: str, nodata: Any = None) -> Variable:
+    """A variable with something in place of values that are not known, and of NaN."""
+    if known is None:
         return variable
     rows = variable.rows
-    variable.fill = fill = fill_of(rows, variable.dtype, mask, nodata)
+    variable.fill = fill = fill_of(rows, variable.dtype, known, nodata)
     if fill is None:
-        holes = mask.size - int(np.count_nonzero(mask))
+        holes = known.size - int(np.count_nonzero(known))
         warn(f"{title} is written with values in {holes:,} holes, since the heights have every number")
-    else:
-        variable.rows = lambda part: np.where(mask[part], rows(part), fill)
+        return variable
+
+    def filled(part: slice) -> NDArray[Any]:
+        values = rows(part)
+        return np.where(known[part] & ~np.isnan(values), values, fill)
+
+    variable.rows = filled
     return variable
 
 
@@ -268,12 +292,14 @@ def _add_tags(surface: Surface, names: _Names, variables: Mapping[str, Variable]
     kinds = types if isinstance(types, Mapping) else {}
     lost = []
     axes = {"x": names.x, "y": names.y}
-    of_variable = {str(surface.metadata.get("variable") or names.main): names.main, **names.attributes}
+    main = str(surface.metadata.get("variable") or names.main)
+    of_variable = {**names.numbers, **names.attributes, main: names.main}
     for space, values in tags.items() if isinstance(tags, Mapping) else ():
         for key, text in values.items() if isinstance(values, Mapping) else ():
             owner, sharp, name = str(key).partition("#")
             known = not space and isinstance(text, str) and bool(name) and not _UNSAFE.search(name)
-            fits = known and name not in _OURS
+            own = name in _OF_NUMBERS and owner in names.numbers
+            fits = known and (name not in _OURS or own)
             value = value_of(text, kinds.get(key)) if known else None
             if fits and sharp and owner == _GLOBAL:
                 names.of_file[name] = value

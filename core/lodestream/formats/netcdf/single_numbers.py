@@ -1,0 +1,64 @@
+"""Coordinates of a surface that have one value, such as its time: ``scalars`` of the metadata, and back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from ...scratch import IN_MEMORY
+from .choice import Choice
+from .names import associated, is_grid_mapping, is_time, time_of
+from .values import chosen, values_of
+
+__all__ = ["SCALARS", "names_of_single", "number_of", "numbers_in"]
+
+#: The key of the metadata with the numbers by their names.
+SCALARS = "scalars"
+
+#: Names whose tags are those of the position.
+_RESERVED = ("x", "y", "NC_GLOBAL")
+
+
+def names_of_single(dataset: Any, choice: Choice) -> list[str]:
+    """Find the coordinates that have one value for a choice: along dimensions with a chosen place, and without any.
+
+    These are the coordinates of such dimensions, dates along them, and what the variable, or the file, names.
+    """
+    variables = dataset.variables
+    main = choice.heights or (choice.x.name if choice.x else "")
+    along = list(choice.index)
+    along += [name for dim in choice.index if is_time(dataset, dim) and (name := time_of(dataset, dim)) is not None]
+    named = [*associated(dataset, main)["coordinates"], *str(dataset.attrs.get("coordinates", "")).split()]
+    return [
+        name
+        for name in dict.fromkeys((*along, *named))
+        if name in variables
+        and name != main
+        and set(variables[name].dims) <= set(choice.index)
+        and not is_grid_mapping(variables[name])
+    ]
+
+
+def number_of(dataset: Any, name: str, choice: Choice) -> float | int | None:
+    """Read the value of such a coordinate; None: it is no number, or its tags would be taken for others."""
+    variable = chosen(dataset.variables[name], choice.index)
+    if variable.ndim or variable.dtype.kind not in "iuf" or name in _RESERVED:
+        return None
+    number = values_of(variable, (), IN_MEMORY)
+    value: float | int = number.array.item()
+    return value if number.valid is None and math.isfinite(value) else None
+
+
+def numbers_in(metadata: Mapping[str, Any]) -> dict[str, float | int]:
+    """Find the single numbers that a file can have; whoever made the container may have written anything."""
+    scalars = metadata.get(SCALARS)
+    return {
+        name: value
+        for name, value in (scalars.items() if isinstance(scalars, Mapping) else ())
+        if isinstance(name, str)
+        and name not in ("", *_RESERVED)
+        and type(value) in (int, float)
+        and math.isfinite(value)
+        and -(2**63) <= value < 2**63
+    }
