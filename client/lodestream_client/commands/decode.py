@@ -175,6 +175,7 @@ class _Job:
             self.metadata = dict(index.metadata_values)
             check_grid(self._out, index.header)
             self._decode_planned(index)
+            self.decoder.view()  # whether the end is damaged
 
     def _read(self, offset: int, length: int) -> bytes:
         self._file.seek(offset)

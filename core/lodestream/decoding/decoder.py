@@ -40,9 +40,10 @@ class Decoder:
     """Decodes a container as its bytes come, and gives a `View` for each state whose errors are known.
 
     `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
-    `CorruptStreamError` with its offset; everything before it stays usable. What a residual holds is known only when it
-    is applied, so this is done when the residual has arrived, and once more when the SHA-256 of the values has; the
-    surface is kept for the first who asks for it.
+    `CorruptStreamError` with its offset; everything before it stays usable. Segments are decoded when somebody asks for
+    values. What a residual holds is known only when it is applied, so the complete state is verified when it is first
+    asked for: by `view`, `complete`, `finish`, errors or values. If it is damaged this raises, and from then on the
+    state before it is the last one.
 
     Parameters
     ----------
@@ -182,7 +183,11 @@ class Decoder:
         ------
         TruncatedStreamError
             If the surface is not complete. What has come stays usable.
+        CorruptStreamError
+            If its end is damaged.
         """
+        if self._ending.damage is not None:
+            raise self._ending.damage
         if not self.complete:
             got, wanted = len(self.layers), self.header.layer_count if self.header else None
             what = f"{got} of {wanted} layers" if got != wanted else f"{got} layers without what makes them exact"
@@ -207,9 +212,21 @@ class Decoder:
         return self._index
 
     @property
-    def complete(self) -> bool:
-        """Whether the whole surface has arrived; metadata and index may still be missing."""
+    def arrived(self) -> bool:
+        """Whether the whole surface has arrived, whatever its residual holds; nothing is decoded for that."""
         return bool(self.layers) and self.layers[-1].complete
+
+    @property
+    def complete(self) -> bool:
+        """Whether the whole surface has arrived and is as it should be; metadata and index may still be missing.
+
+        Raises
+        ------
+        CorruptStreamError
+            If its end is damaged, when this is first found.
+        """
+        self._verify()
+        return self.arrived
 
     def view(self) -> View:
         """The current state.
@@ -218,7 +235,10 @@ class Decoder:
         ------
         TruncatedStreamError
             If the first layer is not complete.
+        CorruptStreamError
+            If the end is damaged, when this is first found; then the state before it is the current one.
         """
+        self._verify()
         if not self.layers:
             raise TruncatedStreamError("expected at least one whole layer, got less")
         return self.layers[-1]
@@ -338,28 +358,22 @@ class Decoder:
             self._ending.promised = values.pop(DIGEST)
         self.metadata = values
         self._values.update(values)
-        self._verify()
 
     def _verify(self) -> None:
-        """Look at the values of the complete state if they need a residual, which may hold anything.
+        """Verify the complete state, if it has arrived and is wanted.
 
         Raises
         ------
         CorruptStreamError
-            If they are damaged; what came before the residual stays.
+            If it is damaged; what came before the residual stays.
         """
-        header = self.header
-        if header is None or not (self.complete and header.corrected) or self._queue.dropped:
+        if self.header is None or not self.arrived or self._selection.finest(self.header) < self.header.levels:
             return
-        if self._selection.finest(header) == header.levels:
-            try:
-                if self._ending.digest is None:
-                    self.layers[-1].verify()
-                else:
-                    self.layers[-1].check_digest()
-            except CorruptStreamError:
-                self.layers.pop()
-                raise
+        try:
+            self.layers[-1].verify()
+        except CorruptStreamError:
+            self.layers.pop()
+            raise
 
     def _show(self, made: State) -> None:
         corrected = made.complete and self.header is not None and self.header.corrected
@@ -392,7 +406,6 @@ class Decoder:
             channels=made.channels if window is None else (),
         )
         self.layers.append(view)
-        self._verify()
 
     def _take_part(self, offset: int, data: Bytes) -> None:
         """Bytes of a plan, once the header is known."""

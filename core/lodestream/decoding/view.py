@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -38,13 +39,22 @@ class Ending:
         The SHA-256 that the values must have, once it has come.
     digest : str or None
         The one that they have, once it was computed.
+    computed : bool
+        Whether `View.verify` has computed the surface.
     verified : list of (Selection, Surface)
-        The surface as `View.verify` computed it, until somebody takes it.
+        The surface as it was computed, until somebody takes it.
+    damage : CorruptStreamError or None
+        What was found to be wrong.
+    lock : RLock
+        Held while the surface is verified, so that of several threads one does it.
     """
 
     promised: str | None = None
     digest: str | None = None
+    computed: bool = False
     verified: list[tuple[Selection, Surface]] = field(default_factory=list)
+    damage: CorruptStreamError | None = None
+    lock: RLock = field(default_factory=RLock)
 
 
 @dataclass(frozen=True)
@@ -65,7 +75,8 @@ class View:
         Whether they are bounds, which the errors do not exceed. They are where the view is a window and not exact: a
         container tells errors of the whole surface, and bounds of those of its parts. Else they were measured.
     complete : bool
-        Whether this is the last state.
+        Whether this is the last state. If it takes a residual, its values are verified when they are first asked for;
+        `CorruptStreamError` then says that the end is damaged, and views before it stay usable.
     channels : tuple of (rms, max_error)
         Errors of each channel by itself, in its unit and in the order of `Header.channel_names`; empty where there is
         one channel, in a window, and where they are not known.
@@ -167,6 +178,8 @@ class View:
         OptionError
             If the region is outside the surface or has no point of the level, the surface has several blocks, the view
             holds another region only, or there is no such level.
+        CorruptStreamError
+            If the end is damaged, see `complete`.
         """
         header, shown = self._queue.header, self._selection.region
         finest = self._finest
@@ -179,6 +192,7 @@ class View:
             raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
         state = self._state
         if level == header.levels:
+            self.verify()
             state = state.copy()
             state[~selection.tiles(header)] = 0
         return replace(self, _selection=selection, _state=state).surface()
@@ -217,7 +231,12 @@ class View:
         values = dict(self._metadata if metadata is None else metadata)
         if level != header.levels:  # the grid of that level, without what a seam repeats
             values = {key: value for key, value in values.items() if key not in ("seam", "turn")}
-        kept = self._taken() if level == header.levels else None
+        if level == header.levels:
+            self.verify()
+        return self._made(level, values, self._taken() if level == header.levels else None)
+
+    def _made(self, level: int, values: dict[str, Any], kept: Surface | None = None) -> Surface:
+        """`_shown` with these metadata of the whole surface; ``kept``: it is computed already."""
         if kept is None:
             surface, values = self._positioned(Surface(blocks=self._blocks(level)), values, level)
         else:
@@ -227,21 +246,42 @@ class View:
         return surface
 
     def verify(self) -> None:
-        """Compute the complete surface and hold it to its SHA-256, if that has come; the next `surface` returns it.
+        """Make sure, once, that a complete state that takes a residual is not damaged: its chunks may hold anything.
+
+        The surface is computed and held to its SHA-256, now or as soon as that has come; the next `surface` returns it.
+        Of other states nothing is done.
 
         Raises
         ------
         CorruptStreamError
-            If a chunk of the residual does not hold what it should, or the SHA-256 is wrong.
+            If a chunk of the residual does not hold what it should, or the SHA-256 is wrong; every time.
         """
+        if not self._corrected or self._queue.dropped:
+            return
+        ending = self._ending
+        with ending.lock:
+            if ending.damage is None:
+                try:
+                    if not ending.computed:
+                        self._compute()
+                        ending.computed = True
+                    self._hold_to_digest()
+                except CorruptStreamError as error:
+                    ending.damage = error
+                    ending.verified.clear()
+            if ending.damage is not None:
+                raise ending.damage
+
+    def _compute(self) -> None:
+        """Compute the complete surface, and its SHA-256 where it may be compared."""
         try:
-            surface = self._shown(self._queue.header.levels)
+            surface = self._made(self._queue.header.levels, dict(self._metadata))
         except InputError:
             return  # nothing of this window is valid, which is no damage
         header, ending = self._queue.header, self._ending
         whole = self._selection.region is None and self._selection.channels(header).all()
         if ending.digest is None and header.exact and whole:
-            # The SHA-256 comes after the residual: the values need not be computed again then.
+            # The SHA-256 may come after the residual: the values need not be computed again then.
             ending.digest = values_digest(surface.blocks)
         ending.verified.append((self._selection, surface))
 
@@ -318,8 +358,8 @@ class View:
             return level_positions(values, header, level)
         return values
 
-    def check_digest(self) -> None:
-        """Hold the SHA-256 that `verify` computed to the one that came with the values, if both are known.
+    def _hold_to_digest(self) -> None:
+        """Hold the SHA-256 of the values to the one that came with them, if both are known.
 
         Raises
         ------
@@ -338,7 +378,7 @@ class View:
             return
         if selection.region is None and selection.channels(header).all():
             self._ending.digest = self._ending.digest or values_digest(surface.blocks)
-            self.check_digest()
+            self._hold_to_digest()
 
     def _nodes(self, level: int) -> list[Nodes]:
         """Which rows and columns of each block are shown at a level, or in the window."""

@@ -363,7 +363,7 @@ class ReceiverState:
         """
         if why == "stopped":
             why = self.stopped_for or why
-        elif self.received < (self.planned or 0) or (why == "complete" and not self.decoder.complete):
+        elif self.received < (self.planned or 0) or (why == "complete" and not self.decoder.arrived):
             raise TruncatedStreamError(f"expected {self.planned} bytes of the surface, got {self.received} at the end")
         self.ended = why
         return Ended(why)

@@ -44,7 +44,7 @@ def with_chunk(data: bytes, chance: random.Random, rule: int | None) -> bytes:
 
 
 def feed(decoder: ls.Decoder, data: bytes, target: ls.Target | None) -> bool:
-    """Feed a container as it stands, or by a plan; whether it is taken."""
+    """Feed a container as it stands, or by a plan, and ask for its state; whether it is taken."""
     try:
         if target is None:
             decoder.feed(data)
@@ -52,6 +52,7 @@ def feed(decoder: ls.Decoder, data: bytes, target: ls.Target | None) -> bool:
             chosen = plan(index_of(data), target)
             for place in (*chosen.before, *chosen.ranges, *chosen.after):
                 decoder.feed_at(place.offset, data[place.offset : place.end])
+        decoder.view()
     except CorruptStreamError:
         return False
     return True
