@@ -80,7 +80,9 @@ def target(random: Random, index: Index) -> Target:
         options["max_bytes"] = random.choice([1, 200, random.randrange(1, index.size + 100), index.surface_end])
     if kind == "region":
         options["region"] = _region(random, *header.blocks[0])
-        if random.random() < 0.6:
+        if random.random() < 0.4 and "max_bytes" not in options:
+            options["level"] = random.randrange(header.levels + 2)
+        elif random.random() < 0.6:
             limit = Tolerance(10 ** random.uniform(-4, 0), relative=True)
             options[random.choice(["until_rms", "until_max"])] = limit
     if kind == "channels":

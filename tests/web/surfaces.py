@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.errors import InputError
+from lodestream.errors import InputError, OptionError
 from lodestream.planning.plan import Plan
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection, selection_of
@@ -77,11 +77,19 @@ def surface(chance: Random, number: int) -> ls.Surface:
         return ls.Surface(blocks=several(chance, rng, number))
     shape = chance.choice([(2, 1), (1, 9), (3, 3), (5, 4), (17, 6), (9, 33), (40, 25), (31, 64), (90, 70), (150, 131)])
     closed = chance.random() < 0.25, chance.random() < 0.25
-    points = chance.choice([heights, heights, heights, plane, points_of])(chance, rng, shape, number)
+    kind = chance.choice([heights, heights, heights, plane, points_of])
+    points = kind(chance, rng, shape, number)
+    places: list[dict[str, Any]] = [
+        {},
+        {"geotransform": [-5.0, 10.0, 0.0, 90.0, 0.0, -9.0]},
+        {"axes": {"x": [0, 10], "y": [85.5, -9]}},
+        {"axes": {"x": [*(float(column**2) for column in range(shape[1])), "values"], "y": [85.5, -9]}},
+    ]
+    metadata = chance.choice(places) if kind is heights else {}
     mask = None
     if chance.random() < 0.3:
         mask = holes(rng, shape)
-    return ls.Surface(points, closed, mask=mask, attributes=attributes(chance, rng, shape, number))
+    return ls.Surface(points, closed, mask=mask, attributes=attributes(chance, rng, shape, number), metadata=metadata)
 
 
 def heights(chance: Random, rng: np.random.Generator, shape: tuple[int, int], number: int) -> _Points:
@@ -196,11 +204,17 @@ def window(chance: Random, container: bytes) -> dict[str, Any] | None:
         spans.append((start, stop))
     region = spans[0], spans[1]
     number = chance.choice([len(decoder.layers) - 1, chance.randrange(len(decoder.layers))])
+    level = chance.choice([header.levels, chance.randrange(header.levels + 1)])
     try:
-        shown = decoder.layers[number].window(region)
-    except InputError:
+        shown = decoder.layers[number].window(region, level)
+    except (InputError, OptionError):  # nothing valid, or no point of the level
         return None
-    return {"region": region, "layer": number, "sha256": digests(shown)}
+    return {"region": region, "level": level, "layer": number, "sha256": digests(shown), "metadata": placed(shown)}
+
+
+def placed(shown: ls.Surface) -> dict[str, Any]:
+    """Where heights lie, by their metadata."""
+    return {key: shown.metadata[key] for key in ("geotransform", "axes", "nodes") if key in shown.metadata}
 
 
 def followed(chance: Random, container: bytes) -> dict[str, Any]:
@@ -220,11 +234,12 @@ def followed_window(chance: Random, container: bytes) -> dict[str, Any] | None:
     if shown is None:
         return None
     orders: list[Order] = ["quality", "quality", "level"]
-    index, target = index_of(container), ls.Target(region=shown["region"], order=chance.choice(orders))
+    index = index_of(container)
+    target = ls.Target(region=shown["region"], level=shown["level"], order=chance.choice(orders))
     windows = read_window_errors(index, lambda offset, length: container[offset : offset + length])
     made = plan(index, target, windows=windows)
     views = _views(container, made, chance.choice([37, 1000, 2**62]), selection_of(target))
-    return {"region": shown["region"], **views}
+    return {"region": shown["region"], "level": shown["level"], **views}
 
 
 def _views(container: bytes, made: Plan, pieces: int, selection: Selection | None) -> dict[str, Any]:

@@ -74,12 +74,14 @@ export class SurfaceView implements ViewInfo {
   }
 
   /**
-   * The points of a window at full resolution; costs time and memory for the window only.
+   * The points of a window, at full resolution or at a coarser level; costs time and memory for the window only. `region`
+   * has rows and columns of the full grid at any level; the window of a level has its points that stand there.
    *
-   * @throws OptionError if the region is outside the surface, or the surface has several blocks.
+   * @throws OptionError if the region is outside the surface or has no point of the level, the surface has several blocks,
+   * or there is no such level.
    */
-  window(region: Region): Promise<Surface> {
-    return this.channel.ask("window", this.view, region);
+  window(region: Region, level?: number): Promise<Surface> {
+    return this.channel.ask("window", this.view, region, level);
   }
 }
 

@@ -1,7 +1,7 @@
 /** Streams from servers of the Python library, over WebSocket and HTTP Range, and over links that break. */
 import { afterAll, beforeAll, describe, expect, it } from "vitest";
 import WebSocket from "ws";
-import { decode } from "../src/decoding";
+import { Decoder, decode } from "../src/decoding";
 import type { View } from "../src/decoding/view";
 import {
   LodestreamError,
@@ -151,6 +151,36 @@ describe.each(TRANSPORTS)("over %s", (name, source, options) => {
     expect(stream.ended).toBe("bytes");
     expect(stream.progress.planned).toBeLessThanOrEqual(9000);
     if (name === "a WebSocket") expect(stream.progress.connections).toBe(1);
+  });
+
+  it("the window of a level comes alone, and is cut out of the level", async () => {
+    const region: Region = [
+      [5, 40],
+      [12, 30],
+    ];
+    const decoder = new Decoder(await loadKernels());
+    decoder.feed(served.data);
+    const level = decoder.header!.levels - 1;
+    const own = decoder.surface(level).blocks[0]!;
+    const [rows, columns] = ([0, 1] as const).map((axis) => {
+      const lines = axis ? own.columns : own.rows;
+      const [start, stop] = region[axis];
+      return [...lines].flatMap((place, number) => (place >= start && place < stop ? [number] : []));
+    });
+    const wanted = rows!.flatMap((row) =>
+      columns!.map((column) => Number(own.points.values[row * own.shape[1] + column])),
+    );
+    const stream = streamOf(source(), { region, level }, options);
+    const last = (await all(stream)).at(-1)!;
+    expect(stream.ended).toBe("level");
+    expect(last.bound).toBe(true);
+    const shown = last.surface().blocks[0]!;
+    expect(shown.shape).toEqual([rows!.length, columns!.length]);
+    expect([...shown.points.values].map(Number)).toEqual(wanted);
+    expect([...last.window(region, level).blocks[0]!.points.values].map(Number)).toEqual(wanted);
+    expect(() => last.surface(level + 1)).toThrow(/level of 0 to/);
+    expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
+    expect(() => stream.aim({ region, level: level - 1 })).toThrow(/another stream/);
   });
 
   it("a region comes first, once it is looked at", async () => {

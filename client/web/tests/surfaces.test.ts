@@ -15,9 +15,9 @@ const AT_ONCE = 24;
 interface Case {
   container: string;
   expected: Expected;
-  window: { region: Region; layer: number; sha256: string[] } | null;
+  window: { region: Region; level: number; layer: number; sha256: string[]; metadata: object } | null;
   followed: Followed;
-  followed_window: (Followed & { region: Region }) | null;
+  followed_window: (Followed & { region: Region; level: number }) | null;
 }
 
 interface Followed {
@@ -65,12 +65,18 @@ function check({ container, expected, window, followed, followed_window }: Case,
   if (window) {
     const decoder = new Decoder(kernels);
     decoder.feed(data);
-    expect(digests(decoder.layers[window.layer]!.window(window.region)), `${name}, window`).toEqual(window.sha256);
+    const { region, level, layer, sha256 } = window;
+    const shown = decoder.layers[layer]!.window(region, level);
+    expect(digests(shown), `${name}, window ${region} of level ${level}`).toEqual(sha256);
+    const { geotransform, axes, nodes } = shown.metadata;
+    const placed = JSON.parse(JSON.stringify({ geotransform, axes, nodes }));
+    expect(placed, `${name}, window ${region} of level ${level}`).toEqual(window.metadata);
   }
   checkViews(data, followed, new Decoder(kernels), `${name}, views of a plan`);
   if (followed_window === null) return;
-  const { region } = followed_window;
-  checkViews(data, followed_window, new Decoder(kernels, { region }), `${name}, views of the window ${region}`);
+  const { region, level } = followed_window;
+  const what = `${name}, views of the window ${region} of level ${level}`;
+  checkViews(data, followed_window, new Decoder(kernels, { region, level }), what);
 }
 
 function checkViews(data: Uint8Array, followed: Followed, decoder: Decoder, name: string): void {

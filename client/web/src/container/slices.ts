@@ -54,6 +54,7 @@ class Run {
 export class Slices {
   readonly #index: Index;
   readonly #whole: boolean;
+  readonly #level: number;
   readonly #items: Item[];
   readonly #starts: Float64Array;
   readonly #seen: Uint8Array;
@@ -76,8 +77,10 @@ export class Slices {
   #near: readonly Groups[] = [];
   #reached: number[] | null = null; // null while all comes in order
 
-  constructor(index: Index, wanted: SelectedSlices) {
+  /** `level` is the finest of the segments that are wanted: a layer that has finer ones is then no state. */
+  constructor(index: Index, wanted: SelectedSlices, level: number = index.header.levels) {
     this.#index = index;
+    this.#level = level;
     this.#whole = wanted.whole;
     this.#wanted = wanted.segments;
     const chunks = [...wanted.chunks].map(([number, chunk]): Item => ({ number, chunk }));
@@ -100,7 +103,7 @@ export class Slices {
       wanted.segments.map((segment) => segment.layer),
       index.layers.length,
     );
-    this.#byLevel = new Groups(this.#levels, index.levels.length);
+    this.#byLevel = new Groups(this.#levels, level + 1);
   }
 
   /**
@@ -130,7 +133,7 @@ export class Slices {
           levels.push(this.#levels[i]!);
         }
       });
-      this.#near = [new Groups(layers, this.#index.layers.length), new Groups(levels, this.#index.levels.length)];
+      this.#near = [new Groups(layers, this.#index.layers.length), new Groups(levels, this.#level + 1)];
     }
     this.#reached = this.#groupsReached();
   }
@@ -202,14 +205,15 @@ export class Slices {
     const risen = this.#risen();
     const { layers, levels, header } = this.#index;
     const layer = this.#byLayer.whole(this.#received);
-    if (layer !== null) {
+    const level = this.#byLevel.whole(this.#received);
+    const ended = level === this.#level && level < header.levels;
+    if (layer !== null && layers[layer]!.level <= this.#level && !ended) {
       const record = layers[layer]!;
       const last = layer === layers.length - 1;
       if (last && !this.#chunks) return this.#end(layer);
-      const level = this.#layerLevel[layer]!;
       return {
         number: layer,
-        level,
+        level: this.#layerLevel[layer]!,
         bytes: this.#inFile ? record.end : this.#bytes,
         rms: record.errors.rms,
         maxError: record.errors.maximum,
@@ -220,7 +224,6 @@ export class Slices {
         wholeNear: false,
       };
     }
-    const level = this.#byLevel.whole(this.#received);
     if (level !== null && level < header.levels && !this.#inFile) {
       return {
         number: level,

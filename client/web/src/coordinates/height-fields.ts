@@ -190,21 +190,47 @@ export function planeAnywhere(plane: Plane, shape: Shape): Plane {
   }) as unknown as Plane;
 }
 
+/** A window of the grid of a level of one block. */
+export interface LevelWindow {
+  /** Of the level's grid. */
+  readonly shape: Shape;
+  /** Rows and columns of the level's grid; across the seam of a closed axis they go on beyond its end. */
+  readonly inside: Region;
+  /** Shape and `axes` of the whole surface. */
+  readonly full: Shape;
+  readonly axes: unknown;
+  /** The rows and columns of the whole surface at which those of the window stand, beyond its end across the seam. */
+  readonly places: Positions;
+}
+
 /**
- * Metadata of a window of a surface of this shape: a geotransform, or axes, move with it. Across the seam of a closed axis
- * both go on, beyond the end of the surface.
+ * Metadata of a window of a level, from those of the level's grid: a geotransform with its nodes, or axes, move with it.
+ * Across the seam of a closed axis all go on, beyond the end of the surface.
  */
-export function windowMetadata(metadata: Metadata, shape: Shape, region: Region): Metadata {
-  const { seam: _seam, turn: _turn, poles: _poles, ...values } = metadata;
-  const [[top], [left]] = region;
+export function windowMetadata(metadata: Metadata, window: LevelWindow): Metadata {
+  const { seam: _seam, turn: _turn, poles: _poles, nodes, ...values } = metadata;
+  const { shape, inside, full, axes, places } = window;
+  const [[top], [left]] = inside;
+  const lines = ([0, 1] as const).map((axis) => lineOf(nodesOf(nodes)[axis], inside[axis], shape[axis]));
+  if (lines.some((line) => line !== null)) values.nodes = lines;
   if (values.geotransform !== undefined && values.geotransform !== null) {
     const [x0, xColumn, xRow, y0, yColumn, yRow] = geotransformOf(values.geotransform);
     const x = x0 + left * xColumn + top * xRow;
     values.geotransform = [x, xColumn, xRow, y0 + left * yColumn + top * yRow, yColumn, yRow];
   }
   if (values.axes !== undefined) {
-    const range = ([start, stop]: Span): Int32Array => Int32Array.from({ length: stop - start }, (_, i) => start + i);
-    values.axes = axesAt(values.axes, shape, [range(region[0]), range(region[1])]);
+    // Of the whole surface: a step of a level across the seam may be shorter than the others.
+    values.axes = axesAt(axes, full, places);
   }
   return values;
+}
+
+/** Where the rows or columns of a window stand, in steps of the even grid from its first; null where evenly. */
+function lineOf(nodes: readonly number[] | null, [start, stop]: Span, length: number): number[] | null {
+  if (nodes === null) return null;
+  const line = Array.from({ length: stop - start }, (_, i) => {
+    const place = start + i;
+    return nodes[place % length]! + Math.floor(place / length) * length - start;
+  });
+  return line.every((place, i) => place === i) ? null : line;
 }

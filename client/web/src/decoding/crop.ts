@@ -70,9 +70,9 @@ function nodesOf(crop: AxisCrop): Span {
 type Taken = readonly [first: number, taken: number, nodes: number];
 
 /**
- * A window of one channel in a state, of a surface of one grid, in memory that the caller's scope ends: lattice
+ * A window of a level of one channel in a state, of a surface of one grid, in memory that the caller's scope ends: lattice
  * coordinates over two to the power of `fraction`. `state` has the passes that remain of each tile, 0 where nothing is
- * needed.
+ * needed; `region` has rows and columns of the level.
  */
 export function reconstructWindow(
   arena: Arena,
@@ -81,13 +81,14 @@ export function reconstructWindow(
   tiles: Tiles,
   state: Int8Array,
   region: Region,
+  finest: number,
 ): { plane: Plane; fraction: number } {
   const { layout } = header;
   let whole = 0;
-  while (whole < layout.levels && !state.subarray(...layout.tilesOf(whole + 1)).some((left) => left !== 0)) whole++;
+  while (whole < finest && !state.subarray(...layout.tilesOf(whole + 1)).some((left) => left !== 0)) whole++;
   const crops: (readonly [AxisCrop, AxisCrop])[] = []; // finest level first
   let spans: Region = region;
-  for (let level = layout.levels; level > 0; level--) {
+  for (let level = finest; level > 0; level--) {
     const steps = layout.steps(0, level);
     const crop = [cropAxis(steps[0], spans[0]), cropAxis(steps[1], spans[1])] as const;
     crops.push(crop);
@@ -99,9 +100,9 @@ export function reconstructWindow(
     [spans[0][0], sizes[0], 0],
     [spans[1][0], sizes[1], 0],
   ]);
-  for (let level = 1; level <= layout.levels; level++) {
-    const crop = crops[layout.levels - level]!;
-    const finer = crops[layout.levels - level - 1];
+  for (let level = 1; level <= finest; level++) {
+    const crop = crops[finest - level]!;
+    const finer = crops[finest - level - 1];
     const wanted: Region = finer ? [nodesOf(finer[0]), nodesOf(finer[1])] : region;
     const steps = [crop[0].step, crop[1].step] as const;
     const canvas = allocatePlane(arena, [steps[0].length, steps[1].length]);
@@ -121,7 +122,7 @@ export function reconstructWindow(
     const address = canvas.address + 4 * (crop[0].start * canvas.pitch + crop[1].start);
     reconstructed = { address, rows: bottom - top, columns: right - left, pitch: canvas.pitch };
   }
-  return { plane: reconstructed, fraction: whole < layout.levels ? FRACTION_BITS : 0 };
+  return { plane: reconstructed, fraction: whole < finest ? FRACTION_BITS : 0 };
 }
 
 /** Copy a plane into the first rows and columns of another. */

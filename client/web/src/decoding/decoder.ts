@@ -26,8 +26,6 @@ const ENTRY = 256;
 export interface DecoderOptions extends Selection {
   /** Limit on the memory of the surface, see `Capacity`. */
   readonly maxVertices?: number | null;
-  /** The finest level that the caller will use; only memory for it is then counted. */
-  readonly level?: number;
 }
 
 /** What exists from the header, and the masks, on. */
@@ -51,7 +49,6 @@ export class Decoder {
   readonly capacity: Capacity;
   readonly #module: WebAssembly.Module;
   readonly #selection: Selection;
-  readonly #finest: number | undefined;
   readonly #frames = new FrameReader();
   readonly #values: Metadata = {};
   readonly #digest: { value: string | null } = { value: null }; // filled when it comes, for views made before
@@ -73,8 +70,7 @@ export class Decoder {
   /** `module` is that of `loadKernels`. */
   constructor(module: WebAssembly.Module, options: DecoderOptions = {}) {
     this.#module = module;
-    this.#selection = { region: options.region, attributes: options.attributes };
-    this.#finest = options.level;
+    this.#selection = { region: options.region, attributes: options.attributes, level: options.level };
     this.capacity = new Capacity(options.maxVertices);
   }
 
@@ -229,7 +225,7 @@ export class Decoder {
     const header = parseHeader(frame.payload, frame.payloadOffset, frame.end);
     this.#header = header;
     checkSelection(this.#selection, header);
-    checkSize(this.#selection, header, this.capacity, this.#finest);
+    checkSize(this.#selection, header, this.capacity);
     if (!header.masked) this.#begin(header);
   }
 
@@ -237,7 +233,7 @@ export class Decoder {
     this.#header = header;
     this.#begun = {
       header,
-      window: this.#selection.region ? new WindowState(header, this.#selection.region) : null,
+      window: this.#selection.region ? new WindowState(header, this.#selection.region, this.#selection) : null,
       progress: new Progress(header),
       shared: {
         reconstruction: new Reconstruction(this.#module, header),
@@ -315,7 +311,7 @@ export class Decoder {
    */
   #verify(): void {
     const header = this.#header;
-    if (!header?.corrected || !this.complete || (this.#finest ?? header.levels) < header.levels) return;
+    if (!header?.corrected || !this.complete || (this.#selection.level ?? header.levels) < header.levels) return;
     try {
       this.view().verify();
     } catch (error) {
@@ -377,7 +373,8 @@ export class Decoder {
     const index = indexFrom(data, start, begun.header).withMetadata(this.#metadata ?? {}, this.#digest.value);
     this.#index = index;
     begun.window?.follow(index);
-    const slices = new Slices(index, select(index, this.#selection));
+    const finest = begun.window ? this.#selection.level : undefined;
+    const slices = new Slices(index, select(index, this.#selection), finest);
     this.#slices = slices;
     if (this.layers.length || this.#frames.partial) {
       // The file was read in its own order so far, and is not any more.

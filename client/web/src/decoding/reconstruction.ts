@@ -10,7 +10,7 @@ import { hullOf, meets } from "../grid/window";
 import { Arena } from "../kernels/arena";
 import { accepted } from "../kernels/instance";
 import { platformSha256, sha256 } from "../kernels/sha256";
-import { restoredRegion } from "../planning/selection";
+import { regionAt, restoredRegion } from "../planning/selection";
 import { decodeChunk } from "../residual/chunk-coder";
 import { allocatePlane, FRACTION_BITS, inverse } from "../transform/pyramid";
 import { DTYPE_BYTES, DTYPES, type DType, type Region } from "../types";
@@ -103,17 +103,17 @@ export class Reconstruction {
   }
 
   /**
-   * A window of the surface, of one grid. Takes memory for what the window is made of, not for the surface; but an axis
-   * along which it crosses the seam is made whole.
+   * The points of a level in a region of the surface, of one grid. Takes memory for what the window is made of, not for
+   * the surface; but an axis along which it crosses the seam is made whole.
    */
-  window(known: Known, region: Region, corrected: boolean, chosen: readonly boolean[]): BlockGrids {
-    const { shape } = this.header;
-    const around = restoredRegion(this.header, region);
+  window(known: Known, region: Region, level: number, corrected: boolean, chosen: readonly boolean[]): BlockGrids {
+    const shape = this.header.layout.shape(0, level);
+    const around = restoredRegion(this.header, region, level);
     const hull = hullOf(around, shape);
     const first = [hull[0][0], hull[1][0]] as const;
-    const grids = this.#window(known, hull, chosen);
+    const grids = this.#window(known, hull, level, chosen);
     if (corrected) this.#correct([grids], chosen, around, first);
-    return grids.map((grid) => cutGrid(grid, region, shape, first));
+    return grids.map((grid) => cutGrid(grid, regionAt(this.header, region, level), shape, first));
   }
 
   /** Give points of a block where `shown` is 0 the values of holes. */
@@ -168,8 +168,8 @@ export class Reconstruction {
     return found;
   }
 
-  /** The values of a window before residual and holes. */
-  #window(known: Known, region: Region, chosen: readonly boolean[]): Grid[] {
+  /** The values of a window of a level before residual and holes; `region` has rows and columns of the level. */
+  #window(known: Known, region: Region, level: number, chosen: readonly boolean[]): Grid[] {
     const tiles = this.#decoded(known.length);
     const shape = [region[0][1] - region[0][0], region[1][1] - region[1][0]] as const;
     const found: Grid[] = [];
@@ -189,6 +189,7 @@ export class Reconstruction {
                 tiles[channel]!,
                 state,
                 region,
+                level,
               );
               this.#store(channel, reconstructed.plane, reconstructed.fraction, points, dtype, count, component);
             });

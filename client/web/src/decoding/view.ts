@@ -4,11 +4,25 @@ import type { Header } from "../container/header";
 import type { Metadata } from "../container/sections";
 import type { State } from "../container/slices";
 import { rint } from "../coordinates/coordinate-rules";
-import { coordinatesOf, levelMetadata, type Nodes, planeAnywhere, windowMetadata } from "../coordinates/height-fields";
+import {
+  coordinatesOf,
+  type LevelWindow,
+  levelMetadata,
+  type Nodes,
+  planeAnywhere,
+  windowMetadata,
+} from "../coordinates/height-fields";
 import { CorruptStreamError, InputError, OptionError } from "../errors";
 import { levelPositions, type Positions, patchesByBlock } from "../grid/patches";
 import { contains, placesOf } from "../grid/window";
-import { checkSelection, type Selection, selectedChannels, selectedTiles } from "../planning/selection";
+import {
+  checkSelection,
+  nodesOfLevel,
+  regionAt,
+  type Selection,
+  selectedChannels,
+  selectedTiles,
+} from "../planning/selection";
 import type { Block, ChannelErrors, Closed, PointArray, Region, Shape, Surface, ViewInfo } from "../types";
 import { clearGrid, cutGrid, type Grid, newGrid } from "./grids";
 import type { BlockGrids, Known, Reconstruction } from "./reconstruction";
@@ -62,14 +76,24 @@ export class View implements ViewInfo {
     return { number, level, bytes, rms, maxError, bound, complete, channels };
   }
 
+  /** The finest level that can be shown: of a window the one that was asked for. */
+  get #finest(): number {
+    const { levels } = this.#shared.reconstruction.header;
+    return this.#selection.region ? (this.#selection.level ?? levels) : levels;
+  }
+
   /**
-   * The points of a window at full resolution; costs time and memory for the window only. Along a closed axis it may go
-   * on across the seam, as columns 350:370 of 360. Throws `OptionError` where the
-   * region is outside the surface, the surface has several blocks, or the view holds another region only.
+   * The points of a window, at full resolution or at a coarser level; costs time and memory for the window only. `region`
+   * has rows and columns of the full grid at any level; along a closed axis it may go on across the seam, as columns
+   * 350:370 of 360. The window of a coarser level is cut out of that level's grid, bit for bit as `surface` gives it.
+   *
+   * Throws `OptionError` where the region is outside the surface or has no point of the level, the surface has several
+   * blocks, the view holds another region only, or there is no such level.
    */
-  window(region: Region): Surface {
+  window(region: Region, level: number = this.#finest): Surface {
     const { header } = this.#shared.reconstruction;
-    const selection: Selection = { region, attributes: this.#selection.attributes };
+    this.#checkLevel(level);
+    const selection: Selection = { region, attributes: this.#selection.attributes, level };
     checkSelection(selection, header);
     const shown = this.#selection.region;
     if (shown && !contains(shown, region, header.shape)) {
@@ -77,14 +101,23 @@ export class View implements ViewInfo {
         `expected a region inside the one received, ${shown.join(" x ")}, got ${region.join(" x ")}`,
       );
     }
-    const wanted = selectedTiles(selection, header);
-    const state = this.#known.state.slice();
-    for (let unit = 0; unit < state.length; unit++) if (!wanted[Math.floor(unit / header.channels)]) state[unit] = 0;
+    let { state } = this.#known;
+    if (level === header.levels) {
+      const wanted = selectedTiles(selection, header);
+      state = state.map((left, unit) => (wanted[Math.floor(unit / header.channels)] ? left : 0));
+    }
     return new View(this, this.#shared, { length: this.#known.length, state }, selection).surface();
   }
 
+  #checkLevel(level: number): void {
+    if (!(Number.isInteger(level) && level >= 0 && level <= this.#finest)) {
+      throw new OptionError(`expected a level of 0 to ${this.#finest}, got ${level}`);
+    }
+  }
+
   /**
-   * The state as a surface, at full resolution or at a coarser level.
+   * The state as a surface, at full resolution or at a coarser level; without `level` of a window that was received at a
+   * coarser level that one.
    *
    * Throws `OptionError` where there is no such level; `CorruptStreamError` where the SHA-256 of the complete surface is
    * wrong, or no value is finite.
@@ -135,14 +168,10 @@ export class View implements ViewInfo {
     const { header } = reconstruction;
     const { region } = this.#selection;
     const asked = level !== undefined;
-    const shownLevel = level ?? header.levels;
+    const shownLevel = level ?? this.#finest;
+    this.#checkLevel(shownLevel);
     const finest = shownLevel === header.levels;
-    if (!(Number.isInteger(shownLevel) && shownLevel >= 0 && shownLevel <= header.levels)) {
-      throw new OptionError(`expected a level of 0 to ${header.levels}, got ${level}`);
-    }
-    if (!finest && region) {
-      throw new OptionError(`expected the finest level, ${header.levels}, for a window, got ${level}`);
-    }
+    const window = region ? this.#levelWindow(region, shownLevel) : null;
     let values: Metadata = { ...metadata };
     if (asked) {
       // The grid of that level, without what a seam repeats.
@@ -153,19 +182,25 @@ export class View implements ViewInfo {
     const exact = this.complete && finest && header.exact && !region && chosen.every(Boolean);
     const verified = finest ? this.#taken() : null;
     if (verified !== null) {
-      const own = region ? windowMetadata(values, header.shape, region) : values;
+      const own = window ? windowMetadata(values, window) : values;
       return { surface: { blocks: verified.blocks, metadata: own }, digest: exact ? digest.value : null };
     }
-    const nodes = this.#nodes(shownLevel);
-    const grids = region
-      ? [this.#window(region, chosen)]
+    const levelNodes = this.#nodes(shownLevel);
+    const nodes = window ? [wrapped(window.places, header.shape)] : levelNodes;
+    const grids = window
+      ? [this.#window(region!, shownLevel, window, chosen)]
       : reconstruction.blocks(this.#known, shownLevel, this.#corrected && finest, chosen);
-    const closures = header.blocks.map(({ shape, closed }) => (region ? windowClosed(closed, shape, region) : closed));
-    const masks = nodes.map((own, block) => this.#maskAt(block, own));
+    const closures = header.blocks.map(({ closed }) =>
+      window ? windowClosed(closed, window.shape, window.inside) : closed,
+    );
+    const masks = nodes.map((own, block) => {
+      // If no node of a level is valid, what stands under the holes is shown.
+      if (!finest && !this.#maskAt(block, levelNodes[block]!)?.includes(1)) return null;
+      return this.#maskAt(block, own);
+    });
     const keptMasks = this.#corrected && finest ? reconstruction.kept : [];
     let blocks = grids.map((own, block): Block => {
-      let mask = masks[block] ?? null;
-      if (mask && !region && !mask.includes(1)) mask = null; // it shows what stands under the holes
+      const mask = masks[block] ?? null;
       const kept = keptMasks[block] ? pick(keptMasks[block], header.blocks[block]!.shape, nodes[block]!) : null;
       if (mask) reconstruction.clear(own, kept ? union(mask, kept) : mask);
       const [points, ...attributes] = own;
@@ -180,7 +215,7 @@ export class View implements ViewInfo {
     let placed: Nodes = [null, null];
     const only = blocks.length === 1 ? blocks[0]! : null;
     if (!finest && only && header.pointChannels === 1) {
-      values = levelMetadata(values, plane !== null, header.shape, header.closed, nodes[0]!);
+      values = levelMetadata(values, plane !== null, header.shape, header.closed, levelNodes[0]!);
     }
     if (plane && !(finest && !region)) {
       plane = planeAnywhere(plane, header.shape);
@@ -190,7 +225,7 @@ export class View implements ViewInfo {
       const kept = keptMasks[0] ? pick(keptMasks[0], header.shape, nodes[0]!) : null;
       blocks = [withCoordinates(only, plane, placed, kept, header)];
     }
-    if (region) values = windowMetadata(values, header.shape, region);
+    if (window) values = windowMetadata(values, window);
     return { surface: { blocks, metadata: values }, digest: exact ? digest.value : null };
   }
 
@@ -208,11 +243,29 @@ export class View implements ViewInfo {
     return this.complete && this.#shared.reconstruction.header.corrected;
   }
 
-  /** Which rows and columns of each block are shown at a level, or in the window. */
+  /** The window of a level that stands in a region. */
+  #levelWindow(region: Region, level: number): LevelWindow {
+    const { header } = this.#shared.reconstruction;
+    const nodes = nodesOfLevel(header, level);
+    const inside = regionAt(header, region, level);
+    const [rows, columns] = ([0, 1] as const).map((axis) =>
+      placesOf(inside[axis], nodes[axis].length).map((number) => {
+        const place = nodes[axis][number]!;
+        return place < region[axis][0] ? place + header.shape[axis] : place;
+      }),
+    );
+    return {
+      shape: [nodes[0].length, nodes[1].length],
+      inside,
+      full: header.shape,
+      axes: this.#shared.metadata.axes,
+      places: [rows!, columns!],
+    };
+  }
+
+  /** Which rows and columns of each block stand at the nodes of a level. */
   #nodes(level: number): Positions[] {
     const { header } = this.#shared.reconstruction;
-    const { region } = this.#selection;
-    if (region) return [[placesOf(region[0], header.shape[0]), placesOf(region[1], header.shape[1])]];
     return patchesByBlock(header.patches, header.blocks.length).map((own, block) =>
       levelPositions(own, header.patches.length, header.layout, level, header.blocks[block]!.shape),
     );
@@ -225,16 +278,17 @@ export class View implements ViewInfo {
     return mask ? pick(mask, header.blocks[block]!.shape, nodes) : null;
   }
 
-  /** Points and attributes of a window of the only block. */
-  #window(region: Region, chosen: readonly boolean[]): BlockGrids {
+  /** Points and attributes of a window of a level of the only block. */
+  #window(region: Region, level: number, window: LevelWindow, chosen: readonly boolean[]): BlockGrids {
     const { reconstruction } = this.#shared;
     const { header } = reconstruction;
+    const corrected = this.#corrected && level === header.levels;
     if (header.arrangement) {
       // A block that meets itself: what its sides share may lie anywhere in it.
-      const whole = reconstruction.blocks(this.#known, header.levels, this.#corrected, chosen)[0]!;
-      return whole.map((grid) => cutGrid(grid, region, header.shape));
+      const whole = reconstruction.blocks(this.#known, level, corrected, chosen)[0]!;
+      return whole.map((grid) => cutGrid(grid, window.inside, window.shape));
     }
-    return reconstruction.window(this.#known, region, this.#corrected, chosen);
+    return reconstruction.window(this.#known, region, level, corrected, chosen);
   }
 
   #block({ points, mask }: Shown, attributes: readonly Grid[], nodes: Positions, closed: Closed): Block {
@@ -255,6 +309,11 @@ export class View implements ViewInfo {
       columns: nodes[1],
     };
   }
+}
+
+/** Rows and columns of a block of this shape where they go on beyond its end with the first ones. */
+function wrapped([rows, columns]: Positions, shape: Shape): Positions {
+  return [rows.map((row) => row % shape[0]), columns.map((column) => column % shape[1])];
 }
 
 /** A mask of a block at some of its rows and columns. */

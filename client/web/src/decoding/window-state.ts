@@ -9,7 +9,7 @@ import type { Header } from "../container/header";
 import type { Index } from "../container/model";
 import type { State } from "../container/slices";
 import { UNANNOUNCED } from "../entropy/tiles";
-import { selectedTiles } from "../planning/selection";
+import { type Selection, selectedTiles } from "../planning/selection";
 import { WindowFigures, windowErrorsFrom, windowSection } from "../planning/window-errors";
 import type { Region } from "../types";
 import { initialState } from "./progress";
@@ -24,11 +24,11 @@ export class WindowState {
   #index: Index | null = null;
   #knownFrom: Int32Array | null = null; // (level, channel)
 
-  /** `header` has its masks. */
-  constructor(header: Header, region: Region) {
+  /** `header` has its masks, `selection` this region. */
+  constructor(header: Header, region: Region, selection: Selection) {
     this.#header = header;
     this.#region = region;
-    this.#inside = selectedTiles({ region }, header);
+    this.#inside = selectedTiles(selection, header);
     this.#figures = new WindowFigures(header, region);
   }
 

@@ -10,14 +10,14 @@ import { type AxisStep, extension, hasTail, REACH } from "./axis";
 import type { Layout } from "./layout";
 import { samplesOf } from "./window";
 
-/** Which tiles of a surface of one grid the points of a window need, parents included: 1 or 0 for each tile. */
-export function neededTiles(layout: Layout, region: Region): Uint8Array {
+/** Which tiles of a surface of one grid the points of a window of a level need, parents included: 1 or 0 for each. */
+export function neededTiles(layout: Layout, region: Region, finest: number): Uint8Array {
   const { tiles } = layout;
   const needed = new Uint8Array(tiles.length);
   needed[0] = 1;
-  const shape = layout.grids[0]!.shape;
+  const shape = layout.shape(0, finest);
   let samples: Uint8Array[] = ([0, 1] as const).map((axis) => samplesOf(region[axis], shape[axis]));
-  for (let level = layout.levels; level > 0; level--) {
+  for (let level = finest; level > 0; level--) {
     const steps = layout.steps(0, level);
     // Coefficients along each axis: nodes first, details after them.
     const lines = samples.map((own, axis) => coefficientsNeeded(own, steps[axis]!));

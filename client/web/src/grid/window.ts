@@ -69,6 +69,29 @@ export function aligned(region: Region, shape: Shape, sizes: readonly [number, n
   return [rows!, columns!];
 }
 
+/**
+ * The window of a coarser grid that has the points of it that stand in a window of this one, which is of `shape`; null
+ * where none does. `nodes` are the rows and the columns of this grid at which those of the coarser one stand, increasing.
+ */
+export function among(region: Region, shape: Shape, nodes: readonly [Int32Array, Int32Array]): Region | null {
+  const found: Span[] = [];
+  for (const axis of [0, 1] as const) {
+    const line = nodes[axis];
+    const parts = spansOf(region[axis], shape[axis]).map((part) => part.map((end) => firstFrom(line, end)));
+    const count = parts.reduce((sum, [start, stop]) => sum + stop! - start!, 0);
+    if (!count) return null;
+    const start = parts[0]![0]! % line.length; // the first one may stand beyond the seam
+    found.push([start, start + count]);
+  }
+  return [found[0]!, found[1]!];
+}
+
+/** The number of the first of increasing places that is not before a place. */
+function firstFrom(line: Int32Array, place: number): number {
+  const number = line.findIndex((node) => node >= place);
+  return number < 0 ? line.length : number;
+}
+
 /** The smallest window around another one that crosses no seam: all of an axis along which that one does. */
 export function hullOf(region: Region, shape: Shape): Region {
   const [rows, columns] = ([0, 1] as const).map((axis): Span => {

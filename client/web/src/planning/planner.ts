@@ -181,7 +181,7 @@ function selected(index: Index, target: Target, options: WindowOptions): Plan {
       // Layers of which nothing is wanted are there as well.
       const record = after === undefined ? index.layers[index.layers.length - 1]! : index.layers[after.layer - 1]!;
       const { rms, maximum: maxError, channels } = record.errors;
-      if (target.level === undefined || level <= target.level) {
+      if (record.level <= finest) {
         const figures = within({ rms, maxError }, record.number);
         marks.push({ sent: slices.total, number: record.number, level, bytes: slices.total, ...figures, channels });
       }
@@ -191,6 +191,7 @@ function selected(index: Index, target: Target, options: WindowOptions): Plan {
   let ended: Ended;
   if (finest < levels) {
     last = markOfLevel(index.levels[finest]!, slices.total);
+    last = { ...last, ...within(last) };
     ended = "level";
   } else {
     for (const chunk of chosen.chunks.values()) slices.append(chunk.range);

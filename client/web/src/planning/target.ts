@@ -50,7 +50,6 @@ export function makeTarget(options: TargetOptions = {}): Target {
     throw new OptionError(`expected order quality or level, got ${JSON.stringify(order)}`);
   }
   if (region !== undefined) {
-    if (level !== undefined) throw new OptionError("expected either a level or a region, got both");
     checkSpans(region);
   }
   if (first !== undefined) checkSpans(first);

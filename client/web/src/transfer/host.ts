@@ -9,7 +9,7 @@ import { Decoder } from "../decoding/decoder";
 import type { View } from "../decoding/view";
 import { InputError } from "../errors";
 import { loadKernels } from "../kernels/instance";
-import { checkSize } from "../planning/selection";
+import { checkSelection, checkSize } from "../planning/selection";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Surface, ViewInfo } from "../types";
 import { isSurface } from "./addresses";
@@ -35,9 +35,9 @@ export class Host implements Questions {
     const { source, options, kept } = opening;
     const target = makeTarget(opening.target);
     const { region, attributes, level } = target;
-    const selection = { region, attributes, maxVertices: opening.maxVertices ?? null };
-    // A later target may want more than this level, see `aim`.
-    this.decoder = new Decoder(await loadKernels(), level === undefined ? selection : { ...selection, level });
+    const maxVertices = opening.maxVertices ?? null;
+    // A later target for the whole surface may want more than this level, see `aim`.
+    this.decoder = new Decoder(await loadKernels(), { region, attributes, level, maxVertices });
     if (opening.keep || kept !== undefined) {
       this.store = new MemoryStore(opening.keep);
       for (const [offset, data] of kept?.slices ?? []) {
@@ -87,7 +87,9 @@ export class Host implements Questions {
     const header = this.decoder?.header;
     if (header && !header.awaitsMasks) {
       const { region, attributes, level } = makeTarget(options);
-      checkSize({ region, attributes }, header, new Capacity(this.decoder!.capacity.maxVertices), level);
+      const selection = { region, attributes, level };
+      checkSelection(selection, header);
+      checkSize(selection, header, new Capacity(this.decoder!.capacity.maxVertices));
     }
     this.own.aim(options);
   }
@@ -100,8 +102,8 @@ export class Host implements Questions {
     return this.viewOf(view).surfaceAsync(level);
   }
 
-  window(view: number, region: Region): Surface {
-    return this.viewOf(view).window(region);
+  window(view: number, region: Region, level: number | undefined): Surface {
+    return this.viewOf(view).window(region, level);
   }
 
   async prices(): Promise<readonly Price[]> {

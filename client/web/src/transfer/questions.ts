@@ -80,7 +80,7 @@ export interface Questions {
   aim(target: TargetOptions): void;
   throttle(rate: number | undefined): void;
   surface(view: number, level: number | undefined): Promise<Surface>;
-  window(view: number, region: Region): Surface;
+  window(view: number, region: Region, level: number | undefined): Surface;
   prices(): Promise<readonly Price[]>;
   kept(): Kept;
 }

@@ -184,13 +184,16 @@ export class ReceiverState<View extends ViewInfo> {
   /**
    * Change what is received and where it stops, while it is being received or after it has ended.
    *
-   * @throws OptionError if the window or the attributes differ, which take another decoder; or if the surface is known
-   * and cannot meet the target.
+   * @throws OptionError if the window, its level or the attributes differ, which take another decoder; or if the surface
+   * is known and cannot meet the target.
    */
   retarget(target: Target): void {
     const names = (some: Target): string => JSON.stringify(some.attributes ?? null);
     if (!sameRegion(target.region, this.target.region) || names(target) !== names(this.target)) {
       throw new OptionError("expected a target with the same region and attributes, got others: open another stream");
+    }
+    if (target.region !== undefined && target.level !== this.target.level) {
+      throw new OptionError("expected a target with the same level of the region, got another: open another stream");
     }
     const { windows, bounded } = this;
     if (this.index !== undefined) plan(this.index, target, undefined, { windows, bounded });

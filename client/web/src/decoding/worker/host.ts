@@ -52,7 +52,7 @@ async function carryOut(decoder: Decoder, call: Exclude<Call, { do: "open" }>): 
     case "surface":
       return viewOf(decoder, call.view).surfaceAsync(call.level ?? undefined);
     case "window":
-      return viewOf(decoder, call.view).window(call.region);
+      return viewOf(decoder, call.view).window(call.region, call.level ?? undefined);
   }
 }
 

@@ -17,7 +17,7 @@ export type Call =
   | { readonly do: "focus"; readonly region: Region | null }
   | { readonly do: "finish" }
   | { readonly do: "surface"; readonly view: number; readonly level: number | null }
-  | { readonly do: "window"; readonly view: number; readonly region: Region };
+  | { readonly do: "window"; readonly view: number; readonly region: Region; readonly level: number | null };
 
 /** A call with its number. */
 export interface Request {

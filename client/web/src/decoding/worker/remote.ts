@@ -10,8 +10,8 @@ import type { Answer, Call, Listener, Port, Request } from "./messages";
 export interface RemoteView extends ViewInfo {
   /** The state as a surface, at full resolution or at a coarser level, see `View.surface`. */
   surface(level?: number): Promise<Surface>;
-  /** A window at full resolution, see `View.window`. */
-  window(region: Region): Promise<Surface>;
+  /** A window at full resolution or at a coarser level, see `View.window`. */
+  window(region: Region, level?: number): Promise<Surface>;
 }
 
 /** A `Decoder` in a worker, at the other end of whose port is `serveDecoder`. Calls are done in the order made. */
@@ -111,7 +111,7 @@ export class RemoteDecoder {
     this.layers.push({
       ...info,
       surface: (level) => shown({ do: "surface", view, level: level ?? null }),
-      window: (region) => shown({ do: "window", view, region }),
+      window: (region, level) => shown({ do: "window", view, region, level: level ?? null }),
     });
   }
 }
