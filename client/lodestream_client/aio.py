@@ -1,9 +1,9 @@
 """Streams and surfaces of a server, for asyncio.
 
-`lodestream_client` exports these names; `lodestream_client.sync` has the same for programs without an event loop. In the
-event loop bytes are only taken apart, at most 64 KiB at a time. Values are decoded where they are asked for: use
-``await asyncio.to_thread(view.surface)`` for a large surface, and ``asyncio.to_thread(stream.decoder.view)`` for its
-end, which is verified when it is first asked for.
+`lodestream_client` exports these names; `lodestream_client.sync` has the same for programs without an event loop. The
+event loop only takes bytes apart, at most 64 KiB at a time. Values are decoded where they are asked for: use ``await
+asyncio.to_thread(view.surface)`` for a large surface, and ``asyncio.to_thread(stream.decoder.view)`` for its end, which
+is verified when it is first asked for.
 
 Examples
 --------
