@@ -30,6 +30,8 @@ CHUNK = 1 << 16
 STREAMS = (0, 16, 64)
 #: Rows, and columns, of surfaces whose tiles are placed.
 TILED = (4096, 32768)
+#: Rows, and columns, of surfaces that `decode` decodes at once.
+WHOLE = 4097
 
 
 def main() -> None:
@@ -44,6 +46,12 @@ def main() -> None:
             head = ["surface", "as float32", "container", "after all input", "with the last surface", "x float32"]
             table("Memory of a Decoder", head, rows)
             note("Peak memory above that of the process before, in a separate process, fed with 64 KiB at a time.")
+            whole = [_whole_row(dtype, Path(folder, f"{dtype}.lode")) for dtype in ("int16", "float32")]
+            table("Memory of decode", ["surface", "container", "peak", "bytes a value"], whole)
+            note(
+                "Peak memory above that of the process before, in a separate process, which has the container's bytes; "
+                "the surface that is returned included."
+            )
             rows = [_tiles_row(side) for side in TILED]
             table("Where tiles lie", ["surface", "tiles", "memory", "a tile", "seconds"], rows)
             note(
@@ -75,6 +83,25 @@ def _decoder_row(name: str, points: NDArray[Any], container: Path) -> list[str]:
     raw = 4 * points.size
     cells = [memory(count) for count in (raw, container.stat().st_size, fed, drawn)]
     return [name, *cells, f"{drawn / raw:.1f}"]
+
+
+def _whole_row(dtype: str, path: Path) -> list[str]:
+    heights = fractal(WHOLE, rounded=dtype == "int16") - 2**15
+    path.write_bytes(lodestream.encode(heights.astype(dtype)))
+    command = [sys.executable, "-m", "benchmarks.memory", "whole", str(path)]
+    peak = int(subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT).stdout)
+    name = f"{WHOLE:,} x {WHOLE:,} {dtype}"
+    return [name, memory(path.stat().st_size), memory(peak), f"{peak / WHOLE**2:.1f}"]
+
+
+def decode_whole(container: Path) -> None:
+    """Print the peak memory of `decode`; runs in a process of its own."""
+    lodestream.decode(lodestream.encode(np.arange(289.0).reshape(17, 17) % 7))  # loads the kernels
+    data, peak = container.read_bytes(), Peak()
+    peak.forget()
+    surface = lodestream.decode(data)
+    print(peak.above())
+    assert surface.points.size == WHOLE**2
 
 
 def decode(container: Path) -> None:
@@ -158,5 +185,7 @@ def _wait(url: str, server: subprocess.Popen[bytes]) -> None:
 if __name__ == "__main__":
     if sys.argv[1] == "tiles":
         place_tiles(int(sys.argv[2]))
+    elif sys.argv[1] == "whole":
+        decode_whole(Path(sys.argv[2]))
     else:
         decode(Path(sys.argv[1]))

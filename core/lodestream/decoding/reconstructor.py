@@ -74,7 +74,7 @@ class Reconstructor:
     coordinate : bool
         Whether sides come from interfaces.
     memory : int32, shape (number,), optional
-        Room of `Region.size` numbers to work in, whatever it holds.
+        Room of `Region.size` numbers to work in, or of `Region.size_above` with ``below``, whatever it holds.
     below : int32, shape (row, column), and int, optional
         The core's only grid if it is made already, and the power of two that it stands over.
     """

@@ -199,7 +199,12 @@ class Region:
     def size(self) -> int:
         """Numbers that a reconstruction takes: the grids of the core, and what is made of each finer level."""
         core = [self.part.shape(number, self.core) for number in range(len(self.grids))]
-        return sum((rows + 1) * (columns + PADDING) for rows, columns in (*core, *(step.shape for step in self.steps)))
+        return _size(core) + self.size_above
+
+    @property
+    def size_above(self) -> int:
+        """The same where the core is made already."""
+        return _size([step.shape for step in self.steps])
 
     @cached_property
     def tiles(self) -> list[range]:
@@ -235,6 +240,11 @@ class Region:
             starts, stops = np.array([rows[:2], columns[:2]]).T
             taken |= ((first < stops) & (last > starts)).all(axis=1)
         return consecutive(tiles.start + bands.tile[taken])
+
+
+def _size(shapes: Sequence[tuple[int, int]]) -> int:
+    """Numbers that arrays of these shapes take, each with room for one row more."""
+    return sum((rows + 1) * (columns + PADDING) for rows, columns in shapes)
 
 
 def core_level(layout: Layout, level: int, points: int) -> int:

@@ -122,7 +122,7 @@ def values_of(
             header.predictors[work.channel],
             channels[work.channel],
             work.channel < header.geometric,
-            _room(work.region.size),
+            _room(work.region.size if work.below is None else work.region.size_above),
             work.below,
         )
         coordinates, fraction = reconstructor.reconstruct(work.known)
@@ -210,7 +210,8 @@ def _level_below(
 
     def put(rows: Span) -> int:
         band = _band(whole, rows)
-        (grid,), fraction = Reconstructor(band, predictors, tiles, True, _room(band.size), below).reconstruct(known)
+        reconstructor = Reconstructor(band, predictors, tiles, True, _room(band.size_above), below)
+        (grid,), fraction = reconstructor.reconstruct(known)
         array[slice(*rows)] = grid
         return fraction
 

@@ -311,7 +311,6 @@ class Tiles:
         state: NDArray[np.int8],
         coefficients: Sequence[NDArray[np.int32] | None],
         whole: int,
-        start: int | None = None,
         bare: Collection[int] = (),
     ) -> None:
         """`spread` all tiles of the levels up to one: zeros where they were not announced.
@@ -325,14 +324,12 @@ class Tiles:
             What they hold at the places of these tiles does not matter.
         whole : int
             Coefficients of levels above this one are multiplied by 2**`FRACTION_BITS`.
-        start : int, optional
-            The levels up to this one are passed over.
         bare : collection of int
-            So are these.
+            These levels are passed over.
         """
         table, state = self.table, np.ascontiguousarray(state)
         finer = table.tiles_from(whole + 1)
-        for lowest, highest in _runs(0 if start is None else start + 1, level, bare):
+        for lowest, highest in _runs(0, level, bare):
             span = table.first[[table.tiles_from(lowest) if lowest else 0, table.tiles_from(highest + 1)]]
             for array, numbers in zip(coefficients, table.of_grid, strict=True):
                 if array is None:

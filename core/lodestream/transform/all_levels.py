@@ -83,14 +83,13 @@ def inverse_levels(
     level: int,
     whole: int | None,
     coordinate: bool,
-    start: int | None,
     bare: Collection[int],
 ) -> None:
-    """`pyramid.inverse` from the level ``start`` to another, in place.
+    """`pyramid.inverse` of arrays in one piece of memory, in place.
 
     ``memory`` is that of the arrays, which have the shape (row, column); ``predictors`` have (level, axis, 2).
     """
-    told, fitted, rules, room = _told(layout, coordinate or not layout.shared, level, whole, start, tuple(bare))
+    told, fitted, rules, room = _told(layout, coordinate or not layout.shared, level, whole, tuple(bare))
     table = told.copy()
     table[fitted, _A : _B + 1] = predictors[rules[:, 0], rules[:, 1]]
     kernels.inverse(table, _planes(arrays, memory), memory, np.empty(room, np.int32))
@@ -113,12 +112,12 @@ def _address(array: NDArray[np.int32]) -> int:
 
 @lru_cache(maxsize=2 * REMEMBERED)
 def _told(
-    layout: Layout, coordinate: bool, level: int, whole: int | None, start: int | None, bare: tuple[int, ...]
+    layout: Layout, coordinate: bool, level: int, whole: int | None, bare: tuple[int, ...]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int]:
     """The kernel's table for some levels; its rows with an (a, b) of their own, and which; room to work in."""
     steps = _steps(layout, coordinate)
-    first, last = 0 if start is None else steps.starts[start + 1], steps.starts[level + 1]
-    table, of_level, coarse = steps.table[first:last].copy(), steps.level[first:last], steps.coarse[first:last]
+    last = steps.starts[level + 1]
+    table, of_level, coarse = steps.table[:last].copy(), steps.level[:last], steps.coarse[:last]
     if whole is not None:
         refined = (of_level == whole + 1) & (table[:, _KIND] == kernels.INVERSE_NOTHING)
         table[refined, _KIND] = kernels.INVERSE_REFINE
@@ -127,8 +126,8 @@ def _told(
         table[own, _KIND] = kernels.LIFT_BARE
         own &= coarse >= 0
         table[own, _ROWS] = coarse[own]  # no other row has anything
-    fitted = slice(*np.searchsorted(steps.fitted, (first, max(first, last))))
-    return table, steps.fitted[fitted] - first, steps.rules[fitted], steps.room[level]
+    fitted = slice(int(np.searchsorted(steps.fitted, last)))
+    return table, steps.fitted[fitted], steps.rules[fitted], steps.room[level]
 
 
 @lru_cache(maxsize=2 * REMEMBERED)

@@ -129,7 +129,6 @@ def inverse(
     level: int,
     whole: int | None = None,
     coordinate: bool = True,
-    start: int | None = None,
     bare: Collection[int] = (),
 ) -> None:
     """Turn coefficients into the grids of ``level``, in place, in the first rows and columns of the arrays.
@@ -146,16 +145,15 @@ def inverse(
 
     Of a channel that is no ``coordinate`` no side comes from an interface, and interfaces mean nothing.
 
-    With ``start``, the arrays hold the grids of that level already, as this leaves them there with the same ``whole``.
     Details of the levels in ``bare`` are 0, whatever stands in their places; none where sides come from interfaces.
     """
     if (memory := memory_of(arrays, layout, level)) is not None:
-        inverse_levels(memory, arrays, layout, predictors, level, whole, coordinate, start, bare)
+        inverse_levels(memory, arrays, layout, predictors, level, whole, coordinate, bare)
         return
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.interface]
-    if coordinate and start is None:
+    if coordinate:
         take_nodes(arrays, layout)
-    for finer in range((start or 0) + 1, level + 1):
+    for finer in range(1, level + 1):
         for k in numbers:
             if whole is not None and finer == whole + 1:
                 refine(_corner(arrays[k], layout.shape(k, whole)))  # the first level with details missing

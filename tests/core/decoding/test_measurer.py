@@ -138,3 +138,23 @@ def test_errors_are_those_of_their_definition(seed: int) -> None:
         assert (errors.rms, errors.maximum) == pytest.approx(expected[0], rel=1e-12)
         channels = expected[1:] if header.geometric > 1 else expected
         np.testing.assert_allclose(errors.channels, channels, rtol=1e-12)
+
+
+@pytest.mark.parametrize("attribute", [False, True])
+def test_differences_whose_squares_vanish_are_not_none(attribute: bool) -> None:
+    """Float64 holds differences of 1e-200, and not their squares."""
+    rng = np.random.default_rng(3)
+    tiny = np.rint(rng.normal(size=(300, 280)).cumsum(axis=0) * 50) * 2.0**-700
+    heights = np.rint(rng.normal(size=tiny.shape)).astype(np.int16) if attribute else tiny
+    decoder = decoder_of(ls.encode(ls.Surface(heights, attributes={"tiny": tiny} if attribute else {})))
+    measuring = measurer_of(decoder, Region.whole(decoder.header.layout, decoder.header.levels))
+    states = states_of(decoder, 5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measurer, "_WHOLE_POINTS", 1)
+        patch.setattr(measurer, "_WINDOW_SIDE", 100)
+        measured = measuring.errors(states)
+    for (errors, _), state in zip(measured, states, strict=True):
+        assert errors == measuring.exact_errors(state)[0]
+    first = measured[0][0]
+    rms, maximum = first.channels[1] if attribute else first[:2]
+    assert 0 < rms < maximum < 1e-190

@@ -41,7 +41,6 @@ def test_any_levels_of_any_plane(
     rng = np.random.default_rng(seed)
     layout = Layout.single(shape, closed, (6, 6))
     level = data.draw(st.integers(0, layout.levels))
-    start = data.draw(st.none() | st.integers(0, level))
     whole = data.draw(st.none() | st.integers(0, layout.levels))
     bare = data.draw(st.sets(st.integers(0, layout.levels)))
     predictors = rng.integers(-127, 128, (layout.levels, INTERFACES + 1, 2)).astype(np.int8)
@@ -49,10 +48,10 @@ def test_any_levels_of_any_plane(
     found, expected = allocate(coefficients.shape), allocate(coefficients.shape)
     found[...] = expected[...] = coefficients
     assert all_levels.memory_of([found], layout, level) is not None
-    inverse([found], layout, predictors, level, whole, start=start, bare=bare)
+    inverse([found], layout, predictors, level, whole, bare=bare)
     with patch.object(all_levels, "_AT_ONCE", 0):
         assert all_levels.memory_of([expected], layout, level) is None
-        inverse([expected], layout, predictors, level, whole, start=start, bare=bare)
+        inverse([expected], layout, predictors, level, whole, bare=bare)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -66,19 +65,18 @@ def test_grids_that_share_sides(name: str) -> None:
     predictors = rng.integers(-127, 128, (layout.levels, INTERFACES + 1, 2)).astype(np.int8)
     few = len(layout.grids) * layout.levels <= all_levels._MOST_GRIDS
     for level, whole, coordinate in product(range(layout.levels + 1), (None, 0, 2, layout.levels), (True, False)):
-        for start in (None, *range(level + 1)):
-            bits = int(rng.integers(1, 30))
-            found = grids(layout, level)
-            for array in found:
-                array[...] = rng.integers(-(1 << bits) + 1, 1 << bits, array.shape)
-            expected = [array.copy() for array in found]
-            assert (all_levels.memory_of(found, layout, level) is not None) == few
-            inverse(found, layout, predictors, level, whole, coordinate, start)
-            with patch.object(all_levels, "_AT_ONCE", 0):
-                inverse(expected, layout, predictors, level, whole, coordinate, start)
-            for grid, one, other in zip(layout.grids, found, expected, strict=True):
-                if coordinate or not grid.interface:
-                    np.testing.assert_array_equal(one, other)
+        bits = int(rng.integers(1, 30))
+        found = grids(layout, level)
+        for array in found:
+            array[...] = rng.integers(-(1 << bits) + 1, 1 << bits, array.shape)
+        expected = [array.copy() for array in found]
+        assert (all_levels.memory_of(found, layout, level) is not None) == few
+        inverse(found, layout, predictors, level, whole, coordinate)
+        with patch.object(all_levels, "_AT_ONCE", 0):
+            inverse(expected, layout, predictors, level, whole, coordinate)
+        for grid, one, other in zip(layout.grids, found, expected, strict=True):
+            if coordinate or not grid.interface:
+                np.testing.assert_array_equal(one, other)
 
 
 def test_arrays_apart_take_one_step_after_another() -> None:
