@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -86,13 +87,55 @@ def test_any_window_of_any_level_is_that_of_the_whole(
             used.known[here], used.sign[here] = tiles.known[there], tiles.sign[there]
     memory = [None, np.full(region.size, 12345, np.int32)][int(rng.integers(2))]
     reconstructor = Reconstructor(region, predictors, used, memory=memory)
-    for _ in range(3):
-        state = any_state(layout, rng)
+    coded = {tile for run in region.coded_tiles for tile in run}
+    assert {layout.parents[tile] for tile in coded} <= {*coded, -1}
+    state = np.zeros(len(layout.tiles), np.int8)
+    for changes in (0, 1, 0, 1, 1, len(state), 1, len(state)):
+        # Nothing is left, or one tile changes, in the window or beside it, and a level is no longer known whole.
+        chosen = rng.permutation(len(state))[:changes]
+        state = state.copy() if changes else np.zeros_like(state)
+        state[chosen] = any_state(layout, rng)[chosen]
         expected, fraction = whole(layout, tiles, predictors, state, level)
         (array,), made = reconstructor.reconstruct(known_state(used.table, state, level))
         assert made == fraction
         rows, columns = (np.arange(*span) for span in spans)
         assert np.array_equal(array, expected.take(rows, 0, mode="wrap").take(columns, 1, mode="wrap"))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("length", [1000, 1001, 1002, 1004, 1005, 1006])
+def test_windows_across_the_seam_of_a_long_axis(length: int, axis: int) -> None:
+    """On one side of the seam, on the other one or on both; some levels have a gap there, others have none."""
+    rng = np.random.default_rng(length)
+    shape, closed = ((length, 9), (True, False)) if axis == 0 else ((9, length), (False, True))
+    layout = Layout.single(shape, closed, (3, 3))
+    tiles, predictors = known_surface(layout, rng)
+    for start, stop in ((length - 8, length + 5), (length - 1, length + 1), (length - 3, length), (0, 4)):
+        spans = ((start, stop), (0, 9)) if axis == 0 else ((0, 9), (start, stop))
+        for core in (0, 2, 4):
+            state = any_state(layout, rng)
+            expected, _ = whole(layout, tiles, predictors, state, layout.levels)
+            region = Region.window(layout, layout.levels, *spans, core=core)
+            (array,), _ = Reconstructor(region, predictors, tiles).reconstruct(
+                known_state(tiles.table, state, layout.levels)
+            )
+            assert np.array_equal(array, expected.take(np.arange(start, stop), axis, mode="wrap"))
+
+
+@pytest.mark.parametrize(
+    ("shape", "tile", "spans"),
+    [((4, 41), (3, 1), ((1, 4), (28, 41))), ((612, 49), (1, 4), ((175, 178), (14, 30)))],
+)
+def test_parents_of_coded_tiles_are_coded_where_the_level_below_needs_none_of_them(
+    shape: tuple[int, int], tile: tuple[int, int], spans: tuple[tuple[int, int], tuple[int, int]]
+) -> None:
+    layout = Layout.single(shape, (False, False), tile)
+    region = Region.window(layout, layout.levels, *spans, core=2)
+    coded = [number for run in region.coded_tiles for number in run]
+    needed = {number for run in region.tiles for number in run}
+    parents = {layout.parents[number] for number in coded}
+    assert parents <= {*coded, -1}
+    assert not parents <= {*needed, -1}
 
 
 @settings(max_examples=60, deadline=None)
