@@ -189,9 +189,10 @@ class _Job:
 
     def _decode_planned(self, index: Index) -> None:
         from lodestream.planning.planner import plan
-        from lodestream.planning.window_errors import read_window_errors
+        from lodestream.planning.window_errors import read_window_errors, wants_window_errors
 
-        windows = None if self._target.region is None else read_window_errors(index, self._read)
+        wanted = wants_window_errors(self._target, index.header)
+        windows = read_window_errors(index, self._read) if wanted else None
         chosen = plan(index, self._target, windows=windows)
         self.ended = chosen.ended
         done = 0

@@ -90,13 +90,6 @@ describe("targets", () => {
       { level: -1 },
       { level: 1.5 },
       { level: 1, seconds: 2 },
-      {
-        level: 1,
-        region: [
-          [0, 1],
-          [0, 1],
-        ] as never,
-      },
       { maxBytes: 0 },
       { seconds: 0 },
       { order: "other" as never },

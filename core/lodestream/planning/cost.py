@@ -7,7 +7,7 @@ from collections import Counter
 from ..container.model import Header, Index
 from ..errors import OptionError
 from ..target import Target
-from .window_errors import window_section
+from .window_errors import wants_window_errors, window_section
 
 __all__ = ["MOST_STEPS", "check_cost", "plan_cost"]
 
@@ -52,7 +52,7 @@ def plan_cost(index: Index, target: Target, ranges: int, *, bounded: bool = Fals
     if target.first is not None:
         # Each mark is there twice, and each segment may divide a slice.
         steps += marks + len(index.segments)
-    section = window_section(index) if bounded and target.region is not None else None
+    section = window_section(index) if bounded and wants_window_errors(target, header) else None
     if section is not None:
         steps += (1 + len(index.layers)) * section.length // (2 * len(index.layers) * _AT_ONCE)
     return steps

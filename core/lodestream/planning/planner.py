@@ -18,7 +18,7 @@ from .limits import ErrorLimits
 from .plan import Mark, Plan, Reason
 from .region_first import region_first
 from .selection import select, selection_of
-from .window_errors import WindowErrors, WindowFigures, window_section
+from .window_errors import WindowErrors, WindowFigures, wants_window_errors, window_section
 
 __all__ = ["Mark", "Plan", "Reason", "plan"]
 
@@ -42,7 +42,7 @@ def plan(
     cached : RangeSet or None
     windows : WindowErrors or None
         The container's own bounds of the errors of windows. Their section then comes behind the index, if the target
-        is a window.
+        is a window at full resolution.
     bounded : bool
         Whether errors of windows are told. False: they are NaN before the end, as receivers of
         earlier releases expect.
@@ -152,6 +152,7 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
 def _selected(index: Index, target: Target, windows: WindowErrors | None, bounded: bool) -> Plan:
     """A window, or some attributes only: segments in file order or level by level, then chunks of residual."""
     chosen = select(index, selection_of(target))
+    windows = windows if wants_window_errors(target, index.header) else None
     levels, within = index.header.layout.tile_levels.data, _figures(index, target.region, windows, bounded)
     finest = selection_of(target).finest(index.header)
     segments = [s for s in chosen.segments if levels[s.tile] <= finest]
@@ -192,7 +193,7 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
     marks = [mark for mark in marks if mark.sent < size] + [last]
     if target.level is None:
         marks, ended = _until(marks, target, index.header)
-    section = window_section(index) if target.region is not None and windows is not None and bounded else None
+    section = window_section(index) if windows is not None and bounded else None
     before = (index.index,) if section is None else (index.index, section)
     return Plan(before, _cut(ranges, marks[-1].sent), (index.metadata,), tuple(marks), ended)
 

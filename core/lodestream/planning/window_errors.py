@@ -21,7 +21,7 @@ from ..container.sections import check_of
 from ..errors import CorruptStreamError, OptionError
 from ..grid.window import check_region, is_whole, spans, taken
 from ..kernels import PART_COLUMNS, PART_ROWS
-from ..target import Region
+from ..target import Region, Target
 
 __all__ = [
     "CELL",
@@ -35,6 +35,7 @@ __all__ = [
     "parse_window_errors",
     "read_window_errors",
     "serialize_window_errors",
+    "wants_window_errors",
     "window_section",
 ]
 
@@ -287,6 +288,14 @@ def _crc_table() -> NDArray[np.uint32]:
     for _ in range(8):
         table = np.where(table & 1, np.uint32(0xEDB88320), np.uint32(0)) ^ (table >> 1)
     return table
+
+
+def wants_window_errors(target: Target, header: Header) -> bool:
+    """Whether a target needs the bounds of the errors of windows: that of a window at full resolution.
+
+    That of a coarser level has no limits that they could meet sooner, and often takes fewer bytes than they do.
+    """
+    return target.region is not None and target.level in (None, header.levels)
 
 
 def window_section(index: Index) -> ByteRange | None:

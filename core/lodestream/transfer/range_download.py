@@ -331,7 +331,7 @@ class RangeDownload:
     def _read_index(self) -> list[DownloadEvent]:
         from ..container import read_index
         from ..container.capacity import Capacity
-        from ..planning.window_errors import read_window_errors
+        from ..planning.window_errors import read_window_errors, wants_window_errors
 
         store, size = self.reception.keep(), self.reception.size or 0
 
@@ -343,7 +343,7 @@ class RangeDownload:
         self._needed, windows = None, None
         try:
             index = read_index(read, size, Capacity(self.reception.decoder.capacity.max_vertices))
-            if self.reception.target.region is not None:
+            if wants_window_errors(self.reception.target, index.header):
                 windows = read_window_errors(index, read)
         except _MissingError as missing:
             self._needed = missing.place

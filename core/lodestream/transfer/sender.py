@@ -12,7 +12,7 @@ from ..planning.byte_ranges import RangeSet
 from ..planning.cost import check_cost, plan_cost
 from ..planning.plan import Mark, Plan
 from ..planning.planner import plan
-from ..planning.window_errors import WindowErrors, window_section
+from ..planning.window_errors import WindowErrors, wants_window_errors, window_section
 from ..protocol.connection import Connection, Side, State
 from ..protocol.flow_control import SMALL_MESSAGE
 from ..protocol.messages import (
@@ -199,7 +199,7 @@ class Sender:
         bounded = bool(event.window_errors) and event.target.region is not None
         try:
             check_cost(self._cost(event))
-            windows = self._windows() if bounded else None
+            windows = self._windows() if bounded and wants_window_errors(event.target, index.header) else None
             chosen = plan(index, event.target, self._said(event), windows=windows, bounded=bounded)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None

@@ -21,6 +21,7 @@ from lodestream.grid.layout import Layout
 from lodestream.grid.support import needed_tiles
 from lodestream.grid.window import among, check_region, places, spanning
 from lodestream.planning.planner import plan
+from lodestream.planning.window_errors import read_window_errors
 from lodestream.target import Region
 from lodestream.transform.lifting import CLAMP
 from lodestream.transform.pyramid import allocate, forward, inverse
@@ -225,6 +226,10 @@ def test_fewer_bytes_than_of_the_level_or_of_the_window_and_its_own_errors(order
         feed(decoder, container, place)
     assert (decoder.rms, decoder.max_error, decoder.view().bound) == (chosen.rms, chosen.max_error, True)
     assert not decoder.complete
+    # Bounds of cells could end no stream sooner, and are not sent.
+    windows = read_window_errors(index, lambda offset, length: container[offset : offset + length])
+    assert windows is not None
+    assert plan(index, ls.Target(region=REGION, level=level, order=order), windows=windows) == chosen
 
 
 def test_no_layer_with_finer_data_is_told_as_a_state() -> None:

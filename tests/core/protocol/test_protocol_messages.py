@@ -37,6 +37,7 @@ EVENTS: list[Event] = [
     Open(),
     Open(Target(level=3), 1000, ((0, 96), (200, 1)), DIGEST),
     Open(Target(region=((0, 3), (1, 5))), window_errors=True),
+    Open(Target(region=((0, 3), (1, 5)), level=2), window_errors=True),
     Open(token="lode_dG9rZW4"),
     Open(Target(until_rms=Tolerance(1e-3, True), until_max=Tolerance(2.5), max_bytes=20000, order="level"), 0),
     Open(Target(until_rms={"speed": 0.1, "z": 2}, until_max={"speed": 1.5}, attributes=("speed",))),

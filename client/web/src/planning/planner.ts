@@ -13,7 +13,7 @@ import { ErrorLimits } from "./limits";
 import { type Ended, endOf, type Mark, type Plan } from "./plan";
 import { regionFirst } from "./region-first";
 import { select } from "./selection";
-import { type Figures, type WindowErrors, WindowFigures, windowSection } from "./window-errors";
+import { type Figures, type WindowErrors, WindowFigures, wantsWindowErrors, windowSection } from "./window-errors";
 
 /** What a plan of a window takes from beside the index. */
 export interface WindowOptions {
@@ -157,7 +157,8 @@ function byLevel(index: Index, target: Target, level: number): Plan {
 function selected(index: Index, target: Target, options: WindowOptions): Plan {
   const chosen = select(index, target);
   const { tiles, levels } = index.header.layout;
-  const { windows = null, bounded = true } = options;
+  const { bounded = true } = options;
+  const windows = wantsWindowErrors(target, index.header) ? (options.windows ?? null) : null;
   const within = figuresOf(index, target.region, windows, bounded);
   const finest = target.level ?? levels;
   checkLevel(finest, levels);
@@ -204,7 +205,7 @@ function selected(index: Index, target: Target, options: WindowOptions): Plan {
   if (target.region !== undefined) marks = marks.map((mark) => ({ ...mark, channels: [] }));
   if (target.level === undefined) [marks, ended] = until(marks, target, index.header);
   const ranges = cut(slices.ranges, marks[marks.length - 1]!.sent);
-  const section = target.region !== undefined && windows !== null && bounded ? windowSection(index) : null;
+  const section = windows !== null && bounded ? windowSection(index) : null;
   const before = section === null ? [index.index] : [index.index, section];
   return { before, ranges, after: [index.metadata], marks, ended, prefix: false };
 }

@@ -12,7 +12,7 @@ import type { Read } from "../container/reader";
 import { WINDOW_ERRORS } from "../container/sections";
 import { CorruptStreamError, OptionError } from "../errors";
 import { checkRegion, spansOf } from "../grid/window";
-import type { ByteRange, Region, Span } from "../types";
+import type { ByteRange, Region, Span, Target } from "../types";
 
 // A code is a step of an eighth of an octave: 2^(-k / 8) over 2^16, rounded up; the last one says that there is no error.
 const STEPS = [65536, 60097, 55109, 50536, 46341, 42495, 38968, 35734];
@@ -165,6 +165,14 @@ function countValid(
     for (let column = left; column < right; column++) count += mask[row * width + column]!;
   }
   return count;
+}
+
+/**
+ * Whether a target needs the bounds of the errors of windows: that of a window at full resolution. That of a coarser level
+ * has no limits that they could meet sooner, and often takes fewer bytes than they do.
+ */
+export function wantsWindowErrors(target: Target, header: Header): boolean {
+  return target.region !== undefined && (target.level ?? header.levels) === header.levels;
 }
 
 /** Where a container tells errors of windows; null where it does not, or at a length that is not worth it. */

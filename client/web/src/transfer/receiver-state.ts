@@ -15,7 +15,7 @@ import { type Place, RangeSet } from "../planning/byte-ranges";
 import { type Ended, endOf, type Plan } from "../planning/plan";
 import { plan } from "../planning/planner";
 import { sameRegion } from "../planning/target";
-import { type WindowErrors, windowErrorsFrom, windowSection } from "../planning/window-errors";
+import { type WindowErrors, wantsWindowErrors, windowErrorsFrom, windowSection } from "../planning/window-errors";
 import { MAX_DATA, type Header as ServerHeader } from "../protocol/messages";
 import type { ByteRange, Region, Target, ViewInfo } from "../types";
 import type { StreamDecoder } from "./decoding";
@@ -161,7 +161,7 @@ export class ReceiverState<View extends ViewInfo> {
     const capacity = new Capacity(this.decoder.capacity.maxVertices);
     const found = stepped(indexSteps(size, capacity), store, size);
     if (isPlace(found)) return { missing: found };
-    const section = this.target.region === undefined ? null : windowSection(found);
+    const section = wantsWindowErrors(this.target, found.header) ? windowSection(found) : null;
     if (section === null) return { views: this.learn(found) };
     for (const missing of store.ranges.missing(section.offset, section.length)) return { missing };
     const data = store.read(section.offset, section.length);
