@@ -185,3 +185,15 @@ def test_attributes_of_a_query_may_be_said_one_by_one() -> None:
 
     query = [("attributes", "speed,kind"), ("variable", "z"), ("attributes", "rest")]
     assert SurfaceOptions.parse(query).chosen == {"variable": "z", "attributes": "speed,kind,rest"}
+
+
+def test_a_confined_build_converts_units_to_those_of_the_crs(plain: str, tmp_path: Path) -> None:
+    xarray, pyproj = pytest.importorskip("xarray"), pytest.importorskip("pyproj")
+    place = {name: (name, 2.0 * np.arange(count), {"units": "km"}) for name, count in (("y", 9), ("x", 7))}
+    crs = ((), 0, {"crs_wkt": pyproj.CRS.from_epsg(32633).to_wkt()})
+    values = np.add.outer(np.arange(9.0), np.arange(7.0))
+    data = xarray.Dataset({"z": (("y", "x"), values, {"grid_mapping": "crs"}), "crs": crs}, place)
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    surface = values_of(sync.upload(plain, tmp_path / "a.nc").url)
+    assert surface.metadata["geotransform"] == [-1000.0, 2000.0, 0.0, -1000.0, 0.0, 2000.0]
+    assert any("x and y are converted from 'km'" in note for note in surface.metadata["notes"])
