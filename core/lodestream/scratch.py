@@ -73,7 +73,7 @@ class Scratch(ABC):
 
     @abstractmethod
     def write(self, name: str, array: NDArray[Any]) -> None:
-        """Keep an array under a name; one that is there already is replaced. The array is not changed any more."""
+        """Keep an array of any shape under a name, and change it no more; one that is there already is replaced."""
 
     @abstractmethod
     def read(self, name: str) -> NDArray[Any]:
@@ -109,13 +109,13 @@ class MemoryScratch(Scratch):
         self._arrays: dict[str, NDArray[Any]] = {}
 
     def write(self, name: str, array: NDArray[Any]) -> None:
-        """Keep an array; a part of another one is copied, so that the rest of that one is not kept with it."""
+        """Keep an array of any shape; a part of another is copied, so that the rest of that one is not kept with it."""
         kept = np.array(array) if array.base is not None else np.asarray(array)
         kept.flags.writeable = False
         self._arrays[name] = kept
 
     def read(self, name: str) -> NDArray[Any]:
-        """The array of this name, the one that was kept."""
+        """The array of this name, of the shape that was kept."""
         try:
             return self._arrays[name]
         except KeyError:
