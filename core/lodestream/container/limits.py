@@ -1,7 +1,8 @@
 """What a container may have at most, so that its index and description stay small: section 14 of `docs/format.md`.
 
-Writers keep these limits, and readers refuse a file that does not. They stand far above what surfaces need: a container
-of the encoder has some thirty layers.
+Writers keep these limits, and readers refuse a file that does not. They stand far above what most surfaces need: the
+encoder makes some 20 layers of 30 kB and 60 of 3 MB. Only of surfaces with hundreds of channels it makes fewer than it
+otherwise would, as `ERRORS` allows (`most_layers`).
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ OPTIONAL = 256
 MOST_SECTIONS = LAYERS + OPTIONAL + 6
 
 
-def check_count(count: int, most: int, what: str, offset: int | None = None) -> None:
+def check_count(count: int, most: int, what: str, offset: int | None = None, advice: str = "") -> None:
     """Refuse more of something than a container may have.
 
     Parameters
@@ -58,6 +59,8 @@ def check_count(count: int, most: int, what: str, offset: int | None = None) -> 
         Plural of what is counted.
     offset : int or None
         Where a container tells the count; None: of a surface that is to be encoded.
+    advice : str
+        What to do, for the end of the message.
 
     Raises
     ------
@@ -68,7 +71,7 @@ def check_count(count: int, most: int, what: str, offset: int | None = None) -> 
     """
     if count <= most:
         return
-    problem = f"expected at most {most:,} {what}, got {count:,}"
+    problem = f"expected at most {most:,} {what}, got {count:,}{advice}"
     raise TooLargeError(problem) if offset is None else CorruptStreamError(problem, offset)
 
 
@@ -85,4 +88,6 @@ def most_layers(channels: int, levels: int) -> int:
 
 def check_errors(channels: int, layers: int, levels: int, offset: int | None = None) -> None:
     """Refuse more errors of channels in layers and levels than a container may have; see `check_count`."""
-    check_count(channels * (layers + levels), ERRORS, "errors of channels in layers and levels", offset)
+    advice = ": encode some of the attributes as another surface" if offset is None else ""
+    count = channels * (layers + levels)
+    check_count(count, ERRORS, "errors of channels in layers and levels", offset, advice)

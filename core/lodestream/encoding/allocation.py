@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..container.limits import most_layers
+from ..container import limits
 from ..grid.layout import Layout
 from .curves import Curves, Worth
 
@@ -72,7 +72,7 @@ def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = Fal
     sizes = np.cumsum(curves.bits[order] / 8 + _ENTRY * last)
     gains = np.cumsum(curves.gains[order])
     states, state, start = [], top, 0
-    for end in _layer_ends(sizes, gains, last, few, most_layers(channels, layout.levels + 1)):
+    for end in _layer_ends(sizes, gains, last, few, limits.most_layers(channels, layout.levels + 1)):
         state = state.copy()
         np.minimum.at(state.reshape(-1), unit[start:end], number[start:end])
         states.append(state)
@@ -92,6 +92,8 @@ def _layer_ends(
 ) -> list[int]:
     """How many passes are known after each of at most so many layers, from bytes and gains that the passes add up to.
 
+    Where there would be more layers, neighbours are merged, evenly over the stream, so that it still begins small.
+
     Found from the end to the start, each within a range of bytes that the next one allows. It is the place after the
     `last` pass of a run, if there is one, where the error lies furthest below a line, in the logarithms of both, from
     one end of the range to the other: within a bit-plane the error falls faster at first than later.
@@ -101,7 +103,7 @@ def _layer_ends(
     errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))
     lengths = np.log(np.maximum(sizes, 1.0))
     ends = [sizes.size - 1]
-    while len(ends) < most:
+    while len(ends) < limits.LAYERS:
         end = ends[-1]
         low, high = _range_before(float(sizes[end]), float(sizes[-1]), few)
         if end == 0 or high < _FIRST_LAYER:
@@ -114,6 +116,9 @@ def _layer_ends(
         run = lengths[stop - 1] - lengths[start]
         slope = (errors[stop - 1] - errors[start]) / run if run > 0 else 0.0
         ends.append(int(places[np.argmin(errors[places] - slope * lengths[places])]))
+    if len(ends) > most:  # ends[0] is that of the stream, ends[-1] that of the first layer
+        kept = np.rint(np.linspace(0, len(ends) - 1, most)).astype(int) if most > 1 else [0]
+        ends = [ends[place] for place in kept]
     return [end + 1 for end in reversed(ends)]
 
 

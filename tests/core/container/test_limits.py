@@ -259,8 +259,30 @@ def test_many_channels_have_fewer_layers(monkeypatch: pytest.MonkeyPatch) -> Non
     assert 1 < header.layer_count <= 100 // 8 - header.levels - 1
     assert ls.decode(container).points.tobytes() == values.tobytes()
     monkeypatch.setattr(limits, "ERRORS", 40)
-    with pytest.raises(ls.TooLargeError, match="at most 40 errors of channels in layers and levels, got 56"):
+    words = (
+        "at most 40 errors of channels in layers and levels, got 56: encode some of the attributes as another surface"
+    )
+    with pytest.raises(ls.TooLargeError, match=words):
         ls.encode(ls.Surface(values, attributes={"a": values[..., 4:]}))
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("options", [{}, {"memory": 1 << 20}])
+def test_layers_of_many_channels_are_merged_evenly(
+    monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], reader: str
+) -> None:
+    """Every reader takes what the encoder makes, and its first layers stay small."""
+    attributes = terrain((60, 70))[..., None] * np.linspace(0.5, 1.5, 7) + np.arange(60.0)[:, None, None]
+    surface = ls.Surface(terrain((60, 70)), attributes={"a": attributes.astype(np.float32)})
+    whole = index_of(ls.encode(surface, **options))
+    for layers in (12, 5, 2, 1):
+        monkeypatch.setattr(limits, "ERRORS", 8 * (layers + whole.header.levels + 1))
+        container = ls.encode(surface, **options)
+        READERS[reader](container)
+        index = index_of(container)
+        assert len(index.layers) == layers < len(whole.layers)
+        assert index.layers[0].end < 0.2 * len(container) or layers == 1
+        assert ls.decode(container).attributes["a"].tobytes() == surface.attributes["a"].tobytes()
 
 
 @pytest.mark.parametrize("quality", [{}, {"precision": 0.1}, {"rms": 0.1}, {"memory": 1 << 20}])
