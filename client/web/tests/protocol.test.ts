@@ -302,6 +302,16 @@ describe("unpack", () => {
     expect(JSON.stringify(unpack(nested(1024)))).toBe(`${"[".repeat(1024)}null${"]".repeat(1024)}`);
     expect(() => unpack(nested(1025))).toThrow(/nested more than 1024 deep/);
   });
+
+  it("takes the last value of a key that a map has twice, as Python does", () => {
+    const twice = Uint8Array.from([0x83, 0xa1, 97, 1, 0xa1, 98, 0x82, 0xa1, 97, 3, 0xa1, 97, 4, 0xa1, 97, 2]);
+    expect(unpack(twice)).toEqual({ a: 2, b: { a: 4 } });
+    const text = (word: string) => [0xa0 + word.length, ...new TextEncoder().encode(word)];
+    const message = [...text("type"), ...text("credit"), ...text("bytes"), 7];
+    expect(parse(Uint8Array.from([0x83, ...text("bytes"), 5, ...message]))).toEqual(
+      parse(Uint8Array.from([0x82, ...message])),
+    );
+  });
 });
 
 describe("a connection", () => {

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -23,7 +22,7 @@ from starlette.types import Message, Receive
 from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT
 
 from ..operation.fair_share import exceeds_share
-from ..operation.least_rate import LeastRate
+from ..operation.least_rate import LeastRate, WaitingClock
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
 from .access import Caller
@@ -338,11 +337,13 @@ def _subtract(counter: Counter[Any], key: object, count: int) -> None:
 
 
 def _watched(request: Request, room: _Room, settings: Settings) -> Receive:
-    rate, came = LeastRate(settings.least_rate, settings.idle_seconds, time.monotonic), 0
+    # Neither the disk nor other work of the server makes a client slow.
+    clock = WaitingClock(asyncio.get_running_loop())
+    rate, came = LeastRate(settings.least_rate, settings.idle_seconds, clock), 0
 
     async def receive() -> Message:
         nonlocal came
-        message = await request.receive()
+        message = await clock.waiting(request.receive())
         size = len(message.get("body", b""))
         await room.take(size)
         came += size

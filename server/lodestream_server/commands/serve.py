@@ -97,5 +97,5 @@ def chosen_settings(args: argparse.Namespace) -> Settings:
     except ValidationError as error:
         first = error.errors()[0]
         name = "_".join(map(str, first["loc"]))
-        variable = TABLE[name].variable if name in TABLE else name
-        raise OptionError(f"{variable}: {first['msg'].removeprefix('Value error, ')}") from None
+        variable = f"{TABLE[name].variable}: " if name in TABLE else ""
+        raise OptionError(f"{variable}{first['msg'].removeprefix('Value error, ')}") from None

@@ -353,7 +353,8 @@ class _Watch:
         self._seconds = seconds
         self._rate = rate
         self._written = 0
-        self._timer = loop.call_later(seconds, self._look)
+        self._closing = False
+        self._begin_look()
 
     def write(self, data: bytes) -> None:
         """Write to the transport."""
@@ -372,13 +373,20 @@ class _Watch:
         unsent, closing = self._transport.get_write_buffer_size(), self._transport.is_closing()
         if closing and not unsent:
             return
-        # In a stream the other side's credit and the stream's own clock decide, until it is being closed.
-        if not unsent or (self.upgraded and not closing):
+        # In a stream the other side's credit and the stream's own clock decide, until it is being closed: its time for
+        # that begins when this is first seen. While the event loop was held up, nothing more was given to the client.
+        late = self._loop.time() - self._due > self._seconds / 2
+        begins, self._closing = closing and not self._closing, closing
+        if not unsent or (self.upgraded and not closing) or begins or late:
             self._rate.begin(self._read())
         elif self._rate.shortfall(self._read()) is not None:
             self.when_slow()
             self._transport.abort()
             return
+        self._begin_look()
+
+    def _begin_look(self) -> None:
+        self._due = self._loop.time() + self._seconds
         self._timer = self._loop.call_later(self._seconds, self._look)
 
     def _read(self) -> int:

@@ -2,9 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Awaitable, Callable
+from time import monotonic
+from typing import TypeVar
 
-__all__ = ["LeastRate"]
+__all__ = ["LeastRate", "WaitingClock"]
+
+T = TypeVar("T")
+
+#: Seconds between two looks of a `WaitingClock`: what passes beyond them the server was busy.
+_LOOK = 0.25
+
+
+class WaitingClock:
+    """A clock that goes only while a server waits for a client: a callable that returns seconds.
+
+    It stands while the server does something else with what came, and while the event loop is held up, since then
+    nobody reads what the client sends.
+
+    Parameters
+    ----------
+    loop : asyncio.AbstractEventLoop
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._waited = 0.0
+        self._last = 0.0
+        self._timer: asyncio.TimerHandle | None = None
+
+    def __call__(self) -> float:
+        """Tell the seconds that were waited."""
+        return self._waited
+
+    async def waiting(self, coming: Awaitable[T]) -> T:
+        """Wait for something of the client's, and let the clock go meanwhile."""
+        self._last = monotonic()
+        self._timer = self._loop.call_later(_LOOK, self._look)
+        try:
+            return await coming
+        finally:
+            self._timer.cancel()
+            self._count()
+
+    def _look(self) -> None:
+        self._count()
+        self._timer = self._loop.call_later(_LOOK, self._look)
+
+    def _count(self) -> None:
+        now = monotonic()
+        self._waited += min(now - self._last, _LOOK)
+        self._last = now
 
 
 class LeastRate:

@@ -11,7 +11,7 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from lodestream.container.capacity import memory_limit
 
 from .bounds import Bounds
-from .table import FORMATS, TABLE
+from .table import FORMATS, GONE, PREFIX, TABLE
 
 __all__ = ["Settings"]
 
@@ -62,6 +62,9 @@ class Settings(Bounds):
     @classmethod
     def _completed(cls, given: dict[str, Any]) -> dict[str, Any]:
         """What whoever makes a server says, then the environment, where an empty variable counts as none."""
+        for name, replacement in GONE.items():
+            if name in given or os.environ.get(PREFIX + name.upper()):
+                raise ValueError(f"the setting {name} is gone: use {replacement}")
         variables = {name: os.environ.get(setting.variable) for name, setting in TABLE.items()}
         return {name: text for name, text in variables.items() if text} | given
 

@@ -15,10 +15,16 @@ from typing import Any
 
 from lodestream.sizes import parse_size
 
-__all__ = ["FORMATS", "GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
+__all__ = ["FORMATS", "GONE", "GROUPS", "PREFIX", "TABLE", "Kind", "Setting"]
 
 #: Prefix of the environment variables.
 PREFIX = "LODESTREAM_"
+
+#: Settings of earlier versions, and what says the same now.
+GONE = {
+    "upload_rate": "least_rate, which holds for uploads and for answers",
+    "max_client_streams": "max_streams, of which each client leaves a share for the others",
+}
 
 #: The formats that a server can read: names of `lodestream.formats` (`Format.names`), and `lode` for containers.
 FORMATS = (

@@ -6,17 +6,21 @@ import time
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
 from lodestream import formats
 from lodestream.container import read_index
 from lodestream.container.metadata import MAX_BYTES, check, fitted, packed, with_notes
+from lodestream.container.sections import parse_metadata
+from lodestream.container.shape import parse_extras
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.decoding.decoder import Decoder, decode
 from lodestream.encoding.encoder import encode
 from lodestream.errors import FormatWarning, InputError
 from lodestream.surface import Surface
+from tests.reference.fields import unpack_map
 
 HEIGHTS = np.add.outer(np.arange(6.0), np.arange(5.0))
 
@@ -190,3 +194,15 @@ def test_axes_that_metadata_cannot_hold_are_x_and_y_of_every_point(tmp_path: Pat
         across = coordinates(surface)[0] if channels == 2 else surface.points[..., 0]
         np.testing.assert_array_equal(across, np.broadcast_to(x, (3, count)))
         np.testing.assert_array_equal(decode(encode(surface)).points, surface.points)
+
+
+def test_of_a_key_that_a_map_has_twice_the_last_value_counts() -> None:
+    """In metadata and in extras, by the reference decoder and here, as docs/format.md says."""
+    inner = b"\x82\xa1a\x01\xa1a\x02"
+    twice = b"\x83\xa4unit\xa1m\xa4name" + inner + b"\xa4unit\xa2km"
+    expected = {"unit": "km", "name": {"a": 2}}
+    assert parse_metadata(memoryview(twice), 0) == unpack_map(twice, 0) == expected
+    one, other = (msgpack.packb([[name, 8, 0]]) for name in ("first", "last"))
+    extras = b"\x82" + b"".join(msgpack.packb("attributes") + value for value in (one, other))
+    assert [kind.name for kind in parse_extras(memoryview(extras), 0, 4).attributes] == ["last"]
+    assert unpack_map(extras, 0) == {"attributes": [["last", 8, 0]]}

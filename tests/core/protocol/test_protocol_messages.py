@@ -287,3 +287,15 @@ def test_a_message_with_one_byte_changed_is_read_or_refused(event: Event, data: 
     message[data.draw(st.integers(0, min(len(message), 200) - 1))] = data.draw(st.integers(0, 255))
     got = outcome(bytes(message))
     assert not isinstance(got, str) or got in CODES
+
+
+def test_of_a_key_that_a_message_has_twice_the_last_value_counts() -> None:
+    """As docs/protocol.md says; the client for browsers is tested likewise."""
+    for values in ((1, 2), (2, 1), (-1, 7)):
+        message = b"\x83" + b"".join(
+            msgpack.packb(key) + msgpack.packb(value)
+            for key, value in (("bytes", values[0]), ("type", "credit"), ("bytes", values[1]))
+        )
+        assert parse(message) == Credit(values[1])
+    with pytest.raises(MessageError, match=r"credit\.bytes"):
+        parse(b"\x83\xa5bytes\x01\xa5bytes\xff\xa4type\xa6credit")

@@ -6,7 +6,7 @@ import asyncio
 import shutil
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,7 @@ from lodestream_server import Settings, running_server
 from lodestream_server.access.access import Caller
 from lodestream_server.access.limits import Limits
 from lodestream_server.access.tokens import TokenFile
+from lodestream_server.operation import least_rate
 from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
 from lodestream_server.storage import durable
 from tests.server.helpers import PATIENCE, Raw, eventually, hills, npy, push, raw_stream
@@ -156,11 +157,86 @@ def test_numbers_are_limits_too(tmp_path: Path) -> None:
     asyncio.run(together())
 
 
-def test_an_upload_that_is_too_slow_ends(tmp_path: Path) -> None:
-    made = limits(tmp_path, idle_seconds=1e-6, least_rate=10**9)
-    with pytest.raises(SlowUploadError, match="1000000000 bytes a second"):
-        asyncio.run(read(made, request(b"x", b"y", b"")))
-    assert asyncio.run(read(limits(tmp_path, idle_seconds=1e-6, least_rate=0), request(b"x", b"y", b""))) == b"xy"
+class Slowly:
+    """A body whose parts come after some seconds, on a loop whose time is told."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 0.0
+        self.timers: list[tuple[float, Callable[[], None]]] = []
+        monkeypatch.setattr(least_rate, "monotonic", lambda: self.now)
+
+    def call_later(self, seconds: float, work: Callable[[], None]) -> Slowly:
+        self.timers = [(self.now + seconds, work)]
+        return self
+
+    def cancel(self) -> None:
+        self.timers = []
+
+    def pass_by(self, seconds: float, *, held_up: bool) -> None:
+        """Let time pass, with the timers that come due, or without them until the end."""
+        until = self.now + seconds
+        while not held_up and self.timers and self.timers[0][0] <= until:
+            self.now, work = self.timers.pop()
+            work()
+        self.now = until
+        if held_up and self.timers:
+            self.timers.pop()[1]()
+
+
+@pytest.mark.parametrize(
+    ("rate", "size", "ends"), [(100, 1000, False), (100, 990, True), (0, 1, False), (0, 0, True), (10**9, 10**6, True)]
+)
+def test_an_upload_that_is_too_slow_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: int, size: int, ends: bool
+) -> None:
+    made, slowly = limits(tmp_path, idle_seconds=10, least_rate=rate), Slowly(monkeypatch)
+
+    async def upload() -> int:
+        body = request(*[bytes(size)] * 5, b"")
+        receive = body.receive
+
+        async def late() -> Any:
+            slowly.pass_by(10.25, held_up=False)
+            return await receive()
+
+        body._receive = late
+        monkeypatch.setattr(asyncio.get_running_loop(), "call_later", slowly.call_later)
+        return len(await read(made, body))
+
+    if ends:
+        with pytest.raises(SlowUploadError, match=f"expected at least {rate} bytes a second of an upload"):
+            asyncio.run(upload())
+    else:
+        assert asyncio.run(upload()) == 5 * size
+
+
+@pytest.mark.parametrize("why", ["disk", "loop"])
+def test_time_in_which_the_server_does_not_read_is_not_the_clients(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    """A disk that takes minutes for each part, and other work that holds the event loop up for as long."""
+    made, slowly = limits(tmp_path, idle_seconds=10, least_rate=100), Slowly(monkeypatch)
+
+    async def upload() -> int:
+        body = request(*[bytes(10)] * 30, b"")
+        receive = body.receive
+
+        async def held_up() -> Any:
+            if why == "loop":
+                slowly.pass_by(100, held_up=True)
+            return await receive()
+
+        body._receive = held_up
+        monkeypatch.setattr(asyncio.get_running_loop(), "call_later", slowly.call_later)
+        came = 0
+        async with made.upload(body, ANNA) as watched:
+            async for part in watched.stream():
+                came += len(part)
+                if why == "disk":
+                    slowly.pass_by(100, held_up=False)
+        return came
+
+    assert asyncio.run(upload()) == 300
 
 
 def test_streams_in_all_and_of_one_client(tmp_path: Path) -> None:

@@ -292,6 +292,20 @@ def test_a_stream_has_rules_of_its_own_until_it_is_closed() -> None:
     assert not slow.aborted
     slow.closing = True
     slow.advance(10)
+    assert not slow.aborted, "its time begins when it is seen to close"
+    slow.unsent -= 1000
+    slow.advance(10)
+    assert not slow.aborted
+    slow.advance(10)
+    assert slow.aborted
+
+
+def test_time_in_which_the_server_is_held_up_does_not_count() -> None:
+    slow, watch = watched(100)
+    watch.write(bytes(1 << 20))
+    for _ in range(5):
+        slow.advance(100)  # the look comes late
+        assert not slow.aborted
     slow.advance(10)
     assert slow.aborted
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
+from lodestream.errors import OptionError
 from lodestream_server import Settings
 from lodestream_server.commands.serve import chosen_settings, register
 from lodestream_server.operation import settings as settings_module
@@ -51,6 +52,24 @@ def _bare(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_page_is_the_table() -> None:
     assert manual.PATH.read_text() == manual.render(), "run python -m tests.server.manual"
     assert {setting.group for setting in TABLE.values()} == set(GROUPS)
+
+
+@pytest.mark.parametrize(
+    ("name", "replacement"), [("upload_rate", "least_rate"), ("max_client_streams", "max_streams")]
+)
+def test_a_setting_that_is_gone_says_what_replaced_it(
+    monkeypatch: pytest.MonkeyPatch, name: str, replacement: str
+) -> None:
+    words = f"the setting {name} is gone: use {replacement}"
+    assert name not in Settings.model_fields
+    assert replacement in Settings.model_fields
+    page = (manual.PATH.parent / "operating.md").read_text()
+    assert f"`{name}`" in page
+    with pytest.raises(ValidationError, match=words):
+        Settings(**{name: 1000})
+    monkeypatch.setenv(f"LODESTREAM_{name.upper()}", "1000")
+    with pytest.raises(OptionError, match=f"^{words}"):
+        parse()
 
 
 def test_the_settings_are_the_table_and_their_types_fit() -> None:
