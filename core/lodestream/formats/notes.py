@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from ..container.digest import DIGEST
 from ..errors import FormatWarning
-from ..surface import Surface
+from ..surface import Block, Surface
 from .source import number
 
-__all__ = ["keep_words", "listing", "metadata_left_out", "survives", "warn", "warn_left_out"]
+__all__ = ["keep_words", "listing", "metadata_left_out", "survives", "warn", "warn_left_out", "with_nul_shown"]
 
 #: Names in one note, and characters of each.
 _MOST_NAMES = 12
@@ -54,6 +54,40 @@ def warn_left_out(kind: str, names: Collection[str], why: str = "which it cannot
     """Issue a note about what a file cannot hold, if there is anything."""
     if names:
         warn(f"{kind} is written without {listing(names)}, {why}")
+
+
+def with_nul_shown(kind: str, surface: Surface) -> Surface:
+    """A surface whose metadata and names of attributes have no NUL, at which libraries in C end a text or refuse it.
+
+    It is written as Python writes it, with a note, as writers of meshes do with all control characters.
+    """
+    metadata = {key: _nul_shown(value) for key, value in surface.metadata.items()}
+    changed = [f"control characters of {key}" for key, value in metadata.items() if value != surface.metadata[key]]
+    names = {name: _nul_shown(name) for name in surface.blocks[0].attributes}
+    changed += [f"control characters of {shown}" for name, shown in names.items() if shown != name]
+    if not changed:
+        return surface
+    warn_left_out(kind, changed, "which are written as Python writes them")
+    if all(name == shown for name, shown in names.items()):
+        return Surface(blocks=surface.blocks, metadata=metadata)
+    blocks = [
+        Block(
+            block.points,
+            block.closed,
+            attributes={names[name]: values for name, values in block.attributes.items()},
+            mask=block.mask,
+        )
+        for block in surface.blocks
+    ]
+    return Surface(blocks=blocks, metadata=metadata)
+
+
+def _nul_shown(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.replace("\0", "\\x00")
+    if isinstance(value, dict):
+        return {_nul_shown(key): _nul_shown(inner) for key, inner in value.items()}
+    return [_nul_shown(inner) for inner in value] if isinstance(value, list) else value
 
 
 def keep_words(words: dict[str, str], key: str, text: str) -> None:

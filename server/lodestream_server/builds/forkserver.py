@@ -18,6 +18,7 @@ import importlib
 import json
 import math
 import os
+import re
 import resource
 import selectors
 import signal
@@ -70,8 +71,8 @@ class Allowed:
     threads : int
         Threads of the kernels.
     memory : int or None
-        Bytes of private writable memory; code and files mapped for reading do not count. Beyond it the process gets
-        MemoryError or ends.
+        Bytes of private writable memory beside what the process begins with; code and files mapped for reading do not
+        count. Beyond it the process gets MemoryError or ends.
     seconds : float or None
         Processor time of each thread.
     file_bytes : int or None
@@ -274,7 +275,8 @@ def _limit(allowed: Allowed) -> None:
     if allowed.write is not None:
         tempfile.tempdir = os.environ["TMPDIR"] = os.fspath(allowed.write)
     limits = {
-        resource.RLIMIT_DATA: allowed.memory,
+        # The libraries that are loaded already are the same pages for all processes.
+        resource.RLIMIT_DATA: None if allowed.memory is None else allowed.memory + _private_memory(),
         resource.RLIMIT_FSIZE: allowed.file_bytes,
         resource.RLIMIT_NOFILE: _MOST_FILES,
         resource.RLIMIT_CORE: 0,
@@ -292,6 +294,16 @@ def _limit(allowed: Allowed) -> None:
     os.environ[parallel.VARIABLE] = str(allowed.threads)
     os.nice(_NICE)  # streams come first
     confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1))
+
+
+def _private_memory() -> int:
+    """Bytes of this process that count under RLIMIT_DATA; 0 where the system does not say."""
+    try:
+        text = Path("/proc/self/status").read_text()
+    except OSError:
+        return 0
+    found = re.search(r"^VmData:\s+(\d+) kB$", text, re.MULTILINE)
+    return int(found[1]) << 10 if found else 0
 
 
 def resolve(name: str) -> Callable[..., Any]:

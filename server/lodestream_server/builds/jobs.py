@@ -566,6 +566,7 @@ class Builder:
             folder=folder,
             allowed=self._settings.formats,
             shared=bool(self._settings.dask),
+            memory=self._memory,
         )
 
 

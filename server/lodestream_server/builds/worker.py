@@ -136,6 +136,9 @@ class Job:
         Names of the formats that may be read; None: all.
     shared : bool
         Whether a surface that does not fit into memory is left to others once it is parsed.
+    memory : int or None
+        Bytes that the build may take; None: what this process may have. The limit of the process is larger by what it
+        has begun with, which is not the same after each start of a server.
     """
 
     files: tuple[Path, ...]
@@ -147,6 +150,7 @@ class Job:
     folder: Path
     allowed: tuple[str, ...] | None = None
     shared: bool = False
+    memory: int | None = None
 
     @property
     def container(self) -> Path:
@@ -165,8 +169,9 @@ class Job:
 
     @property
     def room(self) -> int:
-        """Bytes to work in: half of what this process may have."""
-        return memory_limit() // 2
+        """Bytes to work in: half of what the build may take."""
+        limit = memory_limit()
+        return (limit if self.memory is None else min(limit, self.memory)) // 2
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,9 @@ class Bounds(BaseModel):
         "most 8 MiB",
     )
     build_memory: int | None = _follows(
-        256 << 20, "memory of one build: `memory` divided by `workers`, but at least 512 MiB"
+        256 << 20,
+        "memory of one build, beside what its process begins with (250 MB of libraries, which builds share): `memory` "
+        "divided by `workers`, but at least 512 MiB",
     )
     build_seconds: float = _seconds(
         3600.0, "seconds that one build may take, by the clock, and in processor time for each of its threads"

@@ -81,6 +81,14 @@ def nothing() -> None:
     """Do nothing."""
 
 
+def much() -> None:
+    """Load something large."""
+    _loaded.append(bytearray(200 << 20))
+
+
+_loaded = list[bytearray]()
+
+
 def preload() -> None:
     """What `worker.preload` does, where calls of the tests find imported what they are called from."""
     import_module("tests.server.connections.hostile")

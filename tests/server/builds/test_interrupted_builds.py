@@ -24,7 +24,7 @@ from tests.server.helpers import eventually, settled
 from tests.server.programs import Server, server
 
 #: Of a build: nothing fits into half of it in one piece that has so many points with holes.
-MEMORY, SIDE = 384 << 20, 2280
+MEMORY, SIDE = 256 << 20, 2280
 
 Inodes = dict[str, int]
 

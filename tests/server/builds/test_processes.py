@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from lodestream_server.builds import worker
 from lodestream_server.builds.answers import ProcessDiedError, UnforeseenError
 from lodestream_server.builds.fork_control import ForkServer
 from lodestream_server.builds.forkserver import Allowed
@@ -62,6 +63,25 @@ def gone(process: int) -> bool:
     except ProcessLookupError:
         return True
     return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the system does not count the memory of a process so")
+def test_the_memory_of_a_call_is_beside_what_it_begins_with() -> None:
+    """However much the fork server has loaded before."""
+
+    async def check(server: ForkServer) -> None:
+        async with asyncio.timeout(PATIENCE), pool(server) as made:
+            allowed = Allowed(memory=64 << 20)
+            assert await made.run(Call(slow.take, (48 << 20,), allowed=allowed)) == 48 << 20
+            with pytest.raises(MemoryError):
+                await made.run(Call(slow.take, (96 << 20,), allowed=allowed))
+
+    for preload in (slow.nothing, slow.much, worker.preload):
+        server = ForkServer(preload)
+        try:
+            asyncio.run(check(server))
+        finally:
+            server.close()
 
 
 def test_a_fork_server_killed_while_it_idles_harms_nobody() -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from ...errors import FormatError, UnavailableError
 from ...surface import Surface
 from ..beside import folder_beside
+from ..notes import with_nul_shown
 from .hdf5_output import Output
 from .variables import Contents, Variable, contents_of, strips
 
@@ -46,7 +47,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
         raise UnavailableError(
             "expected h5netcdf for NetCDF, which is not installed: install lodestream[formats]"
         ) from None
-    contents = contents_of(surface, "NetCDF")
+    contents = contents_of(with_nul_shown("NetCDF", surface), "NetCDF")
     with folder_beside(file) as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about what other programs may not read
         path = folder / "data.nc"

@@ -18,7 +18,7 @@ from ...parallel import threads
 from ...surface import Surface
 from ..beside import folder_beside
 from ..holes import occurs
-from ..notes import listing, metadata_left_out, survives, warn, warn_left_out
+from ..notes import listing, metadata_left_out, survives, warn, warn_left_out, with_nul_shown
 from . import gdal
 from .tags import describe, missing
 from .writing_heights import even_heights, geotransform, warn_off
@@ -74,7 +74,7 @@ def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], P
         If the file cannot be written, as on a full disk.
     """
     rasterio = gdal.require_rasterio(_TITLE)
-    surface = even_heights(surface, _TITLE)
+    surface = with_nul_shown(_TITLE, even_heights(surface, _TITLE))
     if any(surface.closed):
         warn("GeoTIFF cannot express closed axes")
     warn_left_out(_TITLE, metadata_left_out(surface, _HELD))
