@@ -23,6 +23,7 @@ SECTIONS = (
     "meshes",
     "blocks",
     "formats",
+    "patches",
     "stream",
 )
 

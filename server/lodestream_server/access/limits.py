@@ -286,6 +286,21 @@ class Limits:
                 f"of {most} are left; try again when some are done"
             )
 
+    def check_indexes(self, caller: Caller, most: int, there: tuple[int, int]) -> None:
+        """Check that a caller may have memory for one more index; the numbers are bytes, with that index.
+
+        Raises
+        ------
+        TooManyError
+            If less would be left for others than it has.
+        """
+        everybody, own = there
+        if own and exceeds_share(most, everybody, own - 1) and not self._alone():
+            raise TooManyError(
+                f"expected no more memory for indexes of surfaces that {caller.name} streams than is left for others, "
+                f"got {own >> 10} KiB, and {(most - everybody) >> 10} KiB would be left; try again when some are done"
+            )
+
     def _check_surfaces(self, caller: Caller) -> None:
         """Check that one more surface is allowed, beside those that uploads in progress will be."""
         most = self._settings.max_surfaces

@@ -10,6 +10,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import APIRouter, WebSocket
@@ -99,7 +100,8 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         with parts.limits.stream(caller) as credit:
             record = ready(parts, surface)
             with still_there(parts, surface):
-                container = await asyncio.to_thread(parts.containers.open, record.container or "")
+                share = partial(parts.limits.check_indexes, caller)
+                container = await asyncio.to_thread(parts.containers.open, record.container or "", caller.key, share)
             sender = Sender(container.index, container.sha256, credit, container.window_errors)
             await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
     except WebSocketDisconnect:

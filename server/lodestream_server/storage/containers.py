@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import OrderedDict
-from collections.abc import Iterator
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lodestream.container import ByteRange, Index
     from lodestream.planning.window_errors import WindowErrors
 
-__all__ = ["Containers", "OpenContainer", "index_memory", "most_for_indexes"]
+__all__ = ["Containers", "OpenContainer", "Share", "index_memory", "most_for_indexes"]
 
 # An index holds a record per segment, and whoever makes a container may make many: so many are kept when nobody has the
 # container open any more, as long as they take no more bytes than this.
@@ -44,6 +44,15 @@ _COPIES_OF_MASKS = 4
 _NOWAIT = getattr(os, "RWF_NOWAIT", 0)
 
 
+#: Takes the bytes of memory that there are for indexes, and of these all that are taken and those of the caller, with
+#: one more index; raises an error if the caller may not have that.
+Share = Callable[[int, tuple[int, int]], None]
+
+
+def _nothing(*_: object) -> None:
+    """Do nothing."""
+
+
 @dataclass(frozen=True)
 class OpenContainer:
     """A container that is open for reading; it stays readable if it is deleted meanwhile."""
@@ -51,6 +60,7 @@ class OpenContainer:
     sha256: str
     index: Index
     file: BinaryIO
+    let_go: Callable[[], None] = _nothing
 
     def read(self, place: ByteRange) -> bytes:
         """Read a slice; fewer bytes if the file ends. May be called from any thread."""
@@ -82,6 +92,8 @@ class OpenContainer:
 
     def close(self) -> None:
         """Close the file."""
+        if not self.file.closed:
+            self.let_go()
         self.file.close()
 
 
@@ -98,15 +110,24 @@ class Containers:
     def __init__(self, storage: Storage, most: int | None = None) -> None:
         self._storage = storage
         self._most = most_for_indexes() if most is None else most
-        self._coming = 0  # bytes of indexes that are being read
+        self._coming: Counter[str] = Counter()  # bytes of indexes that are being read, by caller
+        self._open: dict[str, Counter[str]] = {}  # what callers have open, and how often
         self._lock = threading.Lock()
         self._used: OrderedDict[str, Index] = OrderedDict()
         self._sizes: dict[str, int] = {}  # bytes of indexes
         self._indexes: WeakValueDictionary[str, Index] = WeakValueDictionary()
         self._readers: WeakValueDictionary[str, _Reader] = WeakValueDictionary()
 
-    def open(self, sha256: str) -> OpenContainer:
+    def open(self, sha256: str, caller: str = "", share: Share = _nothing) -> OpenContainer:
         """Open a container.
+
+        Parameters
+        ----------
+        sha256 : str
+        caller : str
+            Key of who has it open; each index counts for everybody who has.
+        share : callable
+            Checks the share of the caller where an index is to be read, and raises what it has to say.
 
         Raises
         ------
@@ -125,7 +146,10 @@ class Containers:
         except FileNotFoundError:
             raise self._storage.gone(sha256) from None
         try:
-            return OpenContainer(sha256, self._index(sha256, file), file)
+            index = self._index(sha256, file, caller, share)
+            with self._lock:
+                self._open.setdefault(caller, Counter())[sha256] += 1
+            return OpenContainer(sha256, index, file, partial(self._let_go, caller, sha256))
         except StreamError as error:
             file.close()
             damage.tell(self._storage, sha256, error)
@@ -134,7 +158,16 @@ class Containers:
             file.close()
             raise
 
-    def _index(self, sha256: str, file: BinaryIO) -> Index:
+    def _let_go(self, caller: str, sha256: str) -> None:
+        with self._lock:
+            held = self._open[caller]
+            held[sha256] -= 1
+            if not held[sha256]:
+                del held[sha256]
+            if not held:
+                del self._open[caller]
+
+    def _index(self, sha256: str, file: BinaryIO, caller: str, share: Share) -> Index:
         with self._lock:
             known = self._known(sha256)
             if known is not None:
@@ -148,7 +181,7 @@ class Containers:
                 known = self._known(sha256)
             if known is None:
                 kept, masks = index_memory(file)
-                with self._room(kept + masks):
+                with self._room(kept + masks, caller, share):
                     known = _read_index(file)
                     with self._lock:
                         self._sizes[sha256] = kept
@@ -157,7 +190,7 @@ class Containers:
             return known
 
     @contextmanager
-    def _room(self, size: int) -> Iterator[None]:
+    def _room(self, size: int, caller: str, share: Share) -> Iterator[None]:
         with self._lock:
             if self._taken() + size > self._most:
                 self._used.clear()
@@ -167,16 +200,25 @@ class Containers:
                     f"expected at most {self._most >> 20} MiB of memory for the indexes of all surfaces that are "
                     f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; try again soon"
                 )
-            self._coming += size
+            # Those that nobody has open make room. Who has nothing yet finds a place.
+            everybody = self._coming.total() + self._bytes_of(set().union(*self._open.values()))
+            own = self._coming[caller] + self._bytes_of(self._open.get(caller, ()))
+            share(self._most, (everybody + size, own + size if own else 0))
+            self._coming[caller] += size
         try:
             yield
         finally:
             with self._lock:
-                self._coming -= size
+                self._coming[caller] -= size
+                if not self._coming[caller]:
+                    del self._coming[caller]
+
+    def _bytes_of(self, names: Iterable[str]) -> int:
+        return sum(self._sizes.get(sha256, 0) for sha256 in names)
 
     def _taken(self) -> int:
         self._sizes = {sha256: self._sizes[sha256] for sha256 in tuple(self._indexes)}
-        return self._coming + sum(self._sizes.values())
+        return self._coming.total() + sum(self._sizes.values())
 
     def _known(self, sha256: str) -> Index | None:
         index = self._indexes.get(sha256)

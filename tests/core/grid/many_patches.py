@@ -5,12 +5,15 @@ from __future__ import annotations
 import struct
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 __all__ = [
+    "MORE",
+    "READ",
     "cgns_nodes",
     "esri_rows",
     "geotiff_bands",
@@ -420,3 +423,35 @@ def geotiff_images(folder: Path, count: int) -> Path:
 def geotiff_overviews(folder: Path, count: int) -> Path:
     """A TIFF of one image and so many smaller ones."""
     return _directories(folder, count, 1)
+
+
+#: So many times the patches are read as a kind is listed with.
+MORE = 4
+
+#: Each kind that is read, with a number of patches.
+READ: list[tuple[Callable[[Path, int], Path], int]] = [
+    (hdf5_chunks, 8_000),
+    (hdf5_attributes, 1_000),
+    (netcdf_attributes, 6_000),
+    (plot3d_blocks, 1_000),
+    (png_chunks, 12_000),
+    (png_pixels, 25_000),
+    (ply_properties, 4_000),
+    (ply_elements, 2_500),
+    (obj_groups, 8_000),
+    (off_comments, 25_000),
+    (pcd_fields, 1_500),
+    (text_lines, 25_000),
+    (esri_rows, 25_000),
+    (usgs_profiles, 1_000),
+    (geotiff_strips, 25_000),
+    (geotiff_bands, 1_000),
+    (geotiff_items, 2_000),  # beyond, GDAL's own reading of them takes longer than ours
+    (geotiff_overviews, 1_000),
+    (vtk_fields, 250),
+    (vtk_arrays, 100),
+    (vts_arrays, 249),
+    (vts_pieces, 100),
+    (cgns_nodes, 50),
+    (square_patches, 250),
+]

@@ -1,9 +1,7 @@
-"""Files of very many small patches: what a reader does is in proportion to them, or it refuses them at once."""
+"""Files of very many small patches: a reader reads them, or refuses them with the limit that they are beyond."""
 
 from __future__ import annotations
 
-import os
-import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -19,43 +17,6 @@ from lodestream.formats.netcdf import hdf5_guard
 from . import many_patches
 
 Maker = Callable[[Path, int], Path]
-
-#: Of four times the patches: what is in proportion takes four times as long, what goes with their square sixteen times.
-TIMES, MORE = 8, 4
-
-#: A processor's seconds that a short reading may differ from another one by.
-NOISE = 0.5
-
-#: How long a file that is refused by a limit may take.
-AT_ONCE = 30.0
-
-#: Each with a number of patches, of which four times as many are read.
-READ: list[tuple[Maker, int]] = [
-    (many_patches.hdf5_chunks, 8_000),
-    (many_patches.hdf5_attributes, 1_000),
-    (many_patches.netcdf_attributes, 6_000),
-    (many_patches.plot3d_blocks, 1_000),
-    (many_patches.png_chunks, 12_000),
-    (many_patches.png_pixels, 25_000),
-    (many_patches.ply_properties, 4_000),
-    (many_patches.ply_elements, 2_500),
-    (many_patches.obj_groups, 8_000),
-    (many_patches.off_comments, 25_000),
-    (many_patches.pcd_fields, 1_500),
-    (many_patches.text_lines, 25_000),
-    (many_patches.esri_rows, 25_000),
-    (many_patches.usgs_profiles, 1_000),
-    (many_patches.geotiff_strips, 25_000),
-    (many_patches.geotiff_bands, 1_000),
-    (many_patches.geotiff_items, 2_000),  # beyond, GDAL's own reading of them takes longer than ours
-    (many_patches.geotiff_overviews, 1_000),
-    (many_patches.vtk_fields, 250),
-    (many_patches.vtk_arrays, 100),
-    (many_patches.vts_arrays, 249),
-    (many_patches.vts_pieces, 100),
-    (many_patches.cgns_nodes, 50),
-    (many_patches.square_patches, 250),
-]
 
 #: Each with a number of patches that is too large, and words of the reason.
 REFUSED: list[tuple[Maker, int, type[InputError], str]] = [
@@ -82,44 +43,27 @@ def name_of(value: object) -> str | None:
     return getattr(value, "__name__", None)
 
 
-def seconds(path: Path) -> float:
-    """The processor's time that reading a file takes, in this process and those that it starts."""
-    before = os.times()
+@pytest.mark.parametrize(("maker", "count"), many_patches.READ, ids=name_of)
+def test_very_many_patches_are_read(maker: Maker, count: int, tmp_path: Path) -> None:
+    """In proportion to their number: `make bench ARGS=patches` measures that, and this would not end without it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what is left out
-        formats.read(path)
-    after = os.times()
-    return sum(after[:4]) - sum(before[:4])
-
-
-@pytest.mark.parametrize(("maker", "count"), READ, ids=name_of)
-def test_four_times_the_patches_take_about_four_times_as_long(maker: Maker, count: int, tmp_path: Path) -> None:
-    folders = [tmp_path / name for name in ("least", "few", "many")]
-    for folder in folders:
-        folder.mkdir()
-    least, few, many = map(maker, folders, (count // 10, count, MORE * count))
-    seconds(least)  # loads libraries
-    most = TIMES * seconds(few) + NOISE
-    # Once within it is enough: what else a busy machine does is counted too.
-    assert any(seconds(many) <= most for _ in range(3)), f"expected at most {most} seconds"
+        surface = formats.read(maker(tmp_path, many_patches.MORE * count))
+    assert sum(block.points.size for block in surface.blocks) > 1
 
 
 @pytest.mark.parametrize(("maker", "count", "error", "reason"), REFUSED, ids=name_of)
-def test_a_limit_refuses_very_many_patches_at_once(
+def test_a_limit_refuses_very_many_patches(
     maker: Maker, count: int, error: type[InputError], reason: str, tmp_path: Path
 ) -> None:
     path = maker(tmp_path, count)
-    before = time.process_time()
     with pytest.raises(error, match=reason):
         formats.read(path)
-    assert time.process_time() - before <= AT_ONCE
 
 
-def test_a_line_of_many_numbers_and_a_word_is_known_for_no_numbers_at_once() -> None:
-    before = time.process_time()
+def test_a_line_of_many_numbers_and_a_word_is_known_for_no_numbers() -> None:
     for line in (b"12 " * 1300 + b"x\n", b"1" * 4000 + b"x\n", b"1" + b" " * 4000 + b"x\n", b"1  ;  2" * 500 + b"x\n"):
         assert not text_arrays.sniff(line, ".txt")
-    assert time.process_time() - before < AT_ONCE
 
 
 @pytest.mark.parametrize("line", [b"1.5e3, .5;-2. 3E-4\tnan", b"  12  34 ", b"1 ,2 , 3,", b"+1 inf"])

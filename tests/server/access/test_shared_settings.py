@@ -8,11 +8,13 @@ import shutil
 from collections import Counter
 from collections.abc import Callable
 from contextlib import AsyncExitStack, ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from lodestream import encode
 from lodestream.protocol.messages import BASE_CREDIT
 from lodestream_server import Settings
 from lodestream_server.access.access import Caller
@@ -22,8 +24,10 @@ from lodestream_server.builds.level_queue import LevelQueue
 from lodestream_server.builds.shares import Turns
 from lodestream_server.connections.places import Places
 from lodestream_server.problems import FullError, TooManyError
+from lodestream_server.storage.containers import Containers, OpenContainer, index_memory
+from lodestream_server.storage.storage import Storage
 from tests.server.access.test_limits import ANNA, BERT, CARL, Disk, request
-from tests.server.helpers import PATIENCE
+from tests.server.helpers import PATIENCE, hills
 
 # Storage and processes of levels that are not made.
 nothing: Any = None
@@ -293,6 +297,42 @@ def turns_of_builds(folder: Path) -> None:
 
 
 #: Settings that callers share, and what shows that one of them cannot take everything.
+def test_memory_of_indexes_is_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An eighth of the machine's memory, which no setting says."""
+    data = encode(hills(9, 8))
+    names = [f"{number:064x}" for number in range(40)]
+    for name in names:
+        (tmp_path / name).write_bytes(data)
+    monkeypatch.setattr(Storage, "__init__", lambda self: None)
+    monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
+    with (tmp_path / names[0]).open("rb") as file:
+        each = sum(index_memory(file))
+    containers, town = Containers(Storage.__new__(Storage), 8 * each), Town(tmp_path)
+    left, held = iter(names), dict[Caller, list[OpenContainer]]()
+
+    def open_one(caller: Caller, name: str) -> None:
+        share = partial(town.limits.check_indexes, caller)
+        held.setdefault(caller, []).append(containers.open(name, caller.key, share))
+
+    assert [taken(lambda caller: open_one(caller, next(left)), caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
+    # What somebody has open already takes nothing more, and what is let go makes room.
+    open_one(BERT, names[0])
+    for opened in held.pop(ANNA):
+        opened.close()
+        opened.close()
+    del opened
+    assert taken(lambda caller: open_one(caller, next(left)), CARL) == 1
+    for opened in itertools.chain.from_iterable(held.values()):
+        opened.close()
+    held.clear()
+    assert containers._open == {}
+    alone = Containers(Storage.__new__(Storage), 8 * each)
+    town.limits._alone = lambda: True
+    several = [alone.open(name, ANNA.key, partial(town.limits.check_indexes, ANNA)) for name in names[:8]]
+    for opened in several:
+        opened.close()
+
+
 SHARED: dict[str, Callable[[Path], None]] = {
     "max_uploads": uploads,
     "max_surfaces": surfaces,
