@@ -66,7 +66,7 @@ def test_a_setting_that_is_gone_says_what_replaced_it(
     page = (manual.PATH.parent / "operating.md").read_text()
     assert f"`{name}`" in page
     with pytest.raises(ValidationError, match=words):
-        Settings(**{name: 1000})
+        Settings.model_validate({name: 1000})
     monkeypatch.setenv(f"LODESTREAM_{name.upper()}", "1000")
     with pytest.raises(OptionError, match=f"^{words}"):
         parse()
