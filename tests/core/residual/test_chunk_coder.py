@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import zlib
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from lodestream.errors import CorruptStreamError, StreamError
 from lodestream.quantization.lattice import offset_lattice
+from lodestream.residual import chunk_coder
 from lodestream.residual.chunk_coder import decode_chunk, encode_chunk
 from lodestream.residual.number_line import PATTERNS, from_line
 from tests.reference import residual as reference
@@ -268,3 +270,34 @@ def test_any_place_has_the_value_that_the_reference_gives_it(places: list[int], 
     argument %= 8 * kind.itemsize
     expected = reference._values(given_places, kind, 1, argument)
     assert from_line(PATTERNS, argument, given_places, kind).tobytes() == expected.tobytes()
+
+
+def test_a_chunk_of_one_byte_more_than_plain_values_is_refused() -> None:
+    """Whatever it holds: the encoder stores plain values where nothing is shorter."""
+    rng, lengths = np.random.default_rng(1), set[int]()
+    for size, most in itertools.product(range(1, 60), (1, 2, 4, 8, 16, 32)):
+        restored = rng.integers(-60, 60, size).astype(np.int8)
+        original = (restored + rng.integers(-most, most + 1, size)).astype(np.int8)
+        (data,) = chunk_coder._with_differences(PATTERNS, 0, original, restored, np.zeros(0, np.uint8))
+        lengths.add(len(data) - size)
+        if len(data) > size + 1:
+            with pytest.raises(CorruptStreamError, match=f"at most {1 + size} bytes of residual"):
+                decode_chunk(restored, data, 0)
+        else:
+            np.testing.assert_array_equal(decode_chunk(restored, data, 0), original)
+    assert {1, 2} <= lengths
+
+
+def test_offsets_end_where_the_last_value_does() -> None:
+    """Bytes that are looked at may be there, as zeros; one more is refused."""
+    step = 0.01
+    restored = (np.arange(400) // 7 * step).astype(np.float32)
+    original = (restored.astype(np.float64) + np.where(np.arange(400) < 200, 0.003, 0.004)).astype(np.float32)
+    (data,) = chunk_coder._with_offsets(original, restored, step)
+    places = np.zeros(400, np.int64)
+    coded = np.frombuffer(data[9:], np.uint8).copy()
+    looked_at = chunk_coder.code_offsets(True, restored, step, data[0] >> 2, places, coded)
+    whole = data[: 9 + looked_at].ljust(9 + looked_at, b"\0")
+    assert decode_chunk(restored, whole, 0).tobytes() == original.tobytes()
+    with pytest.raises(CorruptStreamError, match=f"at most {9 + looked_at} bytes"):
+        decode_chunk(restored, whole + b"\0", 0)
