@@ -16,6 +16,7 @@ from lodestream.quantization.lattice import offset_lattice
 from lodestream.residual import chunk_coder
 from lodestream.residual.chunk_coder import decode_chunk, encode_chunk
 from lodestream.residual.number_line import PATTERNS, from_line
+from lodestream.residual.offsets import code_offsets
 from tests.reference import residual as reference
 
 Values = NDArray[Any]
@@ -296,7 +297,7 @@ def test_offsets_end_where_the_last_value_does() -> None:
     (data,) = chunk_coder._with_offsets(original, restored, step)
     places = np.zeros(400, np.int64)
     coded = np.frombuffer(data[9:], np.uint8).copy()
-    looked_at = chunk_coder.code_offsets(True, restored, step, data[0] >> 2, places, coded)
+    looked_at = code_offsets(True, restored, step, data[0] >> 2, places, coded)
     whole = data[: 9 + looked_at].ljust(9 + looked_at, b"\0")
     assert decode_chunk(restored, whole, 0).tobytes() == original.tobytes()
     with pytest.raises(CorruptStreamError, match=f"at most {9 + looked_at} bytes"):
