@@ -38,6 +38,9 @@ _MADE = "_lodestream_made"
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
+#: A part of an array in memory that has this share of its bytes is kept as it is.
+_MOST_OF = 0.9
+
 #: Headers are parsed by one thread at a time: Python 3.11 raises SystemError now and then where several parse at once.
 _parsing = Lock()
 
@@ -109,8 +112,10 @@ class MemoryScratch(Scratch):
         self._arrays: dict[str, NDArray[Any]] = {}
 
     def write(self, name: str, array: NDArray[Any]) -> None:
-        """Keep an array of any shape; a part of another is copied, so that the rest of that one is not kept with it."""
-        kept = np.array(array) if array.base is not None else np.asarray(array)
+        """Keep an array of any shape; a part of a much larger one is copied, so that the rest is not kept with it."""
+        base = array.base
+        is_part = isinstance(base, np.ndarray) and array.nbytes < _MOST_OF * base.nbytes
+        kept = np.array(array) if is_part else np.asarray(array)[...]
         kept.flags.writeable = False
         self._arrays[name] = kept
 
@@ -123,11 +128,11 @@ class MemoryScratch(Scratch):
 
     def those_of(self, names: Iterable[str]) -> set[str]:
         """Those of these names that arrays have."""
-        return self._arrays.keys() & set(names)
+        return {name for name in names if name in self._arrays}
 
     def remove(self, name: str) -> None:
         """Forget an array, if it is there, or all whose names begin with this and a slash."""
-        for kept in [kept for kept in self._arrays if kept == name or kept.startswith(f"{name}/")]:
+        for kept in [kept for kept in list(self._arrays) if kept == name or kept.startswith(f"{name}/")]:
             del self._arrays[kept]
 
     def temporary(self, least: int) -> AbstractContextManager[Room]:

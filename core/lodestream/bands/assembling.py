@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 from ..container.writer import CodedLayer, CodedSegment
 from ..decoding.values import Values
 from ..encoding.holes import given_arrays
-from ..encoding.measured import MeasuredLayer, all_passes
+from ..encoding.layers import MeasuredLayer, all_passes
+from ..planning.window_errors import serialize_window_errors
 from ..scratch import Scratch
 from ..surface import Surface
 from .build import Build
 from .stored import name_of
 
-__all__ = ["Chunks", "coded_layers", "returned_digest"]
+__all__ = ["Chunks", "coded_layers", "returned_digest", "window_section_of"]
 
 #: Values that are hashed at a time.
 _AT_ONCE = 1 << 20
+
+#: The share of the bytes that errors of windows may take.
+_WINDOWS_SHARE = 0.005
 
 
 def _bytes(scratch: Scratch, name: str) -> memoryview:
@@ -130,10 +134,10 @@ def coded_layers(
     large : int
         The coarsest level whose units are large.
     """
-    first = build.prepared.layout.tiles_from(large) if large else len(tops[0])
     starts = np.array([tiles.start for _, _, tiles in pieces])
     stored: dict[tuple[int, int], _Piece] = {}
     for channel, own in enumerate(tops):
+        first = build.first_large(channel, large)
         for number, (level, band, tiles) in enumerate(pieces):
             small = min(max(first - tiles.start, 0), len(tiles))
             planes = own[tiles.start : tiles.stop]
@@ -169,3 +173,12 @@ def returned_digest(surface: Surface, hole: int) -> str:
                     Values([rows] if number == 0 else [rows[..., :0], rows]).clear(hidden[start : start + each], hole)
                 digest.update(np.ascontiguousarray(rows.astype(rows.dtype.newbyteorder("<"), copy=False)).data)
     return digest.hexdigest()
+
+
+def window_section_of(codes: Sequence[NDArray[np.uint8]], total: int) -> bytes | None:
+    """The payload that tells errors of windows; None where it is much beside ``total`` bytes.
+
+    ``codes`` are uint8, shape (cell, 2), of each layer, see `layer_codes`.
+    """
+    payload = serialize_window_errors(codes)
+    return payload if len(payload) < _WINDOWS_SHARE * total else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,10 +13,12 @@ from threading import Lock
 import numpy as np
 
 from ..container.model import Header
+from ..decoding.values import Values
 from ..encoding.lattice_coordinates import Lattices
 from ..encoding.prepared import Prepared
 from ..entropy.tiles import TileTable
-from ..scratch import FolderScratch, Scratch
+from ..quantization.band_steps import Quantiser
+from ..scratch import FolderScratch, MemoryScratch, Scratch
 from .geometry import CORE_POINTS, Bands
 from .grid_runs import GridRuns
 from .references import dump, load
@@ -44,9 +47,9 @@ class Build:
     scratch : Scratch
         Of this stream alone.
     prepared : Prepared
-        With no `rms`; what is large in it is memory-mapped.
+        What is large in it is memory-mapped where other processes are to open it.
     lattices : Lattices
-        With no `fineness`.
+        A stream for one error, whose lattices have a `fineness`, is made in one piece.
     points : int
         Of a piece, about. It decides about memory, not about bytes.
     core_points : int
@@ -58,6 +61,11 @@ class Build:
     ) -> None:
         self.scratch, self.prepared, self.lattices = scratch, prepared, lattices
         self.points, self._core_points = points, core_points
+        #: Of the coordinates, where the stream is made for one error; known when they are transformed.
+        self.quantiser: Quantiser | None = None
+        #: What the last layer shows of each block, of a build in one piece, from when it is known until it is used.
+        self.last: Mapping[int, Values] | None = None
+        self._header: Header | None = None
 
     @cached_property
     def pieces(self) -> Bands | GridRuns:
@@ -68,6 +76,21 @@ class Build:
     def table(self, channel: int) -> TileTable:
         """Of all tiles of a channel: points of interfaces are coordinates."""
         return TileTable.of(self.prepared.layout, channel < self.prepared.geometric)
+
+    def quantiser_of(self, channel: int) -> Quantiser | None:
+        """The quantiser of a channel, if it has one."""
+        return self.quantiser if channel < self.prepared.geometric else None
+
+    def first_large(self, channel: int, level: int) -> int:
+        """The first tile of a channel that is a large unit where those of a level are; as many as there are if none."""
+        return self.prepared.layout.tiles_from(0 if self.quantiser_of(channel) else level)
+
+    @cached_property
+    def is_whole(self) -> bool:
+        """Whether everything is in one piece, in memory: no task is done twice, and what is needed no more can go."""
+        layout = self.prepared.layout
+        in_one = self.pieces.core == layout.levels and self.points >= layout.points(layout.levels)
+        return in_one and isinstance(self.scratch, MemoryScratch)
 
     @property
     def channels(self) -> int:
@@ -87,6 +110,7 @@ class Build:
 
     def save_header(self, header: Header) -> None:
         """Write the header, with the size of chunks, for the tasks that code the residual."""
+        self._header = header
         self.scratch.write(_HEADER, np.frombuffer(pickle.dumps(header, pickle.HIGHEST_PROTOCOL), np.uint8))
 
     def stored_header(self) -> Header:
@@ -97,8 +121,10 @@ class Build:
         FileNotFoundError
             If it has written nothing yet.
         """
-        header: Header = pickle.loads(self.scratch.read(_HEADER).data)
-        return header
+        if self._header is None:
+            self._header = pickle.loads(self.scratch.read(_HEADER).data)
+        assert self._header is not None
+        return self._header
 
     @staticmethod
     def open(folder: str) -> Build:

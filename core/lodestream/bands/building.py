@@ -1,4 +1,4 @@
-"""One stream of a surface, built by phases of tasks: the bytes that `encoding.encoder` makes of it in one piece."""
+"""One stream of a surface, built by phases of tasks; its bytes are the same whatever the pieces are."""
 
 from __future__ import annotations
 
@@ -16,21 +16,27 @@ from ..container.model import Errors, Header
 from ..container.writer import ContainerWriter
 from ..decoding.measurer import Figures, distances_of
 from ..encoding.allocation import assign_layers
-from ..encoding.corrected import remaining_errors
+from ..encoding.band_weights import band_weights
 from ..encoding.curves import Curves
 from ..encoding.header import header_of
 from ..encoding.large_units import candidate, worth
-from ..encoding.measured import MeasuredLayer, all_passes, kept_layers, level_states, shown_states, told_errors
+from ..encoding.layers import (
+    MeasuredLayer,
+    all_passes,
+    kept_layers,
+    level_states,
+    remaining_errors,
+    shown_states,
+    told_errors,
+)
 from ..encoding.residual_encoder import chunk_sample, chunk_size
-from ..encoding.transformed import band_weights
-from ..encoding.written import window_section_of
 from ..planning.window_errors import KIND as WINDOW_ERRORS
 from . import tasks
-from .assembling import Chunks, coded_layers, returned_digest
+from .assembling import Chunks, coded_layers, returned_digest, window_section_of
 from .build import Build
 from .coding import parents_of, sizes_of_unit
 from .executing import Execution, Task
-from .measuring import ValuesOfRows, last_values, measured_runs
+from .measuring import ValuesOfRows, exact_errors, last_values, measured_runs
 from .stored import name_of, pieces_of, read_tiles, transformed
 from .transforming import planes_of_channel, transforming
 
@@ -77,14 +83,18 @@ class Building:
         return self._assemble(out)
 
     def _carry_out(self, share: float, phase: Sequence[Task]) -> None:
+        self._execution.carry_out(phase, self._report(share))
+
+    def _report(self, share: float) -> Callable[[float], None]:
+        """What is told the fraction done of work that takes a share of the time."""
         start = self._done
-        self._execution.carry_out(phase, lambda fraction: self._progress(start + share * fraction))
         self._done = start + share
+        return lambda fraction: self._progress(start + share * fraction)
 
     # Transform.
 
     def _transform(self) -> None:
-        transforming(self._build, self._carry_out).carry_out(_SHARES[0])
+        transforming(self._build, self._carry_out, self._report).carry_out(_SHARES[0])
         for channel, lattice in enumerate(self._build.lattices.channels):
             if not self._scratch.has(f"weights/{channel}"):
                 own, table = self._read("predictors")[channel], self._build.table(channel)
@@ -105,14 +115,14 @@ class Building:
         self._carry_out(_SHARES[1], [Task(name_of("ends", *unit), tasks.code, unit) for unit in units])
 
     def _large_level(self) -> int:
-        """See `large_level`."""
+        """The coarsest level whose units should be large; 0: none should."""
         level, tried = candidate(self._layout)
-        if not level:
+        if not level or all(self._build.quantiser_of(channel) for channel in range(self._build.channels)):
             return 0
         sizes = []
         for tile in tried:
             for channel, tops in enumerate(self._tops):
-                if not tops[tile]:
+                if not tops[tile] or self._build.quantiser_of(channel):
                     continue
                 table = self._build.table(channel)
                 parents = parents_of(table, range(tile, tile + 1))
@@ -152,13 +162,13 @@ class Building:
         """With the largest chunks."""
         build = self._build
         predictors = np.array(self._read("predictors"))
-        return header_of(build.prepared, build.lattices, predictors, self._tops, None, self._large)
+        return header_of(build.prepared, build.lattices, predictors, self._tops, build.quantiser, self._large)
 
     def _choose_layers(self) -> None:
         if self._scratch.has("layers"):
             return
         curves = self._curves()
-        layers = assign_layers(curves, self._layout, self._build.channels)
+        layers = assign_layers(curves, self._layout, self._build.channels, self._build.quantiser is not None)
         shown = shown_states(self._header, layers, all_passes(self._tops))
         self._scratch.write("states", np.stack([*shown, *level_states(self._header)]))
         self._scratch.write("last-state", shown[-1])
@@ -184,8 +194,9 @@ class Building:
         prepared, header = self._build.prepared, self._header
         if len(prepared.chunks) == 1:
             return prepared.chunks[0]
-        rows = chunk_sample(prepared, header.shape)[0]
-        values = ValuesOfRows(last_values(self._build, header, rows), rows[0])
+        start, stop = chunk_sample(prepared, header.shape)[0]
+        shown = last_values(self._build, header, range(start, stop))[0]
+        values = ValuesOfRows(shown, 0 if self._build.is_whole else start)
         return chunk_size(prepared, header, [values], float(self._read("coefficient-bytes")))
 
     def _measured(self) -> tuple[list[MeasuredLayer], list[Errors], list[bool]]:
@@ -200,8 +211,9 @@ class Building:
         measured = []
         for state in range(states):
             distances = distances_of(self._header, figures, state)
-            if distances is None:
+            if distances is None and not self._build.is_whole:
                 raise OutOfRangeError
+            distances = distances or exact_errors(self._build, self._header, self._read("states")[state])
             measured.append((told_errors(distances[0]), distances[1]))
         kept = kept_layers(self._header, layers, measured[: len(layers)])
         whole = np.all([self._read(f"exact/{k}") for k in range(count)], axis=0)
@@ -220,7 +232,7 @@ class Building:
             (channel, level, k)
             for level, k, tiles in self._pieces
             for channel in range(build.channels)
-            if self._has_small(tiles)
+            if tiles.start < build.first_large(channel, self._large)
         ]
         self._carry_out(_SHARES[3] / 2, [Task(name_of("lengths", *unit), tasks.segments, unit) for unit in units])
         chunks = Chunks(scratch, self._runs)
@@ -243,9 +255,6 @@ class Building:
             if payload is not None:
                 writer.optional(WINDOW_ERRORS, payload)
         return writer.end(levels)
-
-    def _has_small(self, tiles: range) -> bool:
-        return tiles.start < self._layout.tiles_from(self._large)
 
     def _read(self, name: str) -> NDArray[Any]:
         return self._scratch.read(name)

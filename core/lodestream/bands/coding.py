@@ -7,18 +7,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..encoding.allocated import unit_curve
 from ..encoding.large_units import unit_size
+from ..entropy.band_fields import COLUMNS, ROWS
+from ..entropy.bitplanes import pass_count, pass_gains
 from ..entropy.part_table import Part, part_of
 from ..entropy.tile_coder import Channel, TileCoder
 from ..entropy.tiles import TileTable
+from ..parallel import spread
+from ..quantization.band_steps import Quantiser
 
 __all__ = ["CodedBand", "Units", "code_segments", "code_units", "parents_of", "sizes_of_unit"]
+
+#: What the last pass of a tile is worth for each coefficient, besides its own bits, in squared lattice steps: a level
+#: whose tiles are all known is inverted without errors of rounding.
+_ROUNDING = 0.2
 
 
 @dataclass(frozen=True)
@@ -67,6 +74,8 @@ class Units:
         Bit-planes of these tiles.
     large : int
         The coarsest level whose units are large; 0: none is.
+    quantiser : Quantiser or None
+        The channel's.
     """
 
     def __init__(
@@ -78,8 +87,9 @@ class Units:
         weights: NDArray[np.float64],
         tops: NDArray[np.int8],
         large: int,
+        quantiser: Quantiser | None = None,
     ) -> None:
-        self.tiles, self.tops = tiles, tops
+        self.tiles, self.tops, self.rounded = tiles, tops, quantiser is None
         parents = parents_of(table, tiles) if tiles.start else range(0)
         self.part: Part = part_of(table, [parents, tiles])
         self.first = len(parents)  # the local number of the first of the tiles
@@ -91,19 +101,22 @@ class Units:
         bands = [slice(table.first[run.start], table.first[run.stop]) for run in (parents, tiles) if run]
         worth = np.concatenate([weights[span] for span in bands])
         self.channel = Channel(flat, worth, np.concatenate([np.zeros(self.first, np.int8), tops]))
-        self.coder = TileCoder([self.part.table], [self.channel], 1, None, large)
+        self.coder = TileCoder([self.part.table], [self.channel], 1, quantiser, large)
         if parents:
             span = self.part.spans[0][1]
             np.abs(flat[span], out=self.coder.tiles[0].known[span])
 
 
 def code_units(units: Units) -> CodedBand:
-    """Code tiles whole, see `allocate`."""
-    curves = [
-        unit_curve(units.coder, tile, 0, units.channel, units.part.table)
-        for tile in range(units.first, units.first + len(units.tiles))
-        if units.channel.top[tile]
-    ]
+    """Code each tile once as a whole: what its passes cost and gain, and the bytes of large units."""
+    table = units.part.table
+
+    def curve(tile: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return unit_curve(units.coder, tile, units.channel, table, units.rounded)
+
+    coded = [tile for tile in range(units.first, units.first + len(units.tiles)) if units.channel.top[tile]]
+    # Contexts of a unit come from itself and its parent: those of a level are coded side by side.
+    curves = [pair for _, level in groupby(coded, table.level_of) for pair in spread(curve, level)]
     strings = [units.coder.strings[key] for key in sorted(units.coder.strings)]
     nothing = np.zeros(0)
     return CodedBand(
@@ -113,6 +126,31 @@ def code_units(units: Units) -> CodedBand:
         np.frombuffer(b"".join(data for data, _ in strings), np.uint8),
         np.concatenate([np.zeros(0, np.int64), *(ends for _, ends in strings)]),
     )
+
+
+def unit_curve(
+    coder: TileCoder, tile: int, channel: Channel, table: TileTable, rounded: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Code all passes of a unit that has a bit-plane: bits and gains, float64, shape (pass,), see `TileCurve`.
+
+    Parameters
+    ----------
+    coder : TileCoder
+        Of ``channel`` alone, in places of ``table``; it knows the unit's parent.
+    tile : int
+    rounded : bool
+        The coefficients are not quantised, so that a level of which all is known has no errors of rounding.
+    """
+    passes = pass_count(int(channel.top[tile]))
+    costs = np.zeros(passes, np.float64)
+    coder.code(tile, 0, passes, passes, costs)
+    bits = costs.copy()
+    bits[:-1] -= costs[1:]
+    rows, weights = table.of_tile(tile), channel.weights[table.first[tile] : table.first[tile + 1]]
+    gains = np.diff(pass_gains(rows, weights, passes, channel.true, coder.tiles[0].early))
+    if rounded:
+        gains[0] += _ROUNDING * float((weights * rows[:, ROWS] * rows[:, COLUMNS]).sum())
+    return bits, gains
 
 
 def code_segments(units: Units, states: Sequence[NDArray[np.int8]]) -> list[bytes]:

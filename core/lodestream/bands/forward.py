@@ -152,7 +152,7 @@ def core_transform(
     Parameters
     ----------
     samples : int32, shape (row, column)
-        Of the core's finest level.
+        Of the core's finest level, an array from `pyramid.empty`; changed.
     bands : Bands
     table : TileTable
         Of all tiles.
@@ -166,10 +166,8 @@ def core_transform(
     int32, flat, and int8, shape (tile,)
         Coefficients and bit-planes of the core's tiles, as `second_step` returns them of a band.
     """
-    array = empty(samples.shape)
-    array[...] = samples
-    predictors = forward([array], bands.layout, fit, bands.core)
-    return predictors, *_of_tiles(array, part_of(table, [bands.core_tiles]), None)
+    predictors = forward([samples], bands.layout, fit, bands.core)
+    return predictors, *_of_tiles(samples, part_of(table, [bands.core_tiles]), None)
 
 
 def overflows(coefficients: NDArray[np.int32]) -> bool:
@@ -193,4 +191,4 @@ def _of_tiles(array: NDArray[np.int32], part: Part, shift: _Shift | None) -> tup
         origins[:, 1] += np.where(table.bands[:, KIND] > 1, shift.details, shift.nodes)
     flat = gather(table, [array], origins)
     planes = np.array([planes_of(table, flat, tile) for tile in range(len(table.members))], np.int8)
-    return flat[part.spans[0][1]].copy(), planes
+    return flat[part.spans[0][1]], planes

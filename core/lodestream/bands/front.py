@@ -26,6 +26,7 @@ from .folders import Folder, check_out, replacing
 from .made import Made
 from .memory import WHOLE, checked_memory, default_memory, whole_memory
 from .room import CopyRoom
+from .streams import encoded
 
 if TYPE_CHECKING:
     import xarray
@@ -175,18 +176,16 @@ def encode(
             surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands, given))
         elif not isinstance(surface, Surface):
             surface = Surface(cast("ArrayLike", surface))
-        stacklevel = 4  # the caller of this function, from the one that makes it in one piece
+        encoder.check(surface, chosen)
+        left_out = at_holes(surface)
+        if left_out is not None:
+            warnings.warn(left_out, FormatWarning, stacklevel=2)
+        told = encoder.rising(progress or (lambda fraction: None))
         if not whole and goes_by_bands(surface, chosen, limit, executor is not None, memory is not None):
-            encoder.check(surface, chosen)
-            left_out = at_holes(surface)
-            if left_out is not None:
-                warnings.warn(left_out, FormatWarning, stacklevel=2)
-            told = encoder.rising(progress or (lambda fraction: None))
             made = Made(surface, chosen, limit, executor, told, read is not None).container(folder.open())
             if made is not None:
                 return _given(made, out)
-            stacklevel = 0
-        return _in_memory(surface, chosen, progress, out, stacklevel)
+        return _in_memory(surface, chosen, told, out)
 
 
 def _reading(source: Any) -> Callable[[Room], Surface] | None:
@@ -227,13 +226,9 @@ def _given(made: Path, out: str | os.PathLike[str] | None) -> bytes | None:
 
 
 def _in_memory(
-    surface: Surface,
-    quality: Quality,
-    progress: _Progress | None,
-    out: str | os.PathLike[str] | None,
-    stacklevel: int,
+    surface: Surface, quality: Quality, progress: _Progress, out: str | os.PathLike[str] | None
 ) -> bytes | None:
-    container = encoder.encode(surface, quality=quality, progress=progress, stacklevel=stacklevel)
+    container = encoded(surface, quality, progress)
     if out is None:
         return container
     with replacing(Path(out)) as unfinished:

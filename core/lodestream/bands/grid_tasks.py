@@ -83,6 +83,8 @@ def core(build: Build, channel: int, fit: int) -> None:
     layout, grids = build.prepared.layout, range(len(build.prepared.layout.grids))
     name = name_of_fit("samples", channel, fit, runs.core)
     arrays = transform.read_grids(build.scratch, name, runs, runs.core, grids)
+    if build.is_whole:
+        build.scratch.remove(name)
     predictors = forward(arrays, layout, bool(fit), runs.core)
     flat, planes = transform.coefficients_of(arrays, build.table(channel), grids, runs.core_tiles)
     build.scratch.write(name_of_fit("coefficients", channel, fit, runs.core, CORE), flat)

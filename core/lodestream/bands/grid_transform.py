@@ -173,4 +173,4 @@ def coefficients_of(
     part = part_of(table, [tiles])
     flat = gather(part.table, arrays, grids=grids)
     planes = np.array([planes_of(part.table, flat, tile) for tile in range(len(tiles))], np.int8)
-    return flat[part.spans[0][1]].copy(), planes
+    return flat[part.spans[0][1]], planes

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..encoding import encoder
 from ..encoding.lattice_coordinates import exact_lattices
 from ..encoding.prepared import Prepared, prepare
 from ..errors import InputError
@@ -32,6 +31,7 @@ from .geometry import CORE_POINTS
 from .memory import BESIDE, OF_BAND, largest_block, masks_memory
 from .references import file_state, root_of
 from .room import FOR_A_VALUE, check_room
+from .streams import shortest
 
 __all__ = ["Made"]
 
@@ -140,18 +140,15 @@ class Made:
         if prepared.arrangement is not None and self._executor is None:
             # No patch is divided.
             self._threads = max(1, min(self._threads, self._room * self._channels // largest_block(self._surface)))
-        raw = sum(array.nbytes for array in self._arrays())
-        best: Path | None = None
-        for bits in (None, *encoder.COARSER):
-            try:
-                found = self._stream(scratch, prepared, bits, room)
-            except OutOfRangeError:
-                return None
-            if best is None or found.stat().st_size < best.stat().st_size:
-                best = found
-            # What looks like noise is not worth coding, see `encoder`.
-            if prepared.precision is not None or best.stat().st_size <= encoder.longest(raw):
-                break
+        try:
+            best = shortest(
+                self._surface,
+                prepared,
+                lambda bits: self._stream(scratch, prepared, bits, room),
+                lambda path: path.stat().st_size,
+            )
+        except OutOfRangeError:
+            return None
         self._progress(1.0)
         return best
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
-from ..decoding.measurer import CORE_POINTS, Figures, Measurer
+from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer
 from ..decoding.region import Region, core_level
 from ..decoding.values import Values, region_of_blocks, values_of
 from ..encoding.prepared import Prepared
@@ -24,7 +24,15 @@ from ..parallel import spread
 from .build import Build
 from .stored import known_tiles
 
-__all__ = ["RUNS_TOGETHER", "Residual", "ValuesOfRows", "last_values", "measure", "measured_runs"]
+__all__ = [
+    "RUNS_TOGETHER",
+    "Residual",
+    "ValuesOfRows",
+    "exact_errors",
+    "last_values",
+    "measure",
+    "measured_runs",
+]
 
 #: What is measured together has so many times the points of a piece of the transform. What its tiles hold takes 8 bytes
 #: a value.
@@ -85,7 +93,9 @@ def measure(build: Build, header: Header, run: range) -> tuple[Figures, Residual
     tiles = _tiles(build, region)
     states = list(np.array(build.scratch.read("states")))
     figures = Measurer(header, region, tiles, build.prepared.comparisons(region)).figures(states)
-    values = values_of(header, region, tiles, np.array(build.scratch.read("last-state")))
+    del tiles  # before values take as much
+    values = last_values(build, header, run)
+    build.last = None
     return figures, _residual(build.prepared, header, run, values)
 
 
@@ -94,15 +104,31 @@ def _region(build: Build, header: Header, run: range) -> Region:
     layout = header.layout
     if header.arrangement is not None:
         return region_of_blocks(header, layout.levels, run)
-    # Files have neighbouring tiles of several levels only up to the core of the pieces.
+    if build.is_whole:
+        return Region.whole(layout, layout.levels)  # all tiles are in one array, and all levels in one call
+    # The scratch has neighbouring tiles of several levels only up to the core of the pieces.
     core = min(build.pieces.core, core_level(layout, layout.levels, CORE_POINTS))
     return Region.window(layout, layout.levels, (run.start, run.stop), (0, header.shape[1]), core)
 
 
-def last_values(build: Build, header: Header, rows: tuple[int, int]) -> Values:
-    """Rows of the only block as they are after the last layer."""
-    region = _region(build, header, range(*rows))
-    return values_of(header, region, _tiles(build, region), np.array(build.scratch.read("last-state")))[0]
+def exact_errors(build: Build, header: Header, state: NDArray[np.int8]) -> Measured:
+    """Errors of the surface in a state, int8, shape (tile, channel), also where float64 does not hold the squares."""
+    region = Region.whole(header.layout, header.levels)
+    return Measurer(header, region, _tiles(build, region), build.prepared.comparisons(region)).exact_errors(state)
+
+
+def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values]:
+    """Rows of the only block, or some blocks, as they are after the last layer.
+
+    Of a build in one piece it is the surface, and kept: the size of chunks is chosen by them before they are coded.
+    """
+    if build.last is not None:
+        return build.last
+    region = _region(build, header, run)
+    values = values_of(header, region, _tiles(build, region), np.array(build.scratch.read("last-state")))
+    if build.is_whole:
+        build.last = values
+    return values
 
 
 def _tiles(build: Build, region: Region) -> list[Tiles]:

@@ -13,10 +13,12 @@ from ..entropy.part_table import Part, flat_span
 from ..entropy.tiles import Tiles
 from ..transform.predictors import default_predictors
 from .build import Build
+from .coding import Units
 
 __all__ = [
     "CORE",
     "PLAIN",
+    "keep_known",
     "kind_of",
     "known_tiles",
     "name_of",
@@ -94,9 +96,30 @@ def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[A
     return found
 
 
+def keep_known(build: Build, channel: int, units: Units) -> None:
+    """Keep, of a channel in one piece that is coded, what a reader knows in the end, and coefficients of small units.
+
+    These are the coder's arrays: measuring then takes nothing more for them.
+    """
+    scratch, core, tiles = build.scratch, build.pieces.core, units.coder.tiles[0]
+    for kind, array in (("known", tiles.known), ("sign", tiles.sign), ("early", tiles.early)):
+        scratch.write(name_of(kind, channel, core, CORE), array)
+    small = flat_span(build.table(channel), range(build.first_large(channel, int(scratch.read("large")))))
+    name = name_of(transformed(build, "coefficients", channel), channel, core, CORE)
+    scratch.write(name, units.channel.true[small])
+
+
 def known_tiles(build: Build, part: Part, channel: int) -> Tiles:
-    """All that a reader knows in the end of a channel in some tiles, which have been coded."""
-    tiles, coefficients = Tiles(part.table), transformed(build, "coefficients", channel)
+    """All that a reader knows in the end of a channel in some tiles, which have been coded; not to be changed."""
+    tiles = Tiles(part.table, build.quantiser_of(channel))
+    if build.is_whole:
+        assert part.table is build.table(channel)
+        piece = channel, build.pieces.core, CORE
+        tiles.known, tiles.sign, tiles.early = (
+            build.scratch.read(name_of(kind, *piece)) for kind in ("known", "sign", "early")
+        )
+        return tiles
+    coefficients = transformed(build, "coefficients", channel)
     for run, span in part.spans:
         known, sign, early = tiles.known[span], tiles.sign[span], tiles.early[span]
         for place, true in stored_tiles(build, coefficients, channel, run):

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..encoding.lattice_coordinates import coordinates_of_strip, strips
+from ..entropy.part_table import flat_span
 from ..transform.pyramid import empty
 from . import forward, measuring
 from .build import Build
@@ -16,6 +17,7 @@ from .geometry import Bands
 from .measuring import measured_runs
 from .stored import (
     CORE,
+    keep_known,
     name_of,
     name_of_fit,
     read_tiles,
@@ -96,6 +98,8 @@ def core(build: Build, channel: int, fit: int) -> None:
     pieces = sample_pieces(build, bands.core)
     name = name_of_fit("samples", channel, fit, bands.core)
     forward.read_rows(build.scratch, name, pieces, (0, len(samples)), samples)
+    if build.is_whole:
+        build.scratch.remove(name)
     predictors, flat, planes = forward.core_transform(samples, bands, build.table(channel), bool(fit))
     build.scratch.write(name_of_fit("coefficients", channel, fit, bands.core, CORE), flat)
     build.scratch.write(name_of_fit("planes", channel, fit, bands.core, CORE), planes)
@@ -104,14 +108,22 @@ def core(build: Build, channel: int, fit: int) -> None:
 
 def code(build: Build, channel: int, level: int, band: int) -> None:
     """Code the units of a band, or of the core, whole."""
-    found = code_units(_units(build, channel, level, band))
-    for kind in ("bits", "gains", "early", "strings", "ends"):
+    units = _units(build, channel, level, band)
+    if build.is_whole:
+        # The units have their own, and nobody else needs them.
+        build.scratch.remove(name_of(transformed(build, "coefficients", channel), channel, level, band))
+    found = code_units(units)
+    if build.is_whole:
+        keep_known(build, channel, units)
+    else:
+        build.scratch.write(name_of("early", channel, level, band), found.early)
+    for kind in ("bits", "gains", "strings", "ends"):
         build.scratch.write(name_of(kind, channel, level, band), getattr(found, kind))
 
 
 def segments(build: Build, channel: int, level: int, band: int) -> None:
     """Code the small units of a band, or of the core, layer after layer."""
-    units = _units(build, channel, level, band)
+    units = _units(build, channel, level, band, build.first_large(channel, int(build.scratch.read("large"))))
     states = build.scratch.read("kept-states")[:, units.tiles.start : units.tiles.stop, channel]
     start = np.maximum(2 * units.tops - 1, 0).astype(np.int8)
     own = code_segments(units, [start, *states])
@@ -132,14 +144,16 @@ def _bands(build: Build) -> Bands:
     return build.pieces
 
 
-def _units(build: Build, channel: int, level: int, band: int) -> Units:
-    """The units of a piece, ready to be coded."""
+def _units(build: Build, channel: int, level: int, band: int, stop: int | None = None) -> Units:
+    """The units of a piece, or those of them before the tile ``stop``, ready to be coded."""
     pieces, table = build.pieces, build.table(channel)
     tiles = pieces.core_tiles if level == pieces.core else pieces.of(level)[band].tiles
+    tiles = tiles[: None if stop is None else max(stop - tiles.start, 0)]
     parents = parents_of(table, tiles) if tiles.start else range(0)
     coefficients, planes = (transformed(build, kind, channel) for kind in ("coefficients", "planes"))
     above = read_tiles(build, coefficients, channel, parents) if parents else np.zeros(0, np.int32)
-    true = np.array(build.scratch.read(name_of(coefficients, channel, level, band)))
-    tops = np.array(build.scratch.read(name_of(planes, channel, level, band)))
+    span = flat_span(table, tiles)
+    true = build.scratch.read(name_of(coefficients, channel, level, band))[: span.stop - span.start]
+    tops = np.array(build.scratch.read(name_of(planes, channel, level, band))[: len(tiles)])
     weights, large = build.scratch.read(f"weights/{channel}"), int(build.scratch.read("large"))
-    return Units(table, tiles, true, above, weights, tops, large)
+    return Units(table, tiles, true, above, weights, tops, large, build.quantiser_of(channel))

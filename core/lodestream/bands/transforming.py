@@ -9,13 +9,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..encoding.one_error import quantize
+from ..entropy.part_table import flat_span
+from ..entropy.tile_coder import planes_of
 from ..transform.predictors import COEFFICIENT_BITS, INTERFACES, default_predictors, fitted_steps
 from . import grid_tasks, grid_transform, tasks
 from .build import Build
 from .executing import Task
 from .forward import fit_columns, fit_rows
 from .grid_runs import GridRuns
-from .stored import PLAIN, name_of, name_of_fit, pieces_of, transformed
+from .stored import CORE, PLAIN, name_of, name_of_fit, pieces_of, transformed
 
 __all__ = ["Transforming", "planes_of_channel", "transforming"]
 
@@ -41,13 +44,15 @@ class Transforming(ABC):
     ----------
     build : Build
     carry_out : callable
+    report : callable
+        Gives, for a share of the time, what is told the fraction of it that is done.
     """
 
     #: The module of the tasks, and the kinds of file in which they leave sampled rows; they write the last one last.
     _tasks: ClassVar[tuple[Any, tuple[str, ...]]]
 
-    def __init__(self, build: Build, carry_out: _CarryOut) -> None:
-        self._build, self._carry_out = build, carry_out
+    def __init__(self, build: Build, carry_out: _CarryOut, report: Callable[[float], Callable[[float], None]]) -> None:
+        self._build, self._carry_out, self._report = build, carry_out, report
         self._scratch, self._layout = build.scratch, build.prepared.layout
 
     def carry_out(self, share: float) -> None:
@@ -55,12 +60,35 @@ class Transforming(ABC):
 
         ``share`` is that of the time which this takes, about.
         """
-        channels = range(self._build.channels)
-        plain = [self._is_plain(channel, share / len(channels)) for channel in channels]
+        channels, quantized = range(self._build.channels), 0
+        if self._build.lattices.fineness:
+            quantized = self._build.prepared.geometric
+            self._quantize(share * quantized / len(channels))
+        plain = [k >= quantized and self._is_plain(k, share / len(channels)) for k in channels]
         if not self._scratch.has(PLAIN):
             self._scratch.write(PLAIN, np.array(plain))
         if not self._scratch.has("predictors"):
             self._scratch.write("predictors", np.stack([self._predictors(channel) for channel in channels]))
+
+    def _quantize(self, share: float) -> None:
+        """Transform and quantize all coordinates, whose errors add up; all levels are in one piece.
+
+        Raises
+        ------
+        NoQuantiserError
+            If no quantization step is short enough.
+        """
+        build, core = self._build, self._build.pieces.core
+        assert build.is_whole
+        found = quantize(build.prepared, build.lattices, build.table(0), self._report(share))
+        build.quantiser = found.quantiser
+        for channel, indices in enumerate(found.indices):
+            table, tiles = build.table(channel), build.pieces.core_tiles
+            planes = np.array([planes_of(table, indices, tile) for tile in tiles], np.int8)
+            self._scratch.write(name_of_fit("coefficients", channel, 1, core, CORE), indices[flat_span(table, tiles)])
+            self._scratch.write(name_of_fit("planes", channel, 1, core, CORE), planes)
+            self._scratch.write(name_of_fit("core-rules", channel, 1), found.predictors[channel])
+            self._scratch.write(f"weights/{channel}", found.weights[channel])
 
     def _is_plain(self, channel: int, share: float) -> bool:
         """Transform a channel; whether it has the default predictors."""
@@ -186,7 +214,9 @@ class _OfGrids(Transforming):
         return max(map(int, largest)) < 1 << COEFFICIENT_BITS
 
 
-def transforming(build: Build, carry_out: _CarryOut) -> Transforming:
+def transforming(
+    build: Build, carry_out: _CarryOut, report: Callable[[float], Callable[[float], None]]
+) -> Transforming:
     """What transforms the channels of a build."""
     kind = _OfGrids if isinstance(build.pieces, GridRuns) else _OfBands
-    return kind(build, carry_out)
+    return kind(build, carry_out, report)

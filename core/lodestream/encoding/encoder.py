@@ -1,70 +1,20 @@
-"""Encoding a surface into a container: chooses the kind of stream that is shortest for what the caller asks."""
+"""What is asked of an encoding: checked before anything takes time."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-
-from numpy.typing import ArrayLike
 
 from ..container import limits, metadata
 from ..container.shape import LONGEST_AXIS
-from ..errors import FormatWarning, OptionError, TooLargeError
-from ..library import require
+from ..errors import OptionError, TooLargeError
 from ..quality import Limit, Quality
 from ..surface import Surface
-from .allocated import allocate
-from .corrected import correct
-from .lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
-from .losses import at_holes
-from .measured import measure
 from .named_precisions import check_names
-from .prepared import Prepared, prepare
-from .quantized import NoQuantiserError, quantize
-from .transformed import transform
-from .written import write
 
-__all__ = ["COARSER", "check", "chosen_quality", "encode", "longest", "rising"]
-
-#: Bits of a channel's range that the lattice keeps where coding does not pay, in the order in which they are tried.
-COARSER = (8, 4, 0)
-
+__all__ = ["check", "chosen_quality", "rising"]
 
 #: Is told the fraction done, 0 to 1.
 _Progress = Callable[[float], None]
-
-
-def encode(
-    surface: Surface | ArrayLike,
-    precision: Limit | None = None,
-    *,
-    rms: Limit | None = None,
-    attribute_precision: Mapping[str, Limit] | None = None,
-    quality: Quality | None = None,
-    progress: Callable[[float], None] | None = None,
-    stacklevel: int = 2,
-) -> bytes:
-    """Encode a surface into a container, in one piece.
-
-    Parameters, result and errors are those of `lodestream.encode`, which chooses between this and building by bands: an
-    array has the shape (row, column) or (row, column, channel). ``stacklevel`` says whom a warning names, as
-    `warnings.warn` counts; 0: there is none.
-    """
-    require("encoding")
-    quality = chosen_quality(quality, precision, rms, attribute_precision)
-    if not isinstance(surface, Surface):
-        surface = Surface(surface)
-    check(surface, quality)
-    told = rising(progress or (lambda fraction: None))
-    left_out = at_holes(surface) if stacklevel else None
-    if left_out is not None:
-        warnings.warn(left_out, FormatWarning, stacklevel=stacklevel)
-    container = None if quality.rms is None else _for_one_error(surface, quality, told)
-    if container is None:
-        container = _progressive(surface, replace(quality, rms=None), told)
-    told(1.0)
-    return container
 
 
 def chosen_quality(
@@ -107,59 +57,6 @@ def _check_counts(surface: Surface) -> None:
     limits.check_names(attributes)
 
 
-def _stages(prepared: Prepared, lattices: Lattices, progress: _Progress) -> bytes:
-    """One stream of a prepared surface, stage by stage. What later stages have no use for is freed between them.
-
-    Raises
-    ------
-    NoQuantiserError
-        If the stream is to be made for an error for which no quantization step is short enough.
-    """
-    transformed = transform(prepared, lattices)
-    progress(0.1)
-    quantized = quantize(transformed, lambda done: progress(0.1 + 0.2 * done))
-    del transformed  # the lattice coordinates of all points
-    allocated = allocate(quantized)
-    del quantized  # the coefficients of large units
-    progress(0.4)
-    measured = measure(allocated, lambda done: progress(0.4 + 0.4 * done))
-    del allocated  # what a reader knows in the end
-    progress(0.7)
-    corrected = correct(measured)
-    del measured  # what a reader has reconstructed in the end
-    progress(0.8)
-    return write(corrected)
-
-
-def _progressive(surface: Surface, quality: Quality, progress: _Progress) -> bytes:
-    """The stream of many layers, up to a precision or bit for bit."""
-    prepared = prepare(surface, quality)
-    container = _stages(prepared, exact_lattices(prepared), progress)
-    raw = sum(array.nbytes for block in surface.blocks for array in (block.points, *block.attributes.values()))
-    for bits in COARSER:
-        if prepared.precision is not None or len(container) <= longest(raw):
-            break
-        # What looks like noise is not worth coding: the lattice keeps the highest bits, the residual stores the rest.
-        container = min(container, _stages(prepared, exact_lattices(prepared, bits), progress), key=len)
-    return container
-
-
-def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> bytes | None:
-    """The stream for one root mean square error; None where exact values are the way to meet it."""
-    prepared = prepare(surface, quality)
-    lattices = fine_lattices(prepared)
-    if lattices is None:
-        return None
-    try:
-        container = _stages(prepared, lattices, progress)
-    except NoQuantiserError:
-        return None
-    if lies_on_coarse_lattice(prepared):
-        exact = prepare(surface, replace(quality, rms=None))
-        container = min(container, _stages(exact, exact_lattices(exact), progress), key=len)
-    return container
-
-
 def rising(progress: _Progress) -> _Progress:
     """Tell fractions that never fall, whatever is tried one after another."""
     highest = 0.0
@@ -170,12 +67,3 @@ def rising(progress: _Progress) -> _Progress:
         progress(highest)
 
     return told
-
-
-def longest(raw: int) -> int:
-    """Most bytes that a container takes which restores so many bytes of values, unless nothing else is shorter.
-
-    >>> longest(100_000)
-    102024
-    """
-    return raw + raw // 100 + 1024

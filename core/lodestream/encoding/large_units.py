@@ -6,39 +6,19 @@ much; and on a few surfaces the neighbours in the same plane tell more than thos
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..entropy.tile_coder import Channel, TileCoder
-from ..entropy.tiles import TileTable
 from ..grid.layout import Layout
-from ..parallel import spread
-from ..quantization.band_steps import Quantiser
 
-__all__ = ["candidate", "large_level", "unit_size", "worth"]
+__all__ = ["candidate", "unit_size", "worth"]
 
 #: Points that all grids have together at the coarsest level whose units are large.
 _LARGE = 1 << 15
 #: By how much larger than others large units may be, and of how many tiles of a channel that is tried.
 _MOST, _TRIED = 1.05, 2
-
-
-def large_level(tables: list[TileTable], channels: list[Channel], geometric: int, quantiser: Quantiser | None) -> int:
-    """The coarsest level whose units should be large; 0: none should. Parameters are those of `TileCoder`."""
-    layout = tables[0].layout
-    level, tiles = candidate(layout)
-    coded = [k for k in range(len(channels)) if quantiser is None or k >= geometric]
-    if not level or not coded:
-        return 0
-    coders = [TileCoder(tables, channels, geometric, quantiser, large) for large in (level, 0)]
-    units = itertools.product(coders, tiles, coded)
-    parents = layout.tile_arrays.parents(np.array(tiles))
-    above = dict(zip(tiles, parents.tolist(), strict=True))
-    sizes = spread(lambda unit: unit_size(unit[0], unit[1], above[unit[1]], unit[2], channels[unit[2]]), units)
-    half = len(sizes) // 2
-    return level if worth(sizes[:half], sizes[half:]) else 0
 
 
 def candidate(layout: Layout) -> tuple[int, list[int]]:

@@ -64,6 +64,8 @@ def tiles_of_grids(layout: Layout, grids: Sequence[int], level: int) -> list[ran
 
     Tiles that they have in common with other grids are among them.
     """
+    if len(grids) == len(layout.grids):
+        return [layout.tiles_of(own) for own in range(level + 1)]
     found: list[range] = []
     for own in range(level + 1):
         starts, tiles = layout.tile_arrays.groups(own)
@@ -83,6 +85,9 @@ def part_of(table: TileTable, runs: Iterable[range]) -> Part:
     Bands whose parents are not among them have none. Tiles may have no bands.
     """
     runs = [run for run in runs if len(run)]
+    ends = [0, *(run.stop for run in runs)]
+    if [run.start for run in runs] == ends[:-1] and ends[-1] == len(table.members):
+        return Part(table, tuple((run, flat_span(table, run)) for run in runs))  # it is the whole table
     part = TileTable(table.layout, table.coordinate, np.concatenate([np.arange(run.start, run.stop) for run in runs]))
     spans, done = [], 0
     for run in runs:

@@ -16,9 +16,9 @@ from lodestream.bands import build, transforming
 from lodestream.bands.build import Build
 from lodestream.bands.building import Building
 from lodestream.bands.executing import Execution
+from lodestream.bands.front import encode
 from lodestream.bands.geometry import CORE_POINTS
 from lodestream.decoding.decoder import decode
-from lodestream.encoding.encoder import encode
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality

@@ -65,7 +65,7 @@ def _by_bands(samples: NDArray[np.int32], layout: Layout, bands: Bands, fit: boo
             columns[level - 1, band.number] = sampled_columns(nodes)
     if bands.core < layout.levels:
         samples = np.concatenate([scratch.read(f"{bands.core}/{k}") for k in range(len(bands.samples(bands.core)))])
-    own_predictors, flat, planes = core_transform(samples, bands, table, fit)
+    own_predictors, flat, planes = core_transform(copied(samples), bands, table, fit)
     predictors[: bands.core] = own_predictors[: bands.core]
     found.flat[flat_span(table, bands.core_tiles)] = flat
     found.planes[bands.core_tiles.start : bands.core_tiles.stop] = planes

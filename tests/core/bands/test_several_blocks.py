@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.bands import grid_tasks, inspecting, made, tasks, transforming
+from lodestream.bands.front import encode
 from lodestream.bands.grid_runs import GridRuns
 from lodestream.bands.inspecting import inspect
 from lodestream.bands.measuring import measured_runs
@@ -24,8 +25,6 @@ from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.container.reader import read_index
 from lodestream.decoding.inspection import Inspection
 from lodestream.decoding.pieces import PiecewiseDecoder
-from lodestream.encoding import transformed
-from lodestream.encoding.encoder import encode
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.residual import chunk_coder
@@ -214,7 +213,7 @@ def test_many_blocks_take_few_files(tmp_path: Path) -> None:
         mask = rng.random((20, 20)) < 0.9
         blocks.append(Block(rng.normal(size=(20, 20)), mask=mask, attributes={"a": rng.normal(size=(20, 20))}))
     surface = Surface(blocks=blocks)
-    expected = encode(surface, stacklevel=0)
+    expected = encode(surface)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (len(os.listdir("/dev/fd")) + 60, before[1]))
     try:
@@ -240,7 +239,6 @@ def test_coefficients_that_are_too_large_are_noticed(monkeypatch: pytest.MonkeyP
     surface = _plates()
     monkeypatch.setattr(transforming, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
     plain = built(surface, 1, 600)
-    monkeypatch.setattr(transformed, "COEFFICIENT_BITS", 0)
     assert plain == encode(surface)
     assert ls.decode(plain).blocks[0].points.tobytes() == surface.blocks[0].points.tobytes()
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 import lodestream as ls
 from lodestream.encoding.lattice_coordinates import fine_lattices, lattice_coordinates
 from lodestream.encoding.noise_shaping import feedback_rules
+from lodestream.encoding.one_error import closed_loop
 from lodestream.encoding.prepared import prepare
-from lodestream.encoding.transformed import transform
 from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.grid.layout import Layout
 from lodestream.quantization.band_steps import Quantiser
@@ -32,15 +32,14 @@ def check(surface: ls.Surface, base: int) -> None:
     prepared = prepare(surface, ls.Quality(rms=Tolerance(0.01, relative=True)))
     fine = fine_lattices(prepared)
     assert fine is not None
-    transformed = transform(prepared, fine)
     layout, table, quantiser = prepared.layout, TileTable.of(prepared.layout), Quantiser(base)
     steps, rules = table.steps(quantiser), feedback_rules(table, quantiser)
     for number, lattice in enumerate(fine.channels[: prepared.geometric]):
-        predictors = transformed.predictors[number]
+        loop, predictors = closed_loop(prepared, fine, table, number)
         reconstructions = [allocate(grid.shape) for grid in layout.grids]
         for reconstruction in reconstructions:
             reconstruction[...] = 77  # of another try
-        indices = transformed.loops[number].indices(steps, rules, reconstructions)
+        indices = loop.indices(steps, rules, reconstructions)
         tiles = Tiles(table, quantiser)
         tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
         grids = [allocate(grid.shape) for grid in layout.grids]

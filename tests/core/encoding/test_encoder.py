@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import InputError, OptionError
+from lodestream.bands import building
 from lodestream.container import describe
 from lodestream.container.model import Header
-from lodestream.encoding import measured
-from lodestream.encoding.allocated import State
+from lodestream.decoding.measurer import Measured
+from lodestream.encoding.layers import MeasuredLayer, State, kept_layers
 
 from ..surfaces import SAMPLES, contained, encoded, errors, index_of, is_told, terrain, torus
 
@@ -186,17 +187,16 @@ def test_a_layer_that_would_raise_the_error_is_left_out(monkeypatch: pytest.Monk
     points = terrain((40, 33), 1)
     told = [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
     assert len(told) > 5
-    kept_layers = measured.kept_layers
 
     def layers_when(raised: int, wrong: float) -> list[float]:
         """What is told if the layer of this number had an error of ``wrong``."""
 
-        def kept(header: Header, states: list[State], found: list[measured.Found]) -> list[measured.MeasuredLayer]:
+        def kept(header: Header, states: list[State], found: list[Measured]) -> list[MeasuredLayer]:
             errors, cells = found[raised]
             changed = [*found[:raised], (errors._replace(rms=wrong), cells), *found[raised + 1 :]]
             return kept_layers(header, states, changed)
 
-        monkeypatch.setattr(measured, "kept_layers", kept)
+        monkeypatch.setattr(building, "kept_layers", kept)
         return [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
 
     assert layers_when(3, told[2] * 1.5) == told[:3] + told[4:]

@@ -1,8 +1,8 @@
-"""The fifth stage: the error of what a receiver shows after each layer and level."""
+"""The states that a receiver shows after each layer and level, and which layers are kept once these are measured."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,26 +10,23 @@ from numpy.typing import NDArray
 
 from ..container.fields import told, told_roughly
 from ..container.model import Errors, Header
-from ..decoding.measurer import Measured as MeasuredState
-from ..decoding.measurer import Measurer
+from ..decoding.measurer import Measured
 from ..decoding.progress import initial_state
-from ..decoding.region import Region
-from ..decoding.values import Values, values_of
-from ..entropy.tile_coder import Strings
 from ..planning.window_errors import is_divided, layer_codes, no_errors
-from .allocated import Allocated, State
-from .quantized import Quantized
 
 __all__ = [
-    "Measured",
     "MeasuredLayer",
+    "State",
     "all_passes",
     "kept_layers",
     "level_states",
-    "measure",
+    "remaining_errors",
     "shown_states",
     "told_errors",
 ]
+
+#: Coding passes still to come of every tile and channel: int8, shape (tile, channel).
+State = NDArray[np.int8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,67 +46,6 @@ class MeasuredLayer:
     state: State
     errors: Errors
     window_codes: NDArray[np.uint8] | None
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """What receivers will see.
-
-    Attributes
-    ----------
-    quantized : Quantized
-    header : Header
-        With the largest chunks; their size is chosen with the residual.
-    strings : dict
-        The bytes of large units, see `TileCoder`.
-    layers : tuple of MeasuredLayer
-    levels : tuple of Errors
-        Of the states that hold all levels up to one, but for the last level.
-    last : tuple of Values, one for each block
-        What a receiver has after the last layer.
-    coefficient_bytes : float
-        See `Allocated`.
-    """
-
-    quantized: Quantized
-    header: Header
-    strings: Strings
-    layers: tuple[MeasuredLayer, ...]
-    levels: tuple[Errors, ...]
-    last: tuple[Values, ...]
-    coefficient_bytes: float
-
-
-def measure(allocated: Allocated, progress: Callable[[float], None]) -> Measured:
-    """Reconstruct every layer and level as a receiver will, and measure their errors.
-
-    A layer that would raise the RMS error is merged with the one after it.
-
-    Parameters
-    ----------
-    allocated : Allocated
-    progress : callable
-        Called now and then with the fraction of this stage that is done, 0 to 1.
-    """
-    quantized, header = allocated.quantized, allocated.header
-    states = shown_states(header, allocated.states, all_passes([channel.top for channel in quantized.channels]))
-    levels, region = level_states(header), Region.whole(header.layout, header.levels)
-    measurer = Measurer(header, region, allocated.tiles, quantized.prepared.comparisons(region))
-    measured = [(told_errors(errors), cells) for errors, cells in measurer.errors([*states, *levels])]
-    del measurer  # and what it compares with, before values take as much
-    layers = kept_layers(header, allocated.states, measured[: len(states)])
-    progress(0.75)
-    told_levels = tuple(errors for errors, _ in measured[len(states) :])
-    last = values_of(header, region, allocated.tiles, states[-1])
-    return Measured(
-        quantized,
-        header,
-        allocated.strings,
-        tuple(layers),
-        told_levels,
-        tuple(last[block] for block in range(len(header.blocks))),
-        allocated.coefficient_bytes,
-    )
 
 
 def told_errors(errors: Errors) -> Errors:
@@ -149,7 +85,7 @@ def level_states(header: Header) -> list[State]:
     return states
 
 
-def kept_layers(header: Header, states: Sequence[State], found: Sequence[MeasuredState]) -> list[MeasuredLayer]:
+def kept_layers(header: Header, states: Sequence[State], found: Sequence[Measured]) -> list[MeasuredLayer]:
     """The layers that lower the RMS error, and the last one.
 
     Parameters
@@ -173,7 +109,7 @@ def kept_layers(header: Header, states: Sequence[State], found: Sequence[Measure
     return [MeasuredLayer(states[number], found[number][0], own) for number, own in zip(kept, codes, strict=True)]
 
 
-def _window_codes(header: Header, found: Sequence[MeasuredState]) -> list[NDArray[np.uint8] | None]:
+def _window_codes(header: Header, found: Sequence[Measured]) -> list[NDArray[np.uint8] | None]:
     """Errors of the cells of each layer, where there are several and they can be told; None otherwise."""
     if header.arrangement is not None or not is_divided(header):
         return [None] * len(found)
@@ -184,3 +120,9 @@ def _window_codes(header: Header, found: Sequence[MeasuredState]) -> list[NDArra
         next(own) if errors.maximum and cells else None if errors.maximum else no_errors(header)
         for errors, cells in found
     ]
+
+
+def remaining_errors(errors: Errors, exact: Sequence[bool], geometric: int) -> Errors:
+    """The errors of the complete surface, of which some channels are exact."""
+    channels = tuple((0.0, 0.0) if known else pair for known, pair in zip(exact, errors.channels, strict=False))
+    return Errors(0.0, 0.0, channels) if all(exact[:geometric]) else errors._replace(channels=channels)
