@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import accumulate
 from unittest.mock import patch
 
 import numpy as np
@@ -11,9 +13,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.container.model import Header
+from lodestream.container.model import ByteRange, Header
+from lodestream.container.reader import read_index
 from lodestream.decoding import batches
 from lodestream.decoding.batches import Coded, batch_length, rounds_of
+from lodestream.decoding.region import Region
+from lodestream.decoding.segments import StoredSegments
+from lodestream.entropy.bitplanes import pass_count
 from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.parallel import VARIABLE, spread
 
@@ -88,6 +94,31 @@ def test_a_parent_after_its_child_begins_a_batch() -> None:
     parent = tiles[segments[last].tile].parent
     late = [s for s in segments if s.tile != parent] + [s for s in segments if s.tile == parent]
     assert batch_length(header.layout, late) == len([s for s in segments if s.tile != parent])
+
+
+def test_stored_segments_are_decoded_in_the_order_of_the_file() -> None:
+    """A parent at the end of the file has not been seen by its children, whichever tile is read first."""
+    container = ls.encode(ls.Surface(rough((130, 260), 1)))
+    index = read_index(lambda offset, length: container[offset : offset + length], len(container))
+    tiles = index.header.layout.tiles
+    parent = tiles[max(index.segments, key=lambda segment: tiles[segment.tile].level).tile].parent
+    late = [s for s in index.segments if s.tile != parent] + [s for s in index.segments if s.tile == parent]
+    data = b"".join([container[s.range.offset : s.range.offset + s.range.length] for s in late])
+    places = accumulate((s.range.length for s in late), initial=0)
+    moved = [replace(s, range=ByteRange(place, s.range.length)) for s, place in zip(late, places, strict=False)]
+
+    remaining: dict[int, int] = {}
+    one_by_one = []
+    for s in moved:
+        first = remaining.get(s.tile, pass_count(s.top))
+        remaining[s.tile] = first - s.passes
+        end = s.range.offset + s.range.length
+        one_by_one.append(Coded(s.tile, s.channel, first - 1, s.passes, data[s.range.offset : end], s.range.offset))
+    assert batch_length(index.header.layout, one_by_one) < len(one_by_one)
+
+    stored = StoredSegments(lambda offset, length: data[offset : offset + length], replace(index, segments=moved))
+    whole = Region.whole(index.header.layout, index.header.levels)
+    assert_same(stored.channels(whole), decoded(index.header, one_by_one, False))
 
 
 def test_views_are_the_same_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -110,6 +110,18 @@ def test_rows_make_every_level_of_any_size(
     _check_levels(ls.encode(surface))
 
 
+def test_levels_of_angles_do_not_say_what_a_seam_adds() -> None:
+    """The last column of the file, a full turn on, belongs to the finest level alone."""
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:40, :60]
+    points = np.stack([x * 6 + rng.normal(size=x.shape) / 9, y * 3 + rng.normal(size=x.shape) / 9, x * y / 99], axis=2)
+    metadata = {"seam": "cols", "turn": [0, 360.0, 1], "unit": "degree"}
+    container = ls.encode(ls.Surface(points.astype(np.float32), (False, True), metadata=metadata))
+    _check_levels(container)
+    assert _decoder(container, 1).surface(IN_MEMORY, 1, lambda fraction: None).metadata == {"unit": "degree"}
+    assert _decoder(container).surface(IN_MEMORY, 1, lambda fraction: None).metadata == metadata
+
+
 def test_kept_holes_come_back() -> None:
     points = SURFACES["floats"][0].points.copy()
     points[3:60, 7:99] = np.nan

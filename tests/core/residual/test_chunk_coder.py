@@ -16,7 +16,7 @@ from lodestream.quantization.lattice import offset_lattice
 from lodestream.residual import chunk_coder
 from lodestream.residual.chunk_coder import decode_chunk, encode_chunk
 from lodestream.residual.number_line import PATTERNS, from_line
-from lodestream.residual.offsets import code_offsets
+from lodestream.residual.offsets import code_offsets, places_of, values_at
 from tests.reference import residual as reference
 
 Values = NDArray[Any]
@@ -302,3 +302,30 @@ def test_offsets_end_where_the_last_value_does() -> None:
     assert decode_chunk(restored, whole, 0).tobytes() == original.tobytes()
     with pytest.raises(CorruptStreamError, match=f"at most {9 + looked_at} bytes"):
         decode_chunk(restored, whole + b"\0", 0)
+
+
+def test_places_beyond_the_last_float32_have_the_last_pattern() -> None:
+    patterns = np.array([0, 1, 0x7FFFFFFF, 0x80000000, 0x80000001, 0xFFFFFFFE, 0xFFFFFFFF], np.uint32)
+    places = places_of(patterns.view(np.float32))
+    assert places.tolist() == [0, 1, 2**31 - 1, -1, -2, -(2**31) + 1, -(2**31)]
+    np.testing.assert_array_equal(values_at(places).view(np.uint32), patterns)
+    beyond = np.array([2**31, 2**40, -(2**31) - 1, -(2**40)], np.int64)
+    assert values_at(beyond).view(np.uint32).tolist() == [0x7FFFFFFF] * 2 + [0xFFFFFFFF] * 2
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+def test_the_length_of_what_is_coded_may_take_four_bytes(size: int) -> None:
+    """Also where fewer would do, as other writers may have it."""
+    values = normal("float32", 500)
+    restored = on_lattice(values, 1e-4)
+    (data,) = chunk_coder._with_differences(PATTERNS, 0, values, restored, np.zeros(0, np.uint32))
+    length, end = chunk_coder._read_length(data, 3)
+    assert 128 <= length < 1 << 14
+    groups = [length >> shift & 127 for shift in range(0, 7 * size, 7)]
+    longer = bytes([group | 128 for group in groups[:-1]] + groups[-1:])
+    data = data[:3] + longer + data[end:]
+    assert reference.restore(data, restored).tobytes() == values.tobytes()
+    assert_same_bits(decode_chunk(restored, data, 0), values)
+    for number in (127, 128, 2**14 - 1, 2**14, 2**21 - 1, 2**21, 2**28 - 1):
+        written = chunk_coder._written_length(number)
+        assert chunk_coder._read_length(written, 0) == (number, len(written))
