@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
+from lodestream.bands.inspecting import _Part, inspect
 from lodestream.decoding.inspection import Inspection
 
 from ..container.forgery import index_of, with_layer_errors
@@ -65,3 +65,13 @@ def test_more_vertices_than_allowed_are_refused() -> None:
     data = ls.encode(np.zeros((1025, 1025), np.int16))
     with pytest.raises(ls.TooLargeError, match="expected at most 1,048,576 vertices, got 1,050,625"):
         _inspected(data)
+
+
+def test_holes_are_what_is_not_valid_and_what_is_not_finite() -> None:
+    points, mask = np.zeros((4, 5, 3), np.float32), np.ones((4, 5), np.bool_)
+    points[0, 0, 1] = points[1, 3, 2] = np.nan
+    points[2, 2, 0] = np.inf
+    mask[0, 0] = mask[3, 4] = False
+    assert _Part([points], None).holes == 3
+    assert _Part([points], mask).holes == 4
+    assert _Part([np.zeros((4, 5, 3), np.int16)], mask).holes == 2

@@ -343,12 +343,14 @@ def layer(*entries: sections.Entry, body: bytes | None = None, channels: int = 1
         [layer(sections.Entry(0, 0, 5, 2, 3), body=b"xxxx")],
         [layer(sections.Entry(99, 0, 5, 2, 3))],
         [layer(sections.Entry(10**6, 0, 5, 2, 3))],
+        [layer(sections.Entry(0, 0, 5, 10, 3))],
         [layer(sections.Entry(0, 0, 5, 11, 3))],
         [layer(sections.Entry(0, 0, 29, 2, 3))],
         [layer(sections.Entry(0, 0, 5, 29, 3))],
         [layer(sections.Entry(0, 0, 0, 2, 3))],
         [layer(sections.Entry(0, 0, 5, 2, 0))],
         [layer(sections.Entry(0, 0, 5, 2, 3)), layer(sections.Entry(0, 0, 5, 1, 3))],
+        [layer(sections.Entry(0, 0, 5, 2, 3)), layer(sections.Entry(0, 0, 0, 8, 3))],
         [layer(sections.Entry(0, 0, 5, 2, 3)), layer(sections.Entry(0, 0, 0, 10, 3))],
         [sections.section(sections.LAYER, b"\xff\xff\xff\xff" + bytes(5))],
         [sections.section(sections.LAYER, b"\x00\x00\xf0\x7f" + bytes(5))],
@@ -529,8 +531,9 @@ def test_a_bomb_in_place_of_residual_is_corrupt() -> None:
     payload = sections.serialize_chunk_table(Errors(0.0, 0.0), [bomb]) + bomb
     bomb = sections.section(sections.RESIDUAL, payload)
     decoder = Decoder()
+    decoder.feed(container[: index.residual.offset] + bomb)
     with pytest.raises(CorruptStreamError, match="residual") as caught:
-        decoder.feed(container[: index.residual.offset] + bomb)
+        decoder.view()
     assert index.residual.offset < caught.value.offset < index.residual.offset + 30
     assert decoder.view().points.tobytes() == expected_views(container)[-2][1]
 

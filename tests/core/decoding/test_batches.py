@@ -116,7 +116,9 @@ def test_stored_segments_are_decoded_in_the_order_of_the_file() -> None:
         one_by_one.append(Coded(s.tile, s.channel, first - 1, s.passes, data[s.range.offset : end], s.range.offset))
     assert batch_length(index.header.layout, one_by_one) < len(one_by_one)
 
-    stored = StoredSegments(lambda offset, length: data[offset : offset + length], replace(index, segments=moved))
+    stored = StoredSegments(
+        lambda offset, length: data[offset : offset + length], replace(index, segments=tuple(moved))
+    )
     whole = Region.whole(index.header.layout, index.header.levels)
     assert_same(stored.channels(whole), decoded(index.header, one_by_one, False))
 

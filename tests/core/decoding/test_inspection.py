@@ -16,6 +16,7 @@ from lodestream.bands.inspecting import inspect
 from lodestream.container import Index, sections
 from lodestream.container.digest import DIGEST
 from lodestream.decoding.inspection import Inspection
+from lodestream.entropy.mask import encode_mask
 
 from ..container.forgery import (
     index_of,
@@ -206,6 +207,12 @@ def test_a_forged_extent_or_number_of_holes(exact: bytes, near: bytes) -> None:
     for data in (exact, near):
         with pytest.raises(ls.CorruptStreamError, match="holes"):
             inspected(with_header(data, holes=(24,)))
+
+
+def test_a_block_without_a_valid_point(near: bytes) -> None:
+    nothing = encode_mask(np.zeros((33, 40), np.bool_))
+    with pytest.raises(ls.CorruptStreamError, match="a valid point in each block"):
+        inspected(with_header(near, holes=(33 * 40,), mask_data=(nothing,)))
 
 
 def test_sections_in_another_order_or_twice(exact: bytes) -> None:
