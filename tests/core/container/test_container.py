@@ -377,6 +377,16 @@ def test_sections_that_lie_are_corrupt(layers: list[bytes]) -> None:
         assert view.points.shape == index.header.shape
 
 
+def test_a_layer_of_coarse_tiles_leaves_the_finest_level_as_it_was() -> None:
+    container, index = contained("small")
+    finest = max(index.segments, key=lambda segment: segment.tile)
+    entries = [sections.Entry(finest.tile, finest.channel, 5, 2, 3)], [sections.Entry(0, 0, 5, 2, 3)]
+    decoder = Decoder()
+    views = decoder.feed(container[: index.header.length] + b"".join(layer(*of) for of in entries))
+    assert [view.level for view in views] == [index.header.layout.level_of(finest.tile)] * 2
+    assert views[0].level > 0
+
+
 def test_an_index_that_lies_is_corrupt_once_it_is_asked_for() -> None:
     container, index = contained("small")
     decoder = Decoder()

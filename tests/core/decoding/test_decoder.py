@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream import Decoder, OptionError, Target, Tolerance, TruncatedStreamError, View, kernels
 from lodestream.container import Index, describe
+from lodestream.encoding import prepared
 from lodestream.planning.planner import plan
 from lodestream.target import Order
 
@@ -73,6 +74,24 @@ def test_every_level_has_exactly_the_recorded_errors(name: str) -> None:
             assert_measured(name, view)
             assert decoder.points_at(record.level).shape[:2] == record.shape
             assert decoder.metadata == {"name": name}
+
+
+def test_tiles_that_no_layer_names_are_known_with_their_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a level that is there as a whole nothing more comes: tiles without a segment are zeros."""
+    monkeypatch.setattr(prepared, "tile_exponents", lambda *_: (4, 4))
+    heights = np.zeros((130, 130), np.int16)
+    heights[:, :50] = np.random.default_rng(3).integers(-9, 10, (130, 50)).cumsum(0).cumsum(1) // 4
+    container = ls.encode(heights)
+    index = index_of(container)
+    tiles = index.header.layout.tiles
+    named = {segment.tile for segment in index.segments}
+    for record in index.levels[:-1]:
+        view = follow(container, plan(index, Target(level=record.level, order="level")))[0].view()
+        rms, worst = errors(heights, view.points)
+        assert is_told(record.rms, rms)
+        assert is_told(record.max_error, worst)
+    levels = {tile.level for number, tile in enumerate(tiles) if number not in named}
+    assert levels & {tiles[number].level for number in named} - {index.header.levels}
 
 
 @pytest.mark.parametrize("name", SAMPLES)
