@@ -312,7 +312,7 @@ class Decoder:
         if self.header is not None:
             raise CorruptStreamError("expected one header, got a second", frame.offset)
         self.header = headers.parse_header(frame.payload, frame.payload_offset, frame.end)
-        self._selection.check(self.header)
+        self._selection.check_surface(self.header)
         self._selection.check_size(self.header, self.capacity)
         if not self.header.masked:
             self._begin(self.header)

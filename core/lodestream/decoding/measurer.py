@@ -327,13 +327,18 @@ class _WindowMeasurer:
 
 
 def _cut(comparison: Comparison, window: _Window) -> Comparison:
-    """What a window is compared with."""
+    """What a window is compared with; of a window of a grid a copy of the channels that are compared, and of no others.
+
+    An array of many components is there in as many comparisons.
+    """
     originals = comparison.originals[window.patches]
-    if window.within is not None:
-        points, counted = originals[0].points, originals[0].counted
-        counted = None if counted is None else np.ascontiguousarray(counted[window.within])
-        originals = [Original(np.ascontiguousarray(points[window.within]), counted)]
-    return comparison._replace(originals=originals)
+    if window.within is None:
+        return comparison._replace(originals=originals)
+    points, counted = originals[0].points, originals[0].counted
+    counted = None if counted is None else np.ascontiguousarray(counted[window.within])
+    channels = slice(comparison.first, comparison.first + len(comparison.channels))
+    compared = np.ascontiguousarray(points[window.within][..., channels])
+    return comparison._replace(originals=[Original(compared, counted)], first=0)
 
 
 def _stacked(frames: Sequence[Grid]) -> NDArray[np.int32]:

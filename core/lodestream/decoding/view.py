@@ -42,7 +42,7 @@ class Ending:
     computed : bool
         Whether `View.verify` has computed the surface.
     verified : list of (Selection, Surface)
-        The surface as it was computed, until somebody takes it.
+        The surface as it was computed, until somebody takes it. Its level is the finest, so the selection names none.
     damage : CorruptStreamError or None
         What was found to be wrong.
     lock : RLock
@@ -176,8 +176,8 @@ class View:
         Raises
         ------
         OptionError
-            If the region is outside the surface or has no point of the level, the surface has several blocks, the view
-            holds another region only, or there is no such level.
+            If the region is outside the surface or has fewer than two points of the level, the surface has several
+            blocks, the view holds another region only, or there is no such level.
         CorruptStreamError
             If the end is damaged, see `complete`.
         """
@@ -187,7 +187,7 @@ class View:
         if not 0 <= level <= finest:
             raise OptionError(f"expected a level of 0 to {finest}, got {level}")
         selection = Selection(region, self._selection.attributes, level)
-        selection.check(header)
+        selection.check_surface(header)
         if shown is not None and not contains(shown, region, header.shape):
             raise OptionError(f"expected a region inside the one received, {shown}, got {region}")
         state = self._state
@@ -283,14 +283,14 @@ class View:
         if ending.digest is None and header.exact and whole:
             # The SHA-256 may come after the residual: the values need not be computed again then.
             ending.digest = values_digest(surface.blocks)
-        ending.verified.append((self._selection, surface))
+        ending.verified.append((replace(self._selection, level=None), surface))
 
     def _taken(self) -> Surface | None:
         """The complete surface, if `verify` has computed it and nobody has taken it."""
         if self._corrected:
             with suppress(IndexError):
                 selection, surface = self._ending.verified.pop()
-                if selection == self._selection:
+                if selection == replace(self._selection, level=None):
                     return surface
                 self._ending.verified.append((selection, surface))
         return None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import Patch
-from .layout import Grid, Layout
+from .layout import Layout
 
 __all__ = [
     "Numbered",
@@ -36,31 +36,40 @@ def numbered_by_block(patches: Sequence[Patch], count: int) -> list[Numbered]:
     return list(found)
 
 
-def _node_positions(grid: Grid, axis: int, above: int) -> NDArray[np.int64]:
-    """Which samples of a grid's axis stand at the nodes so many levels below it."""
-    positions = np.arange(grid.shape[axis], dtype=np.int64)
-    for below in range(above):
-        step = grid.steps_at(below)[axis]
+def _node_positions(layout: Layout, grid: int, axis: int, level: int) -> NDArray[np.int64]:
+    """Which samples of a grid's axis stand at the nodes of a level, increasing.
+
+    They follow each other evenly, but for the last one, which may be the last sample of the axis.
+    """
+    stride, count = 1, layout.grids[grid].shape[axis]
+    last = count - 1
+    for finer in range(layout.levels, level, -1):
+        step = layout.steps(grid, finer)[axis]
         if step.midpoints:
-            run = positions[: 2 * step.run : 2]
-            positions = np.concatenate([run, positions[-1:]]) if step.tail else run
+            if not step.tail and 2 * (step.run - 1) < count - 1:  # beyond the last node of the run is a midpoint
+                last = 2 * (step.run - 1) * stride
+            stride, count = 2 * stride, step.coarse
+    positions = np.arange(0, count * stride, stride, dtype=np.int64)
+    positions[-1] = last
     return positions
 
 
 def level_positions(own: Numbered, count: int, layout: Layout, level: int, shape: Shape) -> Positions:
     """Which rows and columns of a block of this shape, and of these of ``count`` patches, stand at a level's nodes."""
-    positions = [patch_positions(patch, layout, level, number, count, shape) for number, patch in own]
-    rows, columns = (np.unique(np.concatenate(lines)) for lines in zip(*positions, strict=True))
-    return rows, columns
+    rows, columns = (np.zeros(length, np.bool_) for length in shape)
+    for number, patch in own:
+        down, right = patch_positions(patch, layout, level, number, count, shape)
+        rows[down], columns[right] = True, True
+    return np.flatnonzero(rows), np.flatnonzero(columns)
 
 
 def patch_positions(patch: Patch, layout: Layout, level: int, number: int, count: int, shape: Shape) -> Positions:
     """Which rows and columns of its block, of this shape, the nodes of a patch (``number`` of ``count``) stand at."""
-    grid = layout.grids[len(layout.grids) - count + number]
+    grid = len(layout.grids) - count + number
     found = []
     for axis, window in enumerate((patch.rows, patch.columns)):
-        nodes = _node_positions(grid, axis, layout.levels - level)
-        place = window[0] + (grid.shape[axis] - 1 - nodes if patch.flipped[axis] else nodes)
+        nodes = _node_positions(layout, grid, axis, level)
+        place = window[0] + (layout.grids[grid].shape[axis] - 1 - nodes if patch.flipped[axis] else nodes)
         found.append(place % shape[axis])  # along a closed axis windows go on from the last sample to the first
     return found[0], found[1]
 

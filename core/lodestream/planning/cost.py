@@ -45,8 +45,9 @@ def plan_cost(index: Index, target: Target, ranges: int, *, bounded: bool = Fals
     if target.region is not None or target.first is not None:
         steps += header.tables // _AT_ONCE
     if target.region is not None and target.level is not None:
-        # Which rows and columns of the level stand in the region.
-        steps += 4 * len(header.patches) + sum(header.blocks[0][0]) // _AT_ONCE
+        # Which rows and columns of the level stand in the region: each patch lists its own, level by level.
+        lines = (stop - start for patch in header.patches for start, stop in (patch.rows, patch.columns))
+        steps += (16 + header.levels) * len(header.patches) + (sum(header.blocks[0][0]) + sum(lines)) // _AT_ONCE
     if selected:
         steps += len(index.chunks) + header.channels + len(target.attributes or ())
     if target.first is not None:

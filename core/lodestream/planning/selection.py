@@ -54,8 +54,13 @@ class Selection:
         if self.attributes is not None:
             object.__setattr__(self, "attributes", tuple(names_in(self.attributes)))
 
-    def check(self, header: Header) -> None:
+    def check(self, header: Header) -> Region | None:
         """Refuse a region, a level or attributes that the surface does not have.
+
+        Returns
+        -------
+        ((int, int), (int, int)) or None
+            The rows and columns of the level that stand in the region, see `region_at`; None without a region.
 
         Raises
         ------
@@ -63,17 +68,30 @@ class Selection:
             If the region is not inside the surface, or has no point of the level, or there is no such level or
             attribute.
         """
+        window = None
         if self.level is not None and not 0 <= self.level <= header.levels:
             raise OptionError(f"expected a level of 0 to {header.levels}, got {self.level}")
         if self.region is not None:
             if len(header.blocks) > 1:
                 raise OptionError(f"expected a surface of one block for a region, got {len(header.blocks)} blocks")
             check_region(self.region, *header.blocks[0])
-            region_at(header, self.region, self.finest(header))
+            window = region_at(header, self.region, self.finest(header))
         names = dict.fromkeys(kind.name for kind in header.attributes)
         for name in self.attributes or ():
             if name not in names:
                 raise OptionError(f"expected attributes among {', '.join(names) or 'none'}, got {name!r}")
+        return window
+
+    def check_surface(self, header: Header) -> Region | None:
+        """As `check`, and refuse a region that has one point of the level only, which is no surface."""
+        window = self.check(header)
+        if self.region is not None and window is not None and all(stop - start == 1 for start, stop in window):
+            (top, bottom), (left, right) = self.region
+            raise OptionError(
+                f"expected a region with at least two points of level {self.finest(header)}, got rows {top}:{bottom}, "
+                f"columns {left}:{right}, where that level has one: ask for a larger region or for a finer level"
+            )
+        return window
 
     def channels(self, header: Header) -> NDArray[np.bool_]:
         """Which channels are wanted: bool, shape (channel,)."""
@@ -106,15 +124,20 @@ class Selection:
         masked = sum(rows * columns for (rows, columns), _ in header.blocks) if header.masked else 0
         capacity.promise(vertices, ((shape, sizes) for shape in shapes), masked=masked, tables=header.tables)
 
-    def tiles(self, header: Header) -> NDArray[np.bool_]:
-        """Which tiles are wanted: bool, shape (tile,)."""
+    def tiles(self, header: Header, window: Region | None = None) -> NDArray[np.bool_]:
+        """Which tiles are wanted: bool, shape (tile,).
+
+        ``window`` is what `check` has returned; None: it is found again.
+        """
         if self.region is None:
             return np.ones(len(header.layout.tiles), np.bool_)
         level = self.finest(header)
         if header.arrangement is not None:
             # A block that meets itself: what is shared may lie on the other side.
             return np.arange(len(header.layout.tiles)) < header.layout.tiles_of(level).stop
-        return needed_tiles(header.layout, restored(header, self.region, level), level)
+        if window is None or level == header.levels:
+            window = restored(header, self.region, level)
+        return needed_tiles(header.layout, window, level)
 
 
 def region_at(header: Header, region: Region, level: int) -> Region:
@@ -176,10 +199,10 @@ def select(index: Index, selection: Selection) -> SelectedSlices:
         When the surface does not have it.
     """
     header = index.header
-    selection.check(header)
+    window = selection.check_surface(header)
     if selection.region is None and selection.attributes is None:
         return SelectedSlices(index.segments, {k: p for k, p in enumerate(index.chunks) if p.range.length}, True)
-    tiles, channels = selection.tiles(header), selection.channels(header)
+    tiles, channels = selection.tiles(header, window), selection.channels(header)
     segments = tuple(s for s in index.segments if tiles[s.tile] and channels[s.channel])
     corrected = index.chunks and (selection.region is None or selection.finest(header) == header.levels)
     numbers = np.flatnonzero(chunks_touched(header, selection.region, channels)).tolist() if corrected else ()

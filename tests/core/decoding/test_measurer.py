@@ -158,3 +158,18 @@ def test_differences_whose_squares_vanish_are_not_none(attribute: bool) -> None:
     first = measured[0][0]
     rms, maximum = first.channels[1] if attribute else first[:2]
     assert 0 < rms < maximum < 1e-190
+
+
+def test_windows_copy_the_channels_that_are_compared_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, (rows, columns), components = np.random.default_rng(3), (300, 280), 16
+    heights = rng.normal(size=(rows, columns)).cumsum(axis=0).astype(np.float32)
+    kinds = rng.integers(-9, 9, (rows, columns, components)).astype(np.int8)
+    decoder = decoder_of(ls.encode(ls.Surface(heights, attributes={"kinds": kinds})))
+    monkeypatch.setattr(measurer, "_WINDOW_SIDE", 100)
+    monkeypatch.setattr(measurer, "_WHOLE_POINTS", 1)
+    measuring = measurer_of(decoder, Region.whole(decoder.header.layout, decoder.header.levels))
+    windows, compared = measuring._windows(), measuring._compared
+    assert len(windows) > 1
+    assert len(compared) == 1 + components
+    copied = sum(measurer._cut(own, window).originals[0].points.size for window in windows for own in compared)
+    assert copied == rows * columns * (1 + components), "each channel is copied once"

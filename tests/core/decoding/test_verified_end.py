@@ -153,3 +153,17 @@ def test_several_threads_verify_it_once(calls: Calls) -> None:
     with ThreadPoolExecutor(8) as threads:
         assert {view.number for view in threads.map(lambda _: decoder.view(), range(32))} == {last.number}
     assert calls["values_digest"] == 1
+
+
+@pytest.mark.parametrize("finest", [False, True], ids=["no level", "the finest level"])
+@pytest.mark.parametrize("asked", [False, True], ids=["of no level", "of the finest level"])
+def test_a_window_that_was_received_alone_is_computed_once(finest: bool, asked: bool, calls: Calls) -> None:
+    data, region = container(), ((10, 40), (5, 50))
+    level = index_of(data).header.levels
+    decoder = ls.Decoder(ls.Selection(region, level=level if finest else None))
+    decoder.feed(data)
+    assert decoder.complete
+    assert calls["values_of"] == 1
+    window = decoder.view().window(region, level if asked else None)
+    assert calls["values_of"] == 1, "what was verified is taken"
+    np.testing.assert_array_equal(window.points, terrain((70, 60))[10:40, 5:50])

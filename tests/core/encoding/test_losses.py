@@ -312,12 +312,20 @@ def test_variables_of_a_netcdf_that_are_not_taken_are_named_and_its_attributes_k
     data = {
         "depth": (("y", "x"), np.ones((3, 4)), {"long_name": "depth of water", "units": "m", "levels": [1, 2]}),
         "heat": (("t", "y", "x"), np.ones((2, 3, 4))),
+        "wind": (("y", "x", "t"), np.ones((3, 4, 2))),
         "count": (("t",), np.ones(2)),
     }
     dataset = xarray.Dataset(data, {"x": np.arange(4.0), "y": np.arange(3.0)}, {"history": "made\nby hand"})
     dataset.to_netcdf(tmp_path / "a.nc", engine="scipy")
     surface, notes = noted(lambda: formats.read(tmp_path / "a.nc", variable="depth"))
-    assert notes == ["left out variables of the same grid: heat; take them with attributes="]
+    assert notes == [
+        "left out variables of the same grid: wind; take them with attributes=",
+        "left out variables of the same grid over further dimensions: heat",
+    ]
+    taken, _ = noted(lambda: formats.read(tmp_path / "a.nc", variable="depth", attributes="wind"))
+    assert taken.attributes["wind"].shape == (3, 4, 2)
+    with pytest.raises(ls.OptionError, match="expected attributes= of numbers over y and x, got 'heat'"):
+        formats.read(tmp_path / "a.nc", variable="depth", attributes="heat")
     assert surface.metadata["tags"] == {
         "": {"NC_GLOBAL#history": "made\nby hand", "depth#long_name": "depth of water", "depth#levels": "{1,2}"}
     }

@@ -16,6 +16,7 @@ from lodestream.container import ByteRange, Index
 from lodestream.container.chunks import chunk_places, chunks_touched
 from lodestream.container.model import AttributeKind, Chunk
 from lodestream.planning import cost
+from lodestream.planning import selection as selecting
 from lodestream.planning.cost import plan_cost
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection, select
@@ -42,7 +43,8 @@ def every_target(index: Index) -> Iterator[Target]:
             near = ((0, min(header.shape[0], 4)), (0, min(header.shape[1], 5)))
             yield Target(region=near, order=order)
             yield Target(region=near, first=near, order=order)
-            yield from (Target(region=near, level=level, order=order) for level in range(header.levels + 1))
+            strip = ((0, header.shape[0]), near[1])  # it has two points of every level
+            yield from (Target(region=strip, level=level, order=order) for level in range(header.levels + 1))
             yield Target(first=near, order=order)
 
 
@@ -196,3 +198,28 @@ def test_a_message_that_makes_no_plan_costs_nothing() -> None:
     assert sender.cost(serialize(Open())) > 0
     sender.receive(serialize(Open()))
     assert sender.cost(serialize(Stop())) == 0
+
+
+def test_the_window_of_a_level_of_a_long_axis_is_placed_once_without_sorting(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, index = contained("heights")
+    header = replace(index.header, blocks=(((1 << 20, 4), (False, False)),), corrected=False)
+    index = replace(index, header=header, segments=(), chunks=())
+    target = Target(region=((1000, 5000), (0, 4)), level=header.levels - 1)
+    calls: list[str] = []
+
+    def counted(owner: Any, name: str) -> None:
+        original = getattr(owner, name)
+
+        def called(*args: Any, **options: Any) -> Any:
+            calls.append(name)
+            return original(*args, **options)
+
+        monkeypatch.setattr(owner, name, called)
+
+    for name in ("unique", "sort", "argsort"):
+        counted(np, name)
+    counted(selecting, "level_positions")
+    select(index, selecting.selection_of(target))
+    assert calls == ["level_positions"]
+    least = plan_cost(index, target, 0) - plan_cost(index, replace(target, level=None), 0)
+    assert least > 2 * sum(header.shape) // 64, "all of the axis is listed, of the patch and of the block"

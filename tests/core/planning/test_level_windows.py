@@ -78,7 +78,7 @@ def is_shown(whole: ls.Surface, inside: Places) -> bool:
 
 def check_window(view: View, region: Region, level: int, inside: Places) -> None:
     whole = view.surface(level)
-    if not inside[0].size * inside[1].size:
+    if inside[0].size * inside[1].size < 2:
         with pytest.raises(ls.OptionError, match="points of level"):
             view.window(region, level)
     elif not is_shown(whole, inside):
@@ -132,7 +132,7 @@ def test_what_is_sent_for_the_window_of_a_level_is_enough(surface: ls.Surface, d
     inside = standing(header, region, level)
     order: ls.Order = data.draw(st.sampled_from(["quality", "level"]))
     target = ls.Target(region=region, level=level, order=order)
-    if not inside[0].size * inside[1].size:
+    if inside[0].size * inside[1].size < 2:
         with pytest.raises(ls.OptionError, match="points of level"):
             plan(index, target)
         return
@@ -324,6 +324,31 @@ def test_coordinates_are_those_of_the_level(metadata: dict[str, Any]) -> None:
         assert window.closed == (False, len(inside) == len(columns))
 
 
+@pytest.mark.parametrize("below", [0, 2])
+def test_a_region_with_one_point_of_the_level_is_refused_before_anything_is_sent(below: int) -> None:
+    _, container = heights()
+    index = index_of(container)
+    level, span = index.header.levels - below, (0, 1 << below)
+    region = span, span
+    said = (
+        f"expected a region with at least two points of level {level}, got rows 0:{span[1]}, columns 0:{span[1]}, "
+        "where that level has one: ask for a larger region or for a finer level"
+    )
+    for order in ("quality", "level"):
+        with pytest.raises(ls.OptionError, match=said):
+            plan(index, ls.Target(region=region, level=level, order=order))  # type: ignore[arg-type]
+    with pytest.raises(ls.OptionError, match=said):
+        ls.Decoder(ls.Selection(region, level=level)).feed(container)
+    decoder = ls.Decoder()
+    decoder.feed(container)
+    with pytest.raises(ls.OptionError, match=said):
+        decoder.view().window(region, level)
+    larger = (0, 1 + (1 << below)), span
+    assert decoder.view().window(larger, level).shape == (2, 1)
+    assert plan(index, ls.Target(region=larger, level=level)).bytes
+    assert plan(index, ls.Target(first=region)).bytes, "what comes first may be one point"
+
+
 def test_refusals_say_what_there_is() -> None:
     _, container = heights()
     decoder = ls.Decoder()
@@ -338,7 +363,7 @@ def test_refusals_say_what_there_is() -> None:
         plan(index_of(container), ls.Target(region=REGION, level=99))
     with pytest.raises(ls.OptionError, match="other limits"):
         ls.Target(region=REGION, level=1, until_rms=1)
-    received = ls.Decoder(ls.Target(region=REGION, level=3))
+    received = ls.Decoder(ls.Target(region=REGION, level=4))
     received.feed(container)
     with pytest.raises(ls.OptionError, match="inside the one received"):
         received.view().window(((0, 200), (0, 200)), 2)
