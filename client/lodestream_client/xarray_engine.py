@@ -1,7 +1,7 @@
 """``xarray.open_dataset(..., engine="lode")``: containers in files, on web servers and on Lodestream servers, lazily.
 
-What is indexed is decoded as a window of the surface, or of a coarser level of it, so only the bytes that the window
-needs are read. Of several blocks everything is decoded at the first access.
+What is indexed is decoded as a window of the surface, or of a large coarser level of it, so only the bytes that the
+window needs are read. A coarser level of few points, and several blocks, are decoded whole at the first access.
 """
 
 from __future__ import annotations
@@ -47,6 +47,10 @@ _GAP = 1 << 14
 
 #: Rows and columns of the chunks that dask is told of, at least.
 _CHUNK = 512
+
+#: Coarser levels, or regions of them, of at most so many points are decoded whole, once: they have about as many bytes
+#: as a request costs, and a variable of them takes half a megabyte at most.
+_WHOLE_POINTS = 1 << 16
 
 #: Windows that are kept decoded: x, y and z of a window are asked for one after another.
 _WINDOWS = 4
@@ -212,7 +216,7 @@ class Container:
             If there is no such level or window.
         """
         selection = selection_of(Target(level=level, region=region))
-        selection.check(self.header)
+        selection.check(self.header)  # one point is no surface, but is an array
         finest, level = self.header.levels, selection.finest(self.header)
         grid = self._grid(level, block, region)
 
@@ -265,12 +269,15 @@ class Container:
         channels = 3 if header.plane is not None else 0 if header.flat else header.point_channels
         return Grid(shape, closed, channels, header.dtype, attributes, header.masked, metadata)
 
-    def whole(self, level: int, attributes: tuple[str, ...]) -> Surface:
-        """The surface at a level with these attributes, decoded once."""
+    def whole(self, level: int, attributes: tuple[str, ...], region: Region | None = None) -> Surface:
+        """The surface at a level, or the region of it that was opened, with these attributes; decoded once, and kept.
+
+        ``region`` is as of `window`.
+        """
         with self._lock:
-            key = level, attributes
+            key = level, attributes, region
             if key not in self._levels:
-                target = Target(level=level, attributes=attributes)
+                target = Target(level=level, region=region, attributes=attributes)
                 self._levels[key] = self._decoded(target).surface(level)
             return self._levels[key]
 
@@ -348,9 +355,12 @@ class _Lazy(BackendArray):
                 (top, _), (left, _) = region_at(header, region, level)
                 self._first = top, left
         components = {name: count for name, _, count in grid.attributes}
-        width = components.get(part.attribute, 0) if part.attribute is not None else 0
-        self.shape = (*grid.shape, width) if width else grid.shape
+        count = components.get(part.attribute, 0) if part.attribute is not None else 0
+        self.shape = (*grid.shape, count) if count else grid.shape
         self.dtype = part.dtype
+        (top, left), (height, width) = self._first, grid.shape
+        self._opened = (top, top + height), (left, left + width)
+        self._is_small = level < container.header.levels and height * width <= _WHOLE_POINTS
 
     def __getitem__(self, key: indexing.ExplicitIndexer) -> Any:
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, self._taken)
@@ -366,11 +376,19 @@ class _Lazy(BackendArray):
                 row, column, *key[2:]
             ]
         shape = len(self._nodes[0]), len(self._nodes[1])
-        spans = zip(self._first, (rows, columns), shape, strict=True)
-        rows, columns = (((first + start) % n, (first + start) % n + stop - start) for first, (start, stop), n in spans)
-        around = self._around((rows, columns), shape)
-        window = spanning(around, header.shape, self._nodes)
-        values = values_of(self._container.window(self._level, window, names), self._part)
+        rows, columns = (
+            (at + start, at + stop) for at, (start, stop) in zip(self._first, (rows, columns), strict=True)
+        )
+        if self._is_small:
+            around = self._around(self._opened, shape)
+            block = self._container.whole(self._level, names, spanning(around, header.shape, self._nodes)).blocks[0]
+        else:
+            rows, columns = (
+                (start % n, start % n + stop - start) for (start, stop), n in zip((rows, columns), shape, strict=True)
+            )
+            around = self._around((rows, columns), shape)
+            block = self._container.window(self._level, spanning(around, header.shape, self._nodes), names)
+        values = values_of(block, self._part)
         (top, _), (left, _) = around
         cut = values[rows[0] - top : rows[1] - top, columns[0] - left : columns[1] - left]
         return np.array(cut[row, column, *key[2:]])  # a copy, since others take theirs from the same window

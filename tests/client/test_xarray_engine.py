@@ -12,10 +12,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import sync, xarray_engine
 from lodestream_client.xarray_engine import Container, LodeBackend
 from tests.client import files
-from tests.core.surfaces import torus
+from tests.core.surfaces import terrain, torus
 
 ROWS, COLUMNS = 700, 900
 
@@ -151,6 +151,44 @@ def test_a_window_of_a_level_reads_what_it_needs_alone(tmp_path: Path) -> None:
         same, size_of_region = read(slice(None), slice(None), level=level, region=((1000, 1100), (300, 420)))
         assert np.array_equal(same, window)
         assert size_of_region == size
+
+
+def test_a_level_of_few_points_is_read_once_and_large_ones_by_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heights = (terrain((360, 360), 3) * 8).round().astype("i2")
+    surface = ls.Surface(heights, (False, True), attributes={"kind": heights % 5})
+    (tmp_path / "a.lode").write_bytes(ls.encode(surface))
+    decoder = ls.Decoder()
+    decoder.feed((tmp_path / "a.lode").read_bytes())
+    assert decoder.header is not None
+    level, decodings = decoder.header.levels - 3, 0
+    decoded = Container._decoded
+
+    def counted(*args: Any) -> Any:
+        nonlocal decodings
+        decodings += 1
+        return decoded(*args)
+
+    monkeypatch.setattr(Container, "_decoded", counted)
+    for region in (None, ((40, 200), (300, 420))):  # which goes on across the seam
+        wanted = decoder.surface(level) if region is None else decoder.view().window(region, level)
+        decodings = 0
+        with opened(tmp_path / "a.lode", level=level, region=region) as found:
+            (rows, columns), points = found.z.shape, wanted.points.squeeze()
+            for row in range(0, rows, 7):
+                for column in range(0, columns, 3):
+                    assert found.z[row, column].values == points[row, column]
+                    assert found.kind[row, column].values == wanted.attributes["kind"][row, column]
+        assert decodings == 2, "once for the heights, once for the attribute"
+    with opened(tmp_path / "a.lode", level=level, region=((40, 41), (0, 1))) as found:
+        assert found.z.values == decoder.points_at(level)[5, 0], "an array may have one point"
+    monkeypatch.setattr(xarray_engine, "_WHOLE_POINTS", 100)
+    decodings = 0
+    with opened(tmp_path / "a.lode", level=level) as found:
+        for row in range(5):
+            assert np.array_equal(found.z[row, 3:9].values, decoder.points_at(level)[row, 3:9])
+    assert decodings == 5
 
 
 @pytest.mark.parametrize("level", [5, 7])
