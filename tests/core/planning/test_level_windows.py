@@ -366,7 +366,7 @@ def test_refusals_say_what_there_is() -> None:
     received = ls.Decoder(ls.Target(region=REGION, level=4))
     received.feed(container)
     with pytest.raises(ls.OptionError, match="inside the one received"):
-        received.view().window(((0, 200), (0, 200)), 2)
+        received.view().window(((0, 200), (0, 200)), 3)
 
 
 def test_memory_is_counted_for_the_window_of_the_level_alone() -> None:
