@@ -20,7 +20,8 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.encoding import allocated, encoder, large_units, prepared, quantized, transformed
+from lodestream.bands import building, forward, grid_transform, streams, transforming
+from lodestream.encoding import large_units, prepared
 from lodestream.encoding.allocation import assign_layers
 from lodestream.encoding.curves import Curves
 from lodestream.encoding.tiling import WHOLE_TILE, square
@@ -71,8 +72,8 @@ class Crafted:
         """While a surface is encoded."""
         code, most = TileCoder.code, (1 << COEFFICIENT_BITS) - 1
 
-        def gathered(*arguments: Any) -> NDArray[np.int32]:
-            return np.clip(self.factor * gather(*arguments).astype(np.int64), -most, most).astype(np.int32)
+        def gathered(*arguments: Any, **named: Any) -> NDArray[np.int32]:
+            return np.clip(self.factor * gather(*arguments, **named).astype(np.int64), -most, most).astype(np.int32)
 
         def planes(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
             return planes_of(table, true, tile) + (self.ones if tile == 0 else 0)
@@ -105,14 +106,16 @@ class Crafted:
                 patch.setattr(prepared, "tile_exponents", lambda *_: self.tile)
                 patch.setattr(prepared, "square", lambda bits: self.tile if bits == WHOLE_TILE else square(bits))
             if self.factor > 1:
-                patch.setattr(encoder, "COARSER", ())  # no container of fewer bits is tried
-                patch.setattr(transformed, "gather", gathered)
+                patch.setattr(streams, "_COARSER", ())  # no container of fewer bits is tried
+                for module in (forward, grid_transform):
+                    patch.setattr(module, "gather", gathered)
             if self.ones:
-                patch.setattr(quantized, "planes_of", planes)
-                patch.setattr(allocated, "assign_layers", assigned)
+                for module in (forward, grid_transform, transforming):
+                    patch.setattr(module, "planes_of", planes)
+                patch.setattr(building, "assign_layers", assigned)
                 patch.setattr(TileCoder, "code", coded)
             if self.by_level:
-                patch.setattr(allocated, "assign_layers", levels)
+                patch.setattr(building, "assign_layers", levels)
             yield
 
 

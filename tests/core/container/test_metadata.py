@@ -36,7 +36,7 @@ def test_an_encoder_takes_what_fits_and_refuses_a_byte_more() -> None:
     expected = r"metadata of at most 65,536 bytes, got 65,544, of which 65,4\d\d are 'a'"
     for kwargs in ({}, {"precision": 0.1}, {"rms": 0.1}):
         with pytest.raises(InputError, match=expected):
-            encode(Surface(HEIGHTS, metadata=more), **kwargs)  # type: ignore[arg-type]
+            encode(Surface(HEIGHTS, metadata=more), **kwargs)  # type: ignore[call-overload]
 
 
 def test_what_messagepack_cannot_hold_is_refused() -> None:
