@@ -365,6 +365,7 @@ def layer(*entries: sections.Entry, body: bytes | None = None, channels: int = 1
         [sections.section(sections.INDEX, b"\x00")],
         [sections.section(sections.HEADER, b"")],
         [layer()] * 11,
+        [layer(sections.Entry(0, 0, 5, 1, 3)), *[layer(sections.Entry(0, 0, 0, 1, 3))] * 4],
     ],
 )
 def test_sections_that_lie_are_corrupt(layers: list[bytes]) -> None:
@@ -373,6 +374,7 @@ def test_sections_that_lie_are_corrupt(layers: list[bytes]) -> None:
     with pytest.raises(CorruptStreamError) as caught:
         decoder.feed(container[: index.header.length] + b"".join(layers))
     assert caught.value.offset >= index.header.length
+    assert len(decoder.layers) <= index.header.layer_count
     for view in decoder.layers:
         assert view.points.shape == index.header.shape
 

@@ -74,6 +74,28 @@ def test_what_a_step_takes_across_the_seam_gives_what_is_wanted(closed: bool) ->
                 assert len(every) <= stop - start + 120
 
 
+@pytest.mark.parametrize("length", [73, 120, 121])
+@pytest.mark.parametrize("rule", [(16, 0), (127, -127)])
+def test_rough_samples_need_all_that_a_step_takes_beside_them(length: int, rule: tuple[int, int]) -> None:
+    """Differences of millions show the smallest weights, which those of hundreds round away."""
+    step = axis_step(length, length > 73)
+    whole = np.random.default_rng(5).integers(-(1 << 20), 1 << 20, (length, 2)).astype(np.int32)
+    line = whole.copy()
+    forward_step(line, 0, step, rule)
+    nodes, details = line[: step.coarse], line[step.coarse :]
+    for start in range(length - 9):
+        for stop in (start + 1, start + 9):
+            found, made = crop_across_seam(step, start, stop), []
+            for crop in found.crops:
+                ranges = (np.arange(crop.first, crop.first + n) for n in (crop.step.coarse, crop.step.midpoints))
+                parts = [np.take(of, own, 0, mode="wrap") for of, own in zip((nodes, details), ranges, strict=True)]
+                made.append(np.concatenate(parts))
+                inverse_step(made[-1], 0, crop.step, rule)
+            every = np.concatenate(made)
+            wanted = np.concatenate([every[slice(*span)] for span in found.wanted])
+            np.testing.assert_array_equal(wanted, whole[start:stop])
+
+
 @functools.cache
 def surfaces() -> dict[str, ls.Surface]:
     rows, columns = np.mgrid[:300, :340].astype(float)

@@ -122,6 +122,17 @@ def test_levels_of_angles_do_not_say_what_a_seam_adds() -> None:
     assert _decoder(container).surface(IN_MEMORY, 1, lambda fraction: None).metadata == metadata
 
 
+def test_a_flipped_bit_of_a_segment_or_a_chunk_is_found_where_it_is() -> None:
+    container = ls.encode(SURFACES["floats"][0])
+    index = read_index(_read(container), len(container))
+    for part, what in ((index.segments[-1], "segment"), (next(c for c in index.chunks if c.range.length), "chunk")):
+        damaged = bytearray(container)
+        damaged[part.range.end - 1] ^= 1
+        with pytest.raises(ls.CorruptStreamError, match=f"a {what} with the checksum that the index tells") as caught:
+            _decoder(bytes(damaged)).surface(IN_MEMORY, 1 << 21, lambda fraction: None)
+        assert caught.value.offset == part.range.offset
+
+
 def test_kept_holes_come_back() -> None:
     points = SURFACES["floats"][0].points.copy()
     points[3:60, 7:99] = np.nan
