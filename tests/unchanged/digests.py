@@ -66,6 +66,8 @@ def _windows(container: bytes, views: list[View]) -> str:
     digest, random = hashlib.sha256(), np.random.RandomState(rows * columns)
     for _ in range(4):
         region = _span(rows, random), _span(columns, random)
+        if all(stop - start == 1 for start, stop in region):
+            continue  # one point is no surface
         for view in (views[0], views[len(views) // 2], views[-1]):
             _add_window(digest, view, region)
         decoder = Decoder(Selection(region))

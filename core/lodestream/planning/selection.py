@@ -83,7 +83,13 @@ class Selection:
         return window
 
     def check_surface(self, header: Header) -> Region | None:
-        """As `check`, and refuse a region that has one point of the level only, which is no surface."""
+        """As `check`, and refuse a region that has one point of the level only, which is no surface.
+
+        Raises
+        ------
+        OptionError
+            If it is refused.
+        """
         window = self.check(header)
         if self.region is not None and window is not None and all(stop - start == 1 for start, stop in window):
             (top, bottom), (left, right) = self.region
