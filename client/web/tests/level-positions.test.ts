@@ -1,7 +1,7 @@
 /** Nodes of coarser levels lie where they stand in the finest grid, wherever x and y follow rules or are axes. */
 import fc from "fast-check";
 import { beforeAll, expect, it } from "vitest";
-import { coordinatesOf, levelMetadata, placementOf } from "../src/coordinates/height-fields";
+import { coordinatesOf, levelMetadata, placementOf, windowMetadata } from "../src/coordinates/height-fields";
 import { Decoder } from "../src/decoding/decoder";
 import { loadKernels } from "../src/kernels/instance";
 import { containerOf, NAMES } from "./golden";
@@ -79,4 +79,25 @@ it("coordinates of levels are those of their places", () => {
       },
     ),
   );
+});
+
+it("a list with the first number again says how long the step over the seam is", () => {
+  const axes = { x: [0, 4, 20, 24, 40, 44, 360, "values"], y: [0, 1] };
+  const places = [Int32Array.of(0, 1), Int32Array.of(0, 2, 4)] as const;
+  const level = levelMetadata({ axes }, true, [2, 6], [false, true], places);
+  expect(level.axes).toEqual({ x: [0, 20, 40, 360, "values"], y: [0, 1] });
+  const window = windowMetadata(
+    { axes },
+    {
+      shape: [2, 6],
+      inside: [
+        [0, 2],
+        [4, 8],
+      ],
+      full: [2, 6],
+      axes,
+      places: [Int32Array.of(0, 1), Int32Array.of(4, 5, 6, 7)],
+    },
+  );
+  expect(window.axes).toEqual({ x: [40, 44, 360, 364, "values"], y: [0, 1] });
 });

@@ -281,7 +281,7 @@ def level_metadata(
         step = even_step(length, len(at), wraps)
         nodes.append(None if np.array_equal(line, step * np.arange(len(at))) else (line / step).tolist())
     if "axes" in metadata:
-        result["axes"] = axes_at(metadata["axes"], shape, places)
+        result["axes"] = axes_at(metadata["axes"], shape, places, closed)
         result.pop("geotransform", None)
         if any(nodes) or transform is None:
             return result
@@ -310,7 +310,9 @@ def grid_at(rules: Sequence[Rule], shape: tuple[int, int], places: Sequence[NDAr
     return {"grid": anywhere, "nodes": [line.tolist() for line in places]}
 
 
-def axes_at(axes: Any, shape: tuple[int, int], places: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
+def axes_at(
+    axes: Any, shape: tuple[int, int], places: Sequence[NDArray[np.int64]], closed: Closed = (False, False)
+) -> dict[str, Any]:
     """The ``axes`` of some rows and columns of a grid, with the same coordinates there, bit for bit.
 
     Parameters
@@ -321,7 +323,10 @@ def axes_at(axes: Any, shape: tuple[int, int], places: Sequence[NDArray[np.int64
         Of the grid.
     places : two int64 arrays, shape (row,) and (column,)
         Which rows and columns of it. Along a closed axis they may go on after its end, where the coordinates of the
-        first places follow, one turn further; the step across the seam is as long as the one before it.
+        first places follow, one turn further. A list with one number more than the axis has places says how long the
+        step across the seam is; otherwise it is as long as the one before it.
+    closed : (bool, bool)
+        Which axes of these places are closed: a list with that number has it again.
 
     Raises
     ------
@@ -331,7 +336,10 @@ def axes_at(axes: Any, shape: tuple[int, int], places: Sequence[NDArray[np.int64
     rules, _, swapped = _axes(axes)
     result = dict(axes)
     for name, rule, down in (("x", rules[0], swapped), ("y", rules[1], not swapped)):
-        length, line = (shape[0], places[0]) if down else (shape[1], places[1])
+        axis = 0 if down else 1
+        length, line = shape[axis], places[axis]
+        if closed[axis] and _has_turn(rule, length):
+            line = np.append(line, line[0] + length)
         result[name] = _thinned(rule, length, line, down) or _listed(rule, length, line, down)
     return result
 
@@ -344,8 +352,14 @@ def _listed(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> R
     values = np.broadcast_to(values, line.shape).ravel()
     listed, beyond = values[places % length], places >= length
     if beyond.any():
-        listed[beyond] += 2 * values[-1] - values[-2] - values[0]
+        after = float(rule[length]) if _has_turn(rule, length) else 2 * values[-1] - values[-2]
+        listed[beyond] += after - values[0]
     return [*listed.tolist(), VALUES]
+
+
+def _has_turn(rule: Rule, length: int) -> bool:
+    """Whether a rule of a closed axis of this length lists the first number again, one turn further."""
+    return rule[-1] == VALUES and len(rule) - 1 > length
 
 
 def _thinned(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> Rule | None:

@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 from ..coordinates.seams import merge
 from ..surface import Closed, Surface
 
-__all__ = ["TURN", "close_around", "encircles"]
+__all__ = ["TURN", "close_around", "close_uneven", "encircles", "next_around"]
 
 #: Degrees of a full turn.
 TURN = 360.0
 
 #: How far the step over the seam may be from the others, relative to them.
 _TOLERANCE = 0.01
+
+#: How far from a full turn, relative to it, rounded longitudes of one may end.
+_ROUNDING = 1e-6
 
 #: How much longer than the steps on both sides of it the step over the seam of a curvilinear grid may be.
 _STRETCH = 1.5
@@ -43,16 +46,48 @@ def close_around(surface: Surface, longitude: tuple[int, float], closed: Closed 
         With a last row or column that repeats the first merged into it, see `lodestream.coordinates.seams.merge`.
     """
     axis, step = longitude
-    around: Closed = (axis == 0, axis == 1)
-    if closed is not None:
-        around = (around[0] and closed[0], around[1] and closed[1])
-    if not any(around):
+    return _closed(surface, axis, closed, _fits(surface.shape[axis] - 1, step), _fits(surface.shape[axis], step))
+
+
+def close_uneven(surface: Surface, axis: int, longitudes: NDArray[np.float64], closed: Closed | None) -> Surface:
+    """Close the axis along which longitudes of a height field are unevenly spaced, where they go around the Earth.
+
+    Parameters
+    ----------
+    surface : Surface
+        Heights over longitudes and latitudes.
+    axis : {0, 1}
+    longitudes : array of shape (N,)
+        In degrees, wrapped or not, one for each place along the axis.
+    closed : (bool, bool) or None
+        What was said of the surface, which holds; None: nothing.
+
+    Returns
+    -------
+    Surface
+        As of `close_around`. The step over the seam may be as long as `encircles` allows.
+    """
+    unwrapped = np.unwrap(longitudes, period=TURN)
+    repeats = abs(abs(unwrapped[-1] - unwrapped[0]) - TURN) <= TURN * _ROUNDING
+    around = encircles(longitudes[None, :], np.zeros((1, len(longitudes))), 1)
+    return _closed(surface, axis, closed, bool(repeats), around)
+
+
+def next_around(longitudes: NDArray[np.float64]) -> float:
+    """The first of longitudes in degrees, shape (N,), by whole turns as near to the last one as it can be."""
+    return float(np.unwrap([longitudes[-1], longitudes[0]], period=TURN)[1])
+
+
+def _closed(surface: Surface, axis: int, closed: Closed | None, repeats: bool, around: bool) -> Surface:
+    """Merge the last line of an axis that `repeats` its longitude, or close the axis, unless `closed` forbids it."""
+    if closed is not None and not closed[axis]:
         return surface
-    if _fits(surface.shape[axis] - 1, step):
-        return merge(surface, around)
-    if _fits(surface.shape[axis], step):
+    along: Closed = (axis == 0, axis == 1)
+    if repeats:
+        return merge(surface, along)
+    if around:
         mask, attributes = surface.mask, surface.attributes
-        return Surface(surface.points, around, mask=mask, attributes=attributes, metadata=surface.metadata)
+        return Surface(surface.points, along, mask=mask, attributes=attributes, metadata=surface.metadata)
     return surface
 
 

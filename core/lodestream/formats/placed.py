@@ -10,20 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.metadata import fitted
-from ..coordinates.coordinate_rules import VALUES, bits, evaluate, fit_axis, rounded
+from ..coordinates.coordinate_rules import VALUES, Rule, bits, evaluate, fit_axis, rounded
 from ..coordinates.seams import merge, unwrap, wrapped
 from ..errors import FormatError
 from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import DTYPES, Closed, Surface
-from .longitudes import TURN, close_around, encircles
+from .longitudes import TURN, close_around, close_uneven, encircles, next_around
 
 __all__ = ["Coordinate", "place"]
 
 #: How far a coordinate may be from even spacing, in steps, for the heights to count as a regular lattice.
 _EVEN = 0.01
-
-#: How much shorter than a full turn, relative to it, rounded longitudes of one may be.
-_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -59,10 +56,10 @@ def place(
 
     Where both coordinates are vectors of finite values, the result is heights: with a ``geotransform`` where both are
     evenly spaced, and with ``axes`` where that alone does not say every coordinate bit for bit. It is x, y, z
-    otherwise: of arrays, where the axes would be too long for metadata, where one ends at the value at which it begins,
-    and where longitudes that are not evenly spaced jump or go around the Earth. Longitudes that jump are unwrapped; an
-    axis that goes once around the Earth is closed. A missing height is a hole that keeps its x and y: as one of x, y, z
-    it is NaN.
+    otherwise: of arrays, where the axes would be too long for metadata, and where values of one are all the same.
+    Longitudes that jump are unwrapped where that rounds none; an axis that goes once around the Earth is closed, and a
+    list of its longitudes then has the first one again at its end, a turn further. A missing height is a hole that
+    keeps its x and y: as one of x, y, z it is NaN.
 
     Parameters
     ----------
@@ -79,15 +76,18 @@ def place(
     """
     extras: dict[str, Any] = {"attributes": attributes or {}}
     values = dict(metadata or {})
-    lines = [_line(coordinate, closed) for coordinate in (x, y)]
+    lines = [_line(coordinate) for coordinate in (x, y)]
     if x.axis is not None and y.axis == 1 - x.axis and lines[0] is not None and lines[1] is not None:
         rules = _georeference(x, y, lines[0], lines[1])
         # Rules that are too long for metadata are no way to say where each point lies: x and y themselves are.
         if rules is not None and not any(name == "axes" for name, _ in fitted(values | rules)[1]):
             surface = Surface(heights, mask=mask, **extras, metadata=values | rules)
-            for coordinate, line in zip((x, y), lines, strict=True):
-                if coordinate.degrees and coordinate.axis is not None and line is not None and line.even:
-                    surface = close_around(surface, (coordinate.axis, line.step), closed)
+            for name, coordinate, line in (("x", x, lines[0]), ("y", y, lines[1])):
+                if coordinate.degrees and coordinate.axis is not None:
+                    surface = _closed_along(surface, coordinate.axis, line, closed)
+                    axes, length = surface.metadata.get("axes"), surface.shape[coordinate.axis]
+                    if surface.closed[coordinate.axis] and axes is not None:
+                        surface.metadata["axes"] = {**axes, name: _with_next(axes[name], length)}
             return surface
     planes = [_plane(coordinate, heights.shape) for coordinate in (x, y)]
     dtype = np.result_type(*planes, heights, *(() if mask is None else (np.float32,)))
@@ -110,11 +110,12 @@ def place(
 
 @dataclass(frozen=True)
 class _Line:
-    """A coordinate along one axis: its unwrapped values, the line nearest to them, and where they wrap.
+    """A coordinate along one axis: as given, unwrapped, the line nearest to its values, and where they wrap.
 
     `even` says whether that line is near enough for a regular lattice.
     """
 
+    given: NDArray[Any]
     values: NDArray[Any]
     origin: float
     step: float
@@ -122,20 +123,19 @@ class _Line:
     even: bool
 
 
-def _line(coordinate: Coordinate, closed: Closed | None) -> _Line | None:
+def _line(coordinate: Coordinate) -> _Line | None:
     """None for an array over both axes, and where rules cannot take the place of x and y.
 
-    These are values that are not finite or end where they begin, uneven ones of a type that points cannot have, and
-    uneven longitudes that jump or go around the Earth: they are unwrapped, and closed, as x, y, z.
+    These are values that are not finite or are all the same, and uneven ones of a type that points cannot have.
+    Longitudes that jump stay as they are where unwrapping would round them.
     """
     given = coordinate.values
     if coordinate.axis is None or len(given) < 2 or not np.isfinite(given).all():
         return None
-    values, low, jumps = given, None, False
+    values, low = given, None
     if coordinate.degrees:
         turns = np.rint((np.unwrap(given.astype(np.float64), period=TURN) - given) / TURN)
-        jumps = bool(turns.any())
-        if jumps and given.dtype.kind == "f":
+        if turns.any():
             low = float((given.min() + (given.max() - TURN)) / 2)
             values = given.astype(np.float64) + TURN * turns
             if wrapped(values, TURN, low).astype(given.dtype).tobytes() != given.tobytes():
@@ -144,33 +144,41 @@ def _line(coordinate: Coordinate, closed: Closed | None) -> _Line | None:
     step = float((exact[-1] - exact[0]) / (len(exact) - 1))
     away = np.abs(exact - (exact[0] + step * np.arange(len(exact)))).max()
     even = bool(away <= _EVEN * abs(step))
-    around = coordinate.degrees and _around(exact, coordinate.axis, closed)
-    if not step or (not even and (jumps or around or given.dtype.name not in DTYPES)):
+    if (even and not step) or (not even and given.dtype.name not in DTYPES):
         return None
-    return _Line(values, float(exact[0]), step, low, even)
+    return _Line(given, values, float(exact[0]), step, low, even)
 
 
-def _around(longitudes: NDArray[np.float64], axis: int, closed: Closed | None) -> bool:
-    """Whether uneven longitudes, shape (N,), may make their axis a closed one."""
-    if closed is not None and not closed[axis]:
-        return False
-    whole = abs(longitudes[-1] - longitudes[0]) >= TURN * (1 - _ROUNDING)
-    return bool(whole) or encircles(longitudes[None, :], np.zeros((1, len(longitudes))), 1)
+def _closed_along(surface: Surface, axis: int, line: _Line, closed: Closed | None) -> Surface:
+    """Heights, closed along an axis where its longitudes go around the Earth."""
+    if line.even:
+        return close_around(surface, (axis, line.step), closed)
+    return close_uneven(surface, axis, line.values.astype(np.float64), closed)
+
+
+def _with_next(rule: Rule, length: int) -> Rule:
+    """A rule of longitudes of a closed axis of this length: a list says how long the step over the seam is."""
+    if rule[-1] != VALUES or len(rule) - 1 > length:
+        return rule  # that step is as long as the others, or a last value that repeats the first was merged
+    values = rule[:-1]
+    return [*values, next_around(np.array(values, np.float64)), VALUES]
 
 
 def _georeference(x: Coordinate, y: Coordinate, across: _Line, down: _Line) -> dict[str, Any] | None:
     """The metadata that say where heights lie; None where no rules make every coordinate again, bit for bit."""
-    dtype = np.result_type(across.values, down.values)
+    dtype = np.result_type(across.given, down.given)
     transform: list[float] = []
     rules: dict[str, Any] = {}
     for name, line, axis in (("x", across, x.axis), ("y", down, y.axis)):
-        values = line.values.astype(dtype)
+        values = line.values.astype(dtype if line.low is None else np.float64)
         rule = fit_axis(values)
         if rule and rule[-1] is True:
             rule = None  # it depends on the number of places, which changes where a seam is merged
         rules[name] = rule or [*values.tolist(), VALUES]
+        exact = values.astype(np.float64)
+        exact = exact if line.low is None else wrapped(exact, TURN, line.low)
         # Integers beyond 2**53 are no float64, in which rules are evaluated.
-        if not np.array_equal(bits(rounded(values.astype(np.float64), dtype)), bits(values)):
+        if not np.array_equal(bits(rounded(exact, dtype)), bits(line.given.astype(dtype))):
             return None
         origin, step = map(float, rule) if rule and len(rule) == 2 else (line.origin, line.step)
         transform += [origin - step / 2, step, 0.0] if axis == 1 else [origin - step / 2, 0.0, step]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import lodestream as ls
 from lodestream import formats
 from lodestream_client.__main__ import main
 
+from ..conftest import Run
 from ..samples import make
 
 PAGE = (Path(__file__).parents[3] / "docs" / "formats.md").read_text()
@@ -74,3 +77,23 @@ def test_what_a_file_leaves_out_is_a_note(tmp_path: Path, capsys: pytest.Capture
     captured = capsys.readouterr()
     assert "lodestream: PNG holds heights only: crs left out\n" in captured.err
     assert captured.out == ""
+
+
+def test_the_commands_that_choose_a_group(
+    run: Run, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    xarray = pytest.importorskip("xarray")
+    monkeypatch.chdir(tmp_path)
+    commands = [" ".join(it.split()) for it in re.findall(r"`lodestream ([^`]*-o\s+group=[^`]*)`", PAGE)]
+    assert [command.split()[0] for command in commands] == ["encode", "push"]
+    heights = {group: np.arange(48.0).reshape(6, 8) ** k for k, group in ((1, "analysis"), (2, "forecast/surface"))}
+    for mode, (group, values) in zip("wa", heights.items(), strict=True):
+        xarray.Dataset({"z": (("y", "x"), values)}).to_netcdf("sea.nc", group=group, mode=mode)
+    for command in commands:
+        code, stdout, stderr = run(*(server if word == "URL" else word for word in shlex.split(command)))
+        assert code == 0, stderr
+        source = stdout.split()[0] if command.startswith("push") else "sea.lode"
+        code, _, stderr = run("pull" if command.startswith("push") else "decode", source, "sea.npy")
+        assert code == 0, stderr
+        assert np.array_equal(np.load("sea.npy"), heights["forecast/surface"])
+        Path("sea.npy").unlink()

@@ -236,3 +236,39 @@ def test_uneven_axes_of_files_are_kept_at_every_level(
             assert own.values.astype("f8").tobytes() == wanted.astype("f8").tobytes()
             # One type for both axes, and where they have one that is it.
             assert back[name].dtype == np.result_type(*lines.values())
+
+
+@st.composite
+def longitudes(draw: st.DrawFn) -> tuple[NDArray[Any], bool]:
+    """Uneven longitudes as files have them, and whether they go around the Earth."""
+    count, around = draw(st.integers(8, 70)), draw(st.booleans())
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    steps = rng.uniform(1, 1.4, count)
+    line = draw(st.floats(-180, 180)) + np.cumsum(steps) * (360 if around else draw(st.floats(1, 330))) / steps.sum()
+    low = draw(st.sampled_from([None, 0.0, -180.0]))
+    line = line if low is None else low + (line - low) % 360
+    return (line[::-1] if draw(st.booleans()) else line).astype(draw(st.sampled_from(["f4", "f8"]))), around
+
+
+@settings(max_examples=200, deadline=None)
+@given(longitudes(), st.integers(2, 40), st.integers(0, 2**32), st.booleans())
+def test_nodes_over_uneven_longitudes_lie_at_places_of_the_source(
+    line: tuple[NDArray[Any], bool], rows: int, seed: int, turned: bool
+) -> None:
+    xarray = pytest.importorskip("xarray")
+    lon, around = line
+    rng = np.random.default_rng(seed)
+    lat = np.sort(rng.uniform(-80, 80, rows)).astype(lon.dtype)
+    dims = ("lon", "lat") if turned else ("lat", "lon")
+    heights = np.cumsum(rng.normal(size=(len(lon), rows) if turned else (rows, len(lon))), axis=0).astype("f4")
+    east = ("lon", lon, {"units": "degrees_east", "standard_name": "longitude"})
+    north = ("lat", lat, {"units": "degrees_north", "standard_name": "latitude"})
+    surface = ls.Surface.from_xarray(xarray.Dataset({"z": (dims, heights)}, {"lon": east, "lat": north}).z)
+    assert surface.points.ndim == 2
+    assert any(surface.closed) == around
+    decoder = decoder_of(surface)
+    for level in range(header_of(decoder).levels + 1):
+        at = dict(zip(dims, level_nodes(header_of(decoder), level)[0], strict=True))
+        found = decoder.surface(level).to_xarray()
+        assert found.x.values.tobytes() == lon[at["lon"]].astype(found.x.dtype).tobytes()
+        assert found.y.values.tobytes() == lat[at["lat"]].astype(found.y.dtype).tobytes()

@@ -128,23 +128,44 @@ AROUND = np.cumsum(np.tile([8.0, 10.0, 12.0, 10.0], 9)) - 8
 
 
 @pytest.mark.parametrize(
-    ("lon", "options", "channels", "closed"),
+    ("lon", "options", "closed"),
     [
-        (AROUND, {}, 3, True),
-        (AROUND, {"closed": "none"}, 1, False),
-        (AROUND[:-9], {}, 1, False),
-        ((AROUND[:-9] + 200) % 360, {}, 3, False),  # they jump
-        (np.append(AROUND[:-9], 0.0), {}, 3, False),  # x ends where it begins
+        (AROUND, {}, True),
+        (AROUND[::-1], {}, True),
+        ((AROUND + 200) % 360, {}, True),
+        (AROUND, {"closed": "none"}, False),
+        (AROUND[:-9], {}, False),
+        ((AROUND[:-9] + 200) % 360, {}, False),  # they jump
+        (((AROUND[:-9] + 200) % 360).astype("f4"), {}, False),
+        (((AROUND[:-9] + 200) % 360).astype("i4"), {}, False),
+        (np.append(AROUND[:-9], 0.0), {}, False),  # x ends where it begins, once around
     ],
 )
-def test_uneven_longitudes_that_go_around_or_jump_become_points(
-    lon: Array, options: dict[str, str], channels: int, closed: bool, tmp_path: Path
+def test_uneven_longitudes_that_go_around_or_jump_are_axes(
+    lon: Array, options: dict[str, str], closed: bool, tmp_path: Path
 ) -> None:
-    lat = np.arange(6.0) ** 2
+    lat = (np.arange(6.0) ** 2).astype(lon.dtype)
     surface = read_over(tmp_path / "a.nc", lon, lat, **options)
-    assert (surface.points.ndim, surface.closed) == (3 if channels == 3 else 2, (False, closed))
-    wanted = np.dstack((*np.meshgrid(lon, lat), hills((6, len(lon)))))
-    np.testing.assert_array_equal(to_xyz(restore(surface)).points, wanted)
+    assert (surface.points.ndim, surface.closed) == (2, (False, closed))
+    for plane, wanted in zip(coordinates(restore(surface)), np.meshgrid(lon, lat), strict=True):
+        assert (plane.dtype, plane.tobytes()) == (wanted.dtype, wanted.tobytes())
+    steps = np.diff(surface.metadata["axes"]["x"][:-1])
+    assert (np.abs(steps) < 180).all()  # unwrapped
+    assert len(steps) == len(lon) - 1 + closed
+    assert not closed or abs(steps.sum()) == 360  # once around, with the step over the seam
+
+
+@pytest.mark.parametrize("jump", [0, 200])
+def test_a_column_that_repeats_the_first_of_uneven_longitudes_is_merged(jump: int, tmp_path: Path) -> None:
+    lon, lat = (np.append(AROUND, 360.0) + jump) % (360 if jump else 1000), np.arange(6.0) ** 2
+    z = hills((6, len(AROUND)))
+    z = np.concatenate((z, z[:, :1]), axis=1)
+    path = save(tmp_path / "a.nc", {"z": (("lat", "lon"), z), "lon": ("lon", lon, EAST), "lat": ("lat", lat, NORTH)})
+    surface = formats.read(path)
+    assert (surface.shape, surface.closed) == ((6, len(AROUND)), (False, True))
+    back = restore(surface)
+    assert back.points.tobytes() == z.tobytes()
+    assert coordinates(back)[0][0].tobytes() == lon.tobytes()
 
 
 def test_axes_that_no_metadata_hold_become_points(tmp_path: Path) -> None:
@@ -502,3 +523,14 @@ def test_a_library_that_does_not_say_why_has_not_refused_the_file(
         formats.read(path)
     with pytest.raises(FormatError, match="expected a whole chunk"):
         formats.read(path)
+
+
+def test_a_raster_of_uneven_longitudes_that_jump_goes_on_over_the_jump(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    lon, lat = (AROUND[:-9] + 200) % 360, np.arange(6.0) * 2
+    surface = read_over(tmp_path / "a.nc", lon, lat)
+    with pytest.warns(UserWarning, match=r"evenly spaced rows and columns: x changes by up to [12]"):
+        formats.write(surface, tmp_path / "a.tif")
+    with rasterio.open(tmp_path / "a.tif") as raster:
+        step = raster.transform.a
+    assert step == pytest.approx((AROUND[-10] - AROUND[0]) / (len(lon) - 1))

@@ -228,6 +228,25 @@ def test_coordinates_of_a_window_go_on_across_the_seam(metadata: dict[str, Any])
     assert y[:, 0].tolist() == [85.5 - 9 * row for row in range(3, 9)]
 
 
+def test_the_step_over_the_seam_is_that_of_a_list_with_the_first_number_again() -> None:
+    lines = np.cumsum(np.tile([4.0, 16.0], 18))
+    metadata = {"axes": {"x": [0.0, *lines.tolist(), "values"], "y": [85.5, -9]}}
+    surface = ls.Surface(surface_of("integers", (20, 36), (False, True)).points, (False, True), metadata=metadata)
+    region = (3, 9), (34, 40)
+    whole = ls.Decoder()
+    whole.feed(ls.encode(surface))
+    decoder = ls.Decoder(ls.Target(region=region))
+    decoder.feed(ls.encode(surface))
+    assert coordinates(decoder.surface())[0][0].tolist() == [340, 344, 360, 364, 380, 384]
+    assert coordinates(whole.view().window(region))[0][0].tolist() == [340, 344, 360, 364, 380, 384]
+    assert whole.header is not None
+    level = whole.surface(whole.header.levels - 2)
+    assert level.metadata["axes"]["x"] == [*range(0, 361, 40), "values"]
+    again = ls.Decoder(ls.Target(region=((0, 5), (7, 11))))
+    again.feed(ls.encode(level))
+    assert coordinates(again.surface())[0][0].tolist() == [280, 320, 360, 400]
+
+
 def test_a_window_of_a_window_across_the_seam() -> None:
     surface, container = encoded("integers", (24, 36), (False, True))
     decoder = ls.Decoder(ls.Target(region=((2, 20), (30, 50))))

@@ -118,7 +118,7 @@ export function levelMetadata(
   });
   const uneven = nodes[0] || nodes[1];
   if (metadata.axes !== undefined) {
-    result.axes = axesAt(metadata.axes, shape, places);
+    result.axes = axesAt(metadata.axes, shape, places, closed);
     if (uneven || transform === null) delete result.geotransform;
     else result.geotransform = levelGeotransform(transform, steps);
     return result;
@@ -145,10 +145,11 @@ function levelGeotransform(transform: unknown, steps: readonly number[]): number
 
 /**
  * `axes` of some rows and columns of a grid, with the same coordinates there. Along a closed axis places may go on after
- * its end, where the coordinates of the first ones follow, one turn further; the step across the seam is as long as the
- * one before it.
+ * its end, where the coordinates of the first ones follow, one turn further. A list with one number more than the axis has
+ * places says how long the step across the seam is; otherwise it is as long as the one before it. A list of places whose
+ * axis is closed has that number again.
  */
-function axesAt(axes: unknown, shape: Shape, places: Positions): Metadata {
+function axesAt(axes: unknown, shape: Shape, places: Positions, closed: Closed = [false, false]): Metadata {
   const { rules, swapped } = axesOf(axes);
   const at = (rule: CoordinateRule, down: boolean): CoordinateRule => {
     const axis = down ? 0 : 1;
@@ -158,11 +159,28 @@ function axesAt(axes: unknown, shape: Shape, places: Positions): Metadata {
     const still = new Float64Array(1);
     const { values } = evaluate(rule, down ? all : still, down ? still : all, down);
     const line = values.length === all.length ? values : new Float64Array(all.length).fill(values[0]!);
-    const turn = 2 * line.at(-1)! - line.at(-2)! - line[0]!;
-    const listed = Array.from(places[axis], (k) => (k < all.length ? line[k]! : line[k - all.length]! + turn));
+    const after = afterTurn(rule, all.length);
+    const turn = (after ?? 2 * line.at(-1)! - line.at(-2)!) - line[0]!;
+    const wanted = [...places[axis]];
+    if (closed[axis] && after !== null) wanted.push(wanted[0]! + all.length);
+    const listed = wanted.map((k) => (k < all.length ? line[k]! : line[k - all.length]! + turn));
     return [...listed, "values" as const];
   };
   return { ...(axes as Metadata), x: at(rules[0], swapped), y: at(rules[1], !swapped) };
+}
+
+/** The first number of a closed axis of this length once more, one turn further; null: its rule does not list it. */
+function afterTurn(rule: CoordinateRule, length: number): number | null {
+  return rule.at(-1) === "values" && rule.length - 1 > length ? Number(rule[length]) : null;
+}
+
+/** Of x (0) or y (1), which runs along a closed axis of this length, the full turn that `axes` list; null: they do not. */
+export function turnOfAxes(axes: unknown, axis: 0 | 1, length: number): { channel: 0 | 1; turn: number } | null {
+  if (axes === undefined) return null;
+  const { rules, swapped } = axesOf(axes);
+  const channel = (axis === 1) !== swapped ? 0 : 1;
+  const after = afterTurn(rules[channel], length);
+  return after === null ? null : { channel, turn: after - Number(rules[channel][0]) };
 }
 
 /** The rule of every so many places of an axis, from the first one on; null where they, or the rule, are others. */

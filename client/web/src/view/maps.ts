@@ -4,6 +4,7 @@
  */
 
 import { isMap, type Metadata } from "../container/sections";
+import { turnOfAxes } from "../coordinates/height-fields";
 import type { AttributeGrid, Grid } from "./source";
 
 /** Degrees of a full turn. */
@@ -37,7 +38,7 @@ export function unrolled(grid: Grid, flat: boolean, metadata: Metadata): Grid {
   const periods = flat ? ([0, 0, 0] as const) : periodsOf(metadata);
   for (const axis of [0, 1] as const) {
     if (!grid.closed[axis]) continue;
-    const turns = flat ? goingOn(grid, axis) : turnsOf(grid, axis, periods);
+    const turns = flat ? goingOn(grid, axis, metadata.axes) : turnsOf(grid, axis, periods);
     if (turns === null) continue;
     grid = opened(grid, axis, turns);
   }
@@ -56,12 +57,17 @@ function linesAlong({ rowsAt, columnsAt, full }: Grid, axis: 0 | 1) {
   return { nodes: at.length, count, first, step, round: span > 0 ? full[axis] / span : 0, full: full[axis] };
 }
 
-/** Where coordinates would be after the last node of each line, if they go on as they do. */
-function goingOn(grid: Grid, axis: 0 | 1): Turns {
+/** Where coordinates would be after the last node of each line: as `axes` say, otherwise if they go on as they do. */
+function goingOn(grid: Grid, axis: 0 | 1, axes: unknown): Turns {
   const { nodes, count, first, step, round, full } = linesAlong(grid, axis);
   const turns = new Float64Array(3 * count);
+  const listed = turnOfAxes(axes, axis, full);
   for (let line = 0; line < count; line += 1) {
     for (const k of [0, 1]) {
+      if (k === listed?.channel) {
+        turns[3 * line + k] = listed.turn;
+        continue;
+      }
       const [start, end] = [3 * line * first + k, 3 * (line * first + (nodes - 1) * step) + k];
       const turn = (grid.points[end]! - grid.points[start]!) * round;
       // Longitudes that are not quite even go round once all the same.

@@ -68,6 +68,15 @@ describe("closed axes", () => {
     expect(xOf(unrolled(cells, true, {})).at(-1)).toBe(36);
   });
 
+  it("end where a list of uneven longitudes says, at every level", () => {
+    const line = Array.from({ length: 37 }, (_, j) => 30 + 20 * Math.floor(j / 2) + 4 * (j % 2));
+    const axes = { x: [...line, "values"], y: [0, 1] };
+    const uneven = closedGrid(2, 36, (i, j) => [line[j]!, i, 0]);
+    expect(xOf(unrolled(uneven, true, { axes }))).toEqual(line);
+    const coarse = { ...closedGrid(2, 4, (i, j) => [line[9 * j]!, i, 0]), columnsAt: Float64Array.of(0, 9, 18, 27) };
+    expect(xOf(unrolled({ ...coarse, full: [2, 36] }, true, { axes })).at(-1)).toBe(390);
+  });
+
   it.each([angles, {}, { turn: [0, 360, 1] }])("of x, y, z that are longitudes end a turn further: %o", (metadata) => {
     const grid = unrolled(map, false, metadata);
     expect(grid.closed[1]).toBe(false);

@@ -45,8 +45,8 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
         return [float(value) for value in metadata["geotransform"]]
     if not {"grid", "axes", "nodes"} & metadata.keys():
         return None
-    transform = []
-    for first, last in zip(*(coordinates(surface, own) for own in (slice(0, 1), slice(rows - 1, rows))), strict=True):
+    transform, unwrapped = [], _unwrapped(surface)
+    for first, last in zip(*(coordinates(unwrapped, own) for own in (slice(0, 1), slice(rows - 1, rows))), strict=True):
         origin = float(first[0, 0])
         across = (float(first[0, -1]) - origin) / max(columns - 1, 1)
         down = (float(last[0, 0]) - origin) / max(rows - 1, 1)
@@ -54,12 +54,17 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
     return transform
 
 
+def _unwrapped(surface: Surface) -> Surface:
+    """Heights whose longitudes do not jump, as those of an affine rule do not."""
+    metadata = {key: value for key, value in surface.metadata.items() if key != "angles"}
+    return Surface(surface.points, mask=surface.mask, metadata=metadata)
+
+
 def warn_off(surface: Surface, transform: Sequence[float], title: str) -> None:
     """Say how far the cells are from where the heights are."""
-    metadata = {key: value for key, value in surface.metadata.items() if key != "angles"}
-    if not {"grid", "axes", "nodes"} & metadata.keys():
+    if not {"grid", "axes", "nodes"} & surface.metadata.keys():
         return
-    exact = Surface(surface.points, mask=surface.mask, metadata=metadata)
+    exact = _unwrapped(surface)
     affine = Surface(surface.points, mask=surface.mask, metadata={"geotransform": transform})
     away = [0.0, 0.0]
     for rows in rows_at_once(surface.shape):
