@@ -336,7 +336,7 @@ def test_a_region_with_one_point_of_the_level_is_refused_before_anything_is_sent
     )
     for order in ("quality", "level"):
         with pytest.raises(ls.OptionError, match=said):
-            plan(index, ls.Target(region=region, level=level, order=order))  # type: ignore[arg-type]
+            plan(index, ls.Target(region=region, level=level, order=order))
     with pytest.raises(ls.OptionError, match=said):
         ls.Decoder(ls.Selection(region, level=level)).feed(container)
     decoder = ls.Decoder()
