@@ -157,7 +157,7 @@ def coded_layers(
 
 
 def returned_digest(surface: Surface, hole: int) -> str:
-    """`values_digest` of the blocks `as_returned`, of which some rows at a time are looked at."""
+    """`values_digest` of the blocks as they come out of a container, of which some rows at a time are looked at."""
     digest = hashlib.sha256()
     for block in surface.blocks:
         hidden = None
@@ -170,7 +170,7 @@ def returned_digest(surface: Surface, hole: int) -> str:
                 if hidden is not None:
                     rows = np.array(rows)
                     # Points come first, and attributes after them have 0 in place of the value of a hole.
-                    Values([rows] if number == 0 else [rows[..., :0], rows]).clear(hidden[start : start + each], hole)
+                    Values([rows]).clear(hidden[start : start + each], 0 if number else hole)
                 digest.update(np.ascontiguousarray(rows.astype(rows.dtype.newbyteorder("<"), copy=False)).data)
     return digest.hexdigest()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
-from ..decoding.values import Values
 from ..parallel import spread
 from ..residual import chunk_coder
-from ..surface import Block, Surface
 from .holes import given_channel
 from .prepared import Prepared
 
-__all__ = ["ChunkCoder", "Restored", "as_returned", "chunk_sample", "chunk_size", "encode_chunks"]
+__all__ = ["ChunkCoder", "Restored", "chunk_sample", "chunk_size"]
 
 #: Bytes of tables for each chunk, and what small chunks may cost: a share of all bytes.
 _TABLES, _WORTH = 8, 0.01
@@ -30,28 +28,6 @@ class Restored(Protocol):
 
     def window(self, window: ChunkPlace) -> NDArray[Any]:
         """One channel at the place of a chunk, shape (row, column)."""
-
-
-def encode_chunks(prepared: Prepared, header: Header, restored: Sequence[Restored]) -> tuple[list[bytes], list[bool]]:
-    """The section's chunks; and of each channel whether it is exact then.
-
-    A precision is for the coordinates, or for the channel or attribute that it names: the others come back bit for
-    bit, and so do NaN and infinities, and all values of holes that are kept.
-
-    Parameters
-    ----------
-    prepared : Prepared
-    header : Header
-    restored : sequence of Restored, one for each block
-        What comes back without these chunks.
-    """
-    coder = ChunkCoder(prepared, header, restored)
-    windows = list(chunk_places(header))
-    coded = spread(coder.code, windows)
-    exact = [True] * header.channels
-    for window, (_, whole) in zip(windows, coded, strict=True):
-        exact[window.channel] &= whole
-    return [chunk for chunk, _ in coded], exact
 
 
 def chunk_size(
@@ -65,7 +41,7 @@ def chunk_size(
     Parameters
     ----------
     prepared, header, restored
-        As in `encode_chunks`.
+        As of `ChunkCoder`.
     coefficients : float
         Bytes that the coefficients take.
     """
@@ -99,7 +75,18 @@ def chunk_sample(prepared: Prepared, shape: tuple[int, int]) -> tuple[tuple[int,
 
 
 class ChunkCoder:
-    """Makes chunks, see `encode_chunks`."""
+    """Makes chunks.
+
+    A precision is for the coordinates, or for the channel or attribute that it names: the others come back bit for
+    bit, and so do NaN and infinities, and all values of holes that are kept.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    header : Header
+    restored : sequence of Restored, one for each block, or by their numbers
+        What comes back without the chunks.
+    """
 
     def __init__(
         self, prepared: Prepared, header: Header, restored: Sequence[Restored] | Mapping[int, Restored]
@@ -126,17 +113,3 @@ class ChunkCoder:
             exact = chunk_coder.agree(given, wanted)
         step = self._header.lattices[channel].step if wanted.dtype == np.float32 else None
         return chunk_coder.encode_chunk(wanted, known, step), exact
-
-
-def as_returned(surface: Surface, hole: int) -> Iterator[Block]:
-    """The blocks as they come out of a container: holes have the value that says so."""
-    for block in surface.blocks:
-        if block.mask is None:
-            yield block
-            continue
-        arrays = [np.array(array) for array in (block.points, *block.attributes.values())]
-        values = Values([array.reshape(*block.shape, -1) for array in arrays])
-        values.clear(~block.mask if block.kept is None else ~(block.mask | block.kept), hole)
-        points, *attributes = (v.reshape(a.shape) for v, a in zip(values.arrays, arrays, strict=True))
-        named = dict(zip(block.attributes, attributes, strict=True))
-        yield Block(points, block.closed, mask=block.mask, attributes=named)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -331,6 +332,20 @@ def test_a_level_surface_of_many_points(precision: float | None) -> None:
     container = ls.encode(points, precision)
     assert np.array_equal(ls.decode(container).points, points)
     assert len(container) < 400
+
+
+@pytest.mark.parametrize("memory", [None, "1MiB"])
+def test_holes_have_a_nodata_value_that_attributes_cannot_hold(memory: str | None) -> None:
+    heights = np.rint(20 * terrain((90, 70))).astype(np.int16)
+    mask = heights > 5
+    heights[~mask] = -99
+    attributes: dict[str, NDArray[Any]] = {"kind": (heights % 7).astype(np.uint8), "wind": terrain((90, 70), 1).astype(np.float32)}
+    surface = ls.Surface(heights, mask=mask, attributes=attributes, metadata={"nodata": -99})
+    with pytest.warns(ls.FormatWarning, match="values of attributes at"), ThreadPoolExecutor(1) as executor:
+        container = ls.encode(surface, memory=memory, executor=executor if memory else None)
+    decoded = ls.decode(container)  # which compares the digest
+    assert np.array_equal(decoded.points, heights)
+    assert not decoded.attributes["kind"][~mask].any()
 
 
 def test_axes_that_are_too_long_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -49,6 +49,20 @@ export function checkSelection(selection: Selection, header: Header): void {
   }
 }
 
+/** As `checkSelection`, and refuse a region that has one point of the level only, which is no surface. */
+export function checkSurface(selection: Selection, header: Header): void {
+  checkSelection(selection, header);
+  if (!selection.region) return;
+  const level = selection.level ?? header.levels;
+  if (regionAt(header, selection.region, level).every(([start, stop]) => stop - start === 1)) {
+    const [[top, bottom], [left, right]] = selection.region;
+    throw new OptionError(
+      `expected a region with at least two points of level ${level}, got rows ${top}:${bottom}, columns ` +
+        `${left}:${right}, where that level has one: ask for a larger region or for a finer level`,
+    );
+  }
+}
+
 /** Which channels are wanted. */
 export function selectedChannels(selection: Selection, header: Header): boolean[] {
   const chosen = Array.from({ length: header.pointChannels }, () => true);
@@ -129,7 +143,7 @@ export function checkSize(selection: Selection, header: Header, capacity: Capaci
 /** What of a container a selection takes. Throws `OptionError` where the surface does not have it. */
 export function select(index: Index, selection: Selection): SelectedSlices {
   const { header } = index;
-  checkSelection(selection, header);
+  checkSurface(selection, header);
   const chunks = new Map<number, Chunk>();
   if (!selection.region && !selection.attributes) {
     index.chunks.forEach((chunk, number) => {

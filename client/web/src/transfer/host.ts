@@ -9,7 +9,7 @@ import { Decoder } from "../decoding/decoder";
 import type { View } from "../decoding/view";
 import { InputError } from "../errors";
 import { loadKernels } from "../kernels/instance";
-import { checkSelection, checkSize } from "../planning/selection";
+import { checkSize, checkSurface } from "../planning/selection";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Surface, ViewInfo } from "../types";
 import { isSurface } from "./addresses";
@@ -88,7 +88,7 @@ export class Host implements Questions {
     if (header && !header.awaitsMasks) {
       const { region, attributes, level } = makeTarget(options);
       const selection = { region, attributes, level };
-      checkSelection(selection, header);
+      checkSurface(selection, header);
       checkSize(selection, header, new Capacity(this.decoder!.capacity.maxVertices));
     }
     this.own.aim(options);
