@@ -339,7 +339,10 @@ def test_holes_have_a_nodata_value_that_attributes_cannot_hold(memory: str | Non
     heights = np.rint(20 * terrain((90, 70))).astype(np.int16)
     mask = heights > 5
     heights[~mask] = -99
-    attributes: dict[str, NDArray[Any]] = {"kind": (heights % 7).astype(np.uint8), "wind": terrain((90, 70), 1).astype(np.float32)}
+    attributes: dict[str, NDArray[Any]] = {
+        "kind": (heights % 7).astype(np.uint8),
+        "wind": terrain((90, 70), 1).astype(np.float32),
+    }
     surface = ls.Surface(heights, mask=mask, attributes=attributes, metadata={"nodata": -99})
     with pytest.warns(ls.FormatWarning, match="values of attributes at"), ThreadPoolExecutor(1) as executor:
         container = ls.encode(surface, memory=memory, executor=executor if memory else None)
