@@ -12,7 +12,7 @@ import { FOOTER_LENGTH, KIND, type Metadata, parseFooter, parseMetadata } from "
 import { Slices, type State } from "../container/slices";
 import { UNANNOUNCED } from "../entropy/tiles";
 import { CorruptStreamError, TruncatedStreamError } from "../errors";
-import { checkSelection, checkSize, checkSurface, type Selection, select, selectedTiles } from "../planning/selection";
+import { checkSelection, checkSize, type Selection, select, selectedTiles } from "../planning/selection";
 import type { Region, Surface } from "../types";
 import { Progress } from "./progress";
 import { type Coded, Reconstruction } from "./reconstruction";
@@ -224,7 +224,7 @@ export class Decoder {
     if (this.#header !== null) throw new CorruptStreamError("expected one header, got a second", frame.offset);
     const header = parseHeader(frame.payload, frame.payloadOffset, frame.end);
     this.#header = header;
-    checkSurface(this.#selection, header);
+    checkSelection(this.#selection, header);
     checkSize(this.#selection, header, this.capacity);
     if (!header.masked) this.#begin(header);
   }

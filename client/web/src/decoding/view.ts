@@ -16,7 +16,7 @@ import { CorruptStreamError, InputError, OptionError } from "../errors";
 import { levelPositions, type Positions, patchesByBlock } from "../grid/patches";
 import { contains, placesOf } from "../grid/window";
 import {
-  checkSurface,
+  checkSelection,
   nodesOfLevel,
   regionAt,
   type Selection,
@@ -94,7 +94,7 @@ export class View implements ViewInfo {
     const { header } = this.#shared.reconstruction;
     this.#checkLevel(level);
     const selection: Selection = { region, attributes: this.#selection.attributes, level };
-    checkSurface(selection, header);
+    checkSelection(selection, header);
     const shown = this.#selection.region;
     if (shown && !contains(shown, region, header.shape)) {
       throw new OptionError(
