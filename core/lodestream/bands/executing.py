@@ -72,7 +72,7 @@ class Execution:
         done = len(tasks) - len(left)
         if self._executor is not None:
             folder = self._build.folder
-            self._wait(lambda task: partial(_in_folder, folder, task), self._executor, left, done, progress)
+            self._wait(partial(_InFolder, folder), self._executor, left, done, progress)
         elif self._threads == 1:
             for number, task in enumerate(left, done + 1):
                 task.function(self._build, *task.arguments)
@@ -107,6 +107,15 @@ class Execution:
             wait([future for future in pending if not future.cancelled()])
 
 
-def _in_folder(folder: str, task: Task) -> None:
-    """Carry out a task of the build that was saved in a folder; for executors, whose workers may be other machines."""
-    task.function(Build.open(folder), *task.arguments)
+class _InFolder:
+    """A task of the build that was saved in a folder, for executors, whose workers may be other machines.
+
+    It has the name of its function, which Dask's dashboard shows.
+    """
+
+    def __init__(self, folder: str, task: Task) -> None:
+        self._folder, self._task = folder, task
+        self.__name__ = task.function.__name__
+
+    def __call__(self) -> None:
+        self._task.function(Build.open(self._folder), *self._task.arguments)

@@ -109,7 +109,7 @@ def test_a_stream_says_of_its_surface_what_is_true_now(tmp_path: Path, monkeypat
     with running_server(tmp_path, workers=1) as url, _client(url) as http:
         surface = push(http, BODY)
 
-        def fail(self: Containers, sha256: str) -> OpenContainer:
+        def fail(self: Containers, *arguments: object) -> OpenContainer:
             http.delete(surface["url"])
             raise missing
 

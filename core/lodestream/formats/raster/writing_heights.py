@@ -45,6 +45,7 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
         return [float(value) for value in metadata["geotransform"]]
     if not {"grid", "axes", "nodes"} & metadata.keys():
         return None
+    coordinates(surface, slice(0, 1))  # refuses angles that are no rules
     transform, unwrapped = [], _unwrapped(surface)
     for first, last in zip(*(coordinates(unwrapped, own) for own in (slice(0, 1), slice(rows - 1, rows))), strict=True):
         origin = float(first[0, 0])
