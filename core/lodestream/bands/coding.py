@@ -35,7 +35,7 @@ class CodedBand:
     Attributes
     ----------
     bits, gains : float64, flat
-        Of the passes of all tiles one after another, see `TileCurve`.
+        Of the passes of all tiles one after another, see `Curves`.
     early : uint8, flat
         Marks of first passes, see `Tiles`, where the tiles stand in the flat arrays.
     strings : uint8, flat
@@ -131,7 +131,7 @@ def code_units(units: Units) -> CodedBand:
 def unit_curve(
     coder: TileCoder, tile: int, channel: Channel, table: TileTable, rounded: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Code all passes of a unit that has a bit-plane: bits and gains, float64, shape (pass,), see `TileCurve`.
+    """Code all passes of a unit that has a bit-plane: bits and gains, float64, shape (pass,), see `Curves`.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from ..grid.layout import Layout
 from ..scratch import Scratch
 from ..transform.fitting import fitted_to_columns, sample_stride
 from ..transform.lifting import forward_step
-from ..transform.predictors import COEFFICIENT_BITS, is_fitted, predictor
+from ..transform.predictors import is_fitted, predictor
 from ..transform.pyramid import empty, forward
 from .crops import crop_rows
 from .geometry import Band, Bands
@@ -28,7 +28,6 @@ __all__ = [
     "first_step",
     "fit_columns",
     "fit_rows",
-    "overflows",
     "read_rows",
     "sampled_columns",
     "sampled_rows",
@@ -168,11 +167,6 @@ def core_transform(
     """
     predictors = forward([samples], bands.layout, fit, bands.core)
     return predictors, *_of_tiles(samples, part_of(table, [bands.core_tiles]), None)
-
-
-def overflows(coefficients: NDArray[np.int32]) -> bool:
-    """Whether a coefficient, shape (number,), is larger than a container holds: then predictors must not be fitted."""
-    return bool(coefficients.size) and max(int(coefficients.max()), -int(coefficients.min())) >= 1 << COEFFICIENT_BITS
 
 
 class _Shift:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -15,29 +14,12 @@ from .. import kernels
 from ..grid.layout import Layout
 from ..parallel import spread
 
-__all__ = ["Curves", "TileCurve", "Worth"]
+__all__ = ["Curves", "Worth"]
 
 #: Two runs are one where as two they save less than this share of the tile's bits so far.
 _SHARE_OF_TILE = 0.02
 #: Curves of one call of a kernel: some hundredths of a second.
 _AT_ONCE = 1 << 14
-
-
-class TileCurve(NamedTuple):
-    """What the coding passes of one tile of one channel cost and gain.
-
-    Attributes
-    ----------
-    bits : float64, shape (pass,)
-        Bits that each pass takes; the last pass has number 0.
-    gains : float64, shape (pass,)
-        By how much the squared error falls with each pass, in the surface's unit.
-    """
-
-    tile: int
-    channel: int
-    bits: NDArray[np.float64]
-    gains: NDArray[np.float64]
 
 
 class Worth(NamedTuple):
@@ -73,8 +55,10 @@ class Curves:
     tile, channel : int64, shape (curve,)
     counts : int64, shape (curve,)
         Passes of each, at most 64.
-    bits, gains : float64, shape (pass,)
-        Those of `TileCurve` of all curves.
+    bits : float64, shape (pass,)
+        Bits that each pass takes, of one curve after another; the last pass of each has number 0.
+    gains : float64, shape (pass,)
+        By how much the squared error falls with each pass, in the surface's unit.
     """
 
     tile: NDArray[np.int64]
@@ -82,23 +66,6 @@ class Curves:
     counts: NDArray[np.int64]
     bits: NDArray[np.float64]
     gains: NDArray[np.float64]
-
-    @classmethod
-    def joined(cls, curves: Iterable[TileCurve]) -> Curves:
-        """These curves, in their order."""
-        given = list(curves)
-        tile, channel, counts = (
-            np.array(own, np.int64)
-            for own in (
-                [curve.tile for curve in given],
-                [curve.channel for curve in given],
-                [curve.bits.size for curve in given],
-            )
-        )
-        nothing = np.zeros(0)
-        bits = np.concatenate([curve.bits for curve in given] or [nothing])
-        gains = np.concatenate([curve.gains for curve in given] or [nothing])
-        return cls(tile, channel, counts, bits, gains)
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:

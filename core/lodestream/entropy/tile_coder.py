@@ -51,8 +51,6 @@ class TileCoder:
         Of the coordinates.
     large : int
         The coarsest level whose units are large; 0: none are.
-    strings : dict, optional
-        What another coder of the same channels has made of large units, see `strings`.
 
     Attributes
     ----------
@@ -68,10 +66,9 @@ class TileCoder:
         geometric: int,
         quantiser: Quantiser | None,
         large: int = 0,
-        strings: Strings | None = None,
     ) -> None:
         self._channels = channels
-        self.strings: Strings = {} if strings is None else strings
+        self.strings: Strings = {}
         self.tiles = [Tiles(table, quantiser if k < geometric else None, large) for k, table in enumerate(tables)]
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:

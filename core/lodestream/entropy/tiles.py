@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from copy import copy
 from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -153,16 +152,6 @@ class TileTable:
     def level_of(self, tile: int) -> int:
         """The level of one of the table's tiles."""
         return self.layout.level_of(self.members[tile])
-
-    def small_size(self, large: int) -> int:
-        """How long the flat array of coefficients is up to the tile ``large``, the first that is not in it."""
-        return int(self.starts[large]) + PADDING
-
-    def of_small(self, size: int) -> TileTable:
-        """The same places in flat arrays that end after so many coefficients, see `small_size`."""
-        table = copy(self)
-        table.size = size
-        return table
 
     def of_tile(self, tile: int) -> NDArray[np.int64]:
         """The rows of one tile's bands, shape (band, `band_fields.BAND_FIELDS`), a view."""

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from lodestream.container.limits import LAYERS
 from lodestream.encoding.allocation import _layer_ends, assign_layers
-from lodestream.encoding.curves import Curves, TileCurve, Worth
+from lodestream.encoding.curves import Worth
 from lodestream.grid.layout import Layout
+
+from .tile_curves import TileCurve, joined
 
 
 def curves_for(layout: Layout, channels: int, seed: int) -> list[TileCurve]:
@@ -42,7 +44,7 @@ layouts = st.builds(
 @given(layouts, st.integers(1, 3), st.integers(0, 2**32))
 def test_layers_add_every_plane_once_and_parents_never_after_children(layout: Layout, channels: int, seed: int) -> None:
     curves = curves_for(layout, channels, seed)
-    states = assign_layers(Curves.joined(curves), layout, channels)
+    states = assign_layers(joined(curves), layout, channels)
     assert states
     top = np.zeros(states[0].shape, np.int8)
     for curve in curves:
@@ -65,7 +67,7 @@ def test_layers_add_every_plane_once_and_parents_never_after_children(layout: La
 def test_slopes_fall_towards_lower_planes_and_keep_the_sum(planes: int, worth: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     curve = TileCurve(0, 0, 100 * rng.random(planes) + 0.01, rng.normal(size=planes))
-    slopes = Curves.joined([curve]).slopes(saving(worth))
+    slopes = joined([curve]).slopes(saving(worth))
     assert slopes.shape == (planes,)
     assert (np.diff(slopes[::-1]) <= 1e-12).all()
     assert np.isclose((slopes * curve.bits).sum(), curve.gains.clip(0).sum())
@@ -75,7 +77,7 @@ def test_passes_are_one_step_where_two_would_save_less_than_a_segment_takes() ->
     # Of 100 bits each, the first worth 3 a bit and the second 1: where both come together, two steps save
     # 100 * 100 * (3 - 1) / (3 * 100 + 1 * 100) = 50 bits.
     curve = TileCurve(0, 0, np.array([100.0, 100.0]), np.array([100.0, 300.0]))
-    curves = Curves.joined([curve])
+    curves = joined([curve])
     assert curves.slopes(saving(49.0)).tolist() == [1.0, 3.0]
     assert curves.slopes(saving(51.0)).tolist() == [2.0, 2.0]
 
@@ -92,7 +94,7 @@ def many_tiles(tiles: int = 500, passes: int = 16) -> tuple[Layout, list[TileCur
 
 def test_layers_above_4_kb_are_at_most_15_per_cent_of_the_bytes_apart() -> None:
     layout, curves = many_tiles()
-    sizes = np.array([100.0 * (16 - state).sum() for state in assign_layers(Curves.joined(curves), layout, 1)])
+    sizes = np.array([100.0 * (16 - state).sum() for state in assign_layers(joined(curves), layout, 1)])
     growth = sizes[1:] / sizes[:-1]
     assert growth[sizes[:-1] > 4096].max() <= 1.15
     assert growth[sizes[:-1] > 4096].min() >= 1.1
@@ -106,7 +108,7 @@ def test_a_layer_that_is_longer_adds_a_single_pass() -> None:
         TileCurve(tile, 0, rng.uniform(2000, 40_000, 10), rng.uniform(1, 4) * 4.0 ** np.arange(10.0))
         for tile in range(len(layout.tiles))
     ]
-    states = assign_layers(Curves.joined(curves), layout, 1)
+    states = assign_layers(joined(curves), layout, 1)
     sizes = np.array([sum(curve.bits[state[curve.tile, 0] :].sum() / 8 for curve in curves) for state in states])
     longer = (sizes[1:] > 1.15 * sizes[:-1]) & (sizes[:-1] > 4096)
     added = np.array([(before - after).sum() for before, after in itertools.pairwise(states)])
@@ -116,7 +118,7 @@ def test_a_layer_that_is_longer_adds_a_single_pass() -> None:
 
 def test_a_tile_has_few_segments() -> None:
     layout, curves = many_tiles()
-    states = np.array(assign_layers(Curves.joined(curves), layout, 1))
+    states = np.array(assign_layers(joined(curves), layout, 1))
     segments = (np.diff(states[:, :, 0], axis=0) < 0).sum()
     # In a tile of 16 passes each of which is worth a quarter of the last, two go together towards the end.
     assert segments < 12 * len(layout.tiles)
@@ -155,14 +157,14 @@ def test_layers_end_one_after_another_and_with_the_last_pass(passes: int, few: b
 def test_streams_for_one_error_have_few_layers() -> None:
     layout, curves = many_tiles()
     total = 1600 * len(curves)
-    assert len(assign_layers(Curves.joined(curves), layout, 1, few=True)) <= total / 12_000 + 2
-    assert len(assign_layers(Curves.joined(curves[:4]), layout, 1, few=True)) == 3
-    assert len(assign_layers(Curves.joined([TileCurve(0, 0, np.full(4, 100.0), np.ones(4))]), layout, 1, few=True)) == 1
+    assert len(assign_layers(joined(curves), layout, 1, few=True)) <= total / 12_000 + 2
+    assert len(assign_layers(joined(curves[:4]), layout, 1, few=True)) == 3
+    assert len(assign_layers(joined([TileCurve(0, 0, np.full(4, 100.0), np.ones(4))]), layout, 1, few=True)) == 1
 
 
 def test_nothing_to_send_is_one_layer() -> None:
     layout = Layout.single((5, 5), (False, False), (7, 7))
-    states = assign_layers(Curves.joined([]), layout, 3)
+    states = assign_layers(joined([]), layout, 3)
     assert len(states) == 1
     assert states[0].shape == (len(layout.tiles), 3)
     assert not states[0].any()

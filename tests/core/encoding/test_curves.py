@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from lodestream import kernels
 from lodestream.encoding.allocation import _worth
-from lodestream.encoding.curves import Curves, TileCurve, Worth
+from lodestream.encoding.curves import Worth
 from lodestream.grid.layout import Layout
 
 from .test_allocation import curves_for, layouts
+from .tile_curves import TileCurve, joined
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def plain_lift(slopes: dict[tuple[int, int], Floats], layout: Layout) -> None:
 @given(layouts, st.integers(1, 3), st.integers(0, 2**32), st.integers(1, 5))
 def test_slopes_are_those_of_plain_python(layout: Layout, channels: int, seed: int, at_once: int) -> None:
     given_curves = curves_for(layout, channels, seed)
-    curves = Curves.joined(given_curves)
+    curves = joined(given_curves)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lodestream.encoding.curves._AT_ONCE", at_once)
         bare = curves.slopes()
@@ -77,7 +78,7 @@ def test_curves_come_in_any_number_and_length() -> None:
     lengths = [64, 1, 63, 0, 2]
     rng = np.random.default_rng(0)
     given_curves = [TileCurve(k, 0, rng.random(n), rng.random(n)) for k, n in enumerate(lengths)]
-    curves = Curves.joined(given_curves)
+    curves = joined(given_curves)
     assert curves.ends.tolist() == [64, 65, 128, 128, 130]
     assert curves.bytes == pytest.approx(sum(curve.bits.sum() for curve in given_curves) / 8)
     assert curves.slopes().tolist() == [s for curve in given_curves for s in plain_slopes(curve, None).tolist()]
