@@ -25,8 +25,8 @@ import psutil
 from numpy.typing import NDArray
 
 import lodestream
-from lodestream.bands.geometry import Bands
 from lodestream.bands.measuring import RUNS_TOGETHER
+from lodestream.bands.pieces import Pieces
 from lodestream.grid.layout import Layout
 from lodestream.kernels import PART_ROWS
 from lodestream.scratch import FolderScratch
@@ -168,14 +168,14 @@ def _rate(built: Built, name: str) -> float:
 def _tasks_of(side: int) -> Iterator[tuple[str, int, float]]:
     """Of each phase of a build of square heights: the tasks of one level, and the values of each."""
     layout = Layout.single((side, side), (False, False), _TILE)
-    bands = Bands(layout, _POINTS)
-    pieces = len(bands.samples(layout.levels))
-    yield "coordinates", pieces, side**2 / pieces
-    for level in bands.levels:
-        own = len(bands.of(level))
+    pieces = Pieces(layout, _POINTS)
+    strips = len(pieces.samples(layout.levels))
+    yield "coordinates", strips, side**2 / strips
+    for level in pieces.levels:
+        count = len(pieces.of(level))
         for name in _BY_LEVEL:
-            yield name, own, layout.points(level) / own
-    core = layout.points(bands.core)
+            yield name, count, layout.points(level) / count
+    core = layout.points(pieces.core)
     yield from (("core", 1, core), ("code", 1, core), ("segments", 1, core))
     rows = PART_ROWS * max(1, RUNS_TOGETHER * _POINTS // (PART_ROWS * side))
     runs = math.ceil(side / rows)

@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import building, forward, grid_transform, streams, transforming
+from lodestream.bands import building, forward, streams, transforming
 from lodestream.encoding import large_units, prepared
 from lodestream.encoding.allocation import assign_layers
 from lodestream.encoding.curves import Curves
@@ -107,10 +107,9 @@ class Crafted:
                 patch.setattr(prepared, "square", lambda bits: self.tile if bits == WHOLE_TILE else square(bits))
             if self.factor > 1:
                 patch.setattr(streams, "_COARSER", ())  # no container of fewer bits is tried
-                for module in (forward, grid_transform):
-                    patch.setattr(module, "gather", gathered)
+                patch.setattr(forward, "gather", gathered)
             if self.ones:
-                for module in (forward, grid_transform, transforming):
+                for module in (forward, transforming):
                     patch.setattr(module, "planes_of", planes)
                 patch.setattr(building, "assign_layers", assigned)
                 patch.setattr(TileCoder, "code", coded)

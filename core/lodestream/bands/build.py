@@ -14,13 +14,12 @@ import numpy as np
 
 from ..container.model import Header
 from ..decoding.values import Values
-from ..encoding.lattice_coordinates import Lattices
+from ..encoding.lattice_coordinates import Lattices, strips
 from ..encoding.prepared import Prepared
 from ..entropy.tiles import TileTable
 from ..quantization.band_steps import Quantiser
 from ..scratch import FolderScratch, MemoryScratch, Scratch
-from .geometry import CORE_POINTS, Bands
-from .grid_runs import GridRuns
+from .pieces import CORE_POINTS, Pieces
 from .references import dump, load
 
 __all__ = ["Build"]
@@ -53,7 +52,7 @@ class Build:
     points : int
         Of a piece, about. It decides about memory, not about bytes.
     core_points : int
-        See `Bands` and `GridRuns`.
+        See `Pieces`.
     """
 
     def __init__(
@@ -68,10 +67,12 @@ class Build:
         self._header: Header | None = None
 
     @cached_property
-    def pieces(self) -> Bands | GridRuns:
-        """What is worked on together: rows of the one grid, or some of several grids."""
-        kind = Bands if self.prepared.arrangement is None else GridRuns
-        return kind(self.prepared.layout, self.points, self._core_points)
+    def pieces(self) -> Pieces:
+        """What is worked on together."""
+        prepared = self.prepared
+        # Coordinates under holes are chosen for what is around them, and the pieces must not decide about bytes.
+        with_holes = prepared.arrangement is None and prepared.surface.blocks[0].mask is not None
+        return Pieces(prepared.layout, self.points, self._core_points, strips(prepared) if with_holes else None)
 
     def table(self, channel: int) -> TileTable:
         """Of all tiles of a channel: points of interfaces are coordinates."""

@@ -38,7 +38,7 @@ from .coding import parents_of, sizes_of_unit
 from .executing import Execution, Task
 from .measuring import ValuesOfRows, exact_errors, last_values, measured_runs
 from .stored import name_of, pieces_of, read_tiles, transformed
-from .transforming import planes_of_channel, transforming
+from .transforming import Transforming, planes_of_channel
 
 __all__ = ["Building", "OutOfRangeError"]
 
@@ -94,7 +94,7 @@ class Building:
     # Transform.
 
     def _transform(self) -> None:
-        transforming(self._build, self._carry_out, self._report).carry_out(_SHARES[0])
+        Transforming(self._build, self._carry_out, self._report).carry_out(_SHARES[0])
         for channel, lattice in enumerate(self._build.lattices.channels):
             if not self._scratch.has(f"weights/{channel}"):
                 own, table = self._read("predictors")[channel], self._build.table(channel)

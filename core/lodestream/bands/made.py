@@ -27,8 +27,8 @@ from .build import Build
 from .building import Building, OutOfRangeError
 from .executing import Execution
 from .folders import TASKS, remove, replacing
-from .geometry import CORE_POINTS
 from .memory import BESIDE, OF_BAND, largest_block, masks_memory
+from .pieces import CORE_POINTS
 from .references import file_state, root_of
 from .room import FOR_A_VALUE, check_room
 from .streams import shortest

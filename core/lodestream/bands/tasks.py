@@ -5,16 +5,21 @@ A task is called with the build, then with numbers. The array that it writes las
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from ..encoding.lattice_coordinates import coordinates_of_strip, strips
+import numpy as np
+from numpy.typing import NDArray
+
+from ..encoding.lattice_coordinates import coordinates_of_interfaces, coordinates_of_rows
 from ..entropy.part_table import flat_span
+from ..transform import pyramid
+from ..transform.predictors import INTERFACES
 from ..transform.pyramid import empty
 from . import forward, measuring
 from .build import Build
 from .coding import Units, code_segments, code_units, parents_of
-from .geometry import Bands
 from .measuring import measured_runs
+from .pieces import Rows
 from .stored import (
     CORE,
     keep_known,
@@ -31,8 +36,8 @@ __all__ = [
     "coordinates",
     "core",
     "first_step",
+    "interfaces",
     "measure",
-    "sample_pieces",
     "second_step",
     "segments",
 ]
@@ -42,68 +47,93 @@ __all__ = [
 _IN_A_FILE = 1 << 20
 
 
-def sample_pieces(build: Build, level: int) -> list[tuple[int, int]]:
-    """The rows of each piece of a level's samples."""
-    if level == build.prepared.layout.levels and build.prepared.surface.blocks[0].mask is not None:
-        return strips(build.prepared)
-    return _bands(build).samples(level)
+def interfaces(build: Build, channel: int) -> None:
+    """Find lattice coordinates of all interfaces of a channel."""
+    lines = coordinates_of_interfaces(build.prepared, channel, build.lattices.channels[channel])
+    build.scratch.write(f"interfaces/{channel}", np.concatenate(lines))
 
 
-def coordinates(build: Build, channel: int, fit: int, piece: int) -> None:
-    """Lattice coordinates of a piece of the finest level; ``fit`` as in `core`."""
-    layout = build.prepared.layout
-    rows = sample_pieces(build, layout.levels)[piece]
-    shape = rows[1] - rows[0], layout.shape(0, layout.levels)[1]
+def coordinates(build: Build, channel: int, fit: int, number: int) -> None:
+    """Find lattice coordinates of a piece of the finest level; ``fit`` as in `core`."""
+    prepared, layout, lattice = build.prepared, build.prepared.layout, build.lattices.channels[channel]
+    lines: list[NDArray[np.int32]] = []
+    if prepared.interfaces:
+        ends = np.cumsum([grid.shape[0] for grid in layout.grids[: prepared.interfaces]])
+        lines = np.split(build.scratch.read(f"interfaces/{channel}"), ends[:-1])
+    piece = build.pieces.samples(layout.levels)[number]
     with build.scratch.temporary(_IN_A_FILE) as room:
-        # A strip with holes may be larger than a band.
-        samples = empty(shape) if build.prepared.surface.blocks[0].mask is None else room.empty(shape, np.int32)
-        coordinates_of_strip(build.prepared, channel, build.lattices.channels[channel], rows, samples, room)
-        build.scratch.write(name_of_fit("samples", channel, fit, layout.levels, piece), samples)
-        build.scratch.write(
-            name_of_fit("columns", channel, fit, layout.levels, piece), forward.sampled_columns(samples)
-        )
+        arrays = []
+        for rows in piece:
+            shape = rows.height, layout.shape(rows.grid, layout.levels)[1]
+            # A strip with holes may be larger than a piece.
+            array = room.empty(shape, np.int32) if build.pieces.has_strips else empty(shape)
+            coordinates_of_rows(prepared, channel, lattice, rows.grid, (rows.start, rows.stop), lines, array, room)
+            arrays.append(array)
+        _write_samples(build, (channel, fit, layout.levels, number), arrays, piece)
 
 
-def first_step(build: Build, channel: int, fit: int, level: int, band: int) -> None:
-    """The step along the rows' axis of a band; ``fit`` as in `core`."""
-    layout, own = build.prepared.layout, _bands(build).of(level)[band]
-    predictors = rules_of(build, channel, fit, level, [0])
-    name = name_of_fit("samples", channel, fit, level)
-    stepped = forward.first_step(build.scratch, name, sample_pieces(build, level), layout, own, predictors)
-    nodes, details = forward.sampled_rows(stepped, layout, own)
-    build.scratch.write(name_of_fit("halves", channel, fit, level, band), stepped)
-    build.scratch.write(name_of_fit("nodes", channel, fit, level, band), nodes)
-    build.scratch.write(name_of_fit("details", channel, fit, level, band), details)
+def first_step(build: Build, channel: int, fit: int, level: int, number: int) -> None:
+    """Step a piece along the rows' axis; ``fit`` as in `core`."""
+    layout, piece = build.prepared.layout, build.pieces.of(level)[number]
+    predictors = rules_of(build, channel, fit, level, [0, INTERFACES])
+    stepped = forward.first_step(_samples(build, channel, fit, level).read, layout, piece, predictors)
+    lines = forward.sampled_rows(stepped, layout, piece)
+    build.scratch.write(name_of_fit("halves", channel, fit, level, number), forward.joined(stepped))
+    build.scratch.write(name_of_fit("rows", channel, fit, level, number), forward.joined(lines))
 
 
-def second_step(build: Build, channel: int, fit: int, level: int, band: int) -> None:
-    """The step along the columns' axis of a band: its coefficients, and samples of the level below.
-
-    ``fit`` as in `core`.
-    """
-    layout, own = build.prepared.layout, _bands(build).of(level)[band]
-    stepped = np.array(build.scratch.read(name_of_fit("halves", channel, fit, level, band)))
-    predictors = rules_of(build, channel, fit, level, [1])
-    nodes, flat, planes = forward.second_step(stepped, layout, own, predictors, build.table(channel))
-    build.scratch.write(name_of_fit("samples", channel, fit, level - 1, band), nodes)
-    build.scratch.write(name_of_fit("coefficients", channel, fit, level, band), flat)
-    build.scratch.write(name_of_fit("planes", channel, fit, level, band), planes)
-    build.scratch.write(name_of_fit("columns", channel, fit, level - 1, band), forward.sampled_columns(nodes))
+def second_step(build: Build, channel: int, fit: int, level: int, number: int) -> None:
+    """Step a piece along the columns' axis: its coefficients, and samples of the level below; ``fit`` as in `core`."""
+    layout, piece = build.prepared.layout, build.pieces.of(level)[number]
+    stored = build.scratch.read(name_of_fit("halves", channel, fit, level, number))
+    arrays, nodes = forward.second_step(stored, layout, piece, rules_of(build, channel, fit, level, [1]))
+    coefficients = forward.coefficients_of(arrays, build.table(channel), piece.tiles, piece.parts)
+    _write_coefficients(build, (channel, fit, level, number), coefficients)
+    # Details along sides that come from interfaces are in no tile, and must not be too large either.
+    details = [part for array, coarse in zip(arrays, nodes, strict=True) for part in forward.details_of(array, coarse)]
+    build.scratch.write(name_of_fit("largest", channel, fit, level, number), np.array(forward.largest_of(details)))
+    rows = [Rows(part.grid, *part.nodes) for part in piece.parts]
+    _write_samples(build, (channel, fit, level - 1, number), nodes, rows)
 
 
 def core(build: Build, channel: int, fit: int) -> None:
-    """The levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
-    bands, layout = _bands(build), build.prepared.layout
-    samples = empty(layout.shape(0, bands.core))
-    pieces = sample_pieces(build, bands.core)
-    name = name_of_fit("samples", channel, fit, bands.core)
-    forward.read_rows(build.scratch, name, pieces, (0, len(samples)), samples)
+    """Transform the levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
+    layout, level = build.prepared.layout, build.pieces.core
+    samples = _samples(build, channel, fit, level)
+    arrays = [samples.grid(grid) for grid in range(len(layout.grids))]
     if build.is_whole:
-        build.scratch.remove(name)
-    predictors, flat, planes = forward.core_transform(samples, bands, build.table(channel), bool(fit))
-    build.scratch.write(name_of_fit("coefficients", channel, fit, bands.core, CORE), flat)
-    build.scratch.write(name_of_fit("planes", channel, fit, bands.core, CORE), planes)
+        build.scratch.remove(name_of_fit("samples", channel, fit, level))
+    del samples
+    predictors = pyramid.forward(arrays, layout, bool(fit), level)
+    coefficients = forward.coefficients_of(arrays, build.table(channel), build.pieces.core_tiles)
+    _write_coefficients(build, (channel, fit, level, CORE), coefficients)
+    build.scratch.write(name_of_fit("largest", channel, fit, level, CORE), np.array(forward.largest_of(arrays)))
     build.scratch.write(name_of_fit("core-rules", channel, fit), predictors)
+
+
+def _samples(build: Build, channel: int, fit: int, level: int) -> forward.Samples:
+    name, pieces = name_of_fit("samples", channel, fit, level), build.pieces.samples(level)
+    return forward.Samples(build.scratch, name, pieces, build.prepared.layout, level)
+
+
+def _write_samples(
+    build: Build, place: tuple[int, int, int, int], arrays: Sequence[NDArray[np.int32]], piece: Sequence[Rows]
+) -> None:
+    """Write samples of a piece, and those columns of them that a predictor is fitted to.
+
+    ``place`` is channel, fit, level and number.
+    """
+    channel, fit, level, number = place
+    columns = forward.sampled_columns(arrays, build.prepared.layout, level, piece)
+    build.scratch.write(name_of_fit("samples", channel, fit, level, number), forward.joined(arrays))
+    build.scratch.write(name_of_fit("columns", channel, fit, level, number), forward.joined(columns))
+
+
+def _write_coefficients(build: Build, place: tuple[int, int, int, int], coefficients: forward.Coefficients) -> None:
+    """Write what the tiles of a piece hold; ``place`` is channel, fit, level and number."""
+    channel, fit, level, number = place
+    build.scratch.write(name_of_fit("coefficients", channel, fit, level, number), coefficients.flat)
+    build.scratch.write(name_of_fit("planes", channel, fit, level, number), coefficients.planes)
 
 
 def code(build: Build, channel: int, level: int, band: int) -> None:
@@ -137,11 +167,6 @@ def measure(build: Build, number: int) -> None:
     header = build.stored_header()
     figures, residual = measuring.measure(build, header, measured_runs(header, build.points)[number])
     write_measured(build, number, figures, residual.chunks, residual.kept, residual.exact)
-
-
-def _bands(build: Build) -> Bands:
-    assert isinstance(build.pieces, Bands)
-    return build.pieces
 
 
 def _units(build: Build, channel: int, level: int, band: int, stop: int | None = None) -> Units:

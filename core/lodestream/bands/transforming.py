@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +11,17 @@ from ..encoding.one_error import quantize
 from ..entropy.part_table import flat_span
 from ..entropy.tile_coder import planes_of
 from ..transform.predictors import COEFFICIENT_BITS, INTERFACES, default_predictors, fitted_steps
-from . import grid_tasks, grid_transform, tasks
+from . import tasks
 from .build import Build
 from .executing import Task
 from .forward import fit_columns, fit_rows
-from .grid_runs import GridRuns
 from .stored import CORE, PLAIN, name_of, name_of_fit, pieces_of, transformed
 
-__all__ = ["Transforming", "planes_of_channel", "transforming"]
+__all__ = ["Transforming", "planes_of_channel"]
 
 #: What the transform of a channel leaves.
 _TRANSFORMED = (
-    *("samples", "columns", "halves", "nodes", "details", "rows"),
+    *("samples", "columns", "halves", "rows"),
     *("coefficients", "planes", "largest", "rules", "core-rules"),
 )
 
@@ -37,7 +34,7 @@ def planes_of_channel(build: Build, kind: str, channel: int) -> NDArray[np.int8]
     return np.concatenate([build.scratch.read(name_of(kind, channel, level, k)) for level, k, _ in pieces_of(build)])
 
 
-class Transforming(ABC):
+class Transforming:
     """Transforms the channels of a build.
 
     Parameters
@@ -47,9 +44,6 @@ class Transforming(ABC):
     report : callable
         Gives, for a share of the time, what is told the fraction of it that is done.
     """
-
-    #: The module of the tasks, and the kinds of file in which they leave sampled rows; they write the last one last.
-    _tasks: ClassVar[tuple[Any, tuple[str, ...]]]
 
     def __init__(self, build: Build, carry_out: _CarryOut, report: Callable[[float], Callable[[float], None]]) -> None:
         self._build, self._carry_out, self._report = build, carry_out, report
@@ -121,32 +115,37 @@ class Transforming(ABC):
             every = enumerate(names(kind, level, count))
             return [Task(name, function, (channel, int(fit), *arguments, k)) for k, name in every]
 
-        work, rows = self._tasks
-        self._carry_out(0.0, self._before(channel))
-        self._carry_out(share / 4, phase("columns", finest, self._samples(finest), work.coordinates))
+        if self._build.prepared.interfaces:
+            self._carry_out(0.0, [Task(f"interfaces/{channel}", tasks.interfaces, (channel,))])
+        self._carry_out(share / 4, phase("columns", finest, len(pieces.samples(finest)), tasks.coordinates))
         for level in reversed(pieces.levels):
             count = len(pieces.of(level))
             part = share * 3 / 4 * self._layout.points(level) / (self._layout.points(finest) * 4 / 3)
-            sampled = names("columns", level, self._samples(level))
+            columns = names("columns", level, len(pieces.samples(level)))
             for rule in (0, INTERFACES):
-                self._fit(channel, level, rule, fit, sampled)
-            self._carry_out(part / 2, phase(rows[-1], level, count, work.first_step, level))
+                self._fit(channel, level, rule, fit, columns)
+            self._carry_out(part / 2, phase("rows", level, count, tasks.first_step, level))
             self._scratch.remove(name_of_fit("samples", channel, fit, level))
-            self._fit(channel, level, 1, fit, [name for kind in rows for name in names(kind, level, count)])
-            self._carry_out(part / 2, phase("columns", level - 1, count, work.second_step, level))
+            self._fit(channel, level, 1, fit, names("rows", level, count))
+            self._carry_out(part / 2, phase("columns", level - 1, count, tasks.second_step, level))
             # Not by the task: one whose worker dies when it has done this could not be done again.
             self._scratch.remove(name_of_fit("halves", channel, fit, level))
-        self._carry_out(0.0, [Task(done, work.core, (channel, int(fit)))])
+        self._carry_out(0.0, [Task(done, tasks.core, (channel, int(fit)))])
 
     def _fit(self, channel: int, level: int, rule: int, fit: bool, names: list[str]) -> None:
         """Fit a predictor to what the pieces of a level have sampled, or let it be the default one."""
         name = name_of_fit("rules", channel, fit, level, rule)
         if self._scratch.has(name):
             return
-        found = None
+        fitted = None
         if fit and (level - 1, rule) in fitted_steps(self._layout):
-            found = self._fitted([self._scratch.read(sampled) for sampled in names], level, rule)
-        self._scratch.write(name, np.array(found or (0, 0), np.int8))
+            lines = [self._scratch.read(sampled) for sampled in names]
+            pieces = self._build.pieces
+            if rule == 1:
+                fitted = fit_columns(lines, pieces.of(level), self._layout, level)
+            else:
+                fitted = fit_rows(lines, pieces.samples(level), self._layout, level, rule)
+        self._scratch.write(name, np.array(fitted or (0, 0), np.int8))
 
     def _predictors(self, channel: int) -> NDArray[np.int8]:
         predictors, pieces = default_predictors(self._layout), self._build.pieces
@@ -157,66 +156,7 @@ class Transforming(ABC):
                 predictors[level - 1, rule] = self._scratch.read(f"{rules}/{channel}/{level}/{rule}")
         return predictors
 
-    @abstractmethod
-    def _samples(self, level: int) -> int:
-        """How many pieces a level's samples have."""
-
-    def _before(self, channel: int) -> list[Task]:
-        """What comes before the transform of a channel."""
-        return []
-
-    @abstractmethod
-    def _fitted(self, sampled: list[NDArray[np.int32]], level: int, rule: int) -> tuple[int, int] | None:
-        """The (a, b) that fits what pieces have sampled."""
-
-    @abstractmethod
     def _fits(self, channel: int) -> bool:
-        """Whether a container holds the coefficients that fitted predictors leave."""
-
-
-class _OfBands(Transforming):
-    """By bands of rows of the one grid."""
-
-    _tasks = tasks, ("nodes", "details")
-
-    def _samples(self, level: int) -> int:
-        return len(tasks.sample_pieces(self._build, level))
-
-    def _fitted(self, sampled: list[NDArray[np.int32]], level: int, rule: int) -> tuple[int, int] | None:
-        return (fit_rows if rule == 0 else fit_columns)(sampled, self._layout, level)
-
-    def _fits(self, channel: int) -> bool:
-        return int(planes_of_channel(self._build, "planes", channel).max()) <= COEFFICIENT_BITS
-
-
-class _OfGrids(Transforming):
-    """By runs of grids."""
-
-    _tasks = grid_tasks, ("rows",)
-
-    @property
-    def _runs(self) -> GridRuns:
-        assert isinstance(self._build.pieces, GridRuns)
-        return self._build.pieces
-
-    def _before(self, channel: int) -> list[Task]:
-        return [Task(f"interfaces/{channel}", grid_tasks.interfaces, (channel,))]
-
-    def _samples(self, level: int) -> int:
-        return len(self._runs.samples(level))
-
-    def _fitted(self, sampled: list[NDArray[np.int32]], level: int, rule: int) -> tuple[int, int] | None:
-        pieces = [run.grids for run in self._runs.of(level)] if rule == 1 else self._runs.samples(level)
-        return grid_transform.fit(sampled, pieces, self._layout, level, rule)
-
-    def _fits(self, channel: int) -> bool:
+        """Return whether a container holds the coefficients that fitted predictors leave."""
         largest = (self._scratch.read(name_of("largest", channel, level, k)) for level, k, _ in pieces_of(self._build))
         return max(map(int, largest)) < 1 << COEFFICIENT_BITS
-
-
-def transforming(
-    build: Build, carry_out: _CarryOut, report: Callable[[float], Callable[[float], None]]
-) -> Transforming:
-    """What transforms the channels of a build."""
-    kind = _OfGrids if isinstance(build.pieces, GridRuns) else _OfBands
-    return kind(build, carry_out, report)

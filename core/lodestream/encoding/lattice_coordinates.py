@@ -24,8 +24,7 @@ from .prepared import Prepared
 __all__ = [
     "Lattices",
     "coordinates_of_interfaces",
-    "coordinates_of_patch",
-    "coordinates_of_strip",
+    "coordinates_of_rows",
     "exact_lattices",
     "fine_lattices",
     "lattice_coordinates",
@@ -138,16 +137,11 @@ def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> l
         New ones, see `pyramid.allocate`.
     """
     arrays = [allocate(grid.shape) for grid in prepared.layout.grids]
-    if prepared.arrangement is None:
-        _of_one_grid(prepared, channel, lattice, arrays[0])
-    else:
-        _of_patches(prepared, channel, lattice, arrays)
+    interfaces = coordinates_of_interfaces(prepared, channel, lattice)
+    for grid, array in enumerate(arrays):
+        for rows in strips(prepared) if prepared.arrangement is None else [(0, len(array))]:
+            coordinates_of_rows(prepared, channel, lattice, grid, rows, interfaces, array[slice(*rows)])
     return arrays
-
-
-def _of_one_grid(prepared: Prepared, channel: int, lattice: Lattice, array: NDArray[np.int32]) -> None:
-    for rows in strips(prepared):
-        coordinates_of_strip(prepared, channel, lattice, rows, array[slice(*rows)])
 
 
 def strips(prepared: Prepared) -> list[tuple[int, int]]:
@@ -164,18 +158,47 @@ def strips(prepared: Prepared) -> list[tuple[int, int]]:
     return list(pairwise([*starts, rows]))
 
 
-def coordinates_of_strip(
+def coordinates_of_rows(
+    prepared: Prepared,
+    channel: int,
+    lattice: Lattice,
+    grid: int,
+    rows: tuple[int, int],
+    interfaces: Sequence[NDArray[np.int32]],
+    out: NDArray[np.int32],
+    room: Room = IN_MEMORY,
+) -> None:
+    """Put coordinates of a channel in rows of a grid of the layout into ``out``, int32, shape (row, column).
+
+    Parameters
+    ----------
+    prepared, channel, lattice
+    grid : int
+    rows : (int, int)
+        Half-open: all of the grid, where there are several; of the only one a strip, see `strips`, or any rows where it
+        has no holes.
+    interfaces : sequence of int32 arrays, shape (point,)
+        See `coordinates_of_interfaces`.
+    out : int32, shape (row, column)
+    room : Room
+        Where what a strip with holes takes goes.
+    """
+    if grid < prepared.interfaces:
+        out[:, 0] = interfaces[grid]
+    elif prepared.arrangement is None:
+        _of_strip(prepared, channel, lattice, rows, out, room)
+    else:
+        _of_patch(prepared, channel, lattice, grid - prepared.interfaces, interfaces, out)
+
+
+def _of_strip(
     prepared: Prepared,
     channel: int,
     lattice: Lattice,
     rows: tuple[int, int],
     out: NDArray[np.int32],
-    room: Room = IN_MEMORY,
+    room: Room,
 ) -> None:
-    """Put coordinates of one of the `strips` into ``out``, int32, shape (row, column); or of any rows without holes.
-
-    What this takes for a strip with holes goes where there is ``room``.
-    """
     block, within = prepared.surface.blocks[0], slice(*rows)
     lattice.coordinates(prepared.channel(0, channel)[within], out=out)
     if block.mask is None:
@@ -190,14 +213,6 @@ def coordinates_of_strip(
     if rows != (0, layout.shape(0, layout.levels)[0]):
         layout = Layout.single(out.shape, (False, block.closed[1]), layout.tile)
     settle_holes(out, mask[within], layout, room)
-
-
-def _of_patches(prepared: Prepared, channel: int, lattice: Lattice, arrays: list[NDArray[np.int32]]) -> None:
-    interfaces = coordinates_of_interfaces(prepared, channel, lattice)
-    for array, points in zip(arrays, interfaces, strict=False):
-        array[:, 0] = points
-    for number, array in enumerate(arrays[len(interfaces) :]):
-        coordinates_of_patch(prepared, number, channel, lattice, interfaces, array)
 
 
 def coordinates_of_interfaces(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
@@ -224,18 +239,17 @@ def coordinates_of_interfaces(prepared: Prepared, channel: int, lattice: Lattice
     return found
 
 
-def coordinates_of_patch(
+def _of_patch(
     prepared: Prepared,
-    number: int,
     channel: int,
     lattice: Lattice,
+    number: int,
     interfaces: Sequence[NDArray[np.int32]],
     out: NDArray[np.int32],
 ) -> None:
-    """Put coordinates of a channel of a patch into ``out``, int32, shape (row, column).
+    """Put coordinates of a patch into ``out``, int32, shape (row, column).
 
-    Sides take their points from their interfaces, see `coordinates_of_interfaces`: under holes, and on coarser
-    lattices, these may differ.
+    Sides take their points from their interfaces: under holes, and on coarser lattices, these may differ.
     """
     patch = prepared.patches[number]
     out[...] = lattice.coordinates(stored(patch, prepared.channel(patch.block, channel)))

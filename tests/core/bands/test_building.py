@@ -17,7 +17,7 @@ from lodestream.bands.build import Build
 from lodestream.bands.building import Building
 from lodestream.bands.executing import Execution
 from lodestream.bands.front import encode
-from lodestream.bands.geometry import CORE_POINTS
+from lodestream.bands.pieces import CORE_POINTS
 from lodestream.decoding.decoder import decode
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.prepared import prepare

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands import grid_tasks, tasks
+from lodestream.bands import tasks
 from lodestream.bands.cluster import executor_of
 from tests.clusters import local_cluster
 
@@ -46,9 +46,7 @@ def _surface(kind: str) -> ls.Surface:
 
 def _die_in(name: str, dask_worker: Any) -> None:
     """On a worker: die in the first task of this name, when its files are written and nobody knows it."""
-    for module in (tasks, grid_tasks):
-        if (task := getattr(module, name, None)) is not None:
-            setattr(module, name, partial(_dying, task))
+    setattr(tasks, name, partial(_dying, getattr(tasks, name)))
 
 
 def _dying(task: Any, *arguments: Any) -> None:

@@ -1,107 +1,132 @@
-"""The transform by bands: what the transform of the whole makes."""
+"""The transform by pieces of any size leaves what the transform of the whole leaves."""
 
 from __future__ import annotations
 
-import tempfile
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from hypothesis import example, given
+import pytest
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from lodestream.bands.forward import (
-    core_transform,
-    first_step,
-    fit_columns,
-    fit_rows,
-    sampled_columns,
-    sampled_rows,
-    second_step,
-)
-from lodestream.bands.geometry import Bands
+from lodestream.bands.build import Build
+from lodestream.bands.executing import Task
+from lodestream.bands.pieces import Pieces
+from lodestream.bands.stored import read_tiles
+from lodestream.bands.transforming import Transforming, planes_of_channel
+from lodestream.encoding import prepared as preparing
+from lodestream.encoding.lattice_coordinates import exact_lattices, lattice_coordinates
+from lodestream.encoding.prepared import prepare
 from lodestream.entropy.part_table import flat_span
 from lodestream.entropy.tile_coder import planes_of
-from lodestream.entropy.tiles import TileTable, gather
+from lodestream.entropy.tiles import gather
 from lodestream.grid.layout import Layout
-from lodestream.scratch import FolderScratch
-from lodestream.transform.predictors import default_predictors
-from lodestream.transform.pyramid import copied, forward
+from lodestream.quality import Quality
+from lodestream.scratch import MemoryScratch
+from lodestream.surface import Surface
+from lodestream.transform.pyramid import forward
 
-lengths = st.integers(1, 70) | st.integers(1, 300)
+from .block_surfaces import KINDS, block_surface
 
-
-class _Found(NamedTuple):
-    predictors: NDArray[np.int8]
-    flat: NDArray[np.int32]
-    planes: NDArray[np.int8]
+lengths = st.integers(4, 70) | st.integers(4, 300)
+tiles = st.tuples(st.integers(1, 4), st.integers(1, 4))
 
 
-def _by_bands(samples: NDArray[np.int32], layout: Layout, bands: Bands, fit: bool, scratch: FolderScratch) -> _Found:
-    """The whole transform as a build does it, one task after another."""
-    table, predictors = TileTable.of(layout), default_predictors(layout)
-    found = _Found(predictors, np.zeros(table.size, np.int32), np.zeros(len(layout.tiles), np.int8))
-    columns = {}
-    for level in reversed(bands.levels):
-        pieces = bands.samples(level)
-        if level == layout.levels:
-            for number, (first, last) in enumerate(pieces):
-                scratch.write(f"{level}/{number}", samples[first:last])
-                columns[level, number] = sampled_columns(samples[first:last])
-        own = bands.of(level)
-        rule = fit_rows([columns[level, number] for number in range(len(pieces))], layout, level) if fit else None
-        predictors[level - 1, 0] = rule or (0, 0)
-        stepped = [first_step(scratch, str(level), pieces, layout, band, predictors) for band in own]
-        halves = [sampled_rows(rows, layout, band) for rows, band in zip(stepped, own, strict=True)]
-        rows = [nodes for nodes, _ in halves] + [details for _, details in halves]
-        rule = fit_columns(rows, layout, level) if fit else None
-        predictors[level - 1, 1] = rule or (0, 0)
-        for band, half in zip(own, stepped, strict=True):
-            nodes, flat, planes = second_step(half, layout, band, predictors, table)
-            found.flat[flat_span(table, band.tiles)] = flat
-            found.planes[band.tiles.start : band.tiles.stop] = planes
-            scratch.write(f"{level - 1}/{band.number}", nodes)
-            columns[level - 1, band.number] = sampled_columns(nodes)
-    if bands.core < layout.levels:
-        samples = np.concatenate([scratch.read(f"{bands.core}/{k}") for k in range(len(bands.samples(bands.core)))])
-    own_predictors, flat, planes = core_transform(copied(samples), bands, table, fit)
-    predictors[: bands.core] = own_predictors[: bands.core]
-    found.flat[flat_span(table, bands.core_tiles)] = flat
-    found.planes[bands.core_tiles.start : bands.core_tiles.stop] = planes
-    return found
+def _heights(shape: tuple[int, int], closed: tuple[bool, bool], random: np.random.Generator) -> Surface:
+    waves = np.add.outer(np.sin(np.arange(shape[0]) / 9), np.cos(np.arange(shape[1]) / 7)) * 4000
+    return Surface((waves + random.integers(-30, 30, shape)).astype(np.int32), closed)
+
+
+def _check(surface: Surface, tile: tuple[int, int], points: int, core_points: int) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preparing, "tile_exponents", lambda *_: tile)
+        patch.setattr(preparing, "square", lambda bits: tile)
+        prepared = prepare(surface, Quality())
+    build = Build(MemoryScratch(), prepared, exact_lattices(prepared), points, core_points)
+
+    def carry_out(share: float, phase: Sequence[Task]) -> None:
+        for task in phase:
+            task.function(build, *task.arguments)
+
+    def report(share: float) -> Callable[[float], None]:
+        return lambda fraction: None
+
+    Transforming(build, carry_out, report).carry_out(1.0)
+    for channel in range(build.channels):
+        whole = lattice_coordinates(prepared, channel, build.lattices.channels[channel])
+        predictors, table = forward(whole, prepared.layout), build.table(channel)
+        assert np.array_equal(build.scratch.read("predictors")[channel], predictors)
+        flat = gather(table, whole)
+        for level in range(prepared.layout.levels + 1):
+            level_tiles = prepared.layout.tiles_of(level)
+            stored = read_tiles(build, "coefficients", channel, level_tiles)
+            assert np.array_equal(stored, flat[flat_span(table, level_tiles)])
+        planes = [planes_of(table, flat, number) for number in range(len(prepared.layout.tiles))]
+        assert planes_of_channel(build, "planes", channel).tolist() == planes
 
 
 @given(
     st.tuples(lengths, lengths),
     st.tuples(st.booleans(), st.booleans()),
-    st.tuples(st.integers(1, 4), st.integers(1, 4)),
+    tiles,
     st.integers(1, 3000),
     st.integers(1, 400),
-    st.booleans(),
     st.integers(0, 2**32 - 1),
 )
-@example((300, 70), (True, False), (4, 4), 1000, 9, True, 0)
-@example((301, 70), (True, True), (3, 4), 1, 9, True, 0)
-@example((300, 70), (False, False), (3, 3), 1, 9, True, 0)
-def test_bands_make_the_coefficients_of_the_whole(
+@settings(max_examples=40, deadline=None)
+@example((300, 70), (True, False), (4, 4), 1000, 9, 0)
+@example((301, 70), (True, True), (3, 4), 1, 9, 0)
+@example((300, 70), (False, False), (3, 3), 1, 9, 0)
+def test_bands_of_the_only_grid(
+    shape: tuple[int, int], closed: tuple[bool, bool], tile: tuple[int, int], points: int, core: int, seed: int
+) -> None:
+    _check(_heights(shape, closed, np.random.default_rng(seed)), tile, points, core)
+
+
+@given(
+    st.sampled_from(KINDS),
+    st.tuples(st.integers(4, 90), st.integers(4, 90)),
+    st.integers(1, 3),
+    tiles,
+    st.integers(1, 3000),
+    st.integers(1, 400),
+    st.sampled_from(["", "holes"]),
+    st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=15, deadline=None)
+@example("plates", (90, 80), 2, (3, 3), 1, 9, "holes", 1)
+@example("moebius", (24, 90), 3, (3, 4), 1, 9, "", 6)
+def test_grids_of_several(
+    kind: str,
     shape: tuple[int, int],
-    closed: tuple[bool, bool],
+    count: int,
     tile: tuple[int, int],
     points: int,
     core: int,
-    fit: bool,
+    more: str,
     seed: int,
 ) -> None:
-    random = np.random.default_rng(seed)
-    waves = np.add.outer(np.sin(np.arange(shape[0]) / 9), np.cos(np.arange(shape[1]) / 7)) * 4000
-    samples = (waves + random.integers(-30, 30, shape)).astype(np.int32)
-    layout = Layout.single(shape, closed, tile)
-    table = TileTable.of(layout)
-    whole = copied(samples)
-    predictors = forward([whole], layout, fit)
-    flat = gather(table, [whole])
-    with tempfile.TemporaryDirectory() as folder:
-        found = _by_bands(samples, layout, Bands(layout, points, core), fit, FolderScratch(folder))
-    assert np.array_equal(found.predictors, predictors)
-    assert np.array_equal(found.flat, flat)
-    assert found.planes.tolist() == [planes_of(table, flat, number) for number in range(len(layout.tiles))]
+    surface = block_surface(kind, shape, count, "int32", more, np.random.default_rng(seed))
+    _check(surface, tile, points, core)
+
+
+@given(st.tuples(lengths, lengths), st.tuples(st.booleans(), st.booleans()), st.integers(1, 3), st.integers(1, 300))
+def test_pieces_cover_every_level(
+    shape: tuple[int, int], closed: tuple[bool, bool], exponent: int, points: int
+) -> None:
+    layout = Layout.single(shape, closed, (exponent, exponent))
+    pieces = Pieces(layout, points, core_points=9)
+    covered = list(pieces.core_tiles)
+    for level in pieces.levels:
+        rows, coarse = layout.shape(0, level)[0], layout.shape(0, level - 1)[0]
+        bands = pieces.of(level)
+        parts = [part for band in bands for part in band.parts]
+        assert [band.number for band in bands] == list(range(len(bands)))
+        assert [row for part in parts for row in range(*part.nodes)] == list(range(coarse))
+        assert [row for part in parts for row in range(*part.details)] == list(range(rows - coarse))
+        samples = [row for piece in pieces.samples(level) for some in piece for row in range(some.start, some.stop)]
+        assert samples == list(range(rows))
+        covered += [tile for band in bands for tile in band.tiles]
+    assert covered == list(range(len(layout.tiles)))
+    assert pieces.core == 0 or layout.points(pieces.core) <= 9
+    assert pieces.core == layout.levels or layout.points(pieces.core + 1) > 9

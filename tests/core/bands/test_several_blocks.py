@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import grid_tasks, inspecting, made, tasks, transforming
+from lodestream.bands import inspecting, made, tasks, transforming
 from lodestream.bands.front import encode
-from lodestream.bands.grid_runs import GridRuns
 from lodestream.bands.inspecting import inspect
 from lodestream.bands.measuring import measured_runs
 from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
+from lodestream.bands.pieces import Pieces
 from lodestream.container.reader import read_index
 from lodestream.decoding.inspection import Inspection
 from lodestream.decoding.pieces import PiecewiseDecoder
@@ -261,7 +261,7 @@ def test_many_small_blocks_go_together() -> None:
     header = index_of(ls.encode(surface)).header
     assert measured_runs(header, points) == [range(len(surface.blocks))]
     assert measured_runs(header, 1) == [range(k, k + 1) for k in range(len(surface.blocks))]
-    runs, together = (GridRuns(prepared.layout, size, 600) for size in (1, 2 * points))
+    runs, together = (Pieces(prepared.layout, size, 600) for size in (1, 2 * points))
     for level in runs.levels:
         assert [run.tiles.start for run in runs.of(level)[1:]] == [run.tiles.stop for run in runs.of(level)[:-1]]
         assert sum(len(run.tiles) for run in runs.of(level)) == len(prepared.layout.tiles_of(level))
@@ -272,7 +272,7 @@ def test_many_small_blocks_go_together() -> None:
 def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     surface = _plates()
     expected, calls = ls.encode(surface), [0]
-    step, measure = grid_tasks.second_step, tasks.measure
+    step, measure = tasks.second_step, tasks.measure
 
     def counted(*arguments: Any) -> None:
         calls[0] += 1
@@ -281,7 +281,7 @@ def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch:
     def cut(*arguments: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(grid_tasks, "second_step", counted)
+    monkeypatch.setattr(tasks, "second_step", counted)
     monkeypatch.setattr(tasks, "measure", cut)
     monkeypatch.setattr(made, "_FEWEST", 1)
     with pytest.raises(KeyboardInterrupt):

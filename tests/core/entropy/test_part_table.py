@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lodestream.bands.geometry import Bands
+from lodestream.bands.pieces import Pieces
 from lodestream.entropy.part_table import flat_span, part_of
 from lodestream.entropy.tile_coder import Channel, TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather
@@ -30,7 +29,7 @@ def test_bands_with_their_parents_are_coded_as_in_the_table_of_all(
     shape: tuple[int, int], ends: tuple[bool, bool], exponent: int, points: int, large: int, seed: int
 ) -> None:
     layout = Layout([*Layout.single(shape, ends, (exponent, exponent)).grids], (exponent, exponent))
-    table, bands = TileTable.of(layout), Bands(layout, points, core_points=9)
+    table, bands = TileTable.of(layout), Pieces(layout, points, core_points=9)
     own = np.random.default_rng(seed).integers(-40, 40, shape).astype(np.int32)
     flat = gather(table, [own])
     whole, strings = _coded(table, flat, large)
@@ -54,27 +53,3 @@ def test_bands_with_their_parents_are_coded_as_in_the_table_of_all(
             assert [again[part.local(tile)] for tile in band.tiles] == [strings[tile] for tile in band.tiles]
             early = coder.tiles[0].early[part.spans[-1][1]]
             assert np.array_equal(early, whole.tiles[0].early[flat_span(table, band.tiles)])
-
-
-@given(shapes, closed, st.integers(1, 3), st.integers(1, 300))
-def test_bands_cover_every_level(shape: tuple[int, int], ends: tuple[bool, bool], exponent: int, points: int) -> None:
-    layout = Layout.single(shape, ends, (exponent, exponent))
-    bands = Bands(layout, points, core_points=9)
-    tiles = list(bands.core_tiles)
-    for level in bands.levels:
-        rows = layout.shape(0, level)[0], layout.shape(0, level - 1)[0]
-        own = bands.of(level)
-        assert [band.number for band in own] == list(range(len(own)))
-        assert [row for band in own for row in range(*band.nodes)] == list(range(rows[1]))
-        assert [row for band in own for row in range(*band.details)] == list(range(rows[0] - rows[1]))
-        assert [row for piece in bands.samples(level) for row in range(*piece)] == list(range(rows[0]))
-        tiles += [tile for band in own for tile in band.tiles]
-    assert tiles == list(range(len(layout.tiles)))
-    assert bands.core == 0 or layout.points(bands.core) <= 9
-    assert bands.core == layout.levels or layout.points(bands.core + 1) > 9
-
-
-def test_bands_are_of_one_grid() -> None:
-    grid = Layout.single((5, 5), (False, False), (2, 2)).grids[0]
-    with pytest.raises(ValueError, match="one grid"):
-        Bands(Layout([grid, grid], (2, 2)), 100)
