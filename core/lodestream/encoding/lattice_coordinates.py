@@ -175,8 +175,8 @@ def coordinates_of_rows(
     prepared, channel, lattice
     grid : int
     rows : (int, int)
-        Half-open: all of the grid, where there are several; of the only one a strip, see `strips`, or any rows where it
-        has no holes.
+        Half-open: all of the grid, where it has interfaces for sides; of the only block a strip, see `strips`, or any
+        rows where it has no holes.
     interfaces : sequence of int32 arrays, shape (point,)
         See `coordinates_of_interfaces`.
     out : int32, shape (row, column)
@@ -188,7 +188,7 @@ def coordinates_of_rows(
     elif prepared.arrangement is None:
         _of_strip(prepared, channel, lattice, rows, out, room)
     else:
-        _of_patch(prepared, channel, lattice, grid - prepared.interfaces, interfaces, out)
+        _of_patch(prepared, channel, lattice, grid - prepared.interfaces, rows, interfaces, out)
 
 
 def _of_strip(
@@ -244,15 +244,16 @@ def _of_patch(
     channel: int,
     lattice: Lattice,
     number: int,
+    rows: tuple[int, int],
     interfaces: Sequence[NDArray[np.int32]],
     out: NDArray[np.int32],
 ) -> None:
-    """Put coordinates of a patch into ``out``, int32, shape (row, column).
+    """Put coordinates of rows of a patch into ``out``, int32, shape (row, column).
 
     Sides take their points from their interfaces: under holes, and on coarser lattices, these may differ.
     """
     patch = prepared.patches[number]
-    out[...] = lattice.coordinates(stored(patch, prepared.channel(patch.block, channel)))
+    out[...] = lattice.coordinates(stored(patch, prepared.channel(patch.block, channel))[slice(*rows)])
     if channel < prepared.geometric:
         for side, line in zip(patch.sides, lines(out), strict=True):
             if side is not None:
