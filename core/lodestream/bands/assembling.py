@@ -101,7 +101,7 @@ class _Piece:
         self._next = self._used = 0
 
     def data(self, tile: int, first: int, passes: int) -> bytes | memoryview:
-        """The bytes of passes of a tile of which ``first`` remain; small units are asked for in their order."""
+        """Return the bytes of passes of a tile of which ``first`` remain; small units are asked for in their order."""
         if tile < self._first:
             length = self._lengths[self._next]
             self._next += 1
@@ -121,7 +121,7 @@ def coded_layers(
     tops: Sequence[NDArray[np.int8]],
     large: int,
 ) -> Iterator[CodedLayer]:
-    """The segments that each layer adds.
+    """Yield the segments that each layer adds.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def returned_digest(surface: Surface, hole: int) -> str:
 
 
 def window_section_of(codes: Sequence[NDArray[np.uint8]], total: int) -> bytes | None:
-    """The payload that tells errors of windows; None where it is much beside ``total`` bytes.
+    """Return the payload that tells errors of windows; None where it is much beside ``total`` bytes.
 
     ``codes`` are uint8, shape (cell, 2), of each layer, see `layer_codes`.
     """

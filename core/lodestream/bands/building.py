@@ -69,7 +69,7 @@ class Building:
         self._done = 0.0
 
     def write(self, out: BinaryIO) -> int:
-        """Build the container and write it into a file; returns its bytes.
+        """Build the container and write it into a file; return its bytes.
 
         Raises
         ------
@@ -86,7 +86,7 @@ class Building:
         self._execution.carry_out(phase, self._report(share))
 
     def _report(self, share: float) -> Callable[[float], None]:
-        """What is told the fraction done of work that takes a share of the time."""
+        """Return what is told the fraction done of work that takes a share of the time."""
         start = self._done
         self._done = start + share
         return lambda fraction: self._progress(start + share * fraction)
@@ -97,8 +97,8 @@ class Building:
         Transforming(self._build, self._carry_out, self._report).carry_out(_SHARES[0])
         for channel, lattice in enumerate(self._build.lattices.channels):
             if not self._scratch.has(f"weights/{channel}"):
-                own, table = self._read("predictors")[channel], self._build.table(channel)
-                weights = band_weights(self._build.prepared, channel, lattice, table, own)
+                predictors, table = self._read("predictors")[channel], self._build.table(channel)
+                weights = band_weights(self._build.prepared, channel, lattice, table, predictors)
                 self._scratch.write(f"weights/{channel}", weights)
 
     # Coding.
@@ -115,7 +115,7 @@ class Building:
         self._carry_out(_SHARES[1], [Task(name_of("ends", *unit), tasks.code, unit) for unit in units])
 
     def _large_level(self) -> int:
-        """The coarsest level whose units should be large; 0: none should."""
+        """Return the coarsest level whose units should be large; 0: none should."""
         level, tried = candidate(self._layout)
         if not level or all(self._build.quantiser_of(channel) for channel in range(self._build.channels)):
             return 0
@@ -137,16 +137,16 @@ class Building:
         return int(self._read("large"))
 
     def _curves(self) -> Curves:
-        """Of all units, in the order in which they are coded in one piece: by level, tile and channel."""
-        found = [self._curves_of(*piece) for piece in self._pieces]
-        return Curves(*(np.concatenate(own) for own in zip(*found, strict=True)))
+        """Return the curves of all units in the order in which one piece codes them: by level, tile and channel."""
+        arrays = [self._curves_of(*piece) for piece in self._pieces]
+        return Curves(*(np.concatenate(parts) for parts in zip(*arrays, strict=True)))
 
     def _curves_of(self, level: int, number: int, tiles: range) -> tuple[NDArray[Any], ...]:
-        """The arrays of `Curves` for a piece."""
+        """Return the arrays of `Curves` for a piece."""
         channels = self._build.channels
-        own = np.array([tops[tiles.start : tiles.stop] for tops in self._tops], np.int64)
-        counts = np.maximum(2 * own - 1, 0)
-        passes = [np.repeat(np.arange(len(tiles)), each) for each in counts]
+        planes = np.array([tops[tiles.start : tiles.stop] for tops in self._tops], np.int64)
+        counts = np.maximum(2 * planes - 1, 0)
+        passes = [np.repeat(np.arange(len(tiles)), count) for count in counts]
         order = np.argsort(np.concatenate(passes), kind="stable")  # from one channel after the other to tile by tile
         bits, gains = (
             np.concatenate([self._read(name_of(kind, channel, level, number)) for channel in range(channels)])[order]
@@ -190,7 +190,7 @@ class Building:
         return len(measured_runs(self._build.stored_header(), self._build.points))
 
     def _chunk(self) -> tuple[int, int]:
-        """See `chunk_size`."""
+        """Choose the size of chunks, see `chunk_size`."""
         prepared, header = self._build.prepared, self._header
         if len(prepared.chunks) == 1:
             return prepared.chunks[0]
@@ -200,7 +200,7 @@ class Building:
         return chunk_size(prepared, header, [values], float(self._read("coefficient-bytes")))
 
     def _measured(self) -> tuple[list[MeasuredLayer], list[Errors], list[bool]]:
-        """The layers that are kept, the errors of all levels, and of each channel whether it is exact."""
+        """Return the layers that are kept, the errors of all levels, and of each channel whether it is exact."""
         prepared, count = self._build.prepared, self._runs
         figures = [
             Figures(self._read(f"squares/{k}"), self._read(f"equal/{k}"), self._read(f"counts/{k}"))

@@ -52,7 +52,7 @@ class CodedBand:
 
 
 def parents_of(table: TileTable, tiles: range) -> range:
-    """The parents of neighbouring tiles of one level, which are neighbours too; none of level 0 and 1."""
+    """Return the parents of neighbouring tiles of one level, which are neighbours too; none of level 0 and 1."""
     parents = table.layout.tile_arrays.parents(np.arange(tiles.start, tiles.stop))
     return range(int(parents.min()), int(parents.max()) + 1) if parents.min() >= 0 else range(0)
 
@@ -154,7 +154,7 @@ def unit_curve(
 
 
 def code_segments(units: Units, states: Sequence[NDArray[np.int8]]) -> list[bytes]:
-    """The segments of small units, by layer, then by tile.
+    """Return the segments of small units, by layer, then by tile.
 
     Parameters
     ----------
@@ -176,15 +176,15 @@ def code_segments(units: Units, states: Sequence[NDArray[np.int8]]) -> list[byte
 def sizes_of_unit(
     table: TileTable, tile: int, true: NDArray[np.int32], above: NDArray[np.int32], top: int, large: int
 ) -> tuple[int, int]:
-    """Bytes of one unit as a large one and as a small one.
+    """Return bytes of one unit as a large one and as a small one.
 
     Parameters are those of `Units`, of the one tile: coefficients of shape (number,), as they stand in the flat array.
     """
     sizes = []
     for level in (large, 0):
-        own = range(tile, tile + 1)
+        unit = range(tile, tile + 1)
         tops = np.array([top], np.int8)
-        units = Units(table, own, true, above, np.zeros(int(table.first[-1])), tops, level)
+        units = Units(table, unit, true, above, np.zeros(int(table.first[-1])), tops, level)
         parent = 0 if units.first else -1
         sizes.append(unit_size(units.coder, units.first, parent, 0, units.channel))
     return sizes[0], sizes[1]

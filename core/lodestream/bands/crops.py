@@ -35,24 +35,24 @@ class RowsCrop(NamedTuple):
 
 
 def crop_rows(step: AxisStep, nodes: tuple[int, int], details: tuple[int, int]) -> RowsCrop:
-    """What gives nodes and details of a step, from the first to before the last of each; nodes at least.
+    """Return what gives nodes and details of a step, from the first to before the last of each; nodes at least.
 
     Details are counted from the first one. Those that are asked for lie beside the nodes: detail k after node k.
     """
     if not step.midpoints:
         count = nodes[1] - nodes[0]
-        made = AxisStep(count, count, 0, count, False, False, False)
-        return RowsCrop((nodes,), made, slice(0, count), slice(count, count))
+        cropped = AxisStep(count, count, 0, count, False, False, False)
+        return RowsCrop((nodes,), cropped, slice(0, count), slice(count, count))
     first = min(nodes[0], details[0], step.run - 1) - _SUPPORT
     last = max(nodes[1] - 1, details[1]) + _SUPPORT
     if step.wraps:
         if last - first + 1 >= step.run:
             return _whole(step, nodes, details)
         run = last - first + 1
-        made = AxisStep(2 * run - 1, run, run - 1, run, False, False, False)
+        cropped = AxisStep(2 * run - 1, run, run - 1, run, False, False, False)
         start, stop = (2 * first) % step.length, (2 * last + 1) % step.length
         wrapped = ((start, step.length), (0, stop)) if stop <= start else ((start, stop),)
-        return _placed(tuple(span for span in wrapped if span[0] < span[1]), made, first, nodes, details)
+        return _placed(tuple(span for span in wrapped if span[0] < span[1]), cropped, first, nodes, details)
     first, last = max(first, 0), min(last, step.run - 1)
     first = max(min(first, last + 1 - _LEAST_NODES), 0)
     last = min(max(last, first + _LEAST_NODES - 1), step.run - 1)
@@ -60,8 +60,8 @@ def crop_rows(step: AxisStep, nodes: tuple[int, int], details: tuple[int, int]) 
     tail = int(step.tail and last == step.run - 1)
     run = last - first + 1
     ends = step.left and first == 0, step.right and last == step.run - 1
-    made = AxisStep(2 * run - 1 + tail, run + tail, run - 1, run, False, *ends)
-    return _placed(((2 * first, 2 * last + 1 + tail),), made, first, nodes, details)
+    cropped = AxisStep(2 * run - 1 + tail, run + tail, run - 1, run, False, *ends)
+    return _placed(((2 * first, 2 * last + 1 + tail),), cropped, first, nodes, details)
 
 
 def _whole(step: AxisStep, nodes: tuple[int, int], details: tuple[int, int]) -> RowsCrop:
@@ -69,8 +69,14 @@ def _whole(step: AxisStep, nodes: tuple[int, int], details: tuple[int, int]) -> 
 
 
 def _placed(
-    samples: tuple[tuple[int, int], ...], made: AxisStep, first: int, nodes: tuple[int, int], details: tuple[int, int]
+    samples: tuple[tuple[int, int], ...],
+    cropped: AxisStep,
+    first: int,
+    nodes: tuple[int, int],
+    details: tuple[int, int],
 ) -> RowsCrop:
-    own = slice(nodes[0] - first, nodes[1] - first)
-    after = slice(made.coarse + details[0] - first, made.coarse + details[1] - first)
-    return RowsCrop(samples, made, own, after if details[1] > details[0] else slice(made.length, made.length))
+    wanted = slice(nodes[0] - first, nodes[1] - first)
+    after = slice(cropped.coarse + details[0] - first, cropped.coarse + details[1] - first)
+    return RowsCrop(
+        samples, cropped, wanted, after if details[1] > details[0] else slice(cropped.length, cropped.length)
+    )

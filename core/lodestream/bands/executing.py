@@ -67,8 +67,8 @@ class Execution:
             threads and processes of this machine. A task that a Dask worker has begun may end later, as may one of a
             worker that was given up: no task may write other values into a file that another task has written.
         """
-        found = self._build.scratch.those_of(task.done for task in tasks)
-        left = [task for task in tasks if task.done not in found]
+        names = self._build.scratch.those_of(task.done for task in tasks)
+        left = [task for task in tasks if task.done not in names]
         done = len(tasks) - len(left)
         if self._executor is not None:
             folder = self._build.folder
@@ -78,8 +78,10 @@ class Execution:
                 task.function(self._build, *task.arguments)
                 progress(number / len(tasks))
         else:
-            with ThreadPoolExecutor(self._threads, "lodestream-bands") as own:
-                self._wait(lambda task: partial(task.function, self._build, *task.arguments), own, left, done, progress)
+            with ThreadPoolExecutor(self._threads, "lodestream-bands") as pool:
+                self._wait(
+                    lambda task: partial(task.function, self._build, *task.arguments), pool, left, done, progress
+                )
 
     @staticmethod
     def _wait(

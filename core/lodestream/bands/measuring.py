@@ -40,7 +40,7 @@ RUNS_TOGETHER = 2
 
 
 def measured_runs(header: Header, points: int) -> list[range]:
-    """What is measured together: rows of the only grid, or blocks, in runs.
+    """Return what is measured together: rows of the only grid, or blocks, in runs.
 
     ``points`` are those of a piece of the transform, which takes about as much memory.
     """
@@ -66,7 +66,7 @@ class ValuesOfRows:
     top: int
 
     def window(self, window: ChunkPlace) -> NDArray[Any]:
-        """One channel at the place of a chunk, shape (row, column), a view."""
+        """Return one channel at the place of a chunk, shape (row, column), a view."""
         return self.values.window(window, self.top)
 
 
@@ -100,7 +100,7 @@ def measure(build: Build, header: Header, run: range) -> tuple[Figures, Residual
 
 
 def _region(build: Build, header: Header, run: range) -> Region:
-    """What is made of a surface for a run, see `measured_runs`."""
+    """Return what is made of a surface for a run, see `measured_runs`."""
     layout = header.layout
     if header.arrangement is not None:
         return region_of_blocks(header, layout.levels, run)
@@ -112,13 +112,13 @@ def _region(build: Build, header: Header, run: range) -> Region:
 
 
 def exact_errors(build: Build, header: Header, state: NDArray[np.int8]) -> Measured:
-    """Errors of the surface in a state, int8, shape (tile, channel), also where float64 does not hold the squares."""
+    """Measure the surface in a state, int8, shape (tile, channel), also where float64 does not hold the squares."""
     region = Region.whole(header.layout, header.levels)
     return Measurer(header, region, _tiles(build, region), build.prepared.comparisons(region)).exact_errors(state)
 
 
 def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values]:
-    """Rows of the only block, or some blocks, as they are after the last layer.
+    """Return rows of the only block, or some blocks, as they are after the last layer.
 
     Of a build in one piece it is the surface, and kept: the size of chunks is chosen by them before they are coded.
     """
@@ -132,7 +132,7 @@ def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values
 
 
 def _tiles(build: Build, region: Region) -> list[Tiles]:
-    """All that a reader knows in the end of each channel of a region."""
+    """Return all that a reader knows in the end of each channel of a region."""
     prepared = build.prepared
     parts: dict[bool, Part] = {}
     tiles = []

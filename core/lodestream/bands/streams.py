@@ -39,21 +39,21 @@ def encoded(surface: Surface, quality: Quality, progress: _Progress) -> bytes:
     progress : callable
         Is told the fraction done, 0 to 1.
     """
-    told = rising(progress)
-    container = None if quality.rms is None else _for_one_error(surface, quality, told)
+    report = rising(progress)
+    container = None if quality.rms is None else _for_one_error(surface, quality, report)
     if container is None:
         prepared = prepare(surface, replace(quality, rms=None))
         container = shortest(
-            surface, prepared, lambda bits: _stream(prepared, exact_lattices(prepared, bits), told), len
+            surface, prepared, lambda bits: _stream(prepared, exact_lattices(prepared, bits), report), len
         )
-    told(1.0)
+    report(1.0)
     return container
 
 
 def shortest(
     surface: Surface, prepared: Prepared, stream: Callable[[int | None], _Stream], size: Callable[[_Stream], int]
 ) -> _Stream:
-    """The shortest of the streams of many layers, up to a precision or bit for bit.
+    """Return the shortest of the streams of many layers, up to a precision or bit for bit.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def shortest(
 
 
 def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> bytes | None:
-    """The stream for one root mean square error; None where exact values are the way to meet it."""
+    """Return the stream for one root mean square error; None where exact values are the way to meet it."""
     prepared = prepare(surface, quality)
     lattices = fine_lattices(prepared)
     if lattices is None:
@@ -92,7 +92,7 @@ def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> b
 
 
 def _stream(prepared: Prepared, lattices: Lattices, progress: _Progress) -> bytes:
-    """One stream, in one piece: its tasks are carried out one after another, each by all threads."""
+    """Return one stream, in one piece: its tasks are carried out one after another, each by all threads."""
     build = Build(MemoryScratch(), prepared, lattices, _ONE_PIECE, _ONE_PIECE)
     out = io.BytesIO()
     Building(build, Execution(build), progress).write(out)
@@ -100,7 +100,7 @@ def _stream(prepared: Prepared, lattices: Lattices, progress: _Progress) -> byte
 
 
 def _longest(raw: int) -> int:
-    """Most bytes that a container takes which restores so many bytes of values, unless nothing else is shorter.
+    """Return most bytes that a container takes which restores so many bytes of values, unless nothing else is shorter.
 
     >>> _longest(100_000)
     102024

@@ -142,13 +142,13 @@ def code(build: Build, channel: int, level: int, band: int) -> None:
     if build.is_whole:
         # The units have their own, and nobody else needs them.
         build.scratch.remove(name_of(transformed(build, "coefficients", channel), channel, level, band))
-    found = code_units(units)
+    coded = code_units(units)
     if build.is_whole:
         keep_known(build, channel, units)
     else:
-        build.scratch.write(name_of("early", channel, level, band), found.early)
+        build.scratch.write(name_of("early", channel, level, band), coded.early)
     for kind in ("bits", "gains", "strings", "ends"):
-        build.scratch.write(name_of(kind, channel, level, band), getattr(found, kind))
+        build.scratch.write(name_of(kind, channel, level, band), getattr(coded, kind))
 
 
 def segments(build: Build, channel: int, level: int, band: int) -> None:
@@ -156,9 +156,9 @@ def segments(build: Build, channel: int, level: int, band: int) -> None:
     units = _units(build, channel, level, band, build.first_large(channel, int(build.scratch.read("large"))))
     states = build.scratch.read("kept-states")[:, units.tiles.start : units.tiles.stop, channel]
     start = np.maximum(2 * units.tops - 1, 0).astype(np.int8)
-    own = code_segments(units, [start, *states])
-    lengths = np.array([len(data) for data in own], np.int64)
-    build.scratch.write(name_of("segments", channel, level, band), np.frombuffer(b"".join(own), np.uint8))
+    coded = code_segments(units, [start, *states])
+    lengths = np.array([len(data) for data in coded], np.int64)
+    build.scratch.write(name_of("segments", channel, level, band), np.frombuffer(b"".join(coded), np.uint8))
     build.scratch.write(name_of("lengths", channel, level, band), lengths)
 
 
@@ -170,7 +170,7 @@ def measure(build: Build, number: int) -> None:
 
 
 def _units(build: Build, channel: int, level: int, band: int, stop: int | None = None) -> Units:
-    """The units of a piece, or those of them before the tile ``stop``, ready to be coded."""
+    """Return the units of a piece, or those of them before the tile ``stop``, ready to be coded."""
     pieces, table = build.pieces, build.table(channel)
     tiles = pieces.core_tiles if level == pieces.core else pieces.of(level)[band].tiles
     tiles = tiles[: None if stop is None else max(stop - tiles.start, 0)]

@@ -30,7 +30,7 @@ _CarryOut = Callable[[float, Sequence[Task]], None]
 
 
 def planes_of_channel(build: Build, kind: str, channel: int) -> NDArray[np.int8]:
-    """Bit-planes of all tiles of a channel, int8, shape (tile,); ``kind`` as of `transformed`."""
+    """Return bit-planes of all tiles of a channel, int8, shape (tile,); ``kind`` as of `transformed`."""
     return np.concatenate([build.scratch.read(name_of(kind, channel, level, k)) for level, k, _ in pieces_of(build)])
 
 
@@ -74,15 +74,15 @@ class Transforming:
         """
         build, core = self._build, self._build.pieces.core
         assert build.is_whole
-        found = quantize(build.prepared, build.lattices, build.table(0), self._report(share))
-        build.quantiser = found.quantiser
-        for channel, indices in enumerate(found.indices):
+        result = quantize(build.prepared, build.lattices, build.table(0), self._report(share))
+        build.quantiser = result.quantiser
+        for channel, indices in enumerate(result.indices):
             table, tiles = build.table(channel), build.pieces.core_tiles
             planes = np.array([planes_of(table, indices, tile) for tile in tiles], np.int8)
             self._scratch.write(name_of_fit("coefficients", channel, 1, core, CORE), indices[flat_span(table, tiles)])
             self._scratch.write(name_of_fit("planes", channel, 1, core, CORE), planes)
-            self._scratch.write(name_of_fit("core-rules", channel, 1), found.predictors[channel])
-            self._scratch.write(f"weights/{channel}", found.weights[channel])
+            self._scratch.write(name_of_fit("core-rules", channel, 1), result.predictors[channel])
+            self._scratch.write(f"weights/{channel}", result.weights[channel])
 
     def _is_plain(self, channel: int, share: float) -> bool:
         """Transform a channel; whether it has the default predictors."""
@@ -112,8 +112,8 @@ class Transforming:
             return [name_of_fit(kind, channel, fit, level, k) for k in range(count)]
 
         def phase(kind: str, level: int, count: int, function: Callable[..., None], *arguments: int) -> list[Task]:
-            every = enumerate(names(kind, level, count))
-            return [Task(name, function, (channel, int(fit), *arguments, k)) for k, name in every]
+            numbered = enumerate(names(kind, level, count))
+            return [Task(name, function, (channel, int(fit), *arguments, k)) for k, name in numbered]
 
         if self._build.prepared.interfaces:
             self._carry_out(0.0, [Task(f"interfaces/{channel}", tasks.interfaces, (channel,))])

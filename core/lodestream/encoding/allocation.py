@@ -40,7 +40,7 @@ _BYTES_FOR_A_LAYER = 12000
 
 
 def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = False) -> list[NDArray[np.int8]]:
-    """The state after each layer.
+    """Return the state after each layer.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = Fal
 
 
 def _worth(curves: Curves) -> Worth:
-    """See `_SHARE_OF_STREAM`."""
+    """Return what a run is worth, see `_SHARE_OF_STREAM`."""
     falling = -curves.slopes()
     order = np.argsort(falling, kind="stable")
     return Worth(falling[order], np.cumsum(curves.bits[order]), _SHARE_OF_STREAM, _SEGMENT)
@@ -90,8 +90,9 @@ def _worth(curves: Curves) -> Worth:
 def _layer_ends(
     sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: bool, most: int
 ) -> list[int]:
-    """How many passes are known after each of at most so many layers, from bytes and gains that the passes add up to.
+    """Return how many passes are known after each of at most so many layers.
 
+    They follow from bytes and gains that the passes add up to.
     Where there would be more layers, neighbours are merged, evenly over the stream, so that it still begins small.
 
     Found from the end to the start, each within a range of bytes that the next one allows. It is the place after the
@@ -123,7 +124,7 @@ def _layer_ends(
 
 
 def _range_before(size: float, total: float, few: bool) -> tuple[float, float]:
-    """Bytes, at least and at most, after the layer before one that ends at ``size``."""
+    """Return bytes, at least and at most, after the layer before one that ends at ``size``."""
     if few:
         second = _SECOND * _FIRST_LAYER
         count = min(max(int(total / _BYTES_FOR_A_LAYER), _FEWEST), _MOST)

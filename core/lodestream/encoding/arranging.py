@@ -18,12 +18,12 @@ __all__ = ["arranged", "lines", "may_share", "unshared"]
 
 
 def lines(array: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """First row, last row, first column, last column of an array, shape (row, column, ...); views."""
+    """Return first row, last row, first column, last column of an array, shape (row, column, ...); views."""
     return array[0], array[-1], array[:, 0], array[:, -1]
 
 
 def may_share(block: Block, points: NDArray[Any]) -> bool:
-    """Whether one block might share a side with itself, or have a pole: whether any points of its outline agree.
+    """Return whether one block might share a side with itself, or have a pole: whether any points of its outline agree.
 
     Parameters
     ----------
@@ -40,14 +40,14 @@ def may_share(block: Block, points: NDArray[Any]) -> bool:
 
 
 def unshared(blocks: Sequence[Block]) -> Arrangement:
-    """Of blocks that share no sides."""
+    """Return the arrangement of blocks that share no sides."""
     return Arrangement(tuple(whole_patch(k, block.shape, block.closed) for k, block in enumerate(blocks)), ())
 
 
 def arranged(
     blocks: Sequence[Block], points: Sequence[NDArray[Any]], lattices: Sequence[Lattice], room: Room = IN_MEMORY
 ) -> Arrangement | None:
-    """The patches and interfaces of blocks; None of one block that is one patch without interfaces.
+    """Return the patches and interfaces of blocks; None of one block that is one patch without interfaces.
 
     Parameters
     ----------
@@ -67,9 +67,9 @@ def arranged(
             if block.mask is not None:
                 coordinates[rows][~block.mask[rows]] = 0  # whatever stands under holes agrees
         sources.append(LatticeBlock(coordinates, block.closed, block.mask))
-    found = arrange(sources, len(lattices))
-    patches, interfaces = [], list(found.interfaces)
-    for patch in found.patches:
+    arrangement = arrange(sources, len(lattices))
+    patches, interfaces = [], list(arrangement.interfaces)
+    for patch in arrangement.patches:
         sides = list(patch.sides)
         for place in _poles(patch, sources[patch.block]):
             sides[place] = Side(len(interfaces), False)
@@ -85,7 +85,7 @@ def arranged(
 
 
 def _poles(patch: Patch, source: LatticeBlock) -> list[int]:
-    """Which of a patch's four sides are one point, and shared with no other patch."""
+    """Return which of a patch's four sides are one point, and shared with no other patch."""
     window = stored(patch, source.coordinates)
     valid = lines(np.ones(patch.shape, np.bool_) if source.mask is None else stored(patch, source.mask))
     poles = []

@@ -17,7 +17,7 @@ __all__ = ["band_weights"]
 def band_weights(
     prepared: Prepared, channel: int, lattice: Lattice, table: TileTable, predictors: NDArray[np.int8]
 ) -> NDArray[np.float64]:
-    """What a coefficient of one is worth in each band: float64, shape (band,).
+    """Return what a coefficient of one is worth in each band: float64, shape (band,).
 
     Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an attribute
     shares the stream in proportion to its own range.

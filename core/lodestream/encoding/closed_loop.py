@@ -53,10 +53,10 @@ class ClosedLoop:
     def indices(
         self, steps: NDArray[np.int64], rules: NDArray[np.float32], reconstructions: Sequence[NDArray[np.int32]]
     ) -> NDArray[np.int32]:
-        """The index of every coefficient, flat; and what the reader will have of the grids, into ``reconstructions``.
+        """Return the index of every coefficient, and put what the reader will have into ``reconstructions``.
 
-        The result has the shape (`TileTable.size`,), ``reconstructions`` (row, column) each. For ``steps`` and
-        ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
+        The result has the shape (`TileTable.size`,), ``reconstructions`` of the grids (row, column) each. For ``steps``
+        and ``rules`` of the bands see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
         table, predictors = self._table, self._predictors
         for reconstruction in reconstructions:
@@ -73,22 +73,26 @@ class ClosedLoop:
             details = {
                 number: _Details(table.layout, predictors, number, level, reconstructions[number]) for number in of_grid
             }
-            both = {number: table.bands[own, KIND] == _BOTH for number, own in of_grid.items()}
-            coder.code({k: own[~both[k]] for k, own in of_grid.items()}, {k: d.along_one() for k, d in details.items()})
-            coder.code({k: own[both[k]] for k, own in of_grid.items()}, {k: d.along_both() for k, d in details.items()})
+            both = {number: table.bands[numbers, KIND] == _BOTH for number, numbers in of_grid.items()}
+            coder.code(
+                {k: numbers[~both[k]] for k, numbers in of_grid.items()}, {k: d.along_one() for k, d in details.items()}
+            )
+            coder.code(
+                {k: numbers[both[k]] for k, numbers in of_grid.items()}, {k: d.along_both() for k, d in details.items()}
+            )
             for number in of_grid:
                 inverse_level(reconstructions[number], table.layout, predictors, number, level)
         return self._chooser.end()
 
 
 def _bands(table: TileTable) -> Iterator[tuple[int, dict[int, NDArray[np.int64]]]]:
-    """Level by level, interfaces before patches that take their sides from them: the numbers of each grid's bands."""
+    """Yield the numbers of each grid's bands level by level, interfaces before patches that take sides from them."""
     layout = table.layout
     levels = layout.tile_levels[table.origins[:, 0]]
-    every = list(range(len(layout.grids)))
+    grids = list(range(len(layout.grids)))
     interfaces = sum(grid.interface for grid in layout.grids)
     for level in range(layout.levels + 1):
-        groups = [every] if level == 0 else [every[:interfaces], every[interfaces:]]
+        groups = [grids] if level == 0 else [grids[:interfaces], grids[interfaces:]]
         for group in groups:
             yield level, {k: table.of_grid[k][levels[table.of_grid[k]] == level] for k in group}
 
@@ -105,14 +109,14 @@ class _Details:
         self._predicted = allocate((rows, columns))
 
     def along_one(self) -> NDArray[np.int32]:
-        """Those along one axis, from the nodes; int32, shape (row, column) of the level."""
+        """Return those along one axis, from the nodes; int32, shape (row, column) of the level."""
         nodes = self._reconstructed[: self._top, : self._left]
         self._predicted[: self._top, self._left :] = self._third_step(nodes, 1)
         self._predicted[self._top :, : self._left] = self._third_step(nodes, 0)
         return self._predicted
 
     def along_both(self) -> NDArray[np.int32]:
-        """Those along both, once those along one axis are known, too."""
+        """Return those along both, once those along one axis are known, too."""
         details = self._predicted[: self._top, self._left :] + self._reconstructed[: self._top, self._left :]
         both = self._predicted[self._top :, self._left :]
         both[...] = self._third_step(details, 0)
@@ -149,11 +153,11 @@ class _Coder:
                 target[...] = self._aims[grid][window]
                 if predicted:
                     target -= predicted[grid][window]
-        every = np.concatenate([np.zeros(0, np.int64), *of_grid.values()])
-        if not every.size:
+        together = np.concatenate([np.zeros(0, np.int64), *of_grid.values()])
+        if not together.size:
             return
-        self._chooser.choose(every, self._targets)
-        for number in every.tolist():
+        self._chooser.choose(together, self._targets)
+        for number in together.tolist():
             chosen = self._own(self._chooser.chosen, number)
             np.abs(chosen, out=self._own(self._sizes, number))
             np.sign(chosen, out=self._own(self._signs, number), casting="same_kind")
@@ -162,12 +166,12 @@ class _Coder:
             spread_bands(*known, numbers, self._complete, self._complete.size, self._reconstructed_grids[grid], (0, 0))
 
     def _own(self, flat: NDArray[Any], number: int) -> NDArray[Any]:
-        """A band in a flat array, shape (row, column), a view."""
+        """Return a band in a flat array, shape (row, column), a view."""
         place, stride, rows, columns = self._table.bands[number, [OFFSET, STRIDE, ROWS, COLUMNS]].tolist()
         return flat[place : place + rows * stride].reshape(rows, stride)[:, :columns]
 
     def _window(self, number: int) -> tuple[slice, slice]:
-        """Where a band lies among the coefficients of its grid."""
+        """Return where a band lies among the coefficients of its grid."""
         _, top, left = self._table.origins[number].tolist()
         rows, columns = self._table.bands[number, [ROWS, COLUMNS]].tolist()
         return slice(top, top + rows), slice(left, left + columns)
@@ -181,7 +185,9 @@ def choose_indices(
     wanted: float,
     fineness: int,
 ) -> tuple[Quantiser, list[NDArray[np.int32]]] | None:
-    """The longest quantization steps whose error is at most the one wanted, and the indices then; None: there are none.
+    """Return the longest quantization steps whose error is at most the one wanted, and the indices then.
+
+    None if there are none.
 
     Parameters
     ----------
@@ -199,14 +205,14 @@ def choose_indices(
 
     def error(base: int) -> float:
         steps, rules = table.steps(Quantiser(base)), feedback_rules(table, Quantiser(base))
-        found = []
+        indices = []
         for number, loop in enumerate(loops):
-            found.append(loop.indices(steps, rules, [canvas[number, :, :-PADDING] for canvas in canvases]))
+            indices.append(loop.indices(steps, rules, [canvas[number, :, :-PADDING] for canvas in canvases]))
         done.append(base)
         rms = error_of(len(done) / MOST_TRIES)
         if rms <= wanted:
             kept.clear()
-            kept[base] = found
+            kept[base] = indices
         return rms
 
     base = longest_base(error, wanted, _LIKELY_STEP * fineness)

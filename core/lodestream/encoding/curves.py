@@ -78,7 +78,7 @@ class Curves:
         return float(self.bits.sum()) / 8
 
     def slopes(self, worth: Worth = _NOTHING) -> NDArray[np.float64]:
-        """Gain for each bit of every pass: the same for all passes of a run, falling from run to run of a curve.
+        """Return gain for each bit of every pass: the same for all passes of a run, falling from run to run of a curve.
 
         Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
         where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): what `worth` says, and a

@@ -20,7 +20,7 @@ _Progress = Callable[[float], None]
 def chosen_quality(
     quality: Quality | None, precision: Limit | None, rms: Limit | None, attributes: Mapping[str, Limit] | None
 ) -> Quality:
-    """The quality that was given, or that the shorthand says; `OptionError` is raised if there are both."""
+    """Return the quality that was given, or that the shorthand says; `OptionError` is raised if there are both."""
     if quality is None:
         return Quality.of(precision, rms, attributes)
     if precision is not None or rms is not None or attributes:

@@ -81,7 +81,7 @@ def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, 
         return
     known = np.ascontiguousarray(mask)
     strips = list(rows_at_once(values.shape))
-    ends = [(own.min(), own.max()) for rows in strips if (own := values[rows][known[rows]]).size]
+    ends = [(valid.min(), valid.max()) for rows in strips if (valid := values[rows][known[rows]]).size]
     low, high = min(least for least, _ in ends), max(most for _, most in ends)
     heights = room.empty(values.shape, np.float64)
     for rows in strips:
@@ -89,8 +89,8 @@ def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, 
     _fill(heights, known, closed, _SWEEPS, room)
     for rows in strips:
         hidden = ~known[rows]
-        found = np.clip(heights[rows][hidden], float(low), float(high))
-        inside = to_dtype(found, values.dtype)  # the largest integers are no float64, which may be beyond them
+        clipped = np.clip(heights[rows][hidden], float(low), float(high))
+        inside = to_dtype(clipped, values.dtype)  # the largest integers are no float64, which may be beyond them
         values[rows][hidden] = np.clip(inside, low, high)
 
 
@@ -114,7 +114,7 @@ def settle_holes(
     if mask.all() or not mask.any():
         return
     strips = list(rows_at_once(coordinates.shape))
-    ends = [(own.min(), own.max()) for strip in strips if (own := coordinates[strip][mask[strip]]).size]
+    ends = [(valid.min(), valid.max()) for strip in strips if (valid := coordinates[strip][mask[strip]]).size]
     low, high = min(least for least, _ in ends), max(most for _, most in ends)
     height, width = layout.grids[0].shape
     work = room.empty((height, width + PADDING), np.int32)[:, :width]
@@ -151,11 +151,11 @@ def _fill(
 ) -> None:
     """Fill one grid by way of coarser ones, in place."""
     shape = ((values.shape[0] + 1) // 2, (values.shape[1] + 1) // 2)
-    coarser, found = room.empty(shape, np.float64), room.empty(shape, np.bool_)
+    coarser, filled = room.empty(shape, np.float64), room.empty(shape, np.bool_)
     for first, last in _runs(coarser.size):
-        kernels.pull(values, known, *values.shape, first, last, coarser, found)
-    if not found.all():
-        _fill(coarser, found, closed, sweeps + _MORE, room)
+        kernels.pull(values, known, *values.shape, first, last, coarser, filled)
+    if not filled.all():
+        _fill(coarser, filled, closed, sweeps + _MORE, room)
     for first, last in _runs(values.size):
         kernels.push(values, known, *values.shape, first, last, *closed, coarser)
     for first, last in _runs(2 * sweeps * values.size):
@@ -163,5 +163,5 @@ def _fill(
 
 
 def _runs(count: int) -> Iterator[tuple[int, int]]:
-    """So many points cut into what one call of a kernel does."""
+    """Divide so many points into what one call of a kernel does."""
     return ((first, min(first + _AT_ONCE, count)) for first in range(0, count, _AT_ONCE))

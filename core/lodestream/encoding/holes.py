@@ -18,13 +18,13 @@ Arrays = list[NDArray[Any]]
 
 
 def given_arrays(block: Block) -> Arrays:
-    """Points and attributes of a block as they were given, shape (row, column, channel); views."""
-    every = (block.points, *block.attributes.values())
-    return [array if array.ndim == 3 else array[..., np.newaxis] for array in every]
+    """Return points and attributes of a block as they were given, shape (row, column, channel); views."""
+    arrays = (block.points, *block.attributes.values())
+    return [array if array.ndim == 3 else array[..., np.newaxis] for array in arrays]
 
 
 def given_channel(block: Block, channel: int) -> NDArray[Any]:
-    """One channel of a block as it was given, shape (row, column), a view.
+    """Return one channel of a block as it was given, shape (row, column), a view.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def given_channel(block: Block, channel: int) -> NDArray[Any]:
 
 
 def filled(block: Block, room: Room = IN_MEMORY) -> Arrays:
-    """Points and attributes of a block, finite everywhere; C-contiguous, shape (row, column, channel).
+    """Return points and attributes of a block, finite everywhere; C-contiguous, shape (row, column, channel).
 
     What has no holes is not copied; large copies go where there is room.
     """
@@ -61,7 +61,7 @@ def filled(block: Block, room: Room = IN_MEMORY) -> Arrays:
 
 
 def known_values(values: NDArray[Any], block: Block, coordinate: bool) -> NDArray[np.bool_] | None:
-    """Where one channel has numbers that are worth coding, bool, shape (row, column); None: everywhere.
+    """Return where one channel has numbers that are worth coding, bool, shape (row, column); None: everywhere.
 
     A valid point may lack an attribute, and a hole that is kept may have some of its coordinates; the residual gives
     both back. Numbers that lie further out than all valid ones are left to it as well.
@@ -89,7 +89,7 @@ def known_values(values: NDArray[Any], block: Block, coordinate: bool) -> NDArra
 
 
 def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]], room: Room = IN_MEMORY) -> NDArray[Any]:
-    """The valid points of all blocks, shape (row, column) or (row, column, channel).
+    """Return the valid points of all blocks, shape (row, column) or (row, column, channel).
 
     Parameters
     ----------
@@ -107,8 +107,8 @@ def valid_points(blocks: Sequence[Block], points: Sequence[NDArray[Any]], room: 
         valid, done = room.empty((count, 1, points[0].shape[2]), points[0].dtype), 0
         for block, array in zip(blocks, points, strict=True):
             for rows in rows_at_once(array.shape):
-                own = array[rows]
-                chosen = own.reshape(-1, own.shape[2]) if block.mask is None else own[block.mask[rows]]
+                strip = array[rows]
+                chosen = strip.reshape(-1, strip.shape[2]) if block.mask is None else strip[block.mask[rows]]
                 valid[done : done + len(chosen), 0] = chosen
                 done += len(chosen)
     return valid[..., 0] if flat else valid

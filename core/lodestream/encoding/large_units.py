@@ -22,19 +22,22 @@ _MOST, _TRIED = 1.05, 2
 
 
 def candidate(layout: Layout) -> tuple[int, list[int]]:
-    """The coarsest level whose units may be large, 0 if there is none, and the tiles on which that is tried."""
+    """Return the coarsest level whose units may be large, 0 if there is none, and the tiles on which that is tried."""
     level = next((level for level in range(1, layout.levels + 1) if layout.points(level) >= _LARGE), 0)
     tiles = layout.tiles_of(layout.levels)
     return level, sorted({tiles[len(tiles) * (2 * i + 1) // (2 * _TRIED)] for i in range(_TRIED)})
 
 
 def worth(large: Sequence[int], small: Sequence[int]) -> bool:
-    """Whether units should be large that take so many bytes as large ones and as small ones."""
+    """Return whether units should be large that take so many bytes as large ones and as small ones."""
     return sum(large) <= _MOST * sum(small)
 
 
 def unit_size(coder: TileCoder, tile: int, parent: int, number: int, channel: Channel) -> int:
-    """Bytes of one unit whose parent, -1 if it has none, is known. ``channel`` is that of ``number`` in the coder."""
+    """Count the bytes of a unit whose parent, -1 if it has none, is known.
+
+    ``channel`` is that of ``number`` in the coder.
+    """
     planes = int(channel.top[tile])
     if not planes:
         return 0

@@ -54,7 +54,7 @@ class Lattices:
 
 
 def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_MEMORY) -> Lattices:
-    """A lattice for each channel: its own, or one as fine as its precision asks for, or as costs least.
+    """Return a lattice for each channel: its own, or one as fine as its precision asks for, or as costs least.
 
     Parameters
     ----------
@@ -70,36 +70,36 @@ def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_
         If a precision is too small for the values.
     """
     named, first = prepared.named, prepared.point_channels
-    own = {channel: error for channel, error in named.items() if channel < first}
-    found = choose_lattices(
-        prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions, named=own
+    errors = {channel: error for channel, error in named.items() if channel < first}
+    lattices = choose_lattices(
+        prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions, named=errors
     )
-    whole = prepared.precision is None and bits is None and not own
+    whole = prepared.precision is None and bits is None and not errors
     if whole and prepared.point_channels == 1 and prepared.arrangement is None:
         offset = offset_lattice(prepared.arrays[0][0][..., 0])
         if offset is not None and find_lattice(prepared.valid) is None:
-            found[0] = offset
+            lattices[0] = offset
     for number, kind in enumerate(prepared.kinds, 1):
         values = _joined([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays], room)
-        own = {part: named[first + part] for part in range(kind.channels) if first + part in named}
-        found += attribute_lattices(values, prepared.attribute_precisions.get(kind.name), bits, own)
+        errors = {part: named[first + part] for part in range(kind.channels) if first + part in named}
+        lattices += attribute_lattices(values, prepared.attribute_precisions.get(kind.name), bits, errors)
         first += kind.channels
-    return Lattices(tuple(found))
+    return Lattices(tuple(lattices))
 
 
 def _joined(arrays: list[NDArray[Any]], room: Room) -> NDArray[Any]:
-    """Arrays of shape (point, component) one below the other."""
+    """Return arrays of shape (point, component) one below the other."""
     if len(arrays) == 1:
         return arrays[0]
-    found, done = room.empty((sum(map(len, arrays)), arrays[0].shape[1]), arrays[0].dtype), 0
+    joined, done = room.empty((sum(map(len, arrays)), arrays[0].shape[1]), arrays[0].dtype), 0
     for array in arrays:
-        found[done : done + len(array)] = array
+        joined[done : done + len(array)] = array
         done += len(array)
-    return found
+    return joined
 
 
 def fine_lattices(prepared: Prepared) -> Lattices | None:
-    """Lattices whose steps are small beside the error that the stream is made for.
+    """Return lattices whose steps are small beside the error that the stream is made for.
 
     None where it is made for none, and where all steps would be too many, however few make the error.
 
@@ -123,13 +123,13 @@ def fine_lattices(prepared: Prepared) -> Lattices | None:
 
 
 def lies_on_coarse_lattice(prepared: Prepared) -> bool:
-    """Whether the coordinates lie on a lattice as coarse as the error: an exact stream may then be shorter."""
-    found = find_lattice(prepared.valid)
-    return found is not None and prepared.rms is not None and found.spacing >= prepared.rms
+    """Return whether the coordinates lie on a lattice as coarse as the error: an exact stream may then be shorter."""
+    lattice = find_lattice(prepared.valid)
+    return lattice is not None and prepared.rms is not None and lattice.spacing >= prepared.rms
 
 
 def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
-    """Coordinates of a channel on its lattice; what patches share agrees.
+    """Return coordinates of a channel on its lattice; what patches share agrees.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> l
 
 
 def strips(prepared: Prepared) -> list[tuple[int, int]]:
-    """The rows of a surface of one grid, half-open, whose lattice coordinates are found together.
+    """Return the rows of a surface of one grid, half-open, whose lattice coordinates are found together.
 
     Without holes each row is for itself. Those under holes are chosen for what is around them: a surface that is not
     very large is one strip, and what they are then follows from its shape alone, not from the memory that there is.
@@ -153,8 +153,8 @@ def strips(prepared: Prepared) -> list[tuple[int, int]]:
     rows, columns = prepared.layout.shape(0, prepared.layout.levels)
     if prepared.surface.blocks[0].mask is None or rows * columns <= _TOGETHER:
         return [(0, rows)]
-    each = max(_STRIP // columns, _LEAST_ROWS)
-    starts = range(0, max(rows - each // 2, 1), each)
+    height = max(_STRIP // columns, _LEAST_ROWS)
+    starts = range(0, max(rows - height // 2, 1), height)
     return list(pairwise([*starts, rows]))
 
 
@@ -216,27 +216,27 @@ def _of_strip(
 
 
 def coordinates_of_interfaces(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
-    """Coordinates of a channel on all interfaces, int32, shape (point,): those of the first patch that has each.
+    """Return coordinates of a channel on all interfaces, int32, shape (point,): those of the first patch that has each.
 
     All 0 for attributes, which are not shared: blocks may disagree about them.
     """
     grids = prepared.layout.grids[: prepared.interfaces]
-    found = [np.zeros(grid.shape[0], np.int32) for grid in grids]
+    coordinates = [np.zeros(grid.shape[0], np.int32) for grid in grids]
     if channel >= prepared.geometric:
-        return found
+        return coordinates
     known: set[int] = set()
     for patch in prepared.patches:
         for place, side in enumerate(patch.sides):
             if side is not None and side.interface not in known:
                 line = lattice.coordinates(stored_side(patch, prepared.channel(patch.block, channel), place))
-                points = found[side.interface]
+                points = coordinates[side.interface]
                 points[:] = (line[::-1] if side.reversed else line)[: points.size]
                 known.add(side.interface)
     for number, grid in enumerate(grids):
         for end, source in enumerate(grid.sources[:2]):
             if source is not None:
-                found[number][-end] = found[source.grid][-1 if source.reversed else 0]
-    return found
+                coordinates[number][-end] = coordinates[source.grid][-1 if source.reversed else 0]
+    return coordinates
 
 
 def _of_patch(

@@ -49,18 +49,20 @@ class MeasuredLayer:
 
 
 def told_errors(errors: Errors) -> Errors:
-    """Errors as a container tells them."""
+    """Return errors as a container tells them."""
     channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in errors.channels)
     return Errors(told(errors.rms), told(errors.maximum), channels)
 
 
 def all_passes(tops: Sequence[NDArray[np.int8]]) -> State:
-    """Passes of every tile and channel, int8, shape (tile, channel), from their bit-planes, shape (tile,)."""
+    """Return passes of every tile and channel, int8, shape (tile, channel), from their bit-planes, shape (tile,)."""
     return np.stack([np.maximum(2 * top - 1, 0) for top in tops], axis=1).astype(np.int8)
 
 
 def shown_states(header: Header, states: Sequence[State], passes: State) -> list[State]:
-    """What a receiver knows after each layer; tiles of which it has heard nothing are `UNANNOUNCED` until the last.
+    """Return what a receiver knows after each layer.
+
+    Tiles of which it has heard nothing are `UNANNOUNCED` until the last.
 
     Parameters
     ----------
@@ -76,7 +78,7 @@ def shown_states(header: Header, states: Sequence[State], passes: State) -> list
 
 
 def level_states(header: Header) -> list[State]:
-    """The states that hold all levels up to one, but for the last: int8, shape (tile, channel)."""
+    """Return the states that hold all levels up to one, but for the last: int8, shape (tile, channel)."""
     start, states = initial_state(header), []
     for level in range(header.layout.levels):
         state = start.copy()
@@ -85,8 +87,8 @@ def level_states(header: Header) -> list[State]:
     return states
 
 
-def kept_layers(header: Header, states: Sequence[State], found: Sequence[Measured]) -> list[MeasuredLayer]:
-    """The layers that lower the RMS error, and the last one.
+def kept_layers(header: Header, states: Sequence[State], measured: Sequence[Measured]) -> list[MeasuredLayer]:
+    """Return the layers that lower the RMS error, and the last one.
 
     Parameters
     ----------
@@ -97,7 +99,7 @@ def kept_layers(header: Header, states: Sequence[State], found: Sequence[Measure
         Of each: its errors, and the distances in cells, see `coordinate_distances`.
     """
     kept: list[int] = []
-    rms = [errors.rms for errors, _ in found]
+    rms = [errors.rms for errors, _ in measured]
     for number in range(len(states)):
         if number == len(states) - 1:
             while kept and rms[number] > rms[kept[-1]]:
@@ -105,24 +107,24 @@ def kept_layers(header: Header, states: Sequence[State], found: Sequence[Measure
         elif kept and rms[number] > rms[kept[-1]]:
             continue
         kept.append(number)
-    codes = _window_codes(header, [found[number] for number in kept])
-    return [MeasuredLayer(states[number], found[number][0], own) for number, own in zip(kept, codes, strict=True)]
+    codes = _window_codes(header, [measured[number] for number in kept])
+    return [MeasuredLayer(states[number], measured[number][0], code) for number, code in zip(kept, codes, strict=True)]
 
 
-def _window_codes(header: Header, found: Sequence[Measured]) -> list[NDArray[np.uint8] | None]:
-    """Errors of the cells of each layer, where there are several and they can be told; None otherwise."""
+def _window_codes(header: Header, layers: Sequence[Measured]) -> list[NDArray[np.uint8] | None]:
+    """Return errors of the cells of each layer, where there are several and they can be told; None otherwise."""
     if header.arrangement is not None or not is_divided(header):
-        return [None] * len(found)
-    measured = [cells[0] for errors, cells in found if errors.maximum and cells]
+        return [None] * len(layers)
+    measured = [cells[0] for errors, cells in layers if errors.maximum and cells]
     codes = layer_codes(np.stack(measured), header) if measured else np.zeros(0, np.uint8)
-    own = iter([None] * len(measured) if codes is None else codes)
+    code = iter([None] * len(measured) if codes is None else codes)
     return [
-        next(own) if errors.maximum and cells else None if errors.maximum else no_errors(header)
-        for errors, cells in found
+        next(code) if errors.maximum and cells else None if errors.maximum else no_errors(header)
+        for errors, cells in layers
     ]
 
 
 def remaining_errors(errors: Errors, exact: Sequence[bool], geometric: int) -> Errors:
-    """The errors of the complete surface, of which some channels are exact."""
+    """Return the errors of the complete surface, of which some channels are exact."""
     channels = tuple((0.0, 0.0) if known else pair for known, pair in zip(exact, errors.channels, strict=False))
     return Errors(0.0, 0.0, channels) if all(exact[:geometric]) else errors._replace(channels=channels)

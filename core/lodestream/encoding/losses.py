@@ -31,7 +31,7 @@ def at_holes(surface: Surface) -> str | None:
         if block.points.ndim == 3 and block.points.shape[2] > 3:
             arrays = {_MORE_CHANNELS: block.points[..., 3:], **arrays}
         for name, values in arrays.items():
-            lost[name] = lost.get(name, 0) + _said(values[holes], nodata)
+            lost[name] = lost.get(name, 0) + _count_values(values[holes], nodata)
     names = [name for name, count in lost.items() if count]
     if not names:
         return None
@@ -42,18 +42,18 @@ def at_holes(surface: Surface) -> str | None:
 
 
 def _holes(block: Block) -> NDArray[np.bool_] | None:
-    """The holes whose values do not come back, shape (H, W); None where there are none."""
+    """Return the holes whose values do not come back, shape (H, W); None where there are none."""
     if block.mask is None:
         return None
     return ~block.mask if block.kept is None else ~(block.mask | block.kept)
 
 
-def _said(values: NDArray[np.generic], nodata: object) -> int:
-    """At how many holes, axis 0, there is anything but NaN, zero, and the file's word for nothing."""
-    said = (values != 0) & (values == values)
+def _count_values(values: NDArray[np.generic], nodata: object) -> int:
+    """Count the holes, axis 0, that have anything but NaN, zero, and the file's word for nothing."""
+    valued = (values != 0) & (values == values)
     if isinstance(nodata, int | float):
-        said &= values != nodata
-    return int(said.reshape(len(values), -1).any(axis=1).sum()) if len(values) else 0
+        valued &= values != nodata
+    return int(valued.reshape(len(values), -1).any(axis=1).sum()) if len(values) else 0
 
 
 def _short(name: str) -> str:

@@ -34,7 +34,7 @@ def check_names(surface: Surface, quality: Quality) -> None:
 
 
 def named_errors(surface: Surface, arrays: Sequence[Arrays], quality: Quality) -> dict[int, float]:
-    """The largest error allowed of each channel that is named, in its unit.
+    """Return the largest error allowed of each channel that is named, in its unit.
 
     Parameters
     ----------
@@ -45,17 +45,17 @@ def named_errors(surface: Surface, arrays: Sequence[Arrays], quality: Quality) -
     quality : Quality
         Relative errors are shares of the channel's range; of a channel without one they say nothing.
     """
-    found: dict[int, float] = {}
+    errors: dict[int, float] = {}
     block = surface.blocks[0]
     for name, channel in _channels(block).items():
         tolerance = quality.attributes.get(name)
         if tolerance is None:
             continue
-        spans = [_span(own, channel) for own in arrays]
+        spans = [_span(block_arrays, channel) for block_arrays in arrays]
         span = max(high for _, high in spans) - min(low for low, _ in spans)
         if span or not tolerance.relative:
-            found[channel] = tolerance.absolute(span)
-    return found
+            errors[channel] = tolerance.absolute(span)
+    return errors
 
 
 def _width(block: Block) -> int:
@@ -63,7 +63,7 @@ def _width(block: Block) -> int:
 
 
 def _channels(block: Block) -> dict[str, int]:
-    """The number of each channel that has a name of its own; whole attributes have theirs beside these."""
+    """Return the number of each channel that has a name of its own; whole attributes have theirs beside these."""
     width = _width(block)
     names = ["z"] if width == 1 else list("xyz")[:width]
     names += [f"attribute_{number}" for number in range(width - len(names))]
@@ -72,9 +72,9 @@ def _channels(block: Block) -> dict[str, int]:
     return {name: channel for channel, name in enumerate(names) if name not in block.attributes}
 
 
-def _span(own: Arrays, channel: int) -> tuple[float, float]:
-    """Lowest and highest value of a channel of a block."""
-    for array in own:
+def _span(arrays: Arrays, channel: int) -> tuple[float, float]:
+    """Return lowest and highest value of a channel of a block."""
+    for array in arrays:
         if channel < array.shape[2]:
             values = array[..., channel]
             return float(values.min()), float(values.max())

@@ -34,7 +34,7 @@ FILTERS = np.array(
 
 
 def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32]:
-    """What `kernels.choose` is told of each band.
+    """Return what `kernels.choose` is told of each band.
 
     Returns
     -------
@@ -65,5 +65,5 @@ def _filter(count: int, detail: bool) -> tuple[float, float, float]:
 
 
 def _alone(count: int) -> tuple[float, float, float]:
-    """Of a node without neighbours: the squared norm of its synthesis function."""
+    """Return the squared norm of the synthesis function of a node without neighbours."""
     return 0.0, 0.0, (2.0 * 4.0**count + 1.0) / (3.0 * 2.0**count)

@@ -72,8 +72,8 @@ def quantize(prepared: Prepared, lattices: Lattices, table: TileTable, progress:
     def error(tries: float) -> float:
         progress(tries)
         patches = canvases[prepared.interfaces :]
-        own = lattices.channels[: prepared.geometric]
-        return told(coordinate_distances(prepared.originals, own, patches, [0] * len(channels))[0][0])
+        coordinate_lattices = lattices.channels[: prepared.geometric]
+        return told(coordinate_distances(prepared.originals, coordinate_lattices, patches, [0] * len(channels))[0][0])
 
     chosen = choose_indices(table, loops, canvases, error, prepared.rms, lattices.fineness)
     if chosen is None:
@@ -90,7 +90,7 @@ def quantize(prepared: Prepared, lattices: Lattices, table: TileTable, progress:
 def closed_loop(
     prepared: Prepared, lattices: Lattices, table: TileTable, channel: int
 ) -> tuple[ClosedLoop, NDArray[np.int8]]:
-    """What quantizes a coordinate, and its predictors, int8, shape (level, axis, 2).
+    """Return what quantizes a coordinate, and its predictors, int8, shape (level, axis, 2).
 
     It keeps the lattice coordinates, int32, shape (row, column) of each grid.
     """

@@ -107,17 +107,17 @@ class Prepared:
     def originals(self) -> tuple[Original, ...]:
         """What the coordinates of each patch are compared with."""
         masks = [block.mask for block in self.surface.blocks]
-        return tuple(originals_of(self.arrangement, [own[0] for own in self.arrays], masks))
+        return tuple(originals_of(self.arrangement, [arrays[0] for arrays in self.arrays], masks))
 
     def comparisons(self, region: Region) -> list[Comparison]:
-        """What the channels of a region are compared with: of all blocks or some, or of rows of the only one."""
+        """Return what the channels of a region are compared with: of all blocks or some, or of rows of the only one."""
         rows = slice(None) if region.spans is None else slice(*region.spans[0])
         blocks = self.surface.blocks
         return comparisons(
             region,
             self.arrangement,
             self.geometric,
-            [own[0][rows] for own in self.arrays],
+            [arrays[0][rows] for arrays in self.arrays],
             [[array[rows] for array in given_arrays(block)] for block in blocks],
             [None if block.mask is None else block.mask[rows] for block in blocks],
         )
@@ -130,11 +130,11 @@ class Prepared:
     @property
     def rough(self) -> list[bool]:
         """Of each channel whether it need not come back bit for bit."""
-        found = [self.precision is not None or self.rms is not None] * self.geometric
-        found += [False] * (self.point_channels - self.geometric)
+        flags = [self.precision is not None or self.rms is not None] * self.geometric
+        flags += [False] * (self.point_channels - self.geometric)
         for kind in self.kinds:
-            found += [kind.name in self.attribute_precisions] * kind.channels
-        return [any_ or channel in self.named for channel, any_ in enumerate(found)]
+            flags += [kind.name in self.attribute_precisions] * kind.channels
+        return [any_ or channel in self.named for channel, any_ in enumerate(flags)]
 
     @property
     def interfaces(self) -> int:
@@ -142,7 +142,7 @@ class Prepared:
         return len(self.layout.grids) - len(self.patches)
 
     def channel(self, block: int, channel: int) -> NDArray[Any]:
-        """One channel of a block, shape (row, column), holes filled; a view.
+        """Return one channel of a block, shape (row, column), holes filled; a view.
 
         Raises
         ------
@@ -156,12 +156,12 @@ class Prepared:
         raise IndexError(channel)
 
     def span(self, channel: int) -> float:
-        """Largest value of a channel less the smallest one, in its unit."""
+        """Return largest value of a channel less the smallest one, in its unit."""
         values = [self.channel(block, channel) for block in range(len(self.arrays))]
         return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
 
     def canvases(self) -> list[NDArray[np.int32]]:
-        """Room for a reconstruction of all coordinates: int32, shape (coordinate, row, column or more), of each grid.
+        """Return room for reconstructing all coordinates of each grid: int32, shape (coordinate, row, column or more).
 
         What is in it does not matter to whoever reconstructs; rows end in `pyramid.PADDING` columns that kernels use.
         """
@@ -177,7 +177,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
     given, (surface, plane) = surface, _heights(surface)
     blocks, first = surface.blocks, surface.blocks[0]
     arrays = tuple(filled(block, room) for block in blocks)
-    points = [own[0] for own in arrays]
+    points = [block_arrays[0] for block_arrays in arrays]
     point_channels = points[0].shape[2]
     geometric = min(point_channels, 3)
     valid = valid_points(blocks, points, room)
@@ -194,8 +194,8 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
     if len(blocks) > 1 or (geometric > 1 and may_share(first, points[0])):
         arrangement = unshared(blocks)
         if geometric > 1:  # sides are shared by points, not by heights
-            own = {channel: error for channel, error in named.items() if channel < point_channels}
-            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions, named=own)
+            errors = {channel: error for channel, error in named.items() if channel < point_channels}
+            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions, named=errors)
             arrangement = arranged(blocks, points, lattices[:geometric], room)
     if arrangement is None:
         small = absolute is None and rms is None and _takes_small_tiles(surface, valid)
@@ -247,7 +247,7 @@ def _check_counts(prepared: Prepared) -> None:
 
 
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
-    """Heights in place of x, y and z where a short rule makes x and y again, and that rule."""
+    """Return heights in place of x, y and z where a short rule makes x and y again, and that rule."""
     block = surface.blocks[0]
     lost = block.mask is not None and surface.dtype.kind != "f"  # integers have no coordinates under holes
     if len(surface.blocks) > 1 or "angles" in surface.metadata or lost:
@@ -262,7 +262,7 @@ def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
 
 
 def _extent_given(block: Block) -> float:
-    """Of what came as x, y and z, and is coded as heights: tolerances are relative to the diagonal of its box."""
+    """Return the diagonal of the box of what came as x, y and z and is coded as heights, for relative tolerances."""
     points = block.points if block.mask is None else block.points[block.mask][:, np.newaxis]
     return extent_of(points, 3)
 
@@ -275,19 +275,19 @@ def _kinds(block: Block) -> tuple[AttributeKind, ...]:
 
 
 def _divisions(points: Sequence[NDArray[Any]], geometric: int) -> float:
-    """Into how many lattice steps the widest extent is divided where all values come back bit for bit."""
+    """Choose into how many lattice steps the widest extent is divided where all values come back bit for bit."""
     largest = max(points, key=lambda array: array.size)
     return default_divisions([largest[..., channel] for channel in range(geometric)])
 
 
 def _takes_small_tiles(surface: Surface, valid: NDArray[Any]) -> bool:
-    """Whether a surface that is kept exactly has few points, of many bytes each: floats on no lattice."""
+    """Return whether a surface that is kept exactly has few points, of many bytes each: floats on no lattice."""
     few = math.prod(surface.blocks[0].shape) <= SMALL
     return few and surface.dtype.kind == "f" and find_lattice(valid) is None
 
 
 def _of_one_grid(block: Block, geometric: int, small: bool) -> tuple[Layout, Sequence[tuple[int, int]]]:
-    """The layout of a surface of one block that shares no side, and what its chunks may be."""
+    """Return the layout of a surface of one block that shares no side, and what its chunks may be."""
     bits = SMALL_TILE if small else TILE_BITS if geometric == 1 else WHOLE_TILE
     layout = Layout.single(block.shape, block.closed, tile_exponents(block.shape, bits))
     return layout, chunk_exponents(block.shape, small)

@@ -83,14 +83,14 @@ class IndexChooser:
         bands = self._table.bands[numbers]
         relative, classes = self._relative, self._classes
         for first, last in _runs(bands[:, ROWS] * bands[:, COLUMNS]):
-            run, own = bands[first:last], numbers[first:last]
-            kernels.classify(run, self._steps[own], coefficients, relative, classes)
+            run, members = bands[first:last], numbers[first:last]
+            kernels.classify(run, self._steps[members], coefficients, relative, classes)
             kernels.choose(
-                run, self._rules[own], relative, classes, self._rates, self.chosen, self._counts, *self._room
+                run, self._rules[members], relative, classes, self._rates, self.chosen, self._counts, *self._room
             )
 
     def end(self) -> NDArray[np.int32]:
-        """All indices, shape (`TileTable.size`,); what they cost is estimated from them when others are chosen."""
+        """Return all indices, shape (`TileTable.size`,), from which is estimated what others cost."""
         self._bits = -np.log2(self._counts / self._counts.sum(axis=2, keepdims=True))
         chosen = self.chosen
         del self.chosen, self._relative, self._classes
@@ -98,16 +98,16 @@ class IndexChooser:
 
 
 def _rates(bits: NDArray[np.float64]) -> NDArray[np.float32]:
-    """What each index costs with its sign: float32, shape (quantiser, class, `kernels.RATES`)."""
+    """Return what each index costs with its sign: float32, shape (quantiser, class, `kernels.RATES`)."""
     index = np.arange(RATES)
     rates = bits[:, :, np.minimum(index, INDICES - 1)] + (index > 0)
     rates += 2.0 * np.log2(np.maximum(index - INDICES + 3, 1)) * (index >= INDICES - 1)
-    found: NDArray[np.float32] = (_WORTH * rates).astype(np.float32, order="C")
-    return found
+    weighted: NDArray[np.float32] = (_WORTH * rates).astype(np.float32, order="C")
+    return weighted
 
 
 def _runs(sizes: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Where the bands are cut into those of one call of a kernel: the first of each, and the one behind its last.
+    """Divide bands into those of one call of a kernel: the first of each, and the one behind its last.
 
     ``sizes``: coefficients of each band.
     """
@@ -122,24 +122,24 @@ def _runs(sizes: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 @cache
 def _laplace() -> NDArray[np.float64]:
-    """Bits of each index (without its sign) by class, of coefficients with a Laplace distribution.
+    """Return bits of each index (without its sign) by class, of coefficients with a Laplace distribution.
 
     float64, shape (quantiser, class, index).
     """
-    found = np.empty((2, CLASSES, INDICES))
+    bits = np.empty((2, CLASSES, INDICES))
     for odd in range(2):
         for number in range(CLASSES):
             scale = 2.0 ** ((number - _FIRST_CLASS + 0.5) / 2) + 0.01
             places = np.arange(INDICES) - 0.5 * odd * (np.arange(INDICES) > 0)
             borders = np.append((places[1:] + places[:-1]) / 2, np.inf)
             beyond = np.exp(-np.append(0.0, borders) / scale)
-            found[odd, number] = -np.log2(np.maximum(beyond[:-1] - beyond[1:], 1e-7))
-    found.flags.writeable = False
-    return found
+            bits[odd, number] = -np.log2(np.maximum(beyond[:-1] - beyond[1:], 1e-7))
+    bits.flags.writeable = False
+    return bits
 
 
 def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) -> int | None:
-    """The largest base of a quantiser found whose error is at most the one wanted, and close to it; None: none was.
+    """Find the largest base of a quantiser whose error is at most the one wanted, and close to it; None: there is none.
 
     Parameters
     ----------

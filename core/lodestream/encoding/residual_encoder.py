@@ -27,13 +27,13 @@ class Restored(Protocol):
     """Values of a block, or of some of its rows."""
 
     def window(self, window: ChunkPlace) -> NDArray[Any]:
-        """One channel at the place of a chunk, shape (row, column)."""
+        """Return one channel at the place of a chunk, shape (row, column)."""
 
 
 def chunk_size(
     prepared: Prepared, header: Header, restored: Sequence[Restored], coefficients: float
 ) -> tuple[int, int]:
-    """The smallest chunks that do not cost much, as exponents of two of their rows and columns.
+    """Return the smallest chunks that do not cost much, as exponents of two of their rows and columns.
 
     Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
     middle of the surface.
@@ -65,7 +65,7 @@ def chunk_size(
 
 
 def chunk_sample(prepared: Prepared, shape: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows and columns, half-open, on which `chunk_size` tries the sizes of chunks: the largest one in the middle."""
+    """Return rows and columns, half-open, on which `chunk_size` tries sizes: the largest chunk in the middle."""
     starts = [length // 2 >> exponent << exponent for length, exponent in zip(shape, prepared.chunks[-1], strict=True)]
     rows, columns = (
         (start, min(start + (1 << exponent), length))
@@ -95,7 +95,7 @@ class ChunkCoder:
         self._rough = prepared.rough
 
     def code(self, window: ChunkPlace) -> tuple[bytes, bool]:
-        """One chunk, and whether its values are exact then."""
+        """Return one chunk, and whether its values are exact then."""
         prepared, channel = self._prepared, window.channel
         block = prepared.surface.blocks[window.block]
         mask = prepared.kept[window.block] if window.kept else block.mask

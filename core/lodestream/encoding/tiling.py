@@ -24,7 +24,7 @@ WHOLE_TILE, WHOLE_CHUNK = 14, 16
 
 
 def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, int]:
-    """Rows and columns of a tile of 2**bits coefficients, as exponents of two, for a surface of one grid.
+    """Return rows and columns of a tile of 2**bits coefficients, as exponents of two, for a surface of one grid.
 
     They are counted in nodes, half of the points.
 
@@ -40,7 +40,7 @@ def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, 
 
 
 def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
-    """Rows and columns that chunks of residual of a surface of one grid may have, as exponents of two.
+    """Return rows and columns that chunks of residual of a surface of one grid may have, as exponents of two.
 
     The smallest first; ``small``: of a surface that takes small ones, since a window needs a larger share of it.
 
@@ -52,12 +52,12 @@ def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[i
 
 
 def square(bits: int) -> tuple[int, int]:
-    """2**bits in as many rows as columns, or twice as many columns; exponents of two."""
+    """Divide 2**bits into as many rows as columns, or twice as many columns; exponents of two."""
     return bits // 2, bits - bits // 2
 
 
 def _fitting(rows: int, columns: int, bits: int) -> tuple[int, int]:
-    """A square, or something longer where that holds more of what is narrow."""
+    """Return a square, or something longer where that holds more of what is narrow."""
     short, long = square(bits)
     while short > 1 and 2 * min(rows, columns) <= 1 << short:
         short, long = short - 1, long + 1
