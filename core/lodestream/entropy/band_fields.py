@@ -1,4 +1,4 @@
-"""Columns of the table that describes the bands of tiles to the kernels, one row a band.
+"""Columns of the table that describes the bands of tiles to the kernels; one row for each band.
 
 ``OFFSET`` and ``STRIDE``: where a band's first coefficient stands in the flat arrays, and the way to the next row.
 ``FLAGS``: where its first block stands in the array of block flags (stride: blocks across + 1, with a row before and

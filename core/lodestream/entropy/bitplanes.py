@@ -45,19 +45,19 @@ __all__ = [
 
 #: Rows and columns of a block.
 BLOCK = 8
-#: What the kernel may look at behind the last coefficient and its margin.
+#: Elements that the kernel may read behind the last coefficient and its margin.
 PADDING = 16
-#: Coefficients that are looked at in one call of the kernel: some hundredths of a second.
-_AT_ONCE = 1 << 21
+#: Coefficients that one call of the kernel visits; it takes some hundredths of a second.
+_COEFFICIENTS_PER_CALL = 1 << 21
 
 
 def pass_count(planes: int) -> int:
-    """Coding passes of so many bit-planes: two each, but the highest has no first pass."""
+    """Return the number of coding passes of ``planes`` bit-planes: two for each, but the highest has no first pass."""
     return 2 * planes - 1 if planes else 0
 
 
 def new_models(count: int, trellis: bool = False, large: int | None = None) -> NDArray[np.int32]:
-    """The contexts of so many tiles before their first planes: int32, shape (tile, number).
+    """Return the contexts of ``count`` tiles before their first planes: int32, shape (tile, context).
 
     ``large`` is the first of the tiles that are large units, if there are any.
     """
@@ -68,7 +68,7 @@ def new_models(count: int, trellis: bool = False, large: int | None = None) -> N
 
 
 def symbols_room(coefficients: int, planes: int) -> int:
-    """Room for the decisions of a large unit that is written, in numbers of uint16."""
+    """Return the size of ``symbols`` in `code_passes` for a large unit that is written, in elements of uint16."""
     return coefficients * (planes + 2) + 2048
 
 
@@ -88,7 +88,7 @@ def code_passes(
     state: NDArray[np.int64] | None = None,
     symbols: NDArray[np.uint16] | None = None,
 ) -> None:
-    """Code runs of passes of one channel, one after another; plane p of a tile has the passes 2 p + 1 and 2 p.
+    """Code runs of passes of one channel, in order; plane p of a tile has the passes 2 p + 1 and 2 p.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def code_passes(
     symbols = np.zeros(0, np.uint16) if symbols is None else symbols
     arrays = known, sign, flags, early, true, models, data, costs, symbols, state
     # A kernel cannot be interrupted: it returns after so many coefficients, and `state` says where to go on.
-    while kernels.passes(reading, trellis, bands, runs, *arrays, _AT_ONCE) < len(runs):
+    while kernels.passes(reading, trellis, bands, runs, *arrays, _COEFFICIENTS_PER_CALL) < len(runs):
         pass
 
 
@@ -145,36 +145,36 @@ def pass_gains(
     true: NDArray[np.int32],
     early: NDArray[np.uint8],
 ) -> NDArray[np.float64]:
-    """Weighted squared error of a tile by the passes that remain: float64, shape (passes + 1,).
+    """Return the weighted squared error of a tile for each number of passes that remain: float64, shape (passes + 1,).
 
-    ``weights`` are the squared norms of the bands' synthesis functions, one a band; ``early`` is that of the whole
-    tile coded.
+    ``weights`` are the squared norms of the bands' synthesis functions, float64, shape (band,); ``early`` is the state
+    after all passes of the tile have been coded.
     """
-    errors, own = np.zeros(passes + 1), np.empty(passes + 1)
-    for rows, worth in _parts(bands, weights):
-        kernels.pass_gains(rows, worth, true, early, own)
-        errors += own
+    errors, band_errors = np.zeros(passes + 1), np.empty(passes + 1)
+    for part, part_weights in _parts(bands, weights):
+        kernels.pass_gains(part, part_weights, true, early, band_errors)
+        errors += band_errors
     return errors
 
 
 def _parts(
     bands: NDArray[np.int64], weights: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Bands and their weights for one call after another: all at once, or rows of one after another where many."""
-    if (bands[:, ROWS] * bands[:, COLUMNS]).sum() <= _AT_ONCE:
+    """Yield bands and weights call by call: all together, or in runs of rows where there are many coefficients."""
+    if (bands[:, ROWS] * bands[:, COLUMNS]).sum() <= _COEFFICIENTS_PER_CALL:
         yield bands, weights
         return
     for number in range(len(bands)):
         band, weight = bands[number : number + 1], weights[number : number + 1]
         rows, columns = int(band[0, ROWS]), int(band[0, COLUMNS])
-        height = max(1, _AT_ONCE // columns)
-        for top, left in itertools.product(range(0, rows, height), range(0, columns, _AT_ONCE)):
+        height = max(1, _COEFFICIENTS_PER_CALL // columns)
+        for top, first in itertools.product(range(0, rows, height), range(0, columns, _COEFFICIENTS_PER_CALL)):
             part = band.copy()
-            part[0, OFFSET] += top * band[0, STRIDE] + left
-            part[0, ROWS], part[0, COLUMNS] = min(height, rows - top), min(_AT_ONCE, columns - left)
+            part[0, OFFSET] += top * band[0, STRIDE] + first
+            part[0, ROWS], part[0, COLUMNS] = min(height, rows - top), min(_COEFFICIENTS_PER_CALL, columns - first)
             yield part, weight
 
 
 def reconstruction_point(plane: int) -> int:
-    """What is added to a significant magnitude whose bits below ``plane`` are unknown."""
+    """Return the amount added to a significant magnitude whose bits below ``plane`` are unknown."""
     return (7 << plane) >> 4

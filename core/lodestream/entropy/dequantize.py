@@ -1,4 +1,4 @@
-"""Coefficients from what is known of their bits: of tiles, into the arrays that the inverse transform takes."""
+"""Coefficients estimated from their known bits: from tiles into the arrays that the inverse transform takes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ __all__ = ["UNANNOUNCED", "spread_bands"]
 
 #: Passes that remain of a tile that was not announced: more than any tile has.
 UNANNOUNCED = 57
-#: Coefficients in one call of the kernel, but for a band that has more.
-_AT_ONCE = 1 << 22
+#: Coefficients that one call of the kernel writes, unless a single band has more.
+_COEFFICIENTS_PER_CALL = 1 << 22
 
 
 def spread_bands(
@@ -31,9 +31,9 @@ def spread_bands(
     out: NDArray[np.int32],
     origin: tuple[int, int],
 ) -> None:
-    """Put what is known of some bands into an array of coefficients.
+    """Estimate the coefficients of some bands from their known bits and write them into an array.
 
-    Unknown bits are replaced by the reconstruction point; what the remaining passes told counts as unknown.
+    Unknown bits are replaced by the reconstruction point; bits coded by the remaining passes count as unknown.
 
     Parameters
     ----------
@@ -51,23 +51,23 @@ def spread_bands(
         Coefficients of the tiles from this one on are multiplied by 2**`lifting.FRACTION_BITS` and kept within their
         bounds.
     out : int32, shape (row, column)
-        Coefficients from the row and column ``origin`` on; updated. What bands have outside of it is left out.
+        Coefficients from the row and column ``origin`` on; updated. Parts of bands outside it are skipped.
 
     Raises
     ------
     ValueError
         Where a band does not lie inside the flat arrays.
     """
-    for batch in _batches(bands, numbers) if known.size > _AT_ONCE else [numbers] if numbers.size else []:
+    for batch in _batches(bands, numbers) if known.size > _COEFFICIENTS_PER_CALL else [numbers] if numbers.size else []:
         kernels.spread(known, sign, early, bands, origins, steps, batch, state, finer, out, *origin)
 
 
 def _batches(bands: NDArray[np.int64], numbers: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """The bands of each call."""
+    """Divide the band numbers into the batches of single calls, each int64, shape (band,)."""
     sizes = np.cumsum(bands[numbers, ROWS] * bands[numbers, COLUMNS])
     start = 0
     while start < numbers.size:
         reached = sizes[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(sizes, reached + _AT_ONCE, side="right")))
+        stop = max(start + 1, int(np.searchsorted(sizes, reached + _COEFFICIENTS_PER_CALL, side="right")))
         yield numbers[start:stop]
         start = stop

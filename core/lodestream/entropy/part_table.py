@@ -1,4 +1,4 @@
-"""Tables of some of a surface's tiles, for flat arrays that hold these alone."""
+"""Tables of a subset of a surface's tiles, for flat arrays that hold only these."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Part", "consecutive", "flat_span", "part_of", "tiles_of_grids"]
 
 @dataclass(frozen=True)
 class Part:
-    """Some tiles of a surface.
+    """A subset of the tiles of a surface.
 
     Attributes
     ----------
@@ -32,12 +32,12 @@ class Part:
     spans: tuple[tuple[range, slice], ...]
 
     def local(self, tile: int) -> int:
-        """The local number of a tile of the surface.
+        """Return the local number of a tile of the surface.
 
         Raises
         ------
         KeyError
-            If it is not one of these.
+            If the tile is not in the subset.
         """
         before = 0
         for run, _ in self.spans:
@@ -53,34 +53,34 @@ class Part:
 
 
 def consecutive(numbers: NDArray[np.int64]) -> list[range]:
-    """Numbers of tiles, shape (tile,), in any order and perhaps more than once, as runs of neighbours."""
-    every = np.unique(numbers)
-    starts = np.flatnonzero(np.diff(every, prepend=-2) > 1).tolist()
-    return [range(int(every[a]), int(every[b - 1]) + 1) for a, b in pairwise([*starts, len(every)])]
+    """Group tile numbers, shape (tile,), in any order and possibly repeated, into runs of consecutive numbers."""
+    unique = np.unique(numbers)
+    starts = np.flatnonzero(np.diff(unique, prepend=-2) > 1).tolist()
+    return [range(int(unique[a]), int(unique[b - 1]) + 1) for a, b in pairwise([*starts, len(unique)])]
 
 
 def tiles_of_grids(layout: Layout, grids: Sequence[int], level: int) -> list[range]:
-    """The tiles that some grids have at the levels up to one, in runs of neighbours of one level each.
+    """Return the tiles of some grids at levels 0 to ``level``, as runs of consecutive tiles of one level each.
 
-    Tiles that they have in common with other grids are among them.
+    Tiles that these grids share with others are included.
     """
     if len(grids) == len(layout.grids):
-        return [layout.tiles_of(own) for own in range(level + 1)]
-    found: list[range] = []
-    for own in range(level + 1):
-        starts, tiles = layout.tile_arrays.groups(own)
+        return [layout.tiles_of(tile_level) for tile_level in range(level + 1)]
+    runs: list[range] = []
+    for tile_level in range(level + 1):
+        starts, tiles = layout.tile_arrays.groups(tile_level)
         groups = np.unique(np.searchsorted(starts, grids, side="right") - 1).tolist()
-        found += consecutive(np.concatenate([np.arange(tiles[group], tiles[group + 1]) for group in groups]))
-    return found
+        runs += consecutive(np.concatenate([np.arange(tiles[group], tiles[group + 1]) for group in groups]))
+    return runs
 
 
 def flat_span(table: TileTable, tiles: range) -> slice:
-    """Where neighbouring tiles stand in the flat arrays of a table."""
+    """Return the slice that consecutive tiles occupy in the flat arrays of a table."""
     return slice(int(table.starts[tiles.start]), int(table.starts[tiles.stop]))
 
 
 def part_of(table: TileTable, runs: Iterable[range]) -> Part:
-    """A part of a table: some runs of tiles, in their order, none twice and none empty.
+    """Make the part of a table that consists of ``runs`` of tiles, which ascend, do not overlap and are not empty.
 
     Bands whose parents are not among them have none. Tiles may have no bands.
     """

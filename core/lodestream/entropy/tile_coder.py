@@ -1,4 +1,4 @@
-"""The writing end of the tiles: coefficients or indices into runs of coding passes."""
+"""The encoder's side of the tiles: coefficients or indices into runs of coding passes."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ Strings = dict[tuple[int, int], tuple[bytes, NDArray[np.int64]]]
 
 @dataclass
 class Channel:
-    """One channel on its way.
+    """Coefficients of one channel while it is coded.
 
     Attributes
     ----------
     true : int32, flat, see `tiles.gather`
         Coefficients, or indices, with their signs.
     weights : float64, shape (band,)
-        What a unit of one is worth, in squared error.
+        Squared error of a unit error of a coefficient.
     top : int8, shape (tile,)
         Bit-planes.
     """
 
     true: NDArray[np.int32]
-    weights: NDArray[np.float64]  # a band
-    top: NDArray[np.int8]  # a tile
+    weights: NDArray[np.float64]
+    top: NDArray[np.int8]
 
 
 class TileCoder:
-    """Codes the tiles of all channels, plane after plane, as a reader will meet them.
+    """Encode the tiles of all channels, plane after plane, in the order in which a decoder reads them.
 
     All passes of a large unit are coded when the first ones are asked for: its parents must be coded whole by then.
 
@@ -72,9 +72,9 @@ class TileCoder:
         self.tiles = [Tiles(table, quantiser if k < geometric else None, large) for k, table in enumerate(tables)]
 
     def code(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None = None) -> bytes:
-        """The bytes of the next ``passes`` passes of a tile of which ``first`` remain.
+        """Return the bytes of the next ``passes`` passes of a tile of which ``first`` remain.
 
-        ``costs``, float64, shape (pass,), get by its number the bits written when each pass ended.
+        ``costs``, float64, shape (pass,), receives the bits written until the end of each pass, at the pass's number.
         """
         tiles = self.tiles[channel]
         if tile >= tiles.large:
@@ -89,7 +89,7 @@ class TileCoder:
         return data[: run[0, 6]].tobytes()
 
     def _of_string(self, tile: int, channel: int, first: int, passes: int, costs: NDArray[np.float64] | None) -> bytes:
-        """Passes of a large unit, all of which are coded at once. A segment has at least one byte."""
+        """Return the bytes of passes of a large unit, which is coded at once. A segment has at least one byte."""
         if (tile, channel) not in self.strings:
             self.strings[tile, channel] = self._string(tile, channel)
         data, ends = self.strings[tile, channel]
@@ -99,6 +99,7 @@ class TileCoder:
         return data[start : ends[first - passes]] or b"\0"
 
     def _string(self, tile: int, channel: int) -> tuple[bytes, NDArray[np.int64]]:
+        """Code all passes of a large unit; return the bytes, and the bytes used when so many passes remain."""
         tiles, planes = self.tiles[channel], int(self._channels[channel].top[tile])
         rows, passes = tiles.table.of_tile(tile), pass_count(planes)
         coefficients = int((rows[:, ROWS] * rows[:, COLUMNS]).sum())
@@ -110,7 +111,7 @@ class TileCoder:
 
 
 def planes_of(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
-    """Bit-planes of a tile's largest magnitude; ``true`` are flat, shape (coefficient,), as `gather` gives them."""
+    """Return the bit-planes of a tile's largest magnitude; ``true``, (coefficient,), is as `gather` returns it."""
     largest = 0
     for place, stride, height, _ in table.of_tile(tile)[:, :4]:
         frame = true[place - stride - 1 : place + (height + 1) * stride - 1]

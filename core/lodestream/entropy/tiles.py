@@ -1,4 +1,4 @@
-"""Coefficients of one channel cut into tiles, as the embedded coder wants them: flat arrays, zeros around each band."""
+"""Coefficients of one channel cut into tiles for the embedded coder: flat arrays, zeros around each band."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from .dequantize import spread_bands
 
 __all__ = ["BandClass", "Reading", "Run", "TileTable", "Tiles", "gather"]
 
-#: A band without a parent finds a zero between zeros, to which 31 shifts any row or column.
+#: Parent fields of a band without a parent: a zero between zeros, to which shifts by 31 map any row and column.
 NO_PARENT = (1, 0, 31, 31)
 
-#: Where reading: no coefficients that would be written, and no costs.
-_NOTHING, _FREE = np.zeros(0, np.int32), np.zeros(0)
+#: Arguments of a decoding call: no coefficients to write, and no costs.
+_NO_COEFFICIENTS, _NO_COSTS = np.zeros(0, np.int32), np.zeros(0)
 
-#: Column of a table of runs: where a run's bytes begin, see `bitplanes.code_passes`.
+#: Column of a table of runs: the first byte of a run, see `bitplanes.code_passes`.
 RUN_START = 5
 
-#: Numbers before the first band in a flat array: what bands without a parent point at.
-_BEFORE = 3
+#: Zeros before the first band in a flat array: bands without a parent refer to them.
+_MARGIN = 3
 
 
 class BandClass(NamedTuple):
-    """What bands of many tiles have in common: level, grid, and whether they hold details along rows and columns."""
+    """Properties shared by bands of many tiles: level, grid, and whether they hold details along rows and columns."""
 
     level: int
     grid: int
@@ -42,9 +42,9 @@ class BandClass(NamedTuple):
 
 
 class TileTable:
-    """Places of all bands in the flat arrays, of a surface's tiles or of some of them.
+    """Positions of all bands in the flat arrays, of all tiles of a surface or of some.
 
-    Of each tile two numbers are kept; tables of the bands are made when they are asked for.
+    Two numbers are stored for each tile; tables of the bands are computed on demand.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class TileTable:
         self.layout, self.coordinate, self.chosen = layout, coordinate or not layout.shared, chosen
         self.members: range | NDArray[np.int64] = range(layout.tile_arrays.count) if chosen is None else chosen
         count = len(self.members)
-        self.first, self.starts, self.blocks = np.zeros(count + 1, np.int64), np.full(count + 1, _BEFORE), 0
+        self.first, self.starts, self.blocks = np.zeros(count + 1, np.int64), np.full(count + 1, _MARGIN), 0
         for run in runs_of(count):
             arrays = self._arrays_of(run)
             ends = np.cumsum(np.bincount(arrays.tile, minlength=len(run)))
@@ -82,22 +82,22 @@ class TileTable:
             self.starts[run.start + 1 : run.stop + 1] = self.starts[run.start] + sums[ends]
             self.blocks += int(blocks.sum())
         self.size = int(self.starts[-1]) + PADDING
-        # Of few tiles what they were counted by is kept for what will be asked next.
+        # The arrays of a small table are kept: `bands`, `origins` and `of_grid` need them next.
         self._kept = arrays if 0 < count <= AT_ONCE else None
 
     @staticmethod
     def of(layout: Layout, coordinate: bool = True) -> TileTable:
-        """The table of all tiles of a surface, the same object for the same layout."""
+        """Return the table of all tiles of a surface, the same object for the same layout."""
         return _table(layout, coordinate or not layout.shared)
 
     @cached_property
     def bands(self) -> NDArray[np.int64]:
-        """What the kernels are told of all tiles' bands in order, shape (band, `band_fields.BAND_FIELDS`)."""
+        """The kernels' table of all tiles' bands in order, int64, shape (band, `band_fields.BAND_FIELDS`)."""
         arrays = self._arrays()
         height, width = arrays.shape.T
         stride, across = width + 2, (width + 7) // 8
         sizes, blocks = _sizes(arrays.shape)
-        place = _BEFORE + np.cumsum(sizes) - sizes + 2 * stride + 2
+        place = _MARGIN + np.cumsum(sizes) - sizes + 2 * stride + 2
         flags = np.cumsum(blocks) - blocks + across + 2
         columns = [place, stride, height, width, flags, *self._joined(arrays, place, stride), arrays.kind]
         return np.ascontiguousarray(np.array(columns).T)
@@ -123,65 +123,66 @@ class TileTable:
         return np.split(np.argsort(grids, kind="stable"), ends[:-1])
 
     def of_grids(self, chosen: range) -> list[NDArray[np.int64]]:
-        """`of_grid` of some neighbouring grids, int64 of shape (band,): the others cost nothing."""
+        """Return `of_grid` for consecutive grids, int64, shape (band,) each; other grids cost nothing."""
         grids = self._arrays().grid
         order = np.argsort(grids, kind="stable")
         ends = np.searchsorted(grids[order], np.arange(chosen.start, chosen.stop + 1))
         return [order[first:last] for first, last in pairwise(ends.tolist())]
 
     def classes(self) -> tuple[list[BandClass], NDArray[np.int64]]:
-        """All that differs between bands but their places and sizes, and which of them each band is, shape (band,)."""
+        """Return the distinct classes of the bands, and the class number of each band, int64, shape (band,)."""
         arrays, grids = self._arrays(), len(self.layout.grids)
         codes = (arrays.level * grids + arrays.grid) * 4 + arrays.kind
-        found = np.flatnonzero(np.bincount(codes))
+        present = np.flatnonzero(np.bincount(codes))
         number = np.zeros(4 * grids * (self.layout.levels + 1), np.int64)
-        number[found] = np.arange(len(found))
-        classes = [BandClass(k // 4 // grids, k // 4 % grids, (k % 4 > 1, k % 2 == 1)) for k in found.tolist()]
+        number[present] = np.arange(len(present))
+        classes = [BandClass(k // 4 // grids, k // 4 % grids, (k % 4 > 1, k % 2 == 1)) for k in present.tolist()]
         return classes, number[codes]
 
     def steps(self, quantiser: Quantiser) -> NDArray[np.int64]:
-        """The step of each band, in lattice steps; int64, shape (band,)."""
+        """Return the step of each band, in lattice steps; int64, shape (band,)."""
         classes, of_band = self.classes()
-        return np.array([band_step(*own, self.layout, quantiser) for own in classes], np.int64)[of_band]
+        return np.array([band_step(*band_class, self.layout, quantiser) for band_class in classes], np.int64)[of_band]
 
     def tiles_from(self, level: int) -> int:
-        """The first of the table's tiles of a level or of finer ones; as many as there are where there is none."""
+        """Return the number of the first tile of a level or of finer levels, or else the number of tiles."""
         first = self.layout.tiles_from(level)
         return first if self.chosen is None else int(np.searchsorted(self.chosen, first))
 
     def level_of(self, tile: int) -> int:
-        """The level of one of the table's tiles."""
+        """Return the level of one of the table's tiles."""
         return self.layout.level_of(self.members[tile])
 
     def of_tile(self, tile: int) -> NDArray[np.int64]:
-        """The rows of one tile's bands, shape (band, `band_fields.BAND_FIELDS`), a view."""
+        """Return the rows of one tile's bands, shape (band, `band_fields.BAND_FIELDS`), a view."""
         return self.bands[self.first[tile] : self.first[tile + 1]]
 
     def _arrays_of(self, run: range) -> BandArrays:
+        """Compute the arrays of the bands of a run of the table's tiles."""
         numbers = np.arange(run.start, run.stop) if self.chosen is None else self.chosen[run.start : run.stop]
         return self.layout.tile_arrays.bands(numbers, self.coordinate)
 
     def _arrays(self) -> BandArrays:
-        """Of all tiles."""
+        """Compute the arrays of the bands of all tiles."""
         return self._arrays_of(range(len(self.members))) if self._kept is None else self._kept
 
     def _joined(
         self, arrays: BandArrays, place: NDArray[np.int64], stride: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], ...]:
-        """What bands say of their parents, see `bitplanes.code_passes`: four arrays of shape (band,)."""
+        """Return the parent fields of the bands, see `bitplanes.code_passes`: four arrays of shape (band,)."""
         numbers, grids = np.asarray(self.members), len(self.layout.grids)
         above = self.layout.tile_arrays.parents(numbers)
         if self.chosen is not None:
             order = np.argsort(numbers, kind="stable")
-            found = order[np.minimum(np.searchsorted(numbers, above, sorter=order), len(order) - 1)]
-            above = np.where(numbers[found] == above, found, -1)
+            position = order[np.minimum(np.searchsorted(numbers, above, sorter=order), len(order) - 1)]
+            above = np.where(numbers[position] == above, position, -1)
         if not len(arrays.tile):
             return *np.zeros((2, 0), np.int64), *arrays.halved.T
         # The parent of a band has its grid and its kind, and bands stand by tile, grid and kind.
-        keys, own = (arrays.tile * grids + arrays.grid) * 4 + arrays.kind, above[arrays.tile]
-        wanted = keys + 4 * grids * (own - arrays.tile)
+        keys, parent_tile = (arrays.tile * grids + arrays.grid) * 4 + arrays.kind, above[arrays.tile]
+        wanted = keys + 4 * grids * (parent_tile - arrays.tile)
         parent = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        known = (own >= 0) & (keys[parent] == wanted)
+        known = (parent_tile >= 0) & (keys[parent] == wanted)
         # Without its first row, which comes from an interface, a band has an odd origin: its parent's has one too.
         row, column = (((arrays.origin + arrays.halved) >> arrays.halved) - arrays.origin[parent]).T
         joined = place[parent] + row * stride[parent] + column, stride[parent], *arrays.halved.T
@@ -194,14 +195,14 @@ def _table(layout: Layout, coordinate: bool) -> TileTable:
 
 
 def _sizes(shape: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """What bands of a shape (band, axis) take of the flat arrays of coefficients and of block flags, shape (band,)."""
+    """Return the elements that bands of a shape, (band, axis), take of coefficients and of block flags, (band,)."""
     height, width = shape.T
-    # Two rows and two columns of zeros around each band: contexts read beyond its sides without asking.
+    # Two rows and two columns of zeros around each band: contexts read beyond its sides without a test.
     return (height + 4) * (width + 2) + 2, ((height + 7) // 8 + 2) * ((width + 7) // 8 + 1) + 1
 
 
 class Run(NamedTuple):
-    """Passes of a tile, from ``first`` down to ``last``, with their bytes."""
+    """Passes of a tile, from ``first`` down to ``last``, and their bytes."""
 
     tile: int
     first: int
@@ -210,9 +211,9 @@ class Run(NamedTuple):
 
 
 class Reading:
-    """Runs of passes that are decoded one after another.
+    """Runs of passes that are decoded in order, in one or more calls.
 
-    Readings of different tiles may run at the same time, unless one has a tile whose parent the other one has.
+    Readings of different tiles may run in parallel, unless one has a tile whose parent is in the other.
     """
 
     def __init__(self, tiles: Tiles, table: NDArray[np.int64], parts: list[bytes | memoryview]) -> None:
@@ -220,10 +221,10 @@ class Reading:
         self._state = np.zeros(PASSES_STATE, np.int64)
 
     def run(self) -> None:
-        """Decode; after an interruption another call goes on where it was, and once all is done it does nothing."""
+        """Decode the runs. After an interruption, another call continues; once all are decoded, it does nothing."""
         if self._state[0] < len(self._table):
-            data = np.frombuffer(bytearray().join(self._parts), np.uint8)  # kernels take what can be written
-            self._tiles.code(True, self._table, _NOTHING, data, _FREE, self._state)
+            data = np.frombuffer(bytearray().join(self._parts), np.uint8)  # kernels take writable arrays
+            self._tiles.code(True, self._table, _NO_COEFFICIENTS, data, _NO_COSTS, self._state)
             self._parts = []
 
 
@@ -246,28 +247,28 @@ class Tiles:
         self.models = new_models(len(table.members), self.trellis, self.large)
 
     def read(self, runs: Sequence[Run]) -> None:
-        """Decode runs of passes one after another."""
+        """Decode runs of passes in order."""
         self.readings(runs, [len(runs)])[0].run()
 
     def readings(self, runs: Sequence[Run], ends: Sequence[int]) -> list[Reading]:
-        """What decodes the runs up to each of ``ends``, from the end before it."""
-        told = np.array([(tile, first, last, len(data)) for tile, first, last, data in runs], np.int64).reshape(-1, 4)
-        tile, length = told[:, 0], told[:, 3]
-        table = np.empty((len(told), 8), np.int64)  # bands, their number, tile, first, last, start, length, large
+        """Divide the runs at ``ends`` into readings, each from the end before it."""
+        fields = np.array([(tile, first, last, len(data)) for tile, first, last, data in runs], np.int64).reshape(-1, 4)
+        tile, length = fields[:, 0], fields[:, 3]
+        table = np.empty((len(fields), 8), np.int64)  # bands, their number, tile, first, last, start, length, large
         table[:, 0] = self.table.first[tile]
         table[:, 1] = self.table.first[tile + 1] - table[:, 0]
-        table[:, 2:5] = told[:, :3]
+        table[:, 2:5] = fields[:, :3]
         table[:, RUN_START] = length.cumsum() - length
         table[:, 6] = length
         table[:, 7] = tile >= self.large
-        made, begin = [], 0
+        readings, begin = [], 0
         for end in ends:
-            own = table[begin:end]
+            rows = table[begin:end]
             if begin:
-                own[:, RUN_START] -= own[:1, RUN_START].copy()
-            made.append(Reading(self, own, [run.data for run in runs[begin:end]]))
+                rows[:, RUN_START] -= rows[:1, RUN_START].copy()
+            readings.append(Reading(self, rows, [run.data for run in runs[begin:end]]))
             begin = end
-        return made
+        return readings
 
     def code(
         self,
@@ -279,15 +280,15 @@ class Tiles:
         state: NDArray[np.int64] | None = None,
         symbols: NDArray[np.uint16] | None = None,
     ) -> None:
-        """Read or write runs of passes; `bitplanes.code_passes` tells the shapes of all arrays."""
+        """Decode or encode runs of passes; `bitplanes.code_passes` describes the shapes of all arrays."""
         arrays = self.known, self.sign, self.flags, self.early, true, self.models, data, costs
         code_passes(reading, self.table.bands, runs, *arrays, self.trellis, state, symbols)
 
     def spread(self, tile: int, remaining: int, coefficients: Sequence[NDArray[np.int32]]) -> None:
-        """Put a tile's coefficients, as they are known when so many passes remain, into the arrays of all coefficients.
+        """Write a tile's coefficients, estimated from all but the last ``remaining`` passes, into arrays of grids.
 
         ``coefficients`` have the shape (row, column) of each grid. Unknown bits are replaced by the reconstruction
-        point; what the remaining passes told counts as unknown.
+        point; bits coded by the remaining passes count as unknown.
         """
         state = np.full(len(self.table.layout.tiles), remaining, np.int8)
         first, last = self.table.first[tile : tile + 2]
@@ -302,7 +303,7 @@ class Tiles:
         whole: int,
         bare: Collection[int] = (),
     ) -> None:
-        """`spread` all tiles of the levels up to one: zeros where they were not announced.
+        """Apply `spread` to all tiles of the levels up to one; tiles that were not announced give zeros.
 
         Parameters
         ----------
@@ -310,7 +311,7 @@ class Tiles:
         state : int8, shape (tile,)
             Passes that remain of each tile.
         coefficients : int32 arrays, shape (row, column), one for each grid; None of grids that are passed over
-            What they hold at the places of these tiles does not matter.
+            Their values at the places of these tiles are overwritten.
         whole : int
             Coefficients of levels above this one are multiplied by 2**`FRACTION_BITS`.
         bare : collection of int
@@ -323,8 +324,8 @@ class Tiles:
             for array, numbers in zip(coefficients, table.of_grid, strict=True):
                 if array is None:
                     continue
-                own = np.arange(*span) if len(coefficients) == 1 else numbers[slice(*np.searchsorted(numbers, span))]
-                self._spread(own, state, array, finer)
+                bands = np.arange(*span) if len(coefficients) == 1 else numbers[slice(*np.searchsorted(numbers, span))]
+                self._spread(bands, state, array, finer)
 
     def spread_part(
         self,
@@ -334,7 +335,7 @@ class Tiles:
         origin: tuple[int, int],
         finer: bool,
     ) -> None:
-        """`spread` what some bands have in a part of a grid, zeros where they were not announced.
+        """Apply `spread` to bands in a part of a grid; bands of tiles that were not announced give zeros.
 
         Parameters
         ----------
@@ -349,14 +350,14 @@ class Tiles:
         self._spread(numbers, state, part, 0 if finer else len(self.table.members), origin)
 
     def band(self, number: int, state: NDArray[np.int8], finer: bool) -> NDArray[np.int32]:
-        """`spread` one band, by its number in the table, into an array of its own; int32, shape (row, column).
+        """Apply `spread` to one band, by its number in the table; return int32, shape (row, column).
 
         ``finer``: its coefficients are multiplied by 2**`FRACTION_BITS`.
         """
         height, width = (int(n) for n in self.table.bands[number, [ROWS, COLUMNS]])
         array = np.zeros((height, width), np.int32)
-        tile, top, left = (int(n) for n in self.table.origins[number])
-        self._spread(np.array([number]), state, array, tile if finer else tile + 1, (top, left))
+        tile, first_row, first_column = (int(n) for n in self.table.origins[number])
+        self._spread(np.array([number]), state, array, tile if finer else tile + 1, (first_row, first_column))
         return array
 
     def _spread(
@@ -367,12 +368,13 @@ class Tiles:
         finer: int,
         origin: tuple[int, int] = (0, 0),
     ) -> None:
+        """Write the estimated coefficients of some bands into an array whose first element is at ``origin``."""
         arrays = self.known, self.sign, self.early, self.table.bands, self.table.origins, self.steps
         spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
 
 
 def _runs(first: int, last: int, without: Collection[int]) -> Iterator[tuple[int, int]]:
-    """The numbers from ``first`` to ``last`` as runs, by their first and last, without some of them."""
+    """Yield the numbers from ``first`` to ``last`` as (first, last) of runs, omitting those in ``without``."""
     for number in (*sorted(n for n in without if first <= n <= last), last + 1):
         if first < number:
             yield first, number - 1
@@ -385,17 +387,17 @@ def gather(
     origins: NDArray[np.int64] | None = None,
     grids: range | None = None,
 ) -> NDArray[np.int32]:
-    """The signed coefficients of all tiles, shape (`TileTable.size`,), from those of the grids, (row, column).
+    """Collect the signed coefficients of all tiles, shape (`TileTable.size`,), from the arrays of grids, (row, column).
 
     ``origins`` are those of the table, unless the arrays have other rows; ``grids`` are all, unless the tiles have
     bands of these alone.
     """
     flat, bands = np.zeros(table.size, np.int32), table.bands
-    tops = (table.origins if origins is None else origins)[:, 1:]
+    starts = (table.origins if origins is None else origins)[:, 1:]
     of_grid = table.of_grid if grids is None else table.of_grids(grids)
     for array, numbers in zip(coefficients, of_grid, strict=True):
         places = bands[numbers][:, [OFFSET, STRIDE, ROWS, COLUMNS]].tolist()
-        for (place, stride, rows, columns), (top, left) in zip(places, tops[numbers].tolist(), strict=True):
+        for (place, stride, rows, columns), (top, first) in zip(places, starts[numbers].tolist(), strict=True):
             frame = flat[place : place + rows * stride].reshape(rows, stride)
-            frame[:, :columns] = array[top : top + rows, left : left + columns]
+            frame[:, :columns] = array[top : top + rows, first : first + columns]
     return flat

@@ -69,7 +69,7 @@ def read(table: TileTable, units: dict[int, Segments], budget: int) -> Tiles:
     """Read all units, in as many calls of the kernel as a budget needs."""
     tiles = Tiles(table, None, 1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bitplanes, "_AT_ONCE", budget)
+        patch.setattr(bitplanes, "_COEFFICIENTS_PER_CALL", budget)
         tiles.read([Run(tile, *segment) for tile, segments in units.items() for segment in segments])
     return tiles
 

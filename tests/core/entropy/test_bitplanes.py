@@ -188,7 +188,7 @@ def test_gains_of_a_large_tile_are_those_of_its_parts(at_once: int, monkeypatch:
         sizes.append(int((bands[:, ROWS] * bands[:, COLUMNS]).sum()))
         return kernel(bands, *arguments)
 
-    monkeypatch.setattr(bitplanes, "_AT_ONCE", at_once)
+    monkeypatch.setattr(bitplanes, "_COEFFICIENTS_PER_CALL", at_once)
     monkeypatch.setattr(kernels, "pass_gains", counted)
     np.testing.assert_allclose(pass_gains(rows, weights, 19, true, early), whole, rtol=1e-12)
     assert max(sizes) <= at_once

@@ -142,7 +142,7 @@ def test_only_the_bands_that_are_named_are_spread() -> None:
 def test_bands_are_divided_between_calls(at_once: int, bands: list[int]) -> None:
     case = Case([(5, 6)] * 5, [0, 3, 0, 0, 9], [0, 1, 2, 3, 4], 9, 1)
     spread = Mock(wraps=kernels.spread)
-    with patch.object(dequantize, "_AT_ONCE", at_once), patch.object(kernels, "spread", spread):
+    with patch.object(dequantize, "_COEFFICIENTS_PER_CALL", at_once), patch.object(kernels, "spread", spread):
         np.testing.assert_array_equal(case.spread(2), case.expected(2))
     assert [call.args[6].size for call in spread.call_args_list] == bands
 

@@ -42,7 +42,7 @@ def test_masks_of_blobs_come_back(shape: tuple[int, int], seed: int) -> None:
 def test_calls_that_end_within_a_row_change_nothing(mask: Mask, at_once: int) -> None:
     data = encode_mask(mask)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lodestream.entropy.mask._AT_ONCE", at_once)
+        patch.setattr("lodestream.entropy.mask._GROUPS_PER_CALL", at_once)
         assert encode_mask(mask) == data
         assert np.array_equal(decode_mask(data, mask.shape, 0), mask)
 
