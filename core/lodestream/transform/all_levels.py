@@ -1,4 +1,4 @@
-"""All levels of a channel undone in one call of a kernel, or one level of a part of a grid.
+"""The inverse transform of all levels of a channel, or of one level of a part of a grid, in one call of a kernel.
 
 Small surfaces have many levels of few values, and so have prefixes of large ones, whose finest levels hold no details.
 """
@@ -20,11 +20,11 @@ from .predictors import FOUR_POINT, INTERFACES, is_fitted
 
 __all__ = ["LevelInverse", "inverse_levels", "memory_of"]
 
-#: Values of a level that are undone in one call.
-_AT_ONCE = 1 << 20
+#: Points of a level that one call may invert.
+_POINTS_PER_CALL = 1 << 20
 
-#: Levels of all grids whose steps are told in one call: a table takes some 400 bytes for each.
-_MOST_GRIDS = 1 << 14
+#: Levels of all grids that one call may invert: the table of steps takes some 400 bytes for each.
+_MAX_GRID_LEVELS = 1 << 14
 
 #: Columns of a row of the kernel's table.
 _KIND, _PLANE, _AXIS, _ROWS, _COLUMNS, _MIDPOINTS, _RUN, _A, _B, _TABLE = range(10)
@@ -32,23 +32,23 @@ _SOURCE, _FROM, _BY, _LINE = range(kernels.INVERSE_STEP - 4, kernels.INVERSE_STE
 
 
 class _Steps(NamedTuple):
-    """What the kernel is told of every level, but for what a channel and a state have of their own.
+    """The kernel's table for every level, without what depends on the channel and its state.
 
     Attributes
     ----------
     table : int64, shape (step, field)
         Level by level; of a grid a place for `refine`, what it takes from interfaces, then the axes in reverse.
     fitted : int64, shape (fitted step,)
-        The steps that have an (a, b) of their own.
+        The steps whose (a, b) was fitted.
     rules : int64, shape (fitted step, 2)
-        Which one: coarser level and axis.
+        Coarser level and axis of that (a, b).
     level : int64, shape (step,)
     coarse : int64, shape (step,)
-        Of an inverse step along axis 1 the rows that have something where the level has no details, else -1.
+        Of an inverse step along axis 1 the rows that are not all zero where the level has no details, else -1.
     starts : list of int
         The first step of each level, and the number of steps.
     room : list of int
-        Numbers that the kernel works in, up to each level.
+        Elements of working memory that the kernel needs, up to each level.
     """
 
     table: NDArray[np.int64]
@@ -61,11 +61,11 @@ class _Steps(NamedTuple):
 
 
 def memory_of(arrays: Sequence[NDArray[np.int32]], layout: Layout, level: int) -> NDArray[np.int32] | None:
-    """What `inverse_levels` takes: the flat array, shape (number,), that all of these, (row, column), are windows of.
+    """Return the flat array, shape (value,), of which all arrays, (row, column), are windows, for `inverse_levels`.
 
-    None where there is none, or more values than a call may have.
+    None where there is no such array, or where it has more values than a call may have.
     """
-    if layout.points(level) > _AT_ONCE or (len(arrays) > 1 and len(arrays) * layout.levels > _MOST_GRIDS):
+    if layout.points(level) > _POINTS_PER_CALL or (len(arrays) > 1 and len(arrays) * layout.levels > _MAX_GRID_LEVELS):
         return None
     owner = arrays[0] if arrays[0].base is None else arrays[0].base
     if not isinstance(owner, np.ndarray) or owner.dtype != np.int32 or not owner.flags.c_contiguous:
@@ -85,18 +85,18 @@ def inverse_levels(
     coordinate: bool,
     bare: Collection[int],
 ) -> None:
-    """`pyramid.inverse` of arrays in one piece of memory, in place.
+    """Do what `pyramid.inverse` does for arrays in one contiguous memory, in place.
 
     ``memory`` is that of the arrays, which have the shape (row, column); ``predictors`` have (level, axis, 2).
     """
-    told, fitted, rules, room = _told(layout, coordinate or not layout.shared, level, whole, tuple(bare))
-    table = told.copy()
+    template, fitted, rules, room = _kernel_table(layout, coordinate or not layout.shared, level, whole, tuple(bare))
+    table = template.copy()
     table[fitted, _A : _B + 1] = predictors[rules[:, 0], rules[:, 1]]
     kernels.inverse(table, _planes(arrays, memory), memory, np.empty(room, np.int32))
 
 
 def _planes(arrays: Sequence[NDArray[np.int32]], memory: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Where arrays lie within their memory, as the kernel takes it: int64, shape (array, 4)."""
+    """Describe where arrays lie within their memory, as the kernel takes it: int64, shape (array, 4)."""
     first = _address(memory)
     planes = [
         ((_address(array) - first) // array.itemsize, *array.shape, array.strides[0] // array.itemsize)
@@ -106,15 +106,16 @@ def _planes(arrays: Sequence[NDArray[np.int32]], memory: NDArray[np.int32]) -> N
 
 
 def _address(array: NDArray[np.int32]) -> int:
+    """Return the address of an array's first element."""
     address: int = array.__array_interface__["data"][0]
     return address
 
 
 @lru_cache(maxsize=2 * REMEMBERED)
-def _told(
+def _kernel_table(
     layout: Layout, coordinate: bool, level: int, whole: int | None, bare: tuple[int, ...]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], int]:
-    """The kernel's table for some levels; its rows with an (a, b) of their own, and which; room to work in."""
+    """Return the kernel's table for some levels; its fitted rows, and the rule of each; elements of working memory."""
     steps = _steps(layout, coordinate)
     last = steps.starts[level + 1]
     table, of_level, coarse = steps.table[:last].copy(), steps.level[:last], steps.coarse[:last]
@@ -122,16 +123,17 @@ def _told(
         refined = (of_level == whole + 1) & (table[:, _KIND] == kernels.INVERSE_NOTHING)
         table[refined, _KIND] = kernels.INVERSE_REFINE
     for finer in bare:
-        own = (of_level == finer) & (table[:, _KIND] == 1)
-        table[own, _KIND] = kernels.LIFT_BARE
-        own &= coarse >= 0
-        table[own, _ROWS] = coarse[own]  # no other row has anything
+        bare_steps = (of_level == finer) & (table[:, _KIND] == 1)
+        table[bare_steps, _KIND] = kernels.LIFT_BARE
+        bare_steps &= coarse >= 0
+        table[bare_steps, _ROWS] = coarse[bare_steps]  # the other rows are zero
     fitted = slice(int(np.searchsorted(steps.fitted, last)))
     return table, steps.fitted[fitted], steps.rules[fitted], steps.room[level]
 
 
 @lru_cache(maxsize=2 * REMEMBERED)
 def _steps(layout: Layout, coordinate: bool) -> _Steps:
+    """Make the table of all levels of a layout."""
     rows: list[_Step] = []
     starts, room = [0], [0]
     numbers = [k for k, grid in enumerate(layout.grids) if coordinate or not grid.interface]
@@ -141,9 +143,9 @@ def _steps(layout: Layout, coordinate: bool) -> _Steps:
         starts.append(len(rows))
         room.append(max((row.room for row in rows), default=0))
     table = np.zeros((len(rows), kernels.INVERSE_STEP), np.int64)
-    for own, row in zip(table, rows, strict=True):
-        own[: len(row.fields)] = row.fields
-        own[_SOURCE:] = row.source
+    for line, row in zip(table, rows, strict=True):
+        line[: len(row.fields)] = row.fields
+        line[_SOURCE:] = row.source
     fitted = [number for number, row in enumerate(rows) if row.rule is not None]
     rules = np.array([rows[number].rule for number in fitted], np.int64).reshape(-1, 2)
     level_of = np.repeat(np.arange(layout.levels + 1), np.diff(starts))
@@ -152,7 +154,7 @@ def _steps(layout: Layout, coordinate: bool) -> _Steps:
 
 
 class _Step(NamedTuple):
-    """A row of the table while it is made; ``rule`` is its place among all (a, b), None where it has none."""
+    """A row of the table while it is made; ``rule`` is the level and axis of a fitted (a, b), else None."""
 
     fields: list[int]
     source: tuple[int, int, int, int] = (0, 0, 0, 0)
@@ -162,7 +164,7 @@ class _Step(NamedTuple):
 
 
 def _of_grid(layout: Layout, number: int, level: int, coordinate: bool) -> Iterator[_Step]:
-    """What makes a level of a grid, in order."""
+    """Yield the steps that make a level of a grid, in order."""
     grid, shape = layout.grids[number], layout.shape(number, level)
     if level == 0:
         yield from _nodes(layout, number) if coordinate else ()
@@ -171,6 +173,7 @@ def _of_grid(layout: Layout, number: int, level: int, coordinate: bool) -> Itera
     yield _Step([kernels.INVERSE_NOTHING, number, 0, *layout.shape(number, level - 1)])
 
     def lifted(kind: int, axis: int, shape: tuple[int, int]) -> tuple[list[int], tuple[int, int] | None]:
+        """Return the table fields of a step along an axis, and its rule."""
         rule = (level - 1, INTERFACES if grid.interface else axis) if is_fitted(steps[axis]) else None
         return _fields(kind, number, axis, shape, steps[axis], FOUR_POINT), rule
 
@@ -193,25 +196,25 @@ def _of_grid(layout: Layout, number: int, level: int, coordinate: bool) -> Itera
 def _fields(
     kind: int, plane: int, axis: int, shape: tuple[int, int], step: AxisStep, rule: tuple[int, int]
 ) -> list[int]:
-    """A row of the table for a step of the lifting."""
+    """Return the table row of a lifting step."""
     return [kind, plane, axis, *shape, step.midpoints, step.run, *rule, *step.extension(REACH).ravel().tolist()]
 
 
 def _nodes(layout: Layout, number: int) -> Iterator[_Step]:
-    """Level 0 of what a grid takes from interfaces: of an interface its ends, of a patch its sides."""
+    """Yield the steps that copy level 0 of a grid from interfaces: the ends of an interface, the sides of a patch."""
     grid, (rows, columns) = layout.grids[number], layout.shape(number, 0)
     for side, source in enumerate(grid.sources):
         if source is None:
             continue
         place, count = (0, rows - 1, 0, columns - 1)[side], columns if side < 2 else rows
         points = _points(layout, source, 0)
-        if grid.interface:  # a point of another one
+        if grid.interface:  # one point of another interface
             points, count = (*points[:2], 0), 1
         yield _Step([kernels.INVERSE_NODES, number, 1 if side < 2 else 0, 1, count], (*points, place))
 
 
 def _points(layout: Layout, source: Source, level: int) -> tuple[int, int, int]:
-    """Points of an interface at a level in the order of the side that takes them: its number, the first, the stride.
+    """Return an interface's number, and first index and stride of its points in the order of the side that takes them.
 
     A pole is one point.
     """
@@ -222,14 +225,14 @@ def _points(layout: Layout, source: Source, level: int) -> tuple[int, int, int]:
 
 
 class LevelInverse:
-    """The step that makes one level, of a grid or of a part of it, undone in one call.
+    """Inverse transform of one level, of a grid or of a part of it, in one call.
 
     Parameters
     ----------
     steps : (AxisStep, AxisStep)
         Along the columns' axis and along the rows' axis.
     rules : ((int, int), (int, int))
-        The third step's (a, b) of either.
+        The third step's (a, b) of each axis.
     """
 
     def __init__(self, steps: tuple[AxisStep, AxisStep], rules: tuple[tuple[int, int], tuple[int, int]]) -> None:
@@ -240,27 +243,27 @@ class LevelInverse:
                 rows.append(_fields(1, 0, axis, shape, steps[axis], rules[axis]))
                 self._room = max(self._room, work_room(steps[axis], axis, shape[1 - axis]))
         self._table = np.zeros((len(rows), kernels.INVERSE_STEP), np.int64)
-        for own, row in zip(self._table, rows, strict=True):
-            own[: len(row)] = row
+        for line, row in zip(self._table, rows, strict=True):
+            line[: len(row)] = row
 
     def __call__(self, array: NDArray[np.int32], refined: bool, bare: bool) -> None:
         """Turn nodes and details into the finer level, in place.
 
-        Parameters
-        ----------
-        array : int32, shape (row, column)
-            With all its columns side by side, in a C-contiguous array.
-        refined : bool
-            The nodes become steps over 2**`FRACTION_BITS` first, see `pyramid.refine`.
-        bare : bool
-            The details are 0, whatever stands in their places.
+                Parameters
+                ----------
+                array : int32, shape (row, column)
+                    All its columns are adjacent, in a C-contiguous array.
+                refined : bool
+                    The nodes become steps over 2**`FRACTION_BITS` first, see `pyramid.refine`.
+                bare : bool
+        The details count as 0, whatever the array holds there.
         """
         table = self._table.copy()
         if refined:
             table[0, _KIND] = kernels.INVERSE_REFINE
         if bare:
             table[1:, _KIND] = kernels.LIFT_BARE
-            table[table[:, _AXIS] == 1, _ROWS] = self._coarse  # no other row has anything
+            table[table[:, _AXIS] == 1, _ROWS] = self._coarse  # the other rows are zero
         memory = array if array.base is None else array.base
         assert isinstance(memory, np.ndarray)
         memory = memory.reshape(-1)

@@ -1,4 +1,4 @@
-"""The third step fitted by the encoder: which (a, b) leaves the details that take the fewest bits."""
+"""Fitting the third step in the encoder: the (a, b) whose details take the fewest bits."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from .predictors import FIT_NODES, FOUR_POINT
 
 __all__ = ["fitted_predictor", "fitted_to_columns", "sample_stride"]
 
-#: Rules of falling error on smooth surfaces, O(h^4) where a + 3b = 16 and O(h^6) for (22, -2), and none at all.
-_CANDIDATES = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
-_SAMPLE_LINES = 96
-#: Values in one call of a kernel that fits.
-_AT_ONCE = 1 << 22
-#: Least details of a sample that threads share.
-_SHARED = 1 << 13
+#: Starts of the search: (0, 0), and rules with an error of O(h^4) on smooth surfaces, where a + 3b = 16, or O(h^6).
+_START_PREDICTORS = [(0, 0), FOUR_POINT, (19, -1), (22, -2), (25, -3)]
+_MAX_SAMPLE_LINES = 96
+#: Values in one call of a kernel of the fit.
+_VALUES_PER_CALL = 1 << 22
+#: Threads share the work for samples of at least so many details.
+_MIN_DETAILS_FOR_THREADS = 1 << 13
 
 
 class _Sample(NamedTuple):
@@ -37,29 +37,29 @@ class _Sample(NamedTuple):
     largest: int
 
     def batches(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]]:
-        """Factors and details, so many as a kernel takes at once."""
-        for start in range(0, self.details.size, _AT_ONCE):
-            batch = slice(start, start + _AT_ONCE)
+        """Yield factors and details in batches of the size of a kernel's call, each int32, shape (value,)."""
+        for start in range(0, self.details.size, _VALUES_PER_CALL):
+            batch = slice(start, start + _VALUES_PER_CALL)
             yield self.first[batch], self.second[batch], self.details[batch]
 
     def bits(self, a: int, b: int) -> float:
-        """About the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
+        """Estimate the bits that the details take with (a, b): the sum of log2(1 + |e|)."""
         total = np.zeros(1)
         for batch in self.batches():
             kernels.predictor_bits(*batch, self.largest, a, b, total)
         return float(total[0])
 
     def moments(self, a: float, b: float, weighted: bool) -> list[float]:
-        """Sums of u u, u w, w w, u d and w d, weighted by what (a, b) leaves of the details."""
+        """Return the sums of u u, u w, w w, u d and w d, weighted by the details that (a, b) leaves."""
         sums = np.zeros(5)
         for batch in self.batches():
             kernels.predictor_moments(*batch, a, b, weighted, sums)
-        found: list[float] = sums.tolist()
-        return found
+        moments: list[float] = sums.tolist()
+        return moments
 
 
 def fitted_predictor(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
-    """The (a, b) that makes the details along axis 0 of some of the columns smallest, in bits.
+    """Return the (a, b) with which the details along axis 0 of a sample of the columns take the fewest bits.
 
     Parameters
     ----------
@@ -71,25 +71,29 @@ def fitted_predictor(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tup
 
 
 def sample_stride(columns: int, lines: int | None = None) -> int:
-    """Every how manieth column of a grid is looked at, the first one among them; all grids have ``lines`` columns."""
-    return max(1, min((columns if lines is None else lines) // _SAMPLE_LINES, columns))
+    """Return the stride between the columns of a grid that are sampled; sampling begins at column 0.
+
+    ``lines`` is the number of columns of all grids together, by default ``columns``.
+    """
+    return max(1, min((columns if lines is None else lines) // _MAX_SAMPLE_LINES, columns))
 
 
 def fitted_to_columns(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
-    """`fitted_predictor` of the columns that are looked at, int32, shape (row, column), see `sample_stride`."""
+    """Do what `fitted_predictor` does, given the sampled columns, int32, shape (row, column), see `sample_stride`."""
     sample = _sample(grids)
     costs: dict[tuple[int, int], float] = {}
 
     def best_of(tried: list[tuple[int, int]]) -> tuple[int, int]:
+        """Return the (a, b) of fewest bits, counting each only once."""
         new = [ab for ab in dict.fromkeys(tried) if ab not in costs]
-        if sample.details.size < _SHARED:
+        if sample.details.size < _MIN_DETAILS_FOR_THREADS:
             costs.update((ab, sample.bits(*ab)) for ab in new)
         else:
             costs.update(zip(new, spread(lambda ab: sample.bits(*ab), new), strict=True))
         return min(tried, key=costs.__getitem__)
 
     # Bits are not convex in (a, b), and bumpy from rounding: several starts, then a search in steps that get smaller.
-    best = best_of([*_CANDIDATES, *_least_squares(sample)])
+    best = best_of([*_START_PREDICTORS, *_least_squares(sample)])
     for reach in (4, 2, 1):
         around = [(best[0] + i * reach, best[1] + j * reach) for i, j in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))]
         best = best_of([ab for ab in around if max(map(abs, ab)) <= 127])
@@ -97,7 +101,7 @@ def fitted_to_columns(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tu
 
 
 def _sample(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> _Sample:
-    """Columns stepped without the third step."""
+    """Step the columns without the third step, and collect details and factors."""
     samples = []
     for chosen, step in grids:
         if step.midpoints and step.run >= FIT_NODES:
@@ -111,9 +115,10 @@ def _sample(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> _Sample:
 
 
 def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sample:
+    """Collect details and factors of lines that were stepped, shape (sample, line), by runs of midpoints."""
     count, width = midpoints - 5, lines.shape[1]
     first, second, details = np.empty((3, count * width), np.int32)
-    largest, height = 0, max(1, _AT_ONCE // width)
+    largest, height = 0, max(1, _VALUES_PER_CALL // width)
     for start in range(0, count, height):
         stop = min(start + height, count)
         batch = slice(start * width, stop * width)
@@ -123,14 +128,14 @@ def _surroundings(lines: NDArray[np.int32], coarse: int, midpoints: int) -> _Sam
 
 
 def _least_squares(sample: _Sample) -> list[tuple[int, int]]:
-    """Fits of 256 d = a u + b w, residuals reweighted towards small ones in turn."""
-    found = []
+    """Fit 256 d = a u + b w by least squares, iteratively reweighted towards small residuals."""
+    fits = []
     a = b = 0.0
     for turn in range(5):
         uu, uw, ww, ud, wd = sample.moments(a, b, turn > 0)
         determinant = uu * ww - uw * uw
         if determinant <= 1e-9 * uu * ww:
-            break  # one factor is all but a multiple of the other: nothing tells a from b
+            break  # the factors are nearly proportional, so the fit of a and b is ill-conditioned
         a, b = 256 * (ud * ww - wd * uw) / determinant, 256 * (wd * uu - ud * uw) / determinant
-        found.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
-    return found
+        fits.append((max(-127, min(127, round(a))), max(-127, min(127, round(b)))))
+    return fits

@@ -26,7 +26,7 @@ _REACH = 1 + sum(_SPANS)
 
 
 def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.float64]:
-    """The next coarser level: the grid whose bilinear refinement is closest to the points in mean square.
+    """Compute the next coarser level: the grid whose bilinear refinement is closest to the points in mean square.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False)) -> NDArray[np.fl
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArray[np.float64]]:
-    """All levels of a surface, shape (H, W) or (H, W, C), from the coarsest to the input itself (as float64).
+    """Compute all levels of a surface, shape (H, W) or (H, W, C), from the coarsest to the input (as float64).
 
     See `coarsen`.
 
@@ -78,6 +78,7 @@ def hierarchy(points: ArrayLike, closed: Closed = (False, False)) -> list[NDArra
 
 
 def _as_floats(points: ArrayLike) -> NDArray[np.float64]:
+    """Return the points as a C-contiguous float64 array; raise InputError for other shapes and types."""
     array = np.asarray(points)
     if array.ndim not in (2, 3) or array.size == 0 or array.dtype.kind not in "iuf":
         raise InputError(
@@ -87,13 +88,15 @@ def _as_floats(points: ArrayLike) -> NDArray[np.float64]:
 
 
 def _checked(points: NDArray[np.float64], coarser: NDArray[np.float64]) -> NDArray[np.float64]:
-    # Whatever is not finite in the input leaves its mark on the coarser level, which takes less time to look through.
+    """Return the coarser level; raise InputError if the points are not finite."""
+    # A value that is not finite spreads to the coarser level, which is faster to search than the input.
     if not np.isfinite(coarser).all() and not np.isfinite(points).all():
         raise InputError(f"expected finite values, got {int((~np.isfinite(points)).sum())} that are not")
     return coarser
 
 
 def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]:
+    """Compute the next coarser level of points, shape (row, column, ...), without checks."""
     rows, columns = (axis_step(n, c) for n, c in zip(points.shape[:2], closed, strict=True))
     with np.errstate(over="ignore", invalid="ignore"):  # `_checked` looks for what is not finite
         coarse = _coarsen_rows(points, rows)
@@ -102,7 +105,7 @@ def _coarsen(points: NDArray[np.float64], closed: Closed) -> NDArray[np.float64]
 
 
 def _coarsen_rows(points: NDArray[np.float64], step: AxisStep) -> NDArray[np.float64]:
-    """One step along axis 0, for all places along the other axes at once."""
+    """Coarsen along axis 0, for all positions along the other axes at once."""
     if not step.midpoints:
         return points
     nodes, middles = points[: 2 * step.run : 2], points[1 : 2 * step.midpoints : 2]

@@ -27,17 +27,17 @@ __all__ = ["CLAMP", "FRACTION_BITS", "REACH", "TAPS", "forward_step", "inverse_s
 #: The update's taps over 2^24: (1 - 1/sqrt 2)(2 sqrt 2 - 3)^j rounded so that they sum to 2^22.
 TAPS = np.array([4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1], np.float64)
 REACH = len(TAPS)
-#: Largest magnitude that the inverse hands on after each axis; a full decode never reaches it.
+#: The inverse clips to this magnitude after each axis; a complete decode never reaches it.
 CLAMP = 2**27
 #: Binary places between lattice steps in which reconstructions of incomplete levels are computed.
 FRACTION_BITS = 3
 
 #: Samples in one call of the kernel.
-_AT_ONCE = 1 << 22
+_SAMPLES_PER_CALL = 1 << 22
 
 
 def forward_step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> None:
-    """One step along one axis, in place.
+    """Apply one step of the lifting along one axis, in place.
 
     Parameters
     ----------
@@ -69,6 +69,7 @@ def inverse_step(
 
 
 def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int], inverse: int) -> None:
+    """Call the kernel for all lines, in parts between which an interrupt is handled."""
     if not step.midpoints:
         return
     # A transposed or reversed view: the kernel takes rows with their samples side by side.
@@ -80,29 +81,29 @@ def _step(values: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple
     lines = values.shape[1 - axis]
     work = np.empty(work_room(step, axis, lines), np.int32)
     table = step.extension(REACH)
-    whole = lines * step.length <= _AT_ONCE
+    fits_one_call = lines * step.length <= _SAMPLES_PER_CALL
     planes = (values[:, part] if axis == 0 else values[part] for part in _parts(axis, lines, step.length))
-    for plane in [values] if whole else planes:
+    for plane in [values] if fits_one_call else planes:
         done = 0
-        while done < step.run:  # very long axes take several calls, between which an interruption is heard
+        while done < step.run:  # very long axes take several calls, between which Python handles an interrupt
             done = kernels.lift(inverse, axis, plane, step.midpoints, step.run, table, *predictor, done, work)
 
 
 def work_room(step: AxisStep, axis: int, lines: int) -> int:
-    """Numbers of int32 that the kernel works in, to step so many lines along an axis."""
+    """Return the elements of int32 that the kernel needs to step ``lines`` lines along an axis."""
     return (step.midpoints + step.run + 2 * REACH + 5) * _bundle(axis, lines) + 16
 
 
 def _bundle(axis: int, lines: int) -> int:
-    """How many lines the kernel takes together."""
+    """Return how many lines the kernel processes together."""
     return 1 if axis == 1 or lines < kernels.LIFT_STRIP // 4 else kernels.LIFT_STRIP
 
 
 def _parts(axis: int, lines: int, length: int) -> Iterator[slice]:
-    """The lines of each call: whole bundles, of so many samples as are worked on at once, but at least one."""
+    """Yield the lines of each call: whole bundles with at most `_SAMPLES_PER_CALL` samples, but at least one bundle."""
     start = 0
     while start < lines:
         bundle = _bundle(axis, lines - start)
-        count = max(1, _AT_ONCE // (bundle * length)) * bundle
+        count = max(1, _SAMPLES_PER_CALL // (bundle * length)) * bundle
         yield slice(start, start + count)
         start += count

@@ -120,7 +120,7 @@ def solve_closed(right_hand_sides: ArrayLike) -> Floats:
 
 
 def curve_right_hand_sides(points: ArrayLike, closed: bool = False) -> Floats:
-    """Right-hand sides of the systems of curves.
+    """Compute the right-hand sides of the systems of curves.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def curve_right_hand_sides(points: ArrayLike, closed: bool = False) -> Floats:
 
 
 def surface_right_hand_sides(points: ArrayLike, closed: Closed = (False, False)) -> Floats:
-    """Right-hand sides B of the systems A_m Z A_n = B of surfaces.
+    """Compute the right-hand sides B of the systems A_m Z A_n = B of surfaces.
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def surface_right_hand_sides(points: ArrayLike, closed: Closed = (False, False))
 
 
 def coarsen(points: ArrayLike, closed: Closed = (False, False), terms: int = 20) -> Floats:
-    """Next coarser level: the grid whose bilinear refinement is nearest in mean square.
+    """Compute the next coarser level: the grid whose bilinear refinement is nearest in mean square.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def coarsen(points: ArrayLike, closed: Closed = (False, False), terms: int = 20)
 
 
 def hierarchy(points: ArrayLike, closed: Closed = (False, False), terms: int = 20) -> list[Floats]:
-    """Every level, each the optimum for the next finer one.
+    """Compute every level, each the optimum for the next finer one.
 
     Parameters
     ----------
@@ -251,13 +251,14 @@ def hierarchy(points: ArrayLike, closed: Closed = (False, False), terms: int = 2
 
 
 def _coarsen(points: Floats, closed: Closed, terms: int) -> Floats:
+    """Compute the next coarser level of checked points, (row, column) or (row, column, channel)."""
     rows, columns = axis_step(points.shape[0], closed[0]), axis_step(points.shape[1], closed[1])
     along_rows = _coarsen_axis(points, rows, terms)
     return _coarsen_axis(along_rows.swapaxes(0, 1), columns, terms).swapaxes(0, 1).copy()
 
 
 def _coarsen_axis(points: Floats, step: AxisStep, terms: int) -> Floats:
-    """Lemma 1, then Lemma 2, along axis 0."""
+    """Apply Lemma 1, then Lemma 2, along axis 0."""
     # The sweeps go along axis 0, so that its neighbours have to be whole rows in memory.
     sides = np.ascontiguousarray(_right_hand_sides(points, step))
     if step.wraps:
@@ -268,7 +269,7 @@ def _coarsen_axis(points: Floats, step: AxisStep, terms: int) -> Floats:
 
 
 def _right_hand_sides(points: Floats, step: AxisStep) -> Floats:
-    """Lemma 1 along axis 0."""
+    """Apply Lemma 1 along axis 0."""
     if not step.midpoints:
         return points
     midpoints = points[1 : 2 * step.midpoints : 2]
@@ -282,7 +283,7 @@ def _right_hand_sides(points: Floats, step: AxisStep) -> Floats:
 
 
 def _solve(z: Floats, terms: int) -> None:
-    """Lemma 2 along axis 0 (p, ...), in place: both sweeps take all right-hand sides of a row at once."""
+    """Apply Lemma 2 along axis 0 (p, ...), in place: both sweeps take all right-hand sides of a row at once."""
     size = z.shape[0]
     pivots = _pivots(size, terms)
     for i in range(1, size):
@@ -299,7 +300,7 @@ def _solve(z: Floats, terms: int) -> None:
 
 
 def _solve_closed(z: Floats) -> None:
-    """The circulant systems along axis 0 (p, ...), in place."""
+    """Solve the circulant systems along axis 0 (p, ...), in place."""
     size = z.shape[0]
     powers = _DECAY ** np.arange(1, min(size, _CLOSED_TERMS))
     around = 1.0 - _DECAY**size
@@ -312,7 +313,7 @@ def _solve_closed(z: Floats) -> None:
 
 
 def _pivots(size: int, terms: int) -> list[float]:
-    """Reciprocals of the pivots: all alpha where Lemma 2 applies, the exact ones of A_p where p < k."""
+    """Return reciprocals of the pivots: all alpha where Lemma 2 applies, the exact ones of A_p where p < k."""
     if size >= terms:
         return [_ALPHA] * size
     pivots: list[float] = []
@@ -323,6 +324,7 @@ def _pivots(size: int, terms: int) -> list[float]:
 
 
 def _numbers(values: ArrayLike) -> Floats:
+    """Return the values as C-contiguous float64; raise InputError for empty, non-numeric or too large ones."""
     array: NDArray[Any] = np.asarray(values)
     if array.dtype.kind not in "iuf":
         raise InputError(f"expected real numbers, got {array.dtype}")
@@ -338,6 +340,7 @@ def _numbers(values: ArrayLike) -> Floats:
 
 
 def _surface(points: ArrayLike) -> Floats:
+    """Return checked points of a surface, shape (row, column) or (row, column, channel)."""
     values = _numbers(points)
     if values.ndim not in (2, 3):
         raise InputError(f"expected an array of shape (H, W) or (H, W, C), got shape {values.shape}")
@@ -345,6 +348,7 @@ def _surface(points: ArrayLike) -> Floats:
 
 
 def _flags(closed: Closed) -> Closed:
+    """Return the flags of both axes as bool; raise InputError for anything but a pair."""
     try:
         rows, columns = closed
     except (TypeError, ValueError):
@@ -353,6 +357,7 @@ def _flags(closed: Closed) -> Closed:
 
 
 def _positive(terms: int) -> int:
+    """Return ``terms``; raise OptionError unless it is a positive integer."""
     if isinstance(terms, bool) or not isinstance(terms, int | np.integer) or terms < 1:
         raise OptionError(f"expected a positive integer for terms, got {terms!r}")
     return int(terms)

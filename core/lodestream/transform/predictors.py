@@ -1,4 +1,4 @@
-"""The third step of the lifting as the format sees it: which steps have an (a, b) of their own, which a common one."""
+"""Predictors (a, b) of the third step as the format sees them: which steps have a fitted one, which the fixed one."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ __all__ = [
     "predictor",
 ]
 
-#: A coefficient has at most so many magnitude bits.
+#: Magnitude bits of a coefficient, at most.
 COEFFICIENT_BITS = 28
 #: The third step where the axis is too short to fit one: the four-point rule.
 FOUR_POINT = (16, 0)
-#: Nodes that an axis needs for an (a, b) of its own.
+#: Nodes that an axis needs for a fitted (a, b).
 FIT_NODES = 24
 #: Beside axis 0 and axis 1 of the patches: the axis of the interfaces.
 INTERFACES = 2
@@ -33,28 +33,28 @@ INTERFACES = 2
 
 @lru_cache(maxsize=REMEMBERED)
 def fitted_steps(layout: Layout) -> tuple[tuple[int, int], ...]:
-    """(coarser level, axis) of every step with an (a, b) of its own: along an axis 0 or 1 that is long enough.
+    """Return (coarser level, axis) of every step with a fitted (a, b): along an axis that is long enough.
 
-    All patches have it in common; all interfaces have another in common, whose axis is `INTERFACES`.
+    All patches share one (a, b); all interfaces share another one, whose axis is `INTERFACES`.
     """
-    found = []
+    steps = []
     for level in range(layout.levels):
         fitted = set()
         for number, grid in enumerate(layout.grids):
             for axis, step in enumerate(layout.steps(number, level + 1)):
                 if is_fitted(step):
                     fitted.add(INTERFACES if grid.interface else axis)
-        found += [(level, axis) for axis in sorted(fitted)]
-    return tuple(found)
+        steps += [(level, axis) for axis in sorted(fitted)]
+    return tuple(steps)
 
 
 def default_predictors(layout: Layout) -> NDArray[np.int8]:
-    """What no container carries: (0, 0) for every step; int8, shape (level, axis, 2)."""
+    """Return the predictors before any is fitted: (0, 0) for every step; int8, shape (level, axis, 2)."""
     return np.zeros((layout.levels, INTERFACES + 1, 2), np.int8)
 
 
 def predictor(predictors: NDArray[np.int8], grid: Grid, step: AxisStep, level: int, axis: int) -> tuple[int, int]:
-    """The (a, b) of a grid's step along an axis from ``level`` to the level below."""
+    """Return the (a, b) of a grid's step along an axis from ``level`` to the level below."""
     if not is_fitted(step):
         return FOUR_POINT
     a, b = (int(x) for x in predictors[level - 1, INTERFACES if grid.interface else axis])
@@ -62,5 +62,5 @@ def predictor(predictors: NDArray[np.int8], grid: Grid, step: AxisStep, level: i
 
 
 def is_fitted(step: AxisStep) -> bool:
-    """Whether a step has an (a, b) of its own: along an axis that is long enough."""
+    """Return whether a step has a fitted (a, b): along an axis that is long enough."""
     return step.midpoints > 0 and step.run >= FIT_NODES

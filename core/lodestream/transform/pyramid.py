@@ -1,4 +1,4 @@
-"""The whole hierarchy of one channel in integers: all levels, in place, with the third step fitted by the encoder.
+"""The hierarchy of one channel in integers: all levels, in place, with the third step fitted by the encoder.
 
 A channel has an array for each grid of the layout, see `lodestream.grid.layout`. A patch whose side comes from an
 interface holds that side's points at every level: level 0 copies them, and the details along the side that the inverse
@@ -44,23 +44,23 @@ _NORM_LEVELS = 6
 
 
 def allocate(shape: tuple[int, int]) -> NDArray[np.int32]:
-    """An int32 array of this shape, (row, column), for a channel's coefficients.
+    """Allocate an int32 array of zeros of shape (row, column) for a channel's coefficients.
 
-    It is a window of a slightly wider one: rows then never lie a power of two apart, where a column's samples would
-    compete for the same lines of the cache.
+    It is a window of a slightly wider array, so that the distance between rows is never a power of two, at which a
+    column's samples would compete for the same cache lines.
     """
     rows, columns = shape
     return np.zeros((rows, columns + PADDING), np.int32)[:, :columns]
 
 
 def empty(shape: tuple[int, int]) -> NDArray[np.int32]:
-    """As `allocate`, shape (row, column), whatever it holds."""
+    """Allocate as `allocate` does, shape (row, column), without setting values."""
     rows, columns = shape
     return np.empty((rows, columns + PADDING), np.int32)[:, :columns]
 
 
 def grids(layout: Layout, level: int) -> list[NDArray[np.int32]]:
-    """As `empty`, of each grid of a level, shape (row, column) each, one after another in one piece of memory."""
+    """Allocate an int32 array for each grid of a level, shape (row, column) each, in one contiguous memory."""
     shapes = [layout.shape(number, level) for number in range(len(layout.grids))]
     ends = list(accumulate((rows * (columns + PADDING) for rows, columns in shapes), initial=0))
     memory = np.empty(ends[-1], np.int32)
@@ -71,7 +71,7 @@ def grids(layout: Layout, level: int) -> list[NDArray[np.int32]]:
 
 
 def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
-    """A copy from `allocate`, shape (row, column)."""
+    """Copy an array, shape (row, column), into one from `allocate`."""
     copy = allocate(array.shape)
     copy[...] = array
     return copy
@@ -119,6 +119,7 @@ def forward(
 
 
 def _corner(array: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.int32]:
+    """Return the first rows and columns of an array, a view of this shape."""
     return array[: shape[0], : shape[1]]
 
 
@@ -140,12 +141,12 @@ def inverse(
     lattice steps, those above count steps over 2**`FRACTION_BITS`; so does the result where ``whole`` is less than
     ``level``.
 
-    Where all details are known, rounding to whole steps undoes that of the forward transform; where they are not, it
-    would only add errors of its own from level to level.
+    Where all details are known, rounding to whole steps undoes that of the forward transform; where some are unknown,
+    it would only add an error at every level.
 
-    Of a channel that is no ``coordinate`` no side comes from an interface, and interfaces mean nothing.
+    If the channel is no ``coordinate``, no side comes from an interface, and interfaces are skipped.
 
-    Details of the levels in ``bare`` are 0, whatever stands in their places; none where sides come from interfaces.
+    Details of the levels in ``bare`` count as 0, whatever the arrays hold there; with interfaces, ``bare`` is empty.
     """
     if (memory := memory_of(arrays, layout, level)) is not None:
         inverse_levels(memory, arrays, layout, predictors, level, whole, coordinate, bare)
@@ -176,8 +177,8 @@ def inverse_level(
 ) -> None:
     """Turn the nodes of the level below and the details of ``level`` into this level of a grid, in place.
 
-    ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2). ``bare``: the details
-    are 0, whatever stands in their places.
+    ``array`` is the grid's, shape (row, column), ``predictors`` have the shape (level, axis, 2). If ``bare``, details
+    count as 0, whatever the array holds there.
     """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in (1, 0):  # the forward transform's axes in reverse: rounding makes the order matter
@@ -190,7 +191,7 @@ def inverse_level(
 def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int) -> None:
     """Turn a level of a grid, shape (row, column), into nodes of the level below and details before the third step.
 
-    In place; the details are what a third step that predicts nothing would leave.
+    In place, as with the predictor (0, 0).
     """
     corner, steps = _corner(array, layout.shape(number, level)), layout.steps(number, level)
     for axis in range(2):
@@ -199,7 +200,7 @@ def bare_level(array: NDArray[np.int32], layout: Layout, number: int, level: int
 
 
 def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: tuple[int, int]) -> NDArray[np.int32]:
-    """What the third step predicts of the details from the nodes of the coarser level: floor((v_k + 128) / 256).
+    """Compute the third step's prediction of details from the coarser level's nodes: floor((v_k + 128) / 256).
 
     Parameters
     ----------
@@ -214,7 +215,7 @@ def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: t
     rows, columns = nodes.shape
     values = allocate((step.length, columns) if axis == 0 else (rows, step.length))
     if nodes.size and predictor != (0, 0):
-        # Undone with the third step and done without it, a step leaves of no details what that predicts.
+        # Inverting zero details with the third step and stepping forward without it leaves the prediction.
         values[:rows, :columns] = nodes
         inverse_step(values, axis, step, predictor)
         forward_step(values, axis, step, (0, 0))
@@ -222,7 +223,7 @@ def third_step(nodes: NDArray[np.int32], axis: int, step: AxisStep, predictor: t
 
 
 def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
-    """Level 0 of what comes from interfaces, in place: their common ends first, then the sides of patches.
+    """Copy level 0 from interfaces, in place: first the ends that interfaces share, then the sides of patches.
 
     The arrays have the shape (row, column) of each grid.
     """
@@ -241,7 +242,7 @@ def take_nodes(arrays: Sequence[NDArray[np.int32]], layout: Layout) -> None:
 
 
 def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source, level: int) -> NDArray[np.int32]:
-    """Points of an interface at a level, in the order of the side that takes them."""
+    """Return the points of an interface at a level, in the order of the side that takes them, shape (point,)."""
     points = arrays[source.grid][: layout.shape(source.grid, level)[0], 0]
     return points[::-1] if source.reversed else points
 
@@ -249,7 +250,7 @@ def _points(arrays: Sequence[NDArray[np.int32]], layout: Layout, source: Source,
 def take_details(
     arrays: Sequence[NDArray[np.int32]], layout: Layout, predictors: NDArray[np.int8], patch: int, level: int
 ) -> None:
-    """The details along a patch's sides that come from interfaces, in place: interfaces are at ``level`` already.
+    """Compute the details along a patch's sides from interfaces at ``level``, in place.
 
     The arrays have the shape (row, column) of each grid, ``predictors`` the shape (level, axis, 2).
     """
@@ -268,16 +269,16 @@ def take_details(
         if points.size == 1:
             target[step.coarse :] = 0  # a pole
             continue
-        # The interface is whole at this level, so its own forward step tells the details: they are never sent twice.
+        # The interface is complete at this level, so its forward step gives the details: they are never sent twice.
         line = points.reshape(1, -1).copy()
         forward_step(line, 1, step, predictor(predictors, grid, step, level, axis))
         target[step.coarse :] = line[0, step.coarse :]
 
 
 def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 0) -> NDArray[np.float64]:
-    """Squared norms of what one unit of a coefficient of a grid adds to the surface, in the middle of the grid.
+    """Compute squared norms of the surface change by a unit of a grid's coefficients, in the middle of the grid.
 
-    What an interface adds reaches into the patches beside it, as their nodes do.
+    A coefficient of an interface also changes the patches beside it, as their nodes do.
 
     Returns
     -------
@@ -297,7 +298,7 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 
 
 
 def _line_norms(layout: Layout, predictors: NDArray[np.int8], number: int) -> NDArray[np.float64]:
-    """Squared norms along each axis of a grid: float64, shape (axis, level, node or detail)."""
+    """Compute squared norms along each axis of a grid: float64, shape (axis, level, node or detail)."""
     lines = np.ones((2, layout.levels + 1, 2))
     for axis in range(2):
         stepping = []
@@ -313,7 +314,7 @@ def _line_norms(layout: Layout, predictors: NDArray[np.int8], number: int) -> ND
 
 @lru_cache(maxsize=4096)
 def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int) -> tuple[float, float]:
-    """Squared norms along one axis of a node and of a detail of a band of level ``first``.
+    """Compute squared norms along one axis of a node and of a detail of a band of level ``first``.
 
     ``stepping``: level and (a, b) of the steps from this level on.
     """
@@ -330,11 +331,11 @@ def _line_norm(stepping: tuple[tuple[int, int, int], ...], first: int) -> tuple[
 
 
 def _synthesised(nodes: NDArray[np.float64], surplus: NDArray[np.float64], a: int, b: int) -> NDArray[np.float64]:
-    """One inverse step of closed lines without rounding; float64, shape (line, sample)."""
+    """Apply one inverse step to closed lines without rounding; float64, shape (line, sample)."""
     count = nodes.shape[1]
     c = np.concatenate([nodes[:, -2:], nodes, nodes[:, :3]], axis=1)
-    before, own, after = (c[:, k : k + count] for k in (1, 2, 3))
-    v = a * (own + after - c[:, 4:-1] - before) + b * (own + after - c[:, 5:] - c[:, :-5])
+    before, here, after = (c[:, k : k + count] for k in (1, 2, 3))
+    v = a * (here + after - c[:, 4:-1] - before) + b * (here + after - c[:, 5:] - c[:, :-5])
     details = surplus + v / 256.0
     d = np.concatenate([details[:, -REACH:], details, details[:, : REACH - 1]], axis=1)
     total = np.zeros_like(nodes)

@@ -49,7 +49,7 @@ def test_any_levels_of_any_plane(
     found[...] = expected[...] = coefficients
     assert all_levels.memory_of([found], layout, level) is not None
     inverse([found], layout, predictors, level, whole, bare=bare)
-    with patch.object(all_levels, "_AT_ONCE", 0):
+    with patch.object(all_levels, "_POINTS_PER_CALL", 0):
         assert all_levels.memory_of([expected], layout, level) is None
         inverse([expected], layout, predictors, level, whole, bare=bare)
     np.testing.assert_array_equal(found, expected)
@@ -63,7 +63,7 @@ def test_grids_that_share_sides(name: str) -> None:
     layout = _layout(GOLDEN / name)
     rng = np.random.default_rng(len(name))
     predictors = rng.integers(-127, 128, (layout.levels, INTERFACES + 1, 2)).astype(np.int8)
-    few = len(layout.grids) * layout.levels <= all_levels._MOST_GRIDS
+    few = len(layout.grids) * layout.levels <= all_levels._MAX_GRID_LEVELS
     for level, whole, coordinate in product(range(layout.levels + 1), (None, 0, 2, layout.levels), (True, False)):
         bits = int(rng.integers(1, 30))
         found = grids(layout, level)
@@ -72,7 +72,7 @@ def test_grids_that_share_sides(name: str) -> None:
         expected = [array.copy() for array in found]
         assert (all_levels.memory_of(found, layout, level) is not None) == few
         inverse(found, layout, predictors, level, whole, coordinate)
-        with patch.object(all_levels, "_AT_ONCE", 0):
+        with patch.object(all_levels, "_POINTS_PER_CALL", 0):
             inverse(expected, layout, predictors, level, whole, coordinate)
         for grid, one, other in zip(layout.grids, found, expected, strict=True):
             if coordinate or not grid.interface:

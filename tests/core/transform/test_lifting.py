@@ -135,7 +135,7 @@ def test_lines_are_divided_between_calls(at_once: int) -> None:
         lines = random_grid((21, width), width)
         expected = reference.forward(lines.astype(np.int64), FREE, 32, -7)
         lift = Mock(wraps=kernels.lift)
-        with patch.object(lifting, "_AT_ONCE", at_once), patch.object(kernels, "lift", lift):
+        with patch.object(lifting, "_SAMPLES_PER_CALL", at_once), patch.object(kernels, "lift", lift):
             ours = stepped(lines, axis, axis_step(21), (32, -7), False)
             np.testing.assert_array_equal(ours, expected)
             planes = [call.args[2].size for call in lift.call_args_list]

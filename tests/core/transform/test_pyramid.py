@@ -163,7 +163,7 @@ def test_a_sample_in_patches_is_the_sample(monkeypatch: pytest.MonkeyPatch) -> N
     values = [smooth((80, 60), 2**20), grid((300, 200), 2**10), smooth((60, 500), 2**24) + grid((60, 500), 9)]
     fits = []
     for at_once in (1 << 22, 1000):
-        monkeypatch.setattr(fitting, "_AT_ONCE", at_once)
+        monkeypatch.setattr(fitting, "_VALUES_PER_CALL", at_once)
         for one in values:
             layout = Layout.single((one.shape[0], one.shape[1]), (False, True), (7, 7))
             fits.append(forward([load(one)], layout))
