@@ -1,4 +1,4 @@
-"""Quantization steps of bands: what a stream made for one root mean square error codes in place of lattice steps.
+"""Quantization steps of bands, for a stream that is encoded for one RMS error, in place of lattice steps.
 
 Each band has a step, so that one of any coefficient changes the surface by about as much. What is coded, plane by
 plane, are the *indices*: a coefficient is its index times its band's step. A *trellis* halves the distance between the
@@ -37,7 +37,7 @@ class Quantiser:
 
 
 def band_step(level: int, grid: int, kind: tuple[bool, bool], layout: Layout, quantiser: Quantiser) -> int:
-    """The quantization step of bands of a level, a grid and a kind, in lattice steps; at least 1 and below 2**26."""
+    """Return the quantization step of bands of a level, grid and kind, in lattice steps; 1 to 2**26 - 1."""
     product = quantiser.base
     for axis in range(2):
         product *= _along(*lifting_steps_along(level, grid, kind[axis], layout, axis))
@@ -45,17 +45,18 @@ def band_step(level: int, grid: int, kind: tuple[bool, bool], layout: Layout, qu
 
 
 def lifting_steps_along(level: int, grid: int, detail: bool, layout: Layout, axis: int) -> tuple[int, bool]:
-    """Lifting steps of an axis from bands of a level to the finest, and whether they have details along it.
+    """Count the lifting steps along an axis from bands of a level to the finest; say whether they are details there.
 
-    Across itself an interface counts as a node: its points change the patches beside it.
+    Across its line, an interface counts as a node, because its points change the patches beside it.
     """
     first = max(level, 1)
     if layout.grids[grid].interface and axis == 1:
         return layout.levels + 1 - first, False
-    every = range(first, layout.levels + 1)
-    return sum(1 for k in every if layout.steps(grid, k)[axis].midpoints), detail
+    levels = range(first, layout.levels + 1)
+    return sum(1 for k in levels if layout.steps(grid, k)[axis].midpoints), detail
 
 
 def _along(count: int, detail: bool) -> int:
+    """Return 2**16 over the norm of a synthesis function after ``count`` lifting steps along an axis."""
     halvings = max(0, (count - 4) // 2)
     return int(_ALONG[int(detail), count - 2 * halvings]) >> halvings

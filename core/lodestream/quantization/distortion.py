@@ -1,4 +1,4 @@
-"""Lattice coordinates into values, and their distances from the original without a reconstruction in between."""
+"""Values from lattice coordinates, and their distances from the original, computed without storing a reconstruction."""
 
 from __future__ import annotations
 
@@ -28,48 +28,49 @@ __all__ = [
     "store_values",
 ]
 
-Coordinates = tuple[NDArray[np.int32], int]  # over two to the power of the second
+#: Coordinates, and the number of their fractional bits.
+Coordinates = tuple[NDArray[np.int32], int]
 
 T = TypeVar("T")
-#: Of each block, or of those alone that are asked for.
+#: Items of all blocks, or of the requested blocks by number.
 ByBlock = Sequence[T] | Mapping[int, T]
 
 #: Points in one call of a kernel, and cells of `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points.
-_AT_ONCE = 1 << 20
-_CELLS = 64
-_EVERY = np.zeros(0, np.bool_)
+_POINTS_PER_CALL = 1 << 20
+_CELLS_PER_CALL = 64
+_ALL_COUNTED = np.zeros(0, np.bool_)
 
 
 def store_values(lattice: Lattice, coordinates: Coordinates, points: NDArray[Any], channel: int) -> None:
-    """`Lattice.values` of coordinates, into a channel.
+    """Write `Lattice.values` of coordinates into a channel.
 
     Parameters
     ----------
     coordinates : (int32 array of shape (row, column), int)
-        Over two to the power of the second.
+        The int is the number of fractional bits.
     points : C-contiguous array, shape (row, column, channel)
     """
     numbers, fraction = coordinates
-    for first in range(0, numbers.size, _AT_ONCE):
-        last = min(first + _AT_ONCE, numbers.size)
+    for first in range(0, numbers.size, _POINTS_PER_CALL):
+        last = min(first + _POINTS_PER_CALL, numbers.size)
         kernels.store_values(numbers, points, points.shape[2], channel, first, last, *_rule(lattice, fraction))
 
 
 def _rule(lattice: Lattice, fraction: int) -> tuple[bool, float, float, float]:
-    """What kernels take of a lattice: whether its rule is "decimal", origin, step, and the scale of coordinates."""
+    """Return a lattice as kernels take it: 1 for the rule "decimal", origin, step, and the scale of coordinates."""
     return lattice.rule == "decimal", lattice.origin, lattice.step, 2.0**-fraction
 
 
 @dataclass(frozen=True)
 class Original:
-    """The points of one patch that reconstructions are compared with.
+    """The points of one patch with which reconstructions are compared.
 
     Attributes
     ----------
     points : C-contiguous array, shape (row, column, channel)
         Finite, under holes too.
     counted : bool, shape (row, column), or None
-        Which points errors are of; None: all.
+        True at the points that are compared; None: all.
     """
 
     points: NDArray[Any]
@@ -77,7 +78,7 @@ class Original:
 
     @property
     def count(self) -> int:
-        """Points that errors are of."""
+        """Number of points that are compared."""
         if self.counted is None:
             return int(self.points.shape[0] * self.points.shape[1])
         return int(np.count_nonzero(self.counted))
@@ -89,17 +90,17 @@ def originals_of(
     masks: ByBlock[NDArray[np.bool_] | None],
     chosen: Sequence[int] | None = None,
 ) -> list[Original]:
-    """What the values of each patch are compared with; each vertex of several patches is counted in one of them.
+    """Return the original values of each patch; a vertex of several patches is counted in one of them only.
 
     Parameters
     ----------
     arrangement : Arrangement or None
-        None: there is one block, which is one patch.
-    points : C-contiguous arrays, shape (row, column, channel), one for each block that is asked for
+        None: the surface is one block, which is one patch.
+    points : C-contiguous arrays, shape (row, column, channel), one for each requested block
     masks : bool, shape (row, column), or None, one for each block
         True where a point is valid.
     chosen : sequence of int, optional
-        Of these patches alone, by their numbers, increasing.
+        Numbers of the patches, ascending; all by default.
     """
     if arrangement is None:
         return [Original(points[0], masks[0])]
@@ -123,14 +124,14 @@ def other_originals(
     geometric: int,
     chosen: Sequence[int] | None = None,
 ) -> list[tuple[list[Original], int]]:
-    """What the reconstructions of each channel that is no coordinate are compared with, and its number in those arrays.
+    """Return the original values of each channel that is no coordinate, and the channel's number in its array.
 
     Points count where they are valid and the channel is finite; those of several patches count in each of them.
 
     Parameters
     ----------
     arrangement : Arrangement or None
-        None: there is one block, which is one patch.
+        None: the surface is one block, which is one patch.
     arrays : for each block its points, then its attributes
         Shape (row, column, channel).
     masks : bool, shape (row, column), or None, one for each block
@@ -138,21 +139,21 @@ def other_originals(
     geometric : int
         The first so many channels of the points are coordinates.
     chosen : sequence of int, optional
-        Of these patches alone, by their numbers, increasing.
+        Numbers of the patches, ascending; all by default.
     """
     patches = None if arrangement is None else arrangement.patches
     if patches is not None and chosen is not None:
         patches = tuple(patches[number] for number in chosen)
-    every = arrays[patches[0].block if patches else 0]
-    if sum(array.shape[2] for array in every) == geometric:
+    first_arrays = arrays[patches[0].block if patches else 0]
+    if sum(array.shape[2] for array in first_arrays) == geometric:
         return []
     if patches is None:
         valid = [masks[0]]
     else:
-        own = [(patch, masks[patch.block]) for patch in patches]
-        valid = [None if mask is None else stored(patch, mask) for patch, mask in own]
-    found = []
-    for number, array in enumerate(every):
+        patch_masks = [(patch, masks[patch.block]) for patch in patches]
+        valid = [None if mask is None else stored(patch, mask) for patch, mask in patch_masks]
+    originals = []
+    for number, array in enumerate(first_arrays):
         first = 0 if number else geometric
         if first == array.shape[2]:
             continue
@@ -160,12 +161,14 @@ def other_originals(
         points = [np.ascontiguousarray(values) for values in points]
         for channel in range(first, array.shape[2]):
             pairs = zip(points, valid, strict=True)
-            found.append(([Original(values, _finite(values[..., channel], mask)) for values, mask in pairs], channel))
-    return found
+            originals.append(
+                ([Original(values, _finite(values[..., channel], mask)) for values, mask in pairs], channel)
+            )
+    return originals
 
 
 def _finite(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
-    """Where values are valid and finite; None: everywhere."""
+    """Return where values are valid and finite, bool, shape (row, column); None: everywhere."""
     if values.dtype.kind != "f":
         return mask
     finite: NDArray[np.bool_] = np.isfinite(values)
@@ -182,7 +185,7 @@ def coordinate_distances(
     channel: int = 0,
     cells: list[NDArray[np.float64]] | None = None,
 ) -> list[tuple[float, float]]:
-    """`distances` between points and the values of lattice coordinates.
+    """Measure the distances between points and the values of lattice coordinates.
 
     Parameters
     ----------
@@ -190,17 +193,17 @@ def coordinate_distances(
     lattices : one for each channel that is compared, at most three
     coordinates : C-contiguous int32 arrays, shape (such a channel, row, column or more), one for each patch
     fractions : int for each of these channels
-        Coordinates stand over two to this power.
+        Number of fractional bits of the coordinates.
     channel : int
         The first of the points' channels that are compared.
     cells : list, optional
-        Is given, for each patch, sums and largest of the squared distances in cells of `kernels.PART_ROWS` x
+        Receives, for each patch, sums and maxima of the squared distances in cells of `kernels.PART_ROWS` x
         `kernels.PART_COLUMNS` points, float64, shape (row of cells, column of cells, 2), unless they are out of range.
 
     Returns
     -------
     list of (rms, maximum)
-        Of the distances; and, where there are several channels, of each by itself.
+        Of the distances; where there are several channels, then of each channel alone.
     """
     dtype, count = originals[0].points.dtype, sum(original.count for original in originals)
     if not count:
@@ -209,11 +212,11 @@ def coordinate_distances(
         distance_figures(original, lattices, place, fractions, channel)
         for original, place in zip(originals, coordinates, strict=True)
     ]
-    found = errors_of_figures(patches, count, dtype)
-    if found is not None:
-        if cells is not None and found[0][1]:
+    errors = errors_of_figures(patches, count, dtype)
+    if errors is not None:
+        if cells is not None and errors[0][1]:
             cells += [patch[..., 0, :] for patch in patches]
-        return found
+        return errors
     return _distances_of_values(originals, lattices, coordinates, fractions, channel)
 
 
@@ -224,7 +227,7 @@ def _distances_of_values(
     fractions: Sequence[int],
     channel: int,
 ) -> list[tuple[float, float]]:
-    """As `coordinate_distances`, where float64 cannot hold the squares."""
+    """Do what `coordinate_distances` does, where float64 cannot hold the squares."""
     compared = []
     last = channel + len(lattices)
     for original, place in zip(originals, coordinates, strict=True):
@@ -242,13 +245,14 @@ def _distances_of_values(
         points, reconstruction = (
             np.concatenate([pair[k].reshape(-1, 1, len(lattices)) for pair in compared]) for k in range(2)
         )
-    found = [distances(points, reconstruction, len(lattices))]
+    errors = [distances(points, reconstruction, len(lattices))]
     if len(lattices) > 1:
-        found += [distances(points[..., k], reconstruction[..., k], 1) for k in range(len(lattices))]
-    return found
+        errors += [distances(points[..., k], reconstruction[..., k], 1) for k in range(len(lattices))]
+    return errors
 
 
 def _kinds(channels: int) -> int:
+    """Return the number of kinds of distances: of all channels together, and of each if there are several."""
     return 1 + channels if channels > 1 else 1
 
 
@@ -259,29 +263,29 @@ def distance_figures(
     fractions: Sequence[int],
     channel: int = 0,
 ) -> NDArray[np.float64]:
-    """Sums and largest of the squared distances of one patch, or of some of its rows, in cells.
+    """Compute sums and maxima of the squared distances of a patch, or of some of its rows, in cells.
 
     Parameters
     ----------
     original, lattices, coordinates, fractions, channel
-        As of `coordinate_distances`, of the one patch.
+        As in `coordinate_distances`, for one patch.
 
     Returns
     -------
     float64, shape (row of cells, column of cells, kind, 2)
-        Cells have `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points. The first kind are the distances; where there
-        are several channels, those of each by itself follow. See `kernels.square_distances`.
+        Cells have `kernels.PART_ROWS` x `kernels.PART_COLUMNS` points. The first kind is the distance of all channels;
+        where there are several channels, the distance of each one follows. See `kernels.square_distances`.
     """
     rules = np.array([_rule(lattice, f) for lattice, f in zip(lattices, fractions, strict=True)], np.float64)
     rows, columns, channels = original.points.shape
     down, across = -(-rows // kernels.PART_ROWS), -(-columns // kernels.PART_COLUMNS)
     figures = np.empty((down, across, _kinds(len(rules)), 2))
-    counted = _EVERY if original.counted is None else np.ascontiguousarray(original.counted)
+    counted = _ALL_COUNTED if original.counted is None else np.ascontiguousarray(original.counted)
     arrays = original.points, coordinates, rules, counted, figures
     shapes = rows, columns, channels, channel, *coordinates.shape[1:]
     spread(
-        lambda first: kernels.square_distances(*arrays, *shapes, first, min(first + _CELLS, down * across)),
-        range(0, down * across, _CELLS),
+        lambda first: kernels.square_distances(*arrays, *shapes, first, min(first + _CELLS_PER_CALL, down * across)),
+        range(0, down * across, _CELLS_PER_CALL),
     )
     return figures
 
@@ -289,7 +293,7 @@ def distance_figures(
 def errors_of_figures(
     patches: Sequence[NDArray[np.float64]], count: int, dtype: np.dtype[Any]
 ) -> list[tuple[float, float]] | None:
-    """RMS and maximum of each kind of distances.
+    """Compute RMS and maximum of each kind of distance.
 
     Parameters
     ----------
@@ -302,7 +306,7 @@ def errors_of_figures(
     Returns
     -------
     list of (float, float), or None
-        None: float64 does not hold the squares; of floats of 8 bytes not even those of the smallest differences.
+        None: float64 cannot hold the squares, or, of float64 values, not those of the smallest differences.
     """
     kinds = range(patches[0].shape[2])
     worst = [max(float(patch[..., kind, 1].max()) for patch in patches) for kind in kinds]

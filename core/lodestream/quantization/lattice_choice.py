@@ -1,4 +1,4 @@
-"""Which lattice each channel of a surface gets, and what is left for the residual section."""
+"""Choice of a lattice for each channel of a surface."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .lattice import LATTICE_BITS, Lattice, find_lattice, precision_lattice
 
 __all__ = ["DEFAULT_DIVISIONS", "attribute_lattices", "channel_of", "choose_lattices"]
 
-#: Lattice steps of the widest extent, unless something else is known to cost less.
+#: Lattice steps of the widest extent by default.
 DEFAULT_DIVISIONS = 2.0**20
-#: Sums and differences of reconstructions on their way to such values do not overflow.
+#: Sums and differences of values up to this magnitude do not overflow during reconstruction.
 LARGEST_VALUE = 1e300
 
 
 def channel_of(points: NDArray[Any], channel: int) -> NDArray[Any]:
-    """One channel of an array (row, column) or (row, column, channel), a view."""
+    """Return one channel of an array (row, column) or (row, column, channel), a view of shape (row, column)."""
     return points if points.ndim == 2 else points[..., channel]
 
 
@@ -35,7 +35,7 @@ def choose_lattices(
     divisions: float = DEFAULT_DIVISIONS,
     named: Mapping[int, float] | None = None,
 ) -> list[Lattice]:
-    """A lattice for each channel.
+    """Choose a lattice for each channel.
 
     Parameters
     ----------
@@ -43,20 +43,20 @@ def choose_lattices(
     geometric : int
         The first so many channels are coordinates, the others attributes.
     precision : float or None
-        Largest distance allowed between a point and what comes back; None: whatever costs least, for what the lattice
-        leaves out is stored.
+        Largest distance allowed between a point and its reconstruction; None: choose by cost, because the residual
+        stores the rest.
     bits : int, optional
-        Keep no more of any channel than so many bits of its range, unless it is named.
+        Bits of its range that are kept of a channel that is not in ``named``.
     divisions : float
-        Into how many lattice steps the widest extent is divided where there is neither a lattice nor a precision.
+        Lattice steps of the widest extent where there is neither a lattice nor a precision.
     named : mapping of int to float, optional
-        Largest errors allowed of single channels, whatever is allowed of a point.
+        Largest errors allowed of single channels, by channel.
 
     Returns
     -------
     list of Lattice
-        The channels' own lattices where found (attributes: always when found; coordinates: unless the precision
-        allows a coarser one), otherwise one step for all coordinates.
+        The lattice that contains a channel's values, if there is one (of a coordinate: unless the precision allows a
+        coarser one), otherwise one step for all coordinates.
 
     Raises
     ------
@@ -81,14 +81,14 @@ def choose_lattices(
     lattices = []
     for channel in range(count):
         low, high = spans[channel]
-        own = find_lattice(channel_of(points, channel))
+        exact = find_lattice(channel_of(points, channel))
         if channel in steps:
-            coarse = own is not None and own.spacing >= steps[channel]
-            lattices.append(own if own is not None and coarse else precision_lattice(low, high, steps[channel]))
+            coarse = exact is not None and exact.spacing >= steps[channel]
+            lattices.append(exact if exact is not None and coarse else precision_lattice(low, high, steps[channel]))
         elif channel >= geometric:
-            lattices.append(own or precision_lattice(low, high, (high - low) / DEFAULT_DIVISIONS))
-        elif own is not None and (precision is None or own.spacing >= wanted):
-            lattices.append(own)
+            lattices.append(exact or precision_lattice(low, high, (high - low) / DEFAULT_DIVISIONS))
+        elif exact is not None and (precision is None or exact.spacing >= wanted):
+            lattices.append(exact)
         else:
             lattices.append(precision_lattice(low, high, wanted))
     return lattices
@@ -100,16 +100,16 @@ def attribute_lattices(
     bits: int | None = None,
     named: Mapping[int, float] | None = None,
 ) -> list[Lattice]:
-    """A lattice for each component of an attribute.
+    """Choose a lattice for each component of an attribute.
 
     Parameters
     ----------
     values : array, shape (point, component)
     precision : Tolerance, optional
-        Largest distance allowed between the values of a point and what comes back. None: the components' own lattices
-        where found, or fine ones, for what they leave out is stored.
+        Largest distance allowed between the values of a point and their reconstruction. None: lattices that contain
+        all values, or fine ones, because the residual stores the rest.
     bits : int, optional
-        Keep no more of any component than so many bits of its range, where no precision is given.
+        Bits of its range that are kept of a component, where no precision is given.
     named : mapping of int to float, optional
         Largest errors of single components.
     """
@@ -118,16 +118,16 @@ def attribute_lattices(
     if precision is not None:
         lows, highs = values.min(axis=0).astype(np.float64), values.max(axis=0).astype(np.float64)
         extent = float(np.sqrt(((highs - lows) ** 2).sum()))
-        if extent or not precision.relative:  # nothing corrects what fewer bits would leave out
+        if extent or not precision.relative:  # there is no residual here, so ``bits`` must not apply
             return choose_lattices(grid, count, precision.absolute(extent), named=named)
     if bits is not None and precision is None:
         return choose_lattices(grid, count, None, bits, named=named)
-    # As attributes of nothing: each component gets its own lattice, or a fine one.
+    # With no coordinates, each component gets a lattice by itself.
     return choose_lattices(grid, 0, None, named=named)
 
 
 def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: list[tuple[float, float]]) -> float:
-    """The widest step that keeps every point within the precision, rounding into the dtype included."""
+    """Return the widest step that keeps every point within the precision, rounding into the dtype included."""
     if not (math.isfinite(precision) and precision > 0):
         raise InputError(f"expected a precision above 0, got {precision}")
     largest = max(max(abs(low), abs(high)) for low, high in spans[:geometric])
@@ -139,7 +139,7 @@ def _step_for(dtype: np.dtype[Any], precision: float, geometric: int, spans: lis
         step = 2.0 * math.floor(allowed - rounding) + 1.0
     else:
         rounding = float(np.spacing(dtype.type(largest))) + 4 * float(np.spacing(largest))
-        # A container tells errors rounded up by at most one part in 2**20, and no more than was asked for.
+        # A container states errors rounded up by at most one part in 2**20, which must not exceed the precision.
         step = 2.0 * (allowed * (1.0 - 2.0**-20) - rounding)
     if step <= 0:
         raise InputError(

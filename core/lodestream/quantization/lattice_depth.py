@@ -1,4 +1,4 @@
-"""How finely to divide values that lie on no lattice: until dividing on costs more than storing the rest does.
+"""How finely to divide values that lie on no lattice: until a finer lattice costs more than storing the rest.
 
 Each bit more of the lattice is one bit less of residual for every value whose bits reach so far. On smooth surfaces
 the transform predicts it, and it costs less; on noisy ones it costs as much or a little more.
@@ -18,15 +18,15 @@ from .lattice import LATTICE_BITS, precision_lattice
 
 __all__ = ["default_divisions"]
 
-#: Lattice steps of the widest extent, in the order of preference, and bits a value that a finer division must save.
-_USUAL = 2.0**20
-_FINEST = 2.0**LATTICE_BITS - 8
-_WORTH = 0.7
-_WINDOW = 256
+#: Lattice steps of the widest extent, in the order of preference; bits that a finer division must save for each value.
+_USUAL_STEPS = 2.0**20
+_FINEST_STEPS = 2.0**LATTICE_BITS - 8
+_MIN_SAVED_BITS = 0.7
+_SAMPLE_SIDE = 256
 
 
 def default_divisions(channels: Sequence[NDArray[Any]]) -> float:
-    """Into how many lattice steps to divide the widest extent of coordinates without a lattice.
+    """Return the number of lattice steps of the widest extent of coordinates without a lattice.
 
     Parameters
     ----------
@@ -34,20 +34,23 @@ def default_divisions(channels: Sequence[NDArray[Any]]) -> float:
         The coordinates of a block, or of the largest, holes filled; finite.
     """
     if any(channel.dtype.kind != "f" for channel in channels):
-        return _USUAL
+        return _USUAL_STEPS
     span = max(float(channel.max()) - float(channel.min()) for channel in channels)
     if not 0.0 < span < np.inf:
-        return _USUAL
-    with np.errstate(over="ignore", invalid="ignore"):  # values at the ends of their type: the usual steps will do
-        saved = _bits(channels, span / _USUAL) - _bits(channels, span / _FINEST)
-    return _FINEST if _WORTH < saved < np.inf else _USUAL
+        return _USUAL_STEPS
+    with np.errstate(over="ignore", invalid="ignore"):  # extreme values get the usual steps
+        saved = _bits(channels, span / _USUAL_STEPS) - _bits(channels, span / _FINEST_STEPS)
+    return _FINEST_STEPS if _MIN_SAVED_BITS < saved < np.inf else _USUAL_STEPS
 
 
 def _bits(channels: Sequence[NDArray[Any]], step: float) -> float:
-    """About what a value takes on a lattice of this step and beyond it, in the middle of the surface."""
+    """Estimate the bits of a value, on a lattice of this step and in the residual, in the middle of the surface."""
     total, count = 0.0, 0
     for channel in channels:
-        middle = tuple(slice(max(0, (n - _WINDOW) // 2), max(0, (n - _WINDOW) // 2) + _WINDOW) for n in channel.shape)
+        middle = tuple(
+            slice(max(0, (n - _SAMPLE_SIDE) // 2), max(0, (n - _SAMPLE_SIDE) // 2) + _SAMPLE_SIDE)
+            for n in channel.shape
+        )
         window = np.ascontiguousarray(channel[middle])
         lattice = precision_lattice(float(channel.min()), float(channel.max()), step)
         work = allocate(window.shape)

@@ -1,4 +1,4 @@
-"""How far a reconstruction is from the original: measured on the values as they are handed out."""
+"""Distance of a reconstruction from the original, measured on the values that a caller receives."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 __all__ = ["distances", "extent_of"]
 
-_ROWS = 256  # rows compared at a time, so that what is in between stays small
+_ROWS_PER_STRIP = 256  # rows compared together, so that temporaries stay small
 
 
 def distances(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int) -> tuple[float, float]:
-    """RMS and maximum distance between corresponding points.
+    """Measure RMS and maximum distance between corresponding points.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def distances(original: NDArray[Any], reconstruction: NDArray[Any], geometric: i
     Returns
     -------
     (float, float)
-        In the surface's unit.
+        RMS and maximum, in the surface's unit.
     """
     total, worst = _squares(original, reconstruction, geometric, 1.0)
     unit = 1.0
@@ -39,7 +39,7 @@ def distances(original: NDArray[Any], reconstruction: NDArray[Any], geometric: i
 
 
 def _squares(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int, unit: float) -> tuple[float, float]:
-    """Sum and largest of the squared distances, in a unit; infinite where they are too large."""
+    """Return sum and maximum of the squared distances, in a unit; infinite where they are too large."""
     total, worst = 0.0, 0.0
     for delta in _differences(original, reconstruction, geometric):
         if unit != 1.0:
@@ -52,18 +52,21 @@ def _squares(original: NDArray[Any], reconstruction: NDArray[Any], geometric: in
 
 
 def _largest(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int) -> float:
+    """Return the largest magnitude of a difference."""
     return max(float(np.abs(delta).max()) for delta in _differences(original, reconstruction, geometric))
 
 
 def _differences(original: NDArray[Any], reconstruction: NDArray[Any], geometric: int) -> Iterator[NDArray[np.float64]]:
-    for start in range(0, original.shape[0], _ROWS):
-        a, b = original[start : start + _ROWS], reconstruction[start : start + _ROWS]
+    """Yield the differences strip by strip, float64, shape (row, column) or (row, column, channel)."""
+    for start in range(0, original.shape[0], _ROWS_PER_STRIP):
+        a, b = original[start : start + _ROWS_PER_STRIP], reconstruction[start : start + _ROWS_PER_STRIP]
         if a.ndim == 3:
             a, b = a[..., :geometric], b[..., :geometric]
         yield _difference(a, b)
 
 
 def _difference(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
+    """Return a - b in float64; its magnitude if both are integers of 64 bits."""
     if a.dtype.kind in "iu" and a.dtype.itemsize == 8:
         # Neighbours beyond 2**53 are the same float64: subtract before converting.
         larger = a >= b
@@ -74,7 +77,7 @@ def _difference(a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def extent_of(points: NDArray[Any], geometric: int) -> float:
-    """Range of heights, shape (row, column), or diagonal of the box of points, shape (row, column, channel)."""
+    """Return the range of heights, (row, column), or the diagonal of the box of points, (row, column, channel)."""
     if points.ndim == 2:
         return float(points.max()) - float(points.min())
     flat = points[..., :geometric].reshape(-1, geometric)

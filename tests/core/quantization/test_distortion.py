@@ -122,7 +122,7 @@ def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.Monke
                 channels = [slice(k, k + 1) for k in range(geometric)]
                 expected += [plain_distances(original[..., own], shown[..., own], known) for own in channels]
             for at_once in (1, 16):
-                monkeypatch.setattr(distortion, "_CELLS", at_once)
+                monkeypatch.setattr(distortion, "_CELLS_PER_CALL", at_once)
                 found = coordinate_distances([Original(original, mask)], lattices, [numbers], [3] * geometric)
                 assert found == expected
 
@@ -209,7 +209,7 @@ def test_values_of_any_lattice_come_in_any_runs(
     lattice = Lattice("decimal" if decimal else "affine", origin, step)
     points = np.zeros(shape, dtype)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(distortion, "_AT_ONCE", at_once)
+        patch.setattr(distortion, "_POINTS_PER_CALL", at_once)
         store_values(lattice, (numbers, fraction), points, channels - 1)
     assert points[..., -1].tobytes() == lattice.values(numbers, points.dtype, fraction).tobytes()
     assert not points[..., :-1].any()
