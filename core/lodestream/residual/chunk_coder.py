@@ -1,6 +1,6 @@
-"""What the lattice leaves out: chunks that turn restored values into the original ones, bit for bit.
+"""The residual: chunks of data that turn values restored from the lattice into the original ones, bit for bit.
 
-A chunk follows the rule that takes the fewest bytes: the values themselves, differences on a line of whole numbers
+A chunk uses the rule that takes the fewest bytes: the values themselves, differences on a line of whole numbers
 (`number_line`, `differences`) by patterns or by decimals, or offsets that repeat (`offsets`).
 """
 
@@ -18,26 +18,26 @@ from .offsets import MOST_BITS, code_offsets, have_offsets, places_of, values_at
 
 __all__ = ["agree", "decode_chunk", "encode_chunk"]
 
-#: The rules beside those of the line.
+#: The rules that are not on the line.
 _RAW, _OFFSETS = 0, 3
-#: Values that are on no line near the others, NaN and infinity, are listed and coded by their number in the list.
-_MOST_SPECIALS = 15
+#: NaN and infinities are not on the line: they are listed, at most so many, and coded by their index in the list.
+_MAX_SPECIALS = 15
 
 
 def encode_chunk(original: NDArray[Any], restored: NDArray[Any], step: float | None = None) -> bytes:
-    """What turns restored values into the original ones.
+    """Encode the difference between restored and original values.
 
     Parameters
     ----------
     original, restored : integers or floats, shape (value,), of one dtype
         ``restored`` is finite.
     step : float, optional
-        Of the lattice that restores; needed where it is one of `lattice.offset_lattice`.
+        Step of the lattice; needed if it comes from `lattice.offset_lattice`.
 
     Returns
     -------
     bytes
-        Empty when they agree bit for bit; never more than the values themselves and one byte.
+        Empty if the values agree bit for bit; at most the values themselves and one byte.
     """
     original, restored = np.ascontiguousarray(original), np.ascontiguousarray(restored)
     if agree(original, restored):
@@ -46,7 +46,7 @@ def encode_chunk(original: NDArray[Any], restored: NDArray[Any], step: float | N
     patterns = original.view(unsigned)
     candidates = [bytes([_RAW]) + patterns.astype(unsigned.newbyteorder("<")).tobytes()]
     specials = np.unique(patterns[~np.isfinite(original)]) if original.dtype.kind == "f" else patterns[:0]
-    if specials.size <= _MOST_SPECIALS:
+    if specials.size <= _MAX_SPECIALS:
         usual = np.isfinite(original)
         candidates += _with_differences(PATTERNS, common_zeros(original[usual]), original, restored, specials)
         places = decimal_places(original[usual])
@@ -58,18 +58,18 @@ def encode_chunk(original: NDArray[Any], restored: NDArray[Any], step: float | N
 
 
 def agree(original: NDArray[Any], restored: NDArray[Any]) -> bool:
-    """Whether contiguous arrays of one dtype and shape are the same bit for bit."""
+    """Return whether contiguous arrays of one dtype and shape are the same bit for bit."""
     unsigned = np.dtype(f"u{original.dtype.itemsize}")
     return np.array_equal(original.view(unsigned), restored.view(unsigned))
 
 
 def decode_chunk(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[Any]:
-    """Undo `encode_chunk`; takes memory in proportion to ``restored``, shape (value,), whatever the data.
+    """Decode data of `encode_chunk`; takes memory in proportion to ``restored``, shape (value,), whatever the data.
 
     Raises
     ------
     CorruptStreamError
-        When the data, which stand at ``offset`` of the container, do not hold one difference for each value.
+        When the data, at ``offset`` of the container, do not hold one difference for each value.
     """
     if not data:
         return restored.copy()
@@ -117,6 +117,7 @@ def decode_chunk(restored: NDArray[Any], data: bytes, offset: int) -> NDArray[An
 def _with_differences(
     rule: int, argument: int, original: NDArray[Any], restored: NDArray[Any], specials: NDArray[Any]
 ) -> list[bytes]:
+    """Encode by a rule of the line: a list of one chunk, or empty where the rule cannot be used."""
     line, exponents = to_line(rule, argument, restored)
     marks = np.zeros(original.size, np.uint8)
     if specials.size:
@@ -139,6 +140,7 @@ def _with_differences(
 
 
 def _with_offsets(original: NDArray[Any], restored: NDArray[Any], step: float) -> list[bytes]:
+    """Encode by the rule of offsets: a list of one chunk, or empty where offsets are too large."""
     places = places_of(original)
     bits = int(np.abs(places - places_of(restored)).max()).bit_length() + 1
     if bits > MOST_BITS:
@@ -150,6 +152,7 @@ def _with_offsets(original: NDArray[Any], restored: NDArray[Any], step: float) -
 
 
 def _decoded_offsets(restored: NDArray[Any], data: bytes, bits: int, offset: int) -> NDArray[Any]:
+    """Decode a chunk that follows the rule of offsets; float32, shape (value,)."""
     if restored.dtype != np.float32 or bits > MOST_BITS or len(data) < 9:
         raise CorruptStreamError(f"expected a rule of residual for {restored.dtype} values, got {data[0]}", offset)
     step = float(np.frombuffer(data, "<f8", 1, 1)[0])
@@ -163,7 +166,7 @@ def _decoded_offsets(restored: NDArray[Any], data: bytes, bits: int, offset: int
 
 
 def _written_length(length: int) -> bytes:
-    """A varint of at most four bytes."""
+    """Encode a length as a varint of at most four bytes."""
     written = b""
     while length > 127:
         written += bytes([length & 127 | 128])
@@ -172,7 +175,7 @@ def _written_length(length: int) -> bytes:
 
 
 def _read_length(data: bytes, place: int) -> tuple[int, int]:
-    """A varint of at most four bytes, and where it ends; bytes missing count as 0."""
+    """Decode a varint of at most four bytes; return it and where it ends. Missing bytes count as 0."""
     length = 0
     for shift in range(0, 28, 7):
         byte = data[place] if place < len(data) else 0

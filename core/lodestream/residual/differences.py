@@ -1,4 +1,4 @@
-"""Differences on a line of whole numbers, coded: what is nearly uniform noise, of a width that is known beforehand.
+"""Coding of differences on a line of whole numbers: nearly uniform noise whose width is known beforehand.
 
 The width follows from the lattice's step and the value's exponent. So the bits that a difference takes are counted
 down from the most that the exponent of the restored value allows, in contexts; the bits themselves and the sign are
@@ -28,7 +28,7 @@ def code_differences(
     data: NDArray[np.uint8],
     stored: NDArray[np.uint8],
 ) -> tuple[int, int]:
-    """Code how far values, shape (value,), are from the places on the line that a lattice restores.
+    """Encode or decode differences of values, shape (value,), from their places on the line that a lattice restores.
 
     Parameters
     ----------
@@ -62,5 +62,5 @@ def code_differences(
 
 
 def most_bits(differences: _Ints, exponents: NDArray[np.int32], marks: NDArray[np.uint8]) -> int:
-    """The largest sum of a difference's bits and its exponent, of those that have no mark; all of shape (value,)."""
+    """Return the largest sum of a difference's bits and its exponent, of values without a mark; all (value,)."""
     return kernels.most_bits(differences, exponents, marks)

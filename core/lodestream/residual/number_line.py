@@ -1,4 +1,4 @@
-"""Values as places on a line of whole numbers, in the order of what they stand for.
+"""Values as places on a line of whole numbers, in the order of the values.
 
 By the rule of patterns these are their bit patterns, less the zeros at the end that all patterns of a chunk have; by
 the rule of decimals, their number of units of so many decimal places.
@@ -16,15 +16,15 @@ __all__ = ["DECIMALS", "MOST_DECIMALS", "PATTERNS", "common_zeros", "decimal_pla
 #: The rules, as a chunk of residual names them; their arguments are how many zeros, and how many decimal places.
 PATTERNS, DECIMALS = 1, 2
 MOST_DECIMALS = 15
-_LARGEST_WHOLE = 2.0**53
-_SAMPLE = 64
+_MAX_WHOLE_NUMBER = 2.0**53
+_SAMPLE_VALUES = 64
 _POWERS = np.array([10.0**places for places in range(MOST_DECIMALS + 1)])
 
 _Ints = NDArray[np.int64]
 
 
 def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDArray[np.int32]]:
-    """Put finite values, shape (value,), on the line.
+    """Map finite values, shape (value,), to their places on the line.
 
     Returns
     -------
@@ -35,7 +35,7 @@ def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDAr
     bits = 8 * values.dtype.itemsize
     if rule == DECIMALS:
         with np.errstate(over="ignore"):
-            wide = np.clip(values.astype(np.float64) * 10.0**argument, -_LARGEST_WHOLE, _LARGEST_WHOLE)
+            wide = np.clip(values.astype(np.float64) * 10.0**argument, -_MAX_WHOLE_NUMBER, _MAX_WHOLE_NUMBER)
         return np.rint(wide).astype(np.int64), np.zeros(values.size, np.int32)
     if values.dtype.kind != "f":
         return values.astype(np.int64) >> argument, np.zeros(values.size, np.int32)
@@ -48,12 +48,12 @@ def to_line(rule: int, argument: int, values: NDArray[Any]) -> tuple[_Ints, NDAr
 
 
 def from_line(rule: int, argument: int, places: _Ints, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Undo `to_line`: values of ``dtype``, shape (value,); the places may be any numbers."""
+    """Map places, any int64, back to values of ``dtype``, shape (value,), the inverse of `to_line`."""
     if rule == DECIMALS:
         # A hostile chunk may name any place; honest ones are whole numbers that float64 holds.
-        whole = np.clip(places, -(2**53), 2**53).astype(np.float64)
+        units = np.clip(places, -(2**53), 2**53).astype(np.float64)
         with np.errstate(over="ignore"):
-            return np.asarray((whole / 10.0**argument).astype(dtype))
+            return np.asarray((units / 10.0**argument).astype(dtype))
     if dtype.kind != "f":
         return (places << argument).astype(dtype)
     signed = np.where(places < 0, ~places, places) << argument
@@ -63,32 +63,32 @@ def from_line(rule: int, argument: int, places: _Ints, dtype: np.dtype[Any]) -> 
 
 
 def common_zeros(values: NDArray[Any]) -> int:
-    """Bits at the end that are 0 in the patterns of all values, shape (value,): the argument of `PATTERNS`."""
+    """Count trailing bits that are 0 in the patterns of all values, shape (value,): the argument of `PATTERNS`."""
     if not values.size:
         return 0
     bits = 8 * values.dtype.itemsize
     seen = int(np.bitwise_or.reduce(values.view(f"u{values.dtype.itemsize}")))
     zeros = (seen & -seen).bit_length() - 1 if seen else 0
-    # The exponents stay whole, so that contexts can tell them.
+    # The exponents are not shortened, so that contexts can use them.
     return min(zeros, 23 if bits == 32 else 52) if values.dtype.kind == "f" else min(zeros, bits - 1)
 
 
 def decimal_places(values: NDArray[Any]) -> int | None:
-    """The fewest decimal places that give all of the values, shape (value,), bit for bit; None if there are none."""
+    """Return the fewest decimal places that give all values, shape (value,), bit for bit; None if there are none."""
     if values.dtype.kind != "f" or not values.size:
         return None
-    every = np.arange(MOST_DECIMALS + 1)
+    places = np.arange(MOST_DECIMALS + 1)
     # Most floats fail within a few values: all scales are tried on a sample, and all values with the first that holds.
-    some = every[_are_decimals(values[:: max(1, values.size // _SAMPLE)], every)]
-    return int(some[0]) if some.size and _are_decimals(values, some[:1])[0] else None
+    exact = places[_are_decimals(values[:: max(1, values.size // _SAMPLE_VALUES)], places)]
+    return int(exact[0]) if exact.size and _are_decimals(values, exact[:1])[0] else None
 
 
 def _are_decimals(values: NDArray[Any], places: _Ints) -> NDArray[np.bool_]:
-    """Whether so many decimal places give all of the values; bool, of the shape of ``places``."""
+    """Test whether each number of decimal places gives all of the values; bool, shape of ``places``."""
     scales = _POWERS[places, np.newaxis]
     unsigned = f"u{values.dtype.itemsize}"
     with np.errstate(over="ignore"):
-        whole = np.rint(np.clip(values.astype(np.float64) * scales, -_LARGEST_WHOLE, _LARGEST_WHOLE))
+        units = np.rint(np.clip(values.astype(np.float64) * scales, -_MAX_WHOLE_NUMBER, _MAX_WHOLE_NUMBER))
         # A zero without its sign, as a whole number has none.
-        again = ((whole + 0.0) / scales).astype(values.dtype)
+        again = ((units + 0.0) / scales).astype(values.dtype)
     return np.asarray((again.view(unsigned) == values.view(unsigned)).all(axis=1))
