@@ -1,9 +1,8 @@
-"""One axis of a grid under coarsening: which samples become nodes, which midpoints, and what lies beyond the ends.
+"""One axis of a grid under coarsening: which samples become nodes and midpoints, and the details beyond the ends.
 
-A *node* is a sample that the coarser level keeps a value for, a *midpoint* one that is predicted from the nodes on
-either side. Nodes and midpoints alternate along a *run*. An interval between nodes that has no midpoint is a *gap*; it
-decouples the least-squares system, so both of its sides are free ends, see
-``docs/mathematics.md``.
+A *node* is a sample for which the coarser level has a value; a *midpoint* is predicted from the nodes on either side.
+Nodes and midpoints alternate along a *run*. An interval between nodes that has no midpoint is a *gap*; it decouples the
+least-squares system, so both of its sides are free ends, see ``docs/mathematics.md``.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ __all__ = ["AxisStep", "axis_lengths", "axis_step", "coarse_length", "extension"
 
 
 def coarse_length(length: int, closed: bool, stops: bool = False) -> int:
-    """Samples that remain of an axis after one step; the same number where the axis has stopped.
+    """Return the samples that remain of an axis after one step; the same number where the axis has stopped.
 
     An open axis is coarsened while it has at least 3 samples, a closed one while it has at least 5. An open axis of
-    even length keeps its last sample as a node of its own beyond a gap; a closed axis of odd length has the gap at
-    the seam. With ``stops`` an open axis of even length has stopped: an axis without a direction has no end that a gap
-    could lie at.
+    even length keeps its last sample as a separate node beyond a gap; a closed axis of odd length has the gap at the
+    seam. With ``stops`` an open axis of even length has stopped, because an axis without a direction has no end for the
+    gap.
     """
     if length < (5 if closed else 3) or (stops and not closed and length % 2 == 0):
         return length
@@ -31,7 +30,7 @@ def coarse_length(length: int, closed: bool, stops: bool = False) -> int:
 
 
 def axis_lengths(length: int, closed: bool, stops: bool = False) -> list[int]:
-    """Lengths of an axis at every level until it stops, coarsest first, the axis itself last."""
+    """Return the lengths of an axis at every level until it stops, coarsest first, the axis itself last."""
     lengths = [length]
     while (coarser := coarse_length(lengths[-1], closed, stops)) != lengths[-1]:
         lengths.append(coarser)
@@ -40,7 +39,7 @@ def axis_lengths(length: int, closed: bool, stops: bool = False) -> list[int]:
 
 @lru_cache(maxsize=4096)
 def extension(midpoints: int, left: bool, right: bool, closed: bool, reach: int) -> NDArray[np.int64]:
-    """Where to find the details beyond the ends, and with which sign.
+    """Return where to find the details beyond the ends of a run, and with which sign.
 
     Parameters
     ----------
@@ -52,7 +51,7 @@ def extension(midpoints: int, left: bool, right: bool, closed: bool, reach: int)
     closed : bool
         The details repeat with period M; ``left`` and ``right`` do not matter.
     reach : int
-        How many details are wanted beyond either end.
+        Number of details beyond either end.
 
     Returns
     -------
@@ -75,7 +74,7 @@ def extension(midpoints: int, left: bool, right: bool, closed: bool, reach: int)
                 index, sign = 0, 0
             sign = -sign
         table[place] = index, sign
-    table.setflags(write=False)  # it is remembered, and shared by all who ask
+    table.setflags(write=False)  # cached, and shared by all callers
     return table
 
 
@@ -107,11 +106,11 @@ class AxisStep:
 
     @property
     def tail(self) -> bool:
-        """The last sample is a node of its own beyond a gap."""
+        """Whether the last sample is a separate node beyond a gap."""
         return self.run < self.coarse
 
     def extension(self, reach: int) -> NDArray[np.int64]:
-        """Details beyond the ends of the run, shape (2 reach, 2); see `extension`."""
+        """Return the details beyond the ends of the run, int64, shape (2 reach, 2); see `extension`."""
         return extension(self.midpoints, self.left, self.right, self.wraps, reach)
 
 
@@ -119,15 +118,15 @@ class AxisStep:
 def axis_step(
     length: int, closed: bool = False, clamped: tuple[bool, bool] = (False, False), stops: bool = False
 ) -> AxisStep:
-    """The step from an axis of this length to the next coarser one.
+    """Return the step from an axis of this length to the next coarser one.
 
-    ``clamped`` says of either end of an open axis whether its node is kept as it is: a side shared with another block,
-    or a pole. For ``stops`` see `coarse_length`.
+    ``clamped`` says whether the node at either end of an open axis keeps its value: at a side shared with another
+    block, or at a pole. For ``stops`` see `coarse_length`.
     """
     coarse = coarse_length(length, closed, stops)
     midpoints = length - coarse
     wraps = closed and length % 2 == 0 and midpoints > 0
     run = midpoints if wraps else midpoints + 1 if midpoints else coarse
     left, right = (False, False) if closed else clamped
-    # With a gap before the last node the run ends at the gap, which is a free end whatever holds that node.
+    # With a gap before the last node, the run ends at the gap, which is a free end even if that node is clamped.
     return AxisStep(length, coarse, midpoints, run, wraps, left, right and run == coarse)

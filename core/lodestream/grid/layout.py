@@ -1,4 +1,4 @@
-"""Where the levels, bands and tiles of a surface lie: pure geometry, the same for writer and reader.
+"""Positions of the levels, bands and tiles of a surface: pure geometry, the same for encoder and decoder.
 
 A surface is coded as one or more *grids*: the patches of its blocks, and the interfaces along which patches meet. The
 coefficients of one channel of a grid fill an array of the grid's own shape. Level l occupies the first rows and
@@ -25,7 +25,7 @@ from .tile_arrays import BandArrays, TileArrays, runs_of
 
 __all__ = ["REMEMBERED", "Band", "Grid", "Layout", "Source", "Tile", "tile_bounds"]
 
-#: Layouts, and tables of their tiles, that are remembered: that of a surface in hand is asked for again and again.
+#: Entries of the caches of layouts and tables of tiles: the surface that is being processed needs its own repeatedly.
 REMEMBERED = 4
 
 Sides = tuple[bool, bool, bool, bool]
@@ -33,9 +33,9 @@ _NONE: Sides = (False, False, False, False)
 
 
 class Source(NamedTuple):
-    """Where a side's points come from: the grid of an interface, perhaps backwards.
+    """The grid of an interface from which a side takes its points, in reverse order if ``reversed``.
 
-    Of an interface's end: another interface's first point, or its last one if ``reversed``.
+    For an end of an interface: the first point of another interface, or its last one if ``reversed``.
     """
 
     grid: int
@@ -43,7 +43,7 @@ class Source(NamedTuple):
 
 
 class Band(NamedTuple):
-    """A tile's part of one band.
+    """The part of one band that lies in a tile.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Band(NamedTuple):
 class Tile(NamedTuple):
     """A tile: its level, its place in the level's grid of tiles, its bands (none empty), its parent's number or -1.
 
-    ``whole`` are the bands of channels that take nothing from interfaces.
+    ``whole`` are the bands of channels that take no points from interfaces.
     """
 
     level: int
@@ -83,9 +83,9 @@ class Tile(NamedTuple):
 
 
 def tile_bounds(length: int, exponent: int) -> list[int]:
-    """Where tiles of 2**exponent coefficients begin along an axis of so many nodes, and where the last one ends.
+    """Return the starts of tiles of 2**exponent coefficients along an axis of ``length`` nodes, and the last end.
 
-    The last tile takes what is left with it, up to half a tile.
+    The last tile includes the remainder, up to half a tile.
     """
     size = 1 << exponent
     count = max(1, (length + size // 2 - 1) // size)
@@ -94,18 +94,18 @@ def tile_bounds(length: int, exponent: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Grid:
-    """What is coarsened by itself: a patch of a block, or an interface of one column.
+    """A grid that is coarsened by itself: a patch of a block, or an interface of one column.
 
     Attributes
     ----------
     shape : (rows, columns)
     closed : (bool, bool)
     clamped : four bool
-        First row, last row, first column, last column: that end of an axis keeps its node as it is.
+        First row, last row, first column, last column: whether the node at that end of an axis keeps its value.
     stops : (bool, bool)
         The axis is not coarsened further once its length is even.
     sources : four Source or None
-        Of the same sides: where their points come from, as far as the channel is a coordinate. No tile holds those.
+        For the same sides: where their points come from in channels of coordinates. No tile holds these points.
     interface : bool
     """
 
@@ -129,12 +129,12 @@ class Grid:
         return rows, columns
 
     def shape_at(self, above: int) -> tuple[int, int]:
-        """The shape so many levels below the grid itself; an axis that has stopped stays."""
+        """Return the shape ``above`` levels below the grid itself; an axis that has stopped keeps its length."""
         rows, columns = (axis[max(len(axis) - 1 - above, 0)] for axis in self.lengths)
         return rows, columns
 
     def steps_at(self, above: int) -> tuple[AxisStep, AxisStep]:
-        """The steps along axis 0 and axis 1 down from the level that is so many levels below the grid itself."""
+        """Return the steps along axis 0 and axis 1 from the level that is ``above`` levels below the grid itself."""
         shape, ends = self.shape_at(above), (self.clamped[:2], self.clamped[2:])
         rows, columns = (axis_step(*a) for a in zip(shape, self.closed, ends, self.stops, strict=True))
         return rows, columns
@@ -148,9 +148,9 @@ class Layout:
     grids : sequence of Grid
         Interfaces first. A surface of one block that shares no side is one grid.
     tile : (int, int)
-        Exponents of two of a tile's rows and columns, in coefficients of one band.
+        Binary logarithms of a tile's rows and columns, in coefficients of one band.
     levels : int, optional
-        The finest level, at least as many as the grids have; by default just as many.
+        The finest level, at least that of the grids; by default that of the grids.
     """
 
     def __init__(self, grids: Sequence[Grid], tile: tuple[int, int], levels: int | None = None) -> None:
@@ -167,19 +167,19 @@ class Layout:
     @staticmethod
     @lru_cache(maxsize=REMEMBERED)
     def single(shape: tuple[int, int], closed: Closed, tile: tuple[int, int]) -> Layout:
-        """The layout of one block that shares no side."""
+        """Return the layout of one block that shares no side."""
         return Layout([Grid(shape, closed)], tile)
 
     @staticmethod
     @lru_cache(maxsize=REMEMBERED)
     def of(grids: tuple[Grid, ...], tile: tuple[int, int]) -> Layout:
-        """The layout of some grids."""
+        """Return the layout of some grids."""
         return Layout(grids, tile)
 
     def part(self, patches: Sequence[int]) -> tuple[Layout, list[int]]:
-        """The layout of some patches and of the interfaces that they need, and the numbers that its grids have here.
+        """Return the layout of some patches and the interfaces that they need, and its grids' numbers in this one.
 
-        ``patches`` are numbers of grids, and come last. Levels are those of this layout, tiles are not.
+        ``patches`` are numbers of grids, and come last. The levels are those of this layout; tiles are numbered anew.
         """
         needed: set[int] = set()
         waiting = list(patches)
@@ -188,22 +188,22 @@ class Layout:
             needed |= new
             waiting += new
         chosen = [*sorted(needed), *patches]
-        own = {number: place for place, number in enumerate(chosen)}
+        number_in_part = {number: place for place, number in enumerate(chosen)}
         grids = []
         for number in chosen:
             first, last, left, right = (
-                None if source is None else source._replace(grid=own[source.grid])
+                None if source is None else source._replace(grid=number_in_part[source.grid])
                 for source in self.grids[number].sources
             )
             grids.append(replace(self.grids[number], sources=(first, last, left, right)))
         return Layout(grids, self.tile, self.levels), chosen
 
     def shape(self, grid: int, level: int) -> tuple[int, int]:
-        """Rows and columns of a grid at a level."""
+        """Return rows and columns of a grid at a level."""
         return self._shapes[grid][level]
 
     def steps(self, grid: int, level: int) -> tuple[AxisStep, AxisStep]:
-        """The steps along axis 0 and axis 1 of a grid from ``level`` (at least 1) to the level below."""
+        """Return the steps along axis 0 and axis 1 of a grid from ``level`` (at least 1) to the level below."""
         return self._steps[grid][level]
 
     @cached_property
@@ -215,17 +215,16 @@ class Layout:
     def tiles(self) -> Sequence[Tile]:
         """All tiles, coarsest level first, then group by group (interfaces first), row by row.
 
-        Each is made when it is asked for. What needs something of many tiles takes `tile_levels`, `parents` or
-        `tile_arrays`.
+        Tiles are computed on access. Code that works on many tiles uses `tile_levels`, `parents` or `tile_arrays`.
         """
         return _Tiles(self)
 
     def level_of(self, tile: int) -> int:
-        """The level of a tile."""
+        """Return the level of a tile."""
         return bisect_right(self._starts, tile) - 1
 
     def tiles_of(self, level: int) -> range:
-        """Numbers of the tiles of a level."""
+        """Return the numbers of the tiles of a level."""
         return range(self._starts[level], self._starts[level + 1])
 
     @cached_property
@@ -245,11 +244,11 @@ class Layout:
         return self.tile_arrays.starts[:-1]
 
     def points(self, level: int) -> int:
-        """Of all grids at a level."""
+        """Return the number of points of all grids at a level."""
         return sum(rows * columns for rows, columns in (shapes[level] for shapes in self._shapes))
 
     def tiles_from(self, level: int) -> int:
-        """The first tile of a level; the number of tiles where there is none, as for level 0."""
+        """Return the first tile of a level; the number of tiles where there is none, as for level 0."""
         return self._starts[level] if 0 < level <= self.levels else self._starts[-1]
 
     @cached_property
@@ -260,7 +259,7 @@ class Layout:
 
 
 class _Tiles(Sequence[Tile]):
-    """The tiles of a layout, each made when it is asked for."""
+    """The tiles of a layout, computed on access."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -276,26 +275,27 @@ class _Tiles(Sequence[Tile]):
 
     def __getitem__(self, number: int | slice) -> Tile | Sequence[Tile]:
         chosen = range(len(self))[number]
-        return tuple(self._made(chosen)) if isinstance(chosen, range) else next(self._made(range(chosen, chosen + 1)))
+        return tuple(self._tiles(chosen)) if isinstance(chosen, range) else next(self._tiles(range(chosen, chosen + 1)))
 
     def __iter__(self) -> Iterator[Tile]:
         for run in runs_of(len(self)):
-            yield from self._made(run)
+            yield from self._tiles(run)
 
-    def _made(self, numbers: range) -> Iterator[Tile]:
+    def _tiles(self, numbers: range) -> Iterator[Tile]:
+        """Yield the tiles of these numbers."""
         tiles, arrays = np.arange(numbers.start, numbers.stop, numbers.step), self._layout.tile_arrays
         bands = _bands(arrays.bands(tiles, True), len(tiles))
         whole = _bands(arrays.bands(tiles, False), len(tiles)) if self._layout.shared else bands
-        each = arrays.levels(tiles), arrays.places(tiles), arrays.parents(tiles)
-        told = zip(*(of.tolist() for of in each), strict=True)
-        for (level, (row, column), parent), own, others in zip(told, bands, whole, strict=True):
-            yield Tile(level, (row, column), own, others, parent)
+        columns = arrays.levels(tiles), arrays.places(tiles), arrays.parents(tiles)
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        for (level, (row, column), parent), tile_bands, whole_bands in zip(rows, bands, whole, strict=True):
+            yield Tile(level, (row, column), tile_bands, whole_bands, parent)
 
 
 def _bands(arrays: BandArrays, count: int) -> list[tuple[Band, ...]]:
-    """The bands of each of so many tiles."""
-    found: list[list[Band]] = [[] for _ in range(count)]
+    """Return the bands of each of ``count`` tiles."""
+    bands: list[list[Band]] = [[] for _ in range(count)]
     for tile, _, grid, kind, start, shape, origin, _ in zip(*(of.tolist() for of in arrays), strict=True):
         rows, columns = ((first, first + length) for first, length in zip(start, shape, strict=True))
-        found[tile].append(Band((kind > 1, kind % 2 == 1), rows, columns, tuple(origin), grid))
-    return [tuple(own) for own in found]
+        bands[tile].append(Band((kind > 1, kind % 2 == 1), rows, columns, tuple(origin), grid))
+    return [tuple(tile_bands) for tile_bands in bands]

@@ -1,8 +1,8 @@
-"""The grids of a surface of several blocks: interfaces along which patches meet, and patches of blocks.
+"""Grids of a surface of several blocks: the patches of blocks, and the interfaces along which patches meet.
 
-A side that two patches share is an interface of its own, coded once, from which both take their points; so does a side
-that is collapsed to a point (a pole), whose interface is that one point. Interfaces that meet in the corner of a patch
-have that point in common: the first of them holds it.
+A side that two patches share is an interface, coded once, from which both take their points. A side that is collapsed
+to a point (a pole) has an interface of this one point. Interfaces that meet in the corner of a patch share that point,
+which is stored with the first of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["VertexCounter", "covers", "grids_of", "shared_points"]
 
 
 def grids_of(arrangement: Arrangement) -> list[Grid]:
-    """The grids of an arrangement: interfaces first, then patches."""
+    """Return the grids of an arrangement: interfaces first, then patches."""
     owners = _owners(arrangement)
     grids = []
     for number, interface in enumerate(arrangement.interfaces):
@@ -46,15 +46,17 @@ def grids_of(arrangement: Arrangement) -> list[Grid]:
 
 
 def _owners(arrangement: Arrangement) -> dict[tuple[int, int], tuple[int, int]]:
-    """For every end of an interface the first end that is the same point; an end is (interface, 0 or 1)."""
+    """Map every end of an interface to the first end that is the same point; an end is (interface, 0 or 1)."""
     parent: dict[tuple[int, int], tuple[int, int]] = {}
 
     def find(end: tuple[int, int]) -> tuple[int, int]:
+        """Return the root of an end in the union-find structure ``parent``."""
         while (above := parent.get(end, end)) != end:
             end = above
         return end
 
     def end_of(side: Side, last: int) -> tuple[int, int]:
+        """Return the end of an interface at the first or last point of a side."""
         pole = arrangement.interfaces[side.interface].length == 1
         return side.interface, 0 if pole else last ^ side.reversed
 
@@ -69,7 +71,7 @@ def _owners(arrangement: Arrangement) -> dict[tuple[int, int], tuple[int, int]]:
 
 
 class VertexCounter:
-    """Leaves each vertex of a surface to one of its patches, so that errors count it once."""
+    """Assigns each vertex of a surface to one of its patches, so that errors count it once."""
 
     def __init__(self, arrangement: Arrangement) -> None:
         self._interfaces = arrangement.interfaces
@@ -78,7 +80,7 @@ class VertexCounter:
         self._known: set[tuple[int, int]] = set()
 
     def count(self, patch: Patch, counted: NDArray[np.bool_]) -> None:
-        """Set to False what earlier patches counted, or an earlier place of this; shape (row, column), as stored."""
+        """Set vertices to False that earlier patches counted, or an earlier place of this; (row, column), as stored."""
         last_row, last_column = (n - 1 for n in counted.shape)
         lines = counted[0], counted[-1], counted[:, 0], counted[:, -1]
         ends = (
@@ -94,11 +96,11 @@ class VertexCounter:
                 continue
             interface = self._interfaces[side.interface]
             if interface.length == 1:
-                line[1:] = False  # a pole: all of the line is one vertex
+                line[1:] = False  # a pole: the whole line is one vertex
                 held.setdefault(self._owners.get((side.interface, 0), (side.interface, 0)), places[0])
                 continue
             if side.interface in self._used:
-                # Not its ends, which other interfaces may share: these are counted by owner below.
+                # Except its ends, which other interfaces may share: these are counted by owner below.
                 line[slice(None) if interface.closed else slice(1, -1)] = False
             self._used.add(side.interface)
             if not interface.closed:
@@ -114,7 +116,7 @@ class VertexCounter:
         self._known.update(held)
 
     def pass_over(self, patch: Patch) -> None:
-        """Leave to a patch what is its own, as `count` does, without counting it."""
+        """Assign vertices to a patch as `count` does, without counting them."""
         for side in patch.sides:
             if side is None:
                 continue
@@ -126,9 +128,9 @@ class VertexCounter:
 
 
 def shared_points(arrangement: Arrangement, shapes: Sequence[tuple[int, int]]) -> Groups:
-    """The points of blocks of these shapes that are one, since they are the same point of an interface.
+    """Return the groups of points of blocks of these shapes that are the same point of an interface.
 
-    They are numbered over all blocks, one after another, each in row order.
+    Points are numbered over all blocks in order, each block in row-major order.
     """
     starts = np.cumsum([0, *(height * width for height, width in shapes)], dtype=np.int64)
     interfaces = starts[-1] + np.cumsum(
@@ -146,48 +148,51 @@ def shared_points(arrangement: Arrangement, shapes: Sequence[tuple[int, int]]) -
             if side is not None:
                 points = starts[patch.block] + (down * shape[1] + right)
                 along = np.arange(points.size)[:: -1 if side.reversed else 1]
-                along = np.minimum(along, arrangement.interfaces[side.interface].length - 1)  # all of a pole are one
+                # All points of a pole are one.
+                along = np.minimum(along, arrangement.interfaces[side.interface].length - 1)
                 pairs.append(np.stack([points, interfaces[side.interface] + along], axis=-1))
-    found = Groups.of(np.concatenate(pairs))
-    real = found.points < starts[-1]  # the points of interfaces have but helped
-    return Groups.of(np.stack([found.points[real], found.firsts[real]], axis=-1))
+    groups = Groups.of(np.concatenate(pairs))
+    real = groups.points < starts[-1]  # without the points of interfaces, which only connect points of blocks
+    return Groups.of(np.stack([groups.points[real], groups.firsts[real]], axis=-1))
 
 
 def covers(shape: tuple[int, int], closed: Closed, patches: Sequence[Patch]) -> bool:
-    """Whether patches of a block cover each of its cells once; along a closed axis the last cells wrap."""
+    """Return whether patches of a block cover each of its cells once; along a closed axis the last cells wrap."""
     cells = [
         (rows, columns)
         for patch in patches
         for rows in _cells(shape[0], closed[0], patch.closed[0], patch.rows)
         for columns in _cells(shape[1], closed[1], patch.closed[1], patch.columns)
     ]
-    whole = [n if wraps else max(n - 1, 1) for n, wraps in zip(shape, closed, strict=True)]
-    # As many cells as the block has, and none twice: then each is there.
+    cells_of_block = [n if wraps else max(n - 1, 1) for n, wraps in zip(shape, closed, strict=True)]
+    # As many cells as the block has, and none twice, so every cell is covered.
     area = sum((b - a) * (d - c) for (a, b), (c, d) in cells)
-    return area == whole[0] * whole[1] and not _overlap(cells)
+    return area == cells_of_block[0] * cells_of_block[1] and not _overlap(cells)
 
 
 def _overlap(cells: list[tuple[tuple[int, int], tuple[int, int]]]) -> bool:
-    """Whether any two rectangles, each (rows, columns), have a cell in common.
+    """Return whether any two rectangles, each (rows, columns), have a cell in common.
 
-    Row after row the columns that are taken are kept in order, so that each is compared with two others: there may be
-    tens of thousands.
+    A sweep over the rows keeps the occupied columns sorted, so that a rectangle is compared with only two others: there
+    may be tens of thousands.
     """
-    taken: list[tuple[int, int]] = []
+    occupied: list[tuple[int, int]] = []
     ends: list[tuple[int, tuple[int, int]]] = []
     for (first, last), columns in sorted(cells):
         while ends and ends[0][0] <= first:
-            taken.pop(bisect_left(taken, heappop(ends)[1]))
-        place = bisect_left(taken, columns)
-        if (place < len(taken) and taken[place][0] < columns[1]) or (place and taken[place - 1][1] > columns[0]):
+            occupied.pop(bisect_left(occupied, heappop(ends)[1]))
+        place = bisect_left(occupied, columns)
+        if (place < len(occupied) and occupied[place][0] < columns[1]) or (
+            place and occupied[place - 1][1] > columns[0]
+        ):
             return True
-        taken.insert(place, columns)
+        occupied.insert(place, columns)
         heappush(ends, (last, columns))
     return False
 
 
 def _cells(length: int, wraps: bool, closed: bool, window: tuple[int, int]) -> Iterator[tuple[int, int]]:
-    """First and past-the-last cell along an axis, in one piece or two."""
+    """Yield first and past-the-last cell along an axis, in one piece or two."""
     if closed:
         yield 0, length
         return

@@ -1,8 +1,8 @@
-"""What a window of a surface needs: the tiles whose coefficients have a part in its points.
+"""The tiles that a window of a surface needs: those whose coefficients affect its points.
 
-From the finest level down, an axis is followed by the indices that are needed: of samples first, then of the nodes and
-details that give them back (`docs/mathematics.md`: an update takes ten details on either side, a third step two nodes
-to the left of a detail and three to the right).
+From the finest level down, the needed indices of an axis are computed: first of samples, then of the nodes and details
+from which they are reconstructed (`docs/mathematics.md`: an update takes ten details on either side, a third step two
+nodes to the left of a detail and three to the right).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from .window import samples
 
 __all__ = ["coefficients_needed", "needed_tiles"]
 
-#: Details that an update takes on either side of a node.
+#: Details that an update uses on either side of a node.
 _UPDATE = 10
-#: Nodes that a third step takes, counted from the detail.
+#: Nodes that the third step uses, relative to the detail.
 _PREDICT = np.arange(-2, 4)
 
 Mask = NDArray[np.bool_]
 
 
 def needed_tiles(layout: Layout, region: Region, level: int) -> Mask:
-    """Which tiles of a surface of one grid the points of a window of a level need, parents included.
+    """Find the tiles of a surface of one grid that the points of a window of a level need, parents included.
 
-    Parents are there because the contexts of a tile's segments look at them.
+    Parents are included because the contexts of a tile's segments use them.
 
     Parameters
     ----------
@@ -45,8 +45,8 @@ def needed_tiles(layout: Layout, region: Region, level: int) -> Mask:
     """
     arrays, shape = layout.tile_arrays, layout.shape(0, level)
     wanted = [samples(span, length) for span, length in zip(region, shape, strict=True)]
-    # Along each axis how many coefficients are needed before each one, nodes first, details after them: level after
-    # level from the finest one, and where a level begins.
+    # Prefix sums of the needed coefficients along each axis, nodes before details, level by level from the finest one;
+    # and where the sums of a level begin.
     before: tuple[list[NDArray[np.int64]], ...] = [], []
     begins = np.zeros((2, level + 2), np.int64)
     for coarser in range(level, -1, -1):
@@ -62,11 +62,11 @@ def needed_tiles(layout: Layout, region: Region, level: int) -> Mask:
     rows, columns = (np.concatenate(counts) for counts in before)
     for run in runs_of(layout.tiles_of(level).stop):
         bands = arrays.bands(np.arange(run.start, run.stop), True)
-        own = np.ones(len(bands.tile), np.bool_)
+        is_needed = np.ones(len(bands.tile), np.bool_)
         for axis, counts in enumerate((rows, columns)):
             first = begins[axis, 1:][bands.level] + bands.start[:, axis]
-            own &= counts[first + bands.shape[:, axis]] > counts[first]
-        needed[run.start + bands.tile[own]] = True
+            is_needed &= counts[first + bands.shape[:, axis]] > counts[first]
+        needed[run.start + bands.tile[is_needed]] = True
     needed[0] = True
     for coarser in range(level, 1, -1):
         tiles = layout.tiles_of(coarser)
@@ -75,11 +75,11 @@ def needed_tiles(layout: Layout, region: Region, level: int) -> Mask:
 
 
 def coefficients_needed(samples: Mask, step: AxisStep) -> Mask:
-    """Which nodes (first) and details (after them) of a step give samples of an axis back; bool, shape (length,)."""
+    """Find the nodes (first) and details (after them) that reconstruct samples of an axis; bool, shape (length,)."""
     if not step.midpoints:
         return samples.copy()
     line = np.zeros(step.length, np.bool_)
-    if step.tail:  # a node beyond a gap is kept as it is, and nothing else depends on it
+    if step.tail:  # a node beyond a gap is unchanged, and nothing else depends on it
         line[step.coarse - 1] = samples[-1]
         if not samples[:-1].any():
             return line
@@ -107,7 +107,7 @@ def coefficients_needed(samples: Mask, step: AxisStep) -> Mask:
     else:
         nodes[places[(places >= 0) & (places < step.run)]] = True
         if places.min() < 0:
-            nodes[:3] = True  # from which those beyond the end are extrapolated
+            nodes[:3] = True  # the nodes beyond the end are extrapolated from these
         if places.max() >= step.run:
             nodes[-3:] = True
     line[: step.run] |= nodes

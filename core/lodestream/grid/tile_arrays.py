@@ -1,7 +1,7 @@
-"""Tiles and bands of a layout by arithmetic: arrays for whichever tiles are asked for, nothing kept for each tile.
+"""Tiles and bands of a layout by arithmetic: arrays for any requested tiles, nothing stored for each tile.
 
-All tiles of a grid's level are alike but those at its ends. So a tile's number tells its level, its grid and its place,
-and these tell its bands and its parent.
+All tiles of a grid's level are alike except those at its ends. So level, grid and place of a tile follow from its
+number, and its bands and its parent from these.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 __all__ = ["AT_ONCE", "BandArrays", "TileArrays", "runs_of"]
 
-#: Tiles whose arrays are made at once, where all tiles are gone through.
+#: Tiles whose arrays are computed together in a loop over all tiles.
 AT_ONCE = 1 << 12
 
-#: Of the bands of a tile of a finer level than 0: whether they hold details along the rows' axis and the columns'.
+#: The three bands of a tile above level 0: whether they hold details along the rows' axis, and along the columns' axis.
 _DOWN, _ACROSS = np.array([0, 1, 1]), np.array([1, 0, 1])
 
 Ints = NDArray[np.int64]
 
 
 class _Grid(Protocol):
-    """What counts of a grid here, see `layout.Grid`."""
+    """The properties of a grid that matter here, see `layout.Grid`."""
 
     @property
     def taken(self) -> tuple[bool, bool, bool, bool]: ...
@@ -39,7 +39,7 @@ class BandArrays(NamedTuple):
     Attributes
     ----------
     tile : int64, shape (band,)
-        Which of the tiles asked for, from 0.
+        Index of the tile in the request, from 0.
     level, grid : int64, shape (band,)
     kind : int64, shape (band,)
         1 for details along the columns' axis plus 2 for details along the rows' axis.
@@ -70,7 +70,7 @@ class TileArrays:
     shapes : int64, shape (level, grid, axis)
         Rows and columns of each grid at each level.
     exponents : (int, int)
-        Of two, of a tile's rows and columns, in coefficients of one band.
+        Binary logarithms of a tile's rows and columns, in coefficients of one band.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class TileArrays:
         self._group = np.cumsum(leads) - 1
         cut = (self._members[self._group] == 1).reshape(levels, -1) & ~self._interface
         cut[0] = False  # level 0 is one tile
-        # The last tile takes what is left with it, up to half a tile.
+        # The last tile includes the remainder, up to half a tile.
         down_across = np.maximum((self._coarse + self._size // 2 - 1) // self._size, 1)
         self._counts = np.where(cut.reshape(-1, 1), down_across, 1)
         ends = np.cumsum(self._counts[self._leader].prod(axis=1))
@@ -106,11 +106,11 @@ class TileArrays:
         self.starts = np.concatenate([self._first[self._group[:: self._grids]], ends[-1:]])
 
     def levels(self, tiles: Ints) -> Ints:
-        """The level of each tile, int64, shape (tile,)."""
+        """Return the level of each tile, int64, shape (tile,)."""
         return self.starts.searchsorted(tiles, side="right") - 1
 
     def groups(self, level: int) -> tuple[Ints, Ints]:
-        """The grids and tiles of a level in groups of grids whose tiles are common, int64, shape (group + 1,) each.
+        """Return the grids and tiles of a level by groups of grids that share tiles, int64, shape (group + 1,) each.
 
         The first grid and the first tile of each group, then how many grids there are and where the next level begins.
         """
@@ -120,23 +120,23 @@ class TileArrays:
         return np.append(grids, self._grids), np.append(self._first[groups], self.starts[level + 1])
 
     def places(self, tiles: Ints) -> Ints:
-        """Row and column of each tile among those of its level and grid, int64, shape (tile, axis)."""
+        """Return row and column of each tile among those of its level and grid, int64, shape (tile, axis)."""
         return self._located(tiles)[1]
 
     def parents(self, tiles: Ints) -> Ints:
-        """The number of each tile's parent, -1 where it has none; int64, shape (tile,)."""
+        """Return the number of each tile's parent, -1 where it has none; int64, shape (tile,)."""
         leader, place = self._located(tiles)
         above = leader - self._grids
-        # A level may have one tile fewer than twice those below it, or one more, since its last tile takes what is
-        # left: that one has the last parent too.
+        # Because the last tile includes the remainder, a level may have one tile fewer than twice those of the level
+        # below, or one more, which then also has the last parent.
         up = np.minimum(place >> self._halved[leader], self._counts[above] - 1)
-        found = self._first[self._group[above]] + up[:, 0] * self._counts[above, 1] + up[:, 1]
-        return np.where(leader >= 2 * self._grids, found, -1)
+        parent = self._first[self._group[above]] + up[:, 0] * self._counts[above, 1] + up[:, 1]
+        return np.where(leader >= 2 * self._grids, parent, -1)
 
     def bands(self, tiles: Ints, coordinate: bool) -> BandArrays:
-        """The bands of tiles: those of coordinates, or of channels that take nothing from interfaces and have none.
+        """Return the bands of tiles in channels of coordinates, or in channels that take no points from interfaces.
 
-        ``tiles`` are numbers, integers of shape (tile,).
+        ``tiles`` are numbers, int64, shape (tile,). Without ``coordinate``, interfaces have no bands.
         """
         leader, place = self._located(tiles)
         number = np.arange(len(tiles))
@@ -155,20 +155,20 @@ class TileArrays:
         if not coordinate:
             kept &= ~self._interface[grid]
         cell, slot = kept.T.nonzero()
-        found = np.array([rows[:, _DOWN[slot], cell], columns[:, _ACROSS[slot], cell]])
-        shape, start, origin = found.transpose(1, 2, 0)
+        extents = np.array([rows[:, _DOWN[slot], cell], columns[:, _ACROSS[slot], cell]])
+        shape, start, origin = extents.transpose(1, 2, 0)
         pair = pair[cell]
         kind = np.where(lowest[cell], 0, slot + 1)
         return BandArrays(number[cell], pair // self._grids, grid[cell], kind, start, shape, origin, self._halved[pair])
 
     def _located(self, tiles: Ints) -> tuple[Ints, Ints]:
-        """Of each tile: its level and the first of its grids, as one number, and its place, shape (tile, axis)."""
+        """Return for each tile level and first grid as one number, and its place, shape (tile, axis)."""
         group = self._first.searchsorted(tiles, side="right") - 1
         leader = self._leader[group]
         return leader, np.array(np.divmod(tiles - self._first[group], self._counts[leader, 1])).T
 
     def _spans(self, pair: Ints, grid: Ints, place: Ints, axis: int, coordinate: bool) -> Ints:
-        """Along an axis, of the nodes and of the details of tiles: length, start, and start within the whole band.
+        """Return length, start, and start within the whole band of the tiles' nodes and details along an axis.
 
         Shape (3, 2, tile and grid).
         """
@@ -176,27 +176,27 @@ class TileArrays:
         last = place == self._counts[pair, axis] - 1
         start = place * self._size[axis]
         stop = np.where(last, coarse, start + self._size[axis])
-        # There are up to two details fewer than nodes, and as many where an axis wraps; those of a stopped axis: 0.
+        # There are up to two details fewer than nodes, as many where an axis wraps, and none on a stopped axis.
         first = np.minimum(start, details)
         count = np.where(last, details, np.minimum(stop, details)) - first
         if coordinate:
-            # A side that comes from an interface is coded there: the first and the last band leave its nodes out.
+            # A side that comes from an interface is coded there: the first and the last band omit its nodes.
             start = start + (self._taken[grid, 2 * axis] & (place == 0))
             stop = stop - (self._taken[grid, 2 * axis + 1] & last)
         return np.array([[stop - start, count], [start, coarse + first], [start, first]])
 
 
 def runs_of(count: int) -> Iterator[range]:
-    """All of so many numbers in runs of `AT_ONCE`."""
+    """Yield the numbers below ``count`` in runs of `AT_ONCE`."""
     for start in range(0, count, AT_ONCE):
         yield range(start, min(start + AT_ONCE, count))
 
 
 def _leads(interface: NDArray[np.bool_], shapes: Ints, exponents: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which grids are the first of those whose tiles are common, bool, shape (level, grid).
+    """Find the grids that are the first of a group that shares tiles, bool, shape (level, grid).
 
-    These are all interfaces, and neighbouring patches small at the level. Grids that have a tile in common have one at
-    the coarser levels too; level 0 of all grids is one tile.
+    All interfaces form a group, and so do neighbouring patches that are small at the level. Grids that share a tile
+    also share one at the coarser levels; level 0 of all grids is one tile.
     """
     levels, grids, _ = shapes.shape
     most = 4 << sum(exponents)  # points of a tile's three bands, and of the nodes under them
@@ -207,14 +207,14 @@ def _leads(interface: NDArray[np.bool_], shapes: Ints, exponents: tuple[int, int
         merged: list[tuple[int, int]] = []
         size = 0
         for start, stop in groups:
-            own = points[stop] - points[start]
+            group_size = points[stop] - points[start]
             joins = merged and interface[start] == interface[merged[-1][0]]
-            if joins and (interface[start] or size + own <= most):
+            if joins and (interface[start] or size + group_size <= most):
                 merged[-1] = merged[-1][0], stop
-                size += own
+                size += group_size
             else:
                 merged.append((start, stop))
-                size = own
+                size = group_size
         groups = merged
         leads[level, [start for start, _ in groups]] = True
     leads[0, 0] = True

@@ -1,8 +1,8 @@
-"""Windows of a grid: rows and columns, half-open, which along a closed axis may go on across its seam.
+"""Windows of a grid: half-open ranges of rows and columns, which may continue across the seam of a closed axis.
 
 Along an open axis of N samples a window runs from ``start`` to before ``stop`` with 0 <= start < stop <= N. Along a
-closed one ``start`` is below N and ``stop`` at most ``start + N``: sample N is sample 0 again. Everything that treats a
-window of a closed axis unlike others is here.
+closed one ``start`` is below N and ``stop`` at most ``start + N``: sample N is sample 0 again. All code that
+distinguishes windows of closed axes is in this module.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Shape = tuple[int, int]
 
 
 def check_region(region: Region, shape: Shape, closed: tuple[bool, bool] = (False, False)) -> None:
-    """Refuse a window that a grid does not have.
+    """Raise an error for a window that does not lie in a grid.
 
     Raises
     ------
@@ -53,18 +53,18 @@ def check_region(region: Region, shape: Shape, closed: tuple[bool, bool] = (Fals
 
 
 def spans(span: Span, length: int) -> list[Span]:
-    """The parts of a window along an axis that do not cross the seam, in the window's order: one or two."""
+    """Return the one or two parts of a window along an axis that do not cross the seam, in the window's order."""
     start, stop = span
     return [span] if stop <= length else [(start, length), (0, stop - length)]
 
 
 def places(span: Span, length: int) -> NDArray[np.int64]:
-    """The samples of an axis in a window, in the window's order; int64, shape (sample,)."""
+    """Return the samples of an axis in a window, in the window's order; int64, shape (sample,)."""
     return np.arange(*span) % length
 
 
 def samples(span: Span, length: int) -> NDArray[np.bool_]:
-    """Which samples of an axis are in a window; bool, shape (sample,)."""
+    """Return which samples of an axis are in a window; bool, shape (sample,)."""
     inside = np.zeros(length, np.bool_)
     for start, stop in spans(span, length):
         inside[start:stop] = True
@@ -72,12 +72,12 @@ def samples(span: Span, length: int) -> NDArray[np.bool_]:
 
 
 def meets(span: Span, part: Span, length: int) -> bool:
-    """Whether a window has samples of a part of the axis, a half-open span that does not cross the seam."""
+    """Return whether a window has samples of a part of the axis, a half-open span that does not cross the seam."""
     return any(start < part[1] and part[0] < stop for start, stop in spans(span, length))
 
 
 def contains(outer: Region, inner: Region, shape: Shape) -> bool:
-    """Whether all points of a window are in another one of the same grid."""
+    """Return whether all points of a window are in another one of the same grid."""
     for (first, last), (start, stop), length in zip(outer, inner, shape, strict=True):
         if last - first < length and (start - first) % length + stop - start > last - first:
             return False
@@ -85,7 +85,7 @@ def contains(outer: Region, inner: Region, shape: Shape) -> bool:
 
 
 def aligned(region: Region, shape: Shape, sizes: Sequence[int]) -> Region:
-    """The smallest window around another one that is made of whole cells of so many rows and columns.
+    """Return the smallest window around another one that consists of whole cells of ``sizes`` rows and columns.
 
     Cells begin with the first sample of an axis; the last one of an axis may be smaller.
     """
@@ -99,60 +99,61 @@ def aligned(region: Region, shape: Shape, sizes: Sequence[int]) -> Region:
 
 
 def among(region: Region, shape: Shape, nodes: Sequence[NDArray[np.int64]]) -> Region | None:
-    """The window of a coarser grid that has the points of it that stand in a window of this one; None if none does.
+    """Return the window of a coarser grid of the points that lie in a window of this one; None if there are none.
 
     Parameters
     ----------
     region : ((int, int), (int, int))
         Rows and columns, half-open, of this grid.
     shape : (int, int)
-        Of this grid.
+        Rows and columns of this grid.
     nodes : two int64 arrays, shape (row,) and (column,)
-        The rows and the columns of this grid at which those of the coarser one stand, increasing.
+        The rows and columns of this grid at which those of the coarser grid lie, ascending.
 
     Returns
     -------
     ((int, int), (int, int)) or None
-        Rows and columns, half-open, of the coarser grid; across its seam where ``region`` crosses this one's.
+        Rows and columns, half-open, of the coarser grid; across its seam where ``region`` crosses the seam.
     """
-    found = []
+    window = []
     for span, length, line in zip(region, shape, nodes, strict=True):
         parts = [np.searchsorted(line, part).tolist() for part in spans(span, length)]
         count, start = sum(stop - start for start, stop in parts), parts[0][0]
         if not count:
             return None
-        start = 0 if start == len(line) else start  # the first one stands beyond the seam
-        found.append((start, start + count))
-    return found[0], found[1]
+        start = 0 if start == len(line) else start  # the first node lies beyond the seam
+        window.append((start, start + count))
+    return window[0], window[1]
 
 
 def spanning(window: Region, shape: Shape, nodes: Sequence[NDArray[np.int64]]) -> Region:
-    """The smallest window of this grid that has the points of a window of a coarser one; undoes `among`.
+    """Return the smallest window of this grid with all points of a window of a coarser one; the inverse of `among`.
 
     Parameters
     ----------
     window : ((int, int), (int, int))
         Rows and columns, half-open, of the coarser grid.
     shape, nodes
-        As of `among`.
+        As in `among`.
     """
-    found = []
+    region = []
     for (start, stop), length, line in zip(window, shape, nodes, strict=True):
         turns, last = divmod(stop - 1, len(line))
-        found.append((int(line[start]), int(line[last]) + 1 + turns * length))
-    return found[0], found[1]
+        region.append((int(line[start]), int(line[last]) + 1 + turns * length))
+    return region[0], region[1]
 
 
 def hull(region: Region, shape: Shape) -> Region:
-    """The smallest window around another one that crosses no seam: all of an axis along which that one does."""
+    """Return the smallest window around another one that crosses no seam: the whole axis where that one does."""
     rows, columns = (span if span[1] <= length else (0, length) for span, length in zip(region, shape, strict=True))
     return rows, columns
 
 
 def taken(array: NDArray[Any], region: Region, shape: Shape, first: Span = (0, 0)) -> NDArray[Any]:
-    """The window of an array of a grid of this shape, shape (row, column, ...); a view where it crosses no seam.
+    """Return a window of the array of a grid, shape (row, column, ...); a view where it crosses no seam.
 
-    The array begins at row and column ``first`` of the grid, which are 0 where the window crosses the seam.
+    ``shape`` is the grid's. The array begins at row and column ``first`` of the grid, which are 0 where the window
+    crosses the seam.
     """
     for axis, (span, length) in enumerate(zip(region, shape, strict=True)):
         if span[1] <= length:
@@ -163,12 +164,12 @@ def taken(array: NDArray[Any], region: Region, shape: Shape, first: Span = (0, 0
 
 
 def within(array: NDArray[Any], around: Region, region: Region, shape: Shape) -> NDArray[Any]:
-    """The part of an array of a window around another one that belongs to this; a view where it is one piece.
+    """Return a window from the array of a window around it; a view where it is contiguous.
 
     ``array`` has the shape (row, column, ...) of the window ``around``; ``shape`` is the grid's.
     """
     for axis, ((first, last), (start, stop), length) in enumerate(zip(around, region, shape, strict=True)):
-        if last - first == length:  # all of the axis, from wherever: the window may go on from its end to its begin
+        if last - first == length:  # the whole axis: the window may continue from its end to its begin
             array = _along(array, axis, (start - first) % length, stop - start, length)
         else:
             begin = start - first if start >= first else start + length - first
@@ -177,12 +178,12 @@ def within(array: NDArray[Any], around: Region, region: Region, shape: Shape) ->
 
 
 def _along(array: NDArray[Any], axis: int, start: int, count: int, length: int) -> NDArray[Any]:
-    """So many samples of an axis from one on, going on with the first ones; a view where they are one piece."""
+    """Return ``count`` samples of an axis from ``start`` on, continuing at the first; a view where contiguous."""
     if start + count <= length:
         return array[(slice(None),) * axis + (slice(start, start + count),)]
     return array.take(places((start, start + count), length), axis=axis)
 
 
 def is_whole(region: Region, shape: Shape) -> bool:
-    """Whether a window has all points of a grid, from whatever point it starts."""
+    """Return whether a window has all points of a grid, from whatever point it starts."""
     return all(stop - start == length for (start, stop), length in zip(region, shape, strict=True))

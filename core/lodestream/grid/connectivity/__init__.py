@@ -1,9 +1,9 @@
-"""Sides that blocks share: where blocks are split, which way their axes run, which interfaces are coded once.
+"""Sides that blocks share: where blocks are split, the direction of axes, and interfaces that are coded once.
 
-Blocks that meet along points of their sides must keep these points the same at every level. So a shared side becomes a
+Blocks that meet along points of their sides must have the same points there at every level. So a shared side becomes an
 *interface*, coded once, and every block that has it is *clamped* at all its open ends (``docs/mathematics.md``, section
-6): then a side's points at a coarser level follow from the side's points alone, whatever lies beside them. For that, a
-interface must be the whole side of every patch that uses it, and be coarsened the same way from all of them:
+6): then a side's points at a coarser level depend on the side's points alone. For that, an interface must be the whole
+side of every patch that uses it, and be coarsened the same way from all of them:
 
 - `find_contacts` finds where sides run through the same points of the lattice;
 - `find_cuts` splits blocks where a contact ends amid a side, as far as the cut goes;

@@ -1,4 +1,4 @@
-"""From blocks to patches and the interfaces that they share."""
+"""Patches of blocks, and the interfaces that they share."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def arrange(blocks: Sequence[LatticeBlock], geometric: int) -> Arrangement:
     ----------
     blocks : sequence of LatticeBlock
     geometric : int
-        How many of the coordinates, the first ones, say where a point is. With fewer than 2 (heights over an implied
-        lattice) nothing is known to be shared, and there are no poles.
+        The first so many coordinates are the position of a point. With fewer than 2 (heights over an implied lattice)
+        no sides are shared, and there are no poles.
 
     Returns
     -------
@@ -50,6 +50,7 @@ def arrange(blocks: Sequence[LatticeBlock], geometric: int) -> Arrangement:
 
 
 def _cuts(blocks: Sequence[LatticeBlock], geometric: int) -> Cuts:
+    """Find the cuts of all blocks; none where points have no position."""
     lengths = {(n, axis): block.coordinates.shape[axis] for n, block in enumerate(blocks) for axis in (0, 1)}
     closed = {(n, axis) for n, block in enumerate(blocks) for axis in (0, 1) if block.closed[axis]}
     if geometric < 2:
@@ -68,12 +69,13 @@ class _Draft:
     place: tuple[int, int]  # among the patches of its block
 
     def along(self, axis: int) -> NDArray[np.intp]:
-        """Indices in the source block, not yet modulo its length."""
+        """Return indices in the source block along an axis, int64, shape (point,), not yet modulo its length."""
         start, stop = self.windows[axis]
         return np.arange(start, stop)[:: -1 if self.flipped[axis] else 1]
 
 
 def _drafts(number: int, block: LatticeBlock, cuts: Cuts) -> list[_Draft]:
+    """Cut a block into drafts of patches."""
     bands = [_bands(cuts, (number, axis)) for axis in (0, 1)]
     closed = tuple(block.closed[axis] and not cuts.at[(number, axis)] for axis in (0, 1))
     return [
@@ -84,7 +86,7 @@ def _drafts(number: int, block: LatticeBlock, cuts: Cuts) -> list[_Draft]:
 
 
 def _bands(cuts: Cuts, axis: tuple[int, int]) -> list[tuple[_Window, bool]]:
-    """Windows of an axis, and whether they are flipped for the sake of a closed axis."""
+    """Return the windows of an axis between cuts, and whether they are flipped for the sake of a closed axis."""
     length, places = cuts.lengths[axis], sorted(cuts.at[axis])
     if axis not in cuts.closed:
         places = [0, *places, length - 1]
@@ -117,7 +119,7 @@ class _Matching:
 
     def __init__(self, blocks: Sequence[LatticeBlock], drafts: Sequence[_Draft], geometric: int) -> None:
         self.poles: set[tuple[int, int]] = set()
-        found: dict[tuple[bool, bytes], list[tuple[tuple[int, int], bool]]] = {}
+        users_by_points: dict[tuple[bool, bytes], list[tuple[tuple[int, int], bool]]] = {}
         lengths: dict[tuple[bool, bytes], int] = {}
         for number, draft in enumerate(drafts):
             block = blocks[draft.block]
@@ -130,18 +132,18 @@ class _Matching:
                     continue
                 place = draft.along(across)[-(side % 2)] % shape[across]
                 line = line_of(block, along, place, draft.along(along) % shape[along], geometric)
-                if (line[1:, :-1] == line[:-1, :-1]).all():  # all in one place: a pole, if no hole is among them
+                if (line[1:, :-1] == line[:-1, :-1]).all():  # all points coincide: a pole, if none is a hole
                     if line[:, -1].all():
                         self.poles.add((number, side))
                     continue
-                # The lesser of both directions is the key, so that sides that run against each other meet. A closed
-                # side was turned before, together with all that it touches, and meets others as it is.
+                # The lesser of both directions is the key, so that sides that run against each other match. A closed
+                # side was turned before, together with all that it touches, and needs no second direction.
                 forward, backward = line.tobytes(), line[::-1].tobytes()
                 against = backward < forward and not draft.closed[along]
                 key = draft.closed[along], backward if against else forward
-                found.setdefault(key, []).append(((number, side), against))
+                users_by_points.setdefault(key, []).append(((number, side), against))
                 lengths[key] = len(line)
-        shared = {key: users for key, users in found.items() if len(users) > 1}
+        shared = {key: users for key, users in users_by_points.items() if len(users) > 1}
         self.users = [[user for user, _ in users] for users in shared.values()]
         self.sides = {
             user: (interface, against) for interface, users in enumerate(shared.values()) for user, against in users
@@ -157,18 +159,19 @@ class _Directions:
 
 
 def _directions(drafts: Sequence[_Draft], matching: _Matching) -> _Directions:
-    """Turn open axes so that shared sides run the same way, wherever it matters and can be done."""
+    """Flip open axes so that shared sides run the same way, wherever it matters and is possible."""
     # Opposite sides are one axis; what a shared side says of two axes is whether they run against each other.
     related: dict[_PatchAxis, list[tuple[_PatchAxis, bool]]] = {}
 
-    def relate(one: _PatchAxis, other: _PatchAxis, against: bool) -> None:
-        related.setdefault(one, []).append((other, against))
-        related.setdefault(other, []).append((one, against))
+    def relate(axis: _PatchAxis, other_axis: _PatchAxis, against: bool) -> None:
+        """Record whether two axes run against each other."""
+        related.setdefault(axis, []).append((other_axis, against))
+        related.setdefault(other_axis, []).append((axis, against))
 
     for users in matching.users:
-        for one, other in pairwise(users):
-            against = matching.sides[one][1] != matching.sides[other][1]
-            relate((one[0], 1 - one[1] // 2), (other[0], 1 - other[1] // 2), against)
+        for first, second in pairwise(users):
+            against = matching.sides[first][1] != matching.sides[second][1]
+            relate((first[0], 1 - first[1] // 2), (second[0], 1 - second[1] // 2), against)
     # Neighbours of one block also where the cut between them is a pole, so that they fit at every level.
     numbers = {(draft.block, *draft.place): number for number, draft in enumerate(drafts)}
     for number, draft in enumerate(drafts):
@@ -183,17 +186,17 @@ def _directions(drafts: Sequence[_Draft], matching: _Matching) -> _Directions:
     for root in related:
         if root in met:
             continue
-        # All that is related gets a direction from the first. If a way round contradicts it, as on a Moebius band,
-        # there is none that suits all: these axes are coarsened only as far as they need no direction.
+        # All related axes get a direction from the first one. If a cycle contradicts it, as on a Moebius band, no
+        # choice of directions is consistent: these axes are coarsened only as far as they need no direction.
         met[root], consistent, pending, members = False, True, [root], []
         while pending:
-            one = pending.pop()
-            members.append(one)
-            for other, against in related[one]:
-                if other not in met:
-                    met[other] = met[one] != against
-                    pending.append(other)
-                consistent &= met[other] == (met[one] != against)
+            first = pending.pop()
+            members.append(first)
+            for second, against in related[first]:
+                if second not in met:
+                    met[second] = met[first] != against
+                    pending.append(second)
+                consistent &= met[second] == (met[first] != against)
         start, stop = drafts[root[0]].windows[root[1]]
         if not drafts[root[0]].closed[root[1]] and _has_direction(stop - start):
             if consistent:
@@ -204,24 +207,25 @@ def _directions(drafts: Sequence[_Draft], matching: _Matching) -> _Directions:
 
 
 def _has_direction(length: int) -> bool:
-    """Whether an open axis meets an even length on its way to the coarsest level, and so a gap at one end."""
+    """Return whether an open axis has an even length at some level, and so a gap at one end."""
     return any(n % 2 == 0 for n in axis_lengths(length, False)[1:])
 
 
 def _finished(drafts: Sequence[_Draft], matching: _Matching, directions: _Directions) -> Arrangement:
-    ahead: dict[int, bool] = {}  # of each interface, whether its first user runs against the order it was matched in
+    """Make patches and interfaces from drafts, their matching sides and their directions."""
+    ahead: dict[int, bool] = {}  # whether an interface's first user runs against the order in which it was matched
     patches, interfaces = [], []
     for number, draft in enumerate(drafts):
         flips = [(number, axis) in directions.flipped for axis in (0, 1)]
-        # As stored, the first side of an axis that is flipped is what was its last.
+        # The first side of a flipped axis, as stored, was its last.
         order = [side ^ flips[side // 2] for side in _SIDES]
         sides: list[Side | None] = []
         for side in order:
-            found = matching.sides.get((number, side))
-            if found is None:
+            matched = matching.sides.get((number, side))
+            if matched is None:
                 sides.append(None)
                 continue
-            interface, against = found
+            interface, against = matched
             runs_against = against != flips[1 - side // 2]
             sides.append(Side(interface, ahead.setdefault(interface, runs_against) != runs_against))
         shares = any(sides)

@@ -1,4 +1,4 @@
-"""Where sides of blocks run through the same points of the lattice."""
+"""Contacts of blocks: where their sides run through the same points of the lattice."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Axis = tuple[int, int]
 
 
 def line_of(block: LatticeBlock, axis: int, place: int, along: NDArray[np.intp], geometric: int) -> NDArray[np.int32]:
-    """Points of a row (``axis`` 1) or column (0) as numbers to compare: coordinates, and 1 where valid, else 0.
+    """Return points of a row (``axis`` 1) or column (0) for comparison: coordinates, and 1 where valid, else 0.
 
     Parameters
     ----------
     block : LatticeBlock
     axis : 0 or 1
-        The axis that the line runs along.
+        The axis along which the line runs.
     place : int
-        Which row or column.
+        Number of the row or column.
     along : int array, shape (N,)
         Indices along the axis.
     geometric : int
-        How many coordinates to take.
+        The number of coordinates that are compared.
 
     Returns
     -------
@@ -65,7 +65,7 @@ class Link:
     shift: int
 
     def at(self, position: int) -> int:
-        """The target's position."""
+        """Return the target's position."""
         return self.sign * position + self.shift
 
     @property
@@ -77,7 +77,7 @@ class Link:
 
 @dataclass(frozen=True)
 class _Edges:
-    """Edges of all sides end to end: side and position of each, points at both ends, whether it can make a contact."""
+    """Edges of all sides in order: side and position, points at both ends, and whether it can make a contact."""
 
     side: NDArray[np.intp]
     position: NDArray[np.intp]
@@ -87,10 +87,10 @@ class _Edges:
 
 
 def find_links(blocks: Sequence[LatticeBlock], geometric: int) -> tuple[list[Axis], list[Link]]:
-    """Find all contacts of sides, longest runs first to last point.
+    """Find all contacts of sides, as the longest possible runs.
 
     A contact begins and ends with an edge between two different valid points; edges without length and invalid points
-    are passed over inside it. Where more than two sides have an edge, each is linked with the next.
+    are allowed inside it. Where more than two sides have an edge, each is linked with the next.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def find_links(blocks: Sequence[LatticeBlock], geometric: int) -> tuple[list[Axi
     Returns
     -------
     list of (int, int)
-        Of each side the axis that it runs along; the two sides of an axis follow each other.
+        The axis along which each side runs; the two sides of an axis are adjacent.
     list of Link
         Each contact once, by the numbers of its sides.
     """
@@ -126,7 +126,7 @@ def find_links(blocks: Sequence[LatticeBlock], geometric: int) -> tuple[list[Axi
 
 
 def _numbered(lines: list[NDArray[np.int32]]) -> NDArray[np.intp]:
-    """A number for each point, the same for equal points."""
+    """Number the points, equal points alike; int64, shape (point,)."""
     rows = np.concatenate(lines)
     order = np.lexsort(rows.T)
     fresh = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
@@ -136,14 +136,16 @@ def _numbered(lines: list[NDArray[np.int32]]) -> NDArray[np.intp]:
 
 
 def _edges(points: NDArray[np.intp], valid: NDArray[np.bool_], offsets: NDArray[np.intp]) -> _Edges:
+    """Make the edges between neighbouring points of each side."""
     side = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     inside = side[1:] == side[:-1]
     position = np.arange(len(points)) - offsets[side]
     firm = valid[1:] & valid[:-1] & (points[1:] != points[:-1])
-    return _Edges(*(each[inside] for each in (side[:-1], position[:-1], points[:-1], points[1:], firm)))
+    return _Edges(*(column[inside] for column in (side[:-1], position[:-1], points[:-1], points[1:], firm)))
 
 
 def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) -> list[Link]:
+    """Link sides along runs of edges that they have in common."""
     low, high = np.minimum(edges.start, edges.stop), np.maximum(edges.start, edges.stop)
     firm = np.flatnonzero(edges.firm)
     # Edges of the same two points stand together, whichever way they run: each is linked with the next.
@@ -151,11 +153,11 @@ def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) ->
     same = (low[order[1:]] == low[order[:-1]]) & (high[order[1:]] == high[order[:-1]])
     if not same.any():
         return []
-    one, other = order[:-1][same], order[1:][same]
-    i, j = edges.position[one], edges.position[other]
-    sign = np.where(edges.start[one] == edges.start[other], 1, -1)
+    edge, next_edge = order[:-1][same], order[1:][same]
+    i, j = edges.position[edge], edges.position[next_edge]
+    sign = np.where(edges.start[edge] == edges.start[next_edge], 1, -1)
     shift = np.where(sign == 1, j - i, j + i + 1)
-    pairs = np.stack([edges.side[one], edges.side[other], sign, shift, i])
+    pairs = np.stack([edges.side[edge], edges.side[next_edge], sign, shift, i])
     pairs = pairs[:, np.lexsort(pairs[::-1])]
     # Along a run source, target, sign and shift stay, and the position grows by one: a run ends where that ends.
     fresh = (np.diff(pairs[:4]) != 0).any(axis=0) | (np.diff(pairs[4]) != 1)
@@ -172,7 +174,7 @@ def _runs(edges: _Edges, points: NDArray[np.intp], offsets: NDArray[np.intp]) ->
 
 
 def _goes_on(before: Link, after: Link, points: NDArray[np.intp], offsets: NDArray[np.intp]) -> bool:
-    """Whether the points between two runs agree too."""
+    """Return whether the points between two runs agree too."""
     if (before.source, before.target, before.sign, before.shift) != (
         after.source,
         after.target,

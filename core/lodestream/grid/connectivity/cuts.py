@@ -1,8 +1,8 @@
-"""Where blocks are split, so that every side of every patch is shared whole or not at all.
+"""Cuts of blocks, so that every side of every patch is shared as a whole or not at all.
 
 A contact that ends amid a side splits the block there, right through to the opposite side; what is linked with that
-side at the cut is split too, and so on. A rim (a side along a closed axis) shared whole needs no cut: the axes of all
-such rims begin at the same point and run the same way round. Where that cannot be, they are cut open.
+side at the cut is split too, and so on. A rim (a side along a closed axis) that is shared as a whole needs no cut: the
+axes of all such rims begin at the same point and run the same way round. Where that is impossible, they are cut.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from .contacts import Axis, Link
 
 __all__ = ["Cuts", "Turn", "find_cuts"]
 
-#: Patches that any surface may be split into, and as many more for each of its blocks. Blocks that meet at corners stay
-#: whole; brick walls of 32 x 32 blocks come to 32 patches a block; what goes beyond are contacts by chance, and axes
-#: that wind round and round, where patches would be too small to be worth coding.
+#: Patches into which any surface may be split, and further ones for each of its blocks. Blocks that meet at corners are
+#: not split; brick walls of 32 x 32 blocks give 32 patches for each block. More arise from accidental contacts, and
+#: from axes that wind round and round, where patches would be too small to be worth coding.
 PATCHES, PATCHES_OF_BLOCK = 64, 32
-#: Where that is exceeded, so many times fewer must do for contacts that split anything.
-_SPARING = 8
+#: Where that limit is exceeded, it is divided by this number, and contacts are added one by one.
+_SPARING_DIVISOR = 8
 
 _Place = tuple[Axis, int]
 
 
 @dataclass(frozen=True)
 class Turn:
-    """How a closed axis lies to the first one that it is linked with: sample t of that is ``sign`` t + ``shift``."""
+    """Position of a closed axis relative to the first one linked with it: its sample t is ``sign`` t + ``shift``."""
 
     sign: int = 1
     shift: int = 0
@@ -54,7 +54,7 @@ class Cuts:
     turns: dict[Axis, Turn] = field(default_factory=dict)
 
     def pieces(self, axis: Axis) -> int:
-        """Number of pieces that the axis falls into."""
+        """Return the number of pieces into which the axis is cut."""
         cuts = len(self.at[axis])
         return max(cuts, 1) if axis in self.closed else cuts + 1
 
@@ -62,8 +62,8 @@ class Cuts:
 def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis], links: Sequence[Link]) -> Cuts:
     """Find where blocks must be split so that all contacts end at ends of patches.
 
-    Where that makes more than 64 + 32 ``blocks`` patches, contacts are taken one by one, the longest first, and those
-    given up that lead to more than 8 + 4 ``blocks``: there, sides that touch are coded separately.
+    Where that makes more than 64 + 32 ``blocks`` patches, contacts are added one by one, the longest first, and omitted
+    if they lead to more than 8 + 4 ``blocks`` patches: there, sides that touch are coded separately.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis]
     closed : set of Axis
         Axes that are closed.
     sides : sequence of Axis
-        Of each side the axis along it.
+        The axis along each side.
     links : sequence of Link
         All contacts.
 
@@ -88,7 +88,7 @@ def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis]
         if splitting.add(contacts):
             return splitting.cuts
     contacts.sort(key=lambda contact: -contact.edges)
-    splitting = _Splitting(lengths, closed, sides, limit // _SPARING)
+    splitting = _Splitting(lengths, closed, sides, limit // _SPARING_DIVISOR)
     for contact in contacts[: 4 * limit]:
         splitting.add([contact])
     return splitting.cuts
@@ -96,7 +96,7 @@ def find_cuts(lengths: dict[Axis, int], closed: set[Axis], sides: Sequence[Axis]
 
 @dataclass(frozen=True)
 class _Contact:
-    """A contact as a whole: its links, each seen from both sides, and the places where it ends."""
+    """A complete contact: its links, each seen from both sides, and the places where it ends."""
 
     links: tuple[Link, ...]
     ends: tuple[_Place, ...]
@@ -115,7 +115,7 @@ class _Seams:
         self._sides = sides
 
     def contacts(self, links: Iterable[Link]) -> list[_Contact]:
-        """Contacts, in the order of their first links."""
+        """Return contacts, in the order of their first links."""
         seen = [view for link in links for view in (link, link.turned)]
         begins = {self._place(link, link.first): number for number, link in enumerate(seen)}
         joined: dict[int, list[int]] = {number: [number, number ^ 1] for number in range(0, len(seen), 2)}
@@ -128,11 +128,11 @@ class _Seams:
                 ends[number].append(self._end(link, link.last))
                 continue
             continued.add(after)
-            one, other = sorted((owner[number], owner[after]))
-            if one != other:
-                for moved in joined.pop(other):
-                    owner[moved] = one
-                    joined[one].append(moved)
+            kept, dropped = sorted((owner[number], owner[after]))
+            if kept != dropped:
+                for moved in joined.pop(dropped):
+                    owner[moved] = kept
+                    joined[kept].append(moved)
         for number, link in enumerate(seen):
             if number not in continued:
                 ends[number].append(self._end(link, link.first))
@@ -144,18 +144,21 @@ class _Seams:
         ]
 
     def _place(self, link: Link, position: int) -> tuple[int, int, int, int, int]:
+        """Identify a link at a position: sides, sign, and position on both sides."""
         here, there = self._norm(link.source, position), self._norm(link.target, link.at(position))
         return link.source, link.target, link.sign, here, there
 
     def _norm(self, side: int, position: int) -> int:
+        """Return a position modulo the length of a closed side."""
         around = self._around[side]
         return position % around if around else position
 
     def _end(self, link: Link, position: int) -> _Place:
+        """Return the place of a link's end."""
         return self._sides[link.source], self._norm(link.source, position)
 
     def _folds(self, link: Link, position: int) -> bool:
-        """Whether the side turns back on itself there."""
+        """Return whether the side turns back on itself there."""
         source, target, sign, here, there = self._place(link, position)
         return source == target and sign == -1 and here == there
 
@@ -171,20 +174,22 @@ class _Splitting:
         self._links: dict[Axis, list[Link]] = defaultdict(list)
 
     def add(self, contacts: Sequence[_Contact]) -> bool:
-        """Split for these contacts; if that makes too many patches, leave everything as it was and say no."""
-        patches, turns, made = self._patches, self.cuts.turns, list[_Place]()
+        """Split for these contacts; if that makes too many patches, undo everything and return False."""
+        patches, turns, added_cuts = self._patches, self.cuts.turns, list[_Place]()
         pending: list[_Place] = []
         for contact in contacts:
             pending.extend(contact.ends)
             for link in contact.links:
                 axis = self._sides[link.source]
                 self._links[axis].append(link)
-                pending.extend(found for place in sorted(self.cuts.at[axis]) for found in self._images(link, place))
-        fits = self._split(pending, made)
-        while fits and (found := self._disagreement()) is not None:
-            fits = self._split([found], made)
+                pending.extend(
+                    conflict for place in sorted(self.cuts.at[axis]) for conflict in self._images(link, place)
+                )
+        fits = self._split(pending, added_cuts)
+        while fits and (conflict := self._disagreement()) is not None:
+            fits = self._split([conflict], added_cuts)
         if not fits:
-            for axis, place in made:
+            for axis, place in added_cuts:
                 self.cuts.at[axis].discard(place)
             for contact in contacts:
                 for link in contact.links:
@@ -193,14 +198,14 @@ class _Splitting:
         return fits
 
     def _images(self, link: Link, place: int) -> list[_Place]:
-        """Where the link has a cut of its source on its target.
+        """Return the cut of a link's target that corresponds to a cut of its source, if there is one.
 
-        A link that reaches a seam at its end either goes on in one that begins there, or is cut there anyway.
+        A link that reaches a seam at its end either continues in one that begins there, or is cut there anyway.
         """
         return [(self._sides[link.target], link.at(place))] if link.first <= place <= link.last else []
 
-    def _split(self, pending: list[_Place], made: list[_Place]) -> bool:
-        """Cut axes, and all that is linked with them there; False as soon as there are too many patches."""
+    def _split(self, pending: list[_Place], added_cuts: list[_Place]) -> bool:
+        """Cut axes, and everything that is linked with them there; return False if there are too many patches."""
         while pending:
             axis, place = pending.pop()
             length = self.cuts.lengths[axis]
@@ -212,7 +217,7 @@ class _Splitting:
                 continue
             pieces = self.cuts.pieces(axis)
             self.cuts.at[axis].add(place)
-            made.append((axis, place))
+            added_cuts.append((axis, place))
             self._patches += (self.cuts.pieces(axis) - pieces) * self.cuts.pieces((axis[0], 1 - axis[1]))
             if self._patches > self._limit:
                 return False
@@ -221,7 +226,7 @@ class _Splitting:
         return True
 
     def _disagreement(self) -> _Place | None:
-        """Turn closed axes so that linked ones agree; the first that cannot, and where to cut it."""
+        """Turn closed axes so that linked ones agree; return the first that cannot, and where to cut it."""
         turns: dict[Axis, Turn] = {}
         self.cuts.turns = turns
         for root in sorted(self.cuts.closed):
@@ -243,11 +248,11 @@ class _Splitting:
         return None
 
 
-def _still(one: Turn, other: Turn, length: int) -> int:
-    """A sample that is the same under both turns if they run against each other, so that one cut serves both."""
-    if one.sign == other.sign:
+def _still(turn: Turn, other_turn: Turn, length: int) -> int:
+    """Return a sample that is the same under both turns if they run against each other, so that one cut serves both."""
+    if turn.sign == other_turn.sign:
         return 0
-    # At t: one.sign t + one.shift = other.sign t + other.shift, hence 2 one.sign t = other.shift - one.shift.
-    twice = one.sign * (other.shift - one.shift) % length
+    # With signs s and -s and shifts a and b: s t + a = -s t + b, hence 2 s t = b - a.
+    twice = turn.sign * (other_turn.shift - turn.shift) % length
     half = twice // 2 if twice % 2 == 0 else (twice + length) // 2
-    return (one.sign * half + one.shift) % length
+    return (turn.sign * half + turn.shift) % length

@@ -1,4 +1,4 @@
-"""Patches of blocks: what they are, cut out of a block and put together again."""
+"""Patches of blocks, cutting them out of a block, and assembling blocks from them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LatticeBlock:
-    """A block as far as its sides are concerned.
+    """The properties of a block that decide which sides are shared.
 
     Attributes
     ----------
     coordinates : int32 array, shape (H, W, G)
         Lattice coordinates of the geometry; all blocks are on one lattice. Only the sides are compared, and points only
-        for being equal, so any numbers that tell points apart will do.
+        for being equal, so any numbers that distinguish points are suitable.
     closed : (bool, bool)
         Whether rows wrap (row H-1 is followed by row 0), whether columns do.
     mask : bool array, shape (H, W), or None
@@ -61,7 +61,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Patch:
-    """What is coded as one block: a window of a source block, perhaps turned round.
+    """A unit of coding: a window of a source block, perhaps flipped.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Patch:
     closed : (bool, bool)
         Only an axis that was not cut.
     flipped : (bool, bool)
-        Stored back to front along that axis.
+        Stored in reverse along that axis.
     sides : four of Side or None
         First row, last row, first column, last column, as stored. None: not shared, or no side (a closed axis).
     clamped : four bools
@@ -127,20 +127,20 @@ class Arrangement:
 
 
 def whole_patch(block: int, shape: tuple[int, int], closed: tuple[bool, bool]) -> Patch:
-    """A block as its only patch, which shares no side."""
+    """Return a whole block as its only patch, which shares no side."""
     none = (None, None, None, None)
     free = (False, False, False, False)
     return Patch(block, (0, shape[0]), (0, shape[1]), closed, (False, False), none, free, (False, False))
 
 
 def stored(patch: Patch, values: NDArray[Any]) -> NDArray[Any]:
-    """A patch as it is stored: its window of the source block, turned round where it is flipped.
+    """Return a patch as it is stored: its window of the source block, reversed where it is flipped.
 
     Parameters
     ----------
     patch : Patch
     values : array, shape (H, W, ...)
-        Of the source block at full resolution: points, mask, attributes.
+        Points, mask or attributes of the source block at full resolution.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def stored(patch: Patch, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def stored_side(patch: Patch, values: NDArray[Any], side: int) -> NDArray[Any]:
-    """One side of what `stored` gives, shape (point, ...): of the first row, last row, first column or last column."""
+    """Return a side of `stored`, shape (point, ...): the first row, last row, first column or last column."""
     places = list(_places(patch, values))
     places[side // 2] = places[side // 2][[-(side % 2)]]
     line: NDArray[Any] = values[np.ix_(*places)]
@@ -159,7 +159,7 @@ def stored_side(patch: Patch, values: NDArray[Any], side: int) -> NDArray[Any]:
 
 
 def _places(patch: Patch, values: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """The rows and columns of the source block, shape (H, W, ...), in the order in which a patch has them."""
+    """Return the rows and columns of the source block, shape (H, W, ...), in the order of a patch."""
     rows, columns = (
         (np.arange(*(window[::-1] if flipped else window), -1 if flipped else 1) - flipped) % length
         for window, flipped, length in zip((patch.rows, patch.columns), patch.flipped, values.shape[:2], strict=True)
@@ -170,10 +170,10 @@ def _places(patch: Patch, values: NDArray[Any]) -> tuple[NDArray[np.intp], NDArr
 def assemble(
     closed: Sequence[tuple[bool, bool]], patches: Sequence[Patch], grids: Sequence[NDArray[Any]]
 ) -> list[NDArray[Any]]:
-    """Put the grids of patches at one level together into grids of the source blocks.
+    """Assemble the grids of patches at one level into grids of the source blocks.
 
-    At full resolution that undoes `stored`. At a coarser level, a closed axis begins at the node nearest in number to
-    the source's first sample.
+    At full resolution this is the inverse of `stored`. At a coarser level, a closed axis begins at the node nearest in
+    number to the source's first sample.
 
     Parameters
     ----------
@@ -182,36 +182,37 @@ def assemble(
     patches : sequence of Patch
         All patches of all blocks, in the order of the `Arrangement`.
     grids : sequence of arrays, shape (rows, columns, ...)
-        Of each patch at that level, as stored.
+        The grid of each patch at that level, as stored.
 
     Returns
     -------
     list of arrays, shape (rows, columns, ...)
     """
-    found: list[list[tuple[Patch, NDArray[Any]]]] = [[] for _ in closed]
+    by_block: list[list[tuple[Patch, NDArray[Any]]]] = [[] for _ in closed]
     for patch, grid in zip(patches, grids, strict=True):
         turned = grid[:: -1 if patch.flipped[0] else 1, :: -1 if patch.flipped[1] else 1]
-        found[patch.block].append((patch, turned))
-    return [_assembled(closed[block], pieces) for block, pieces in enumerate(found)]
+        by_block[patch.block].append((patch, turned))
+    return [_assembled(closed[block], pieces) for block, pieces in enumerate(by_block)]
 
 
 def _assembled(closed: tuple[bool, bool], pieces: list[tuple[Patch, NDArray[Any]]]) -> NDArray[Any]:
+    """Assemble the grids of the patches of one block."""
     first, last = pieces[0][0], pieces[-1][0]
     bands: dict[tuple[int, int], list[NDArray[Any]]] = {}
     for patch, grid in pieces:
         bands.setdefault(patch.rows, []).append(grid)
-    whole = _joined([_joined(band, 1) for band in bands.values()], 0)
+    block = _joined([_joined(band, 1) for band in bands.values()], 0)
     for axis, (start, stop) in enumerate(((first.rows[0], last.rows[1]), (first.columns[0], last.columns[1]))):
         if not closed[axis]:
             continue
         if not first.closed[axis]:
-            whole = np.delete(whole, -1, axis)
+            block = np.delete(block, -1, axis)
             stop -= 1
-        length = whole.shape[axis]
-        whole = np.roll(whole, (2 * start * length + stop - start) // (2 * (stop - start)), axis)
-    return whole
+        length = block.shape[axis]
+        block = np.roll(block, (2 * start * length + stop - start) // (2 * (stop - start)), axis)
+    return block
 
 
 def _joined(grids: list[NDArray[Any]], axis: int) -> NDArray[Any]:
-    """Grids side by side, of which each begins with what ends the one before."""
+    """Join grids along an axis; each begins with the last line of the one before."""
     return np.concatenate([grids[0], *(np.delete(grid, 0, axis) for grid in grids[1:])], axis)
