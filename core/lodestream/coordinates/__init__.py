@@ -1,1 +1,1 @@
-"""Coordinates that follow a rule: height fields, places on the map, seams and angles."""
+"""Coordinates that follow a rule: height fields, geotransforms of levels, seams and angles."""

@@ -1,4 +1,4 @@
-"""Rules of coordinates that follow their index, found so that every value is made again bit for bit.
+"""Rules by which coordinates follow from their index, fitted so that they give every value bit for bit.
 
 A *rule* is a list of plain numbers, evaluated in float64 in the order shown and rounded to the type of the points::
 
@@ -22,16 +22,19 @@ __all__ = ["VALUES", "Rule", "are_rules", "bits", "evaluate", "fit_axis", "neigh
 
 Rule = list[Any]
 
-#: Ends a rule that holds the numbers themselves.
+#: The last item of a rule that lists the values.
 VALUES = "values"
 
-_SAMPLE = 64
+_SAMPLE_VALUES = 64
 
 
 def evaluate(
     rule: Sequence[Any], row: NDArray[np.float64], column: NDArray[np.float64], down: bool
 ) -> NDArray[np.float64]:
-    """Float64 values that broadcast to (H, W), at rows (H, 1) and columns (1, W); all of them, where `last` matters."""
+    """Return float64 values that broadcast to (H, W), at rows (H, 1) and columns (1, W).
+
+    A rule with ``last`` needs all places of its axis. ``down``: y, whose short rules run along the rows.
+    """
     place = row if down else column
     if rule[-1] == VALUES:
         values = np.asarray(rule[:-1], np.float64)
@@ -48,7 +51,7 @@ def evaluate(
     if len(rule) == 3:
         return np.asarray((place * float(rule[1]) + float(rule[0])) / float(rule[2]))
     origin, across, by_row, shift = map(float, rule)
-    # A step of zero needs no plane: a grid that is not rotated has a line for each coordinate.
+    # A step of zero needs no plane: in a grid that is not rotated, a coordinate varies along one axis only.
     columns, rows = (
         (places + shift) * step if step else np.full((1, 1), step) for places, step in ((column, across), (row, by_row))
     )
@@ -56,11 +59,12 @@ def evaluate(
 
 
 def are_rules(rules: object) -> bool:
-    """Whether these are two rules that `evaluate` takes, of x and of y."""
+    """Return whether an object is a pair of rules, of x and of y, that `evaluate` accepts."""
     return isinstance(rules, list) and len(rules) == 2 and all(map(_is_rule, rules))
 
 
 def _is_rule(rule: object) -> bool:
+    """Return whether an object is a rule that `evaluate` accepts."""
     if not isinstance(rule, list) or len(rule) < 2:
         return False
     *numbers, last = rule
@@ -73,35 +77,35 @@ def _is_rule(rule: object) -> bool:
 
 
 def rounded(values: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Float64 values of any shape in a type of points: the nearest float or the nearest integer."""
+    """Round float64 values of any shape to a type of points: the nearest float or the nearest integer."""
     return (values if dtype.kind == "f" else np.rint(values)).astype(dtype)
 
 
 def bits(values: NDArray[Any]) -> NDArray[Any]:
-    """Values of any shape as unsigned integers of their bits, to compare them so that -0.0 is not 0.0."""
+    """View values of any shape as unsigned integers, so that comparisons distinguish -0.0 from 0.0."""
     return np.ascontiguousarray(values).view(f"u{values.dtype.itemsize}")
 
 
 def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule | None:
-    """The rule that makes every value of an evenly spaced axis again, bit for bit.
+    """Find the rule that gives every value of an evenly spaced axis bit for bit.
 
     Parameters
     ----------
     line : array of shape (N,)
         Coordinates in order, of any type of points.
     known : bool array of shape (N,), optional
-        The others may be anything.
+        True where the value must match.
 
     Returns
     -------
     list or None
-        A rule of two or three numbers; None where there is none, also where all are the same.
+        A rule of two or three numbers; None where there is none, or where all values are equal.
     """
     index = np.arange(len(line)) if known is None else np.flatnonzero(known)
     values = line[index]
     if len(values) < 2 or not np.isfinite(values).all() or not _nearly_even(index, values):
         return None
-    sample = np.unique(np.linspace(0, len(index) - 1, min(_SAMPLE, len(index))).round().astype(int))
+    sample = np.unique(np.linspace(0, len(index) - 1, min(_SAMPLE_VALUES, len(index))).round().astype(int))
     for rule in _candidates(index, values):
         if all(_makes(rule, len(line), index[part], values[part]) for part in (sample, slice(None))):
             return [plain(number) for number in rule]
@@ -109,21 +113,22 @@ def fit_axis(line: NDArray[Any], known: NDArray[np.bool_] | None = None) -> Rule
 
 
 def _makes(rule: Rule, length: int, index: NDArray[np.int64], values: NDArray[Any]) -> bool:
+    """Return whether a rule gives these values at these indices bit for bit."""
     if rule[-1] is True:  # depends on the number of places
-        made = evaluate(rule, np.zeros((1, 1)), np.arange(length, dtype=np.float64)[None, :], False)[0, index]
+        evaluated = evaluate(rule, np.zeros((1, 1)), np.arange(length, dtype=np.float64)[None, :], False)[0, index]
     else:
-        made = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
-    return np.array_equal(bits(rounded(made, values.dtype)), bits(values))
+        evaluated = evaluate(rule, np.zeros((1, 1)), index[None, :].astype(np.float64), False)[0]
+    return np.array_equal(bits(rounded(evaluated, values.dtype)), bits(values))
 
 
 def plain(number: Any) -> Any:
-    """Whole numbers as integers, which take fewer bytes; -0.0 is none."""
-    whole = not isinstance(number, bool) and abs(number) < 2**53 and number == int(number) and str(number) != "-0.0"
-    return int(number) if whole else number if isinstance(number, bool) else float(number)
+    """Return whole numbers as int, which take fewer bytes, other numbers as float; -0.0 remains float."""
+    is_whole = not isinstance(number, bool) and abs(number) < 2**53 and number == int(number) and str(number) != "-0.0"
+    return int(number) if is_whole else number if isinstance(number, bool) else float(number)
 
 
 def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
-    """Whether values of different places lie on a line, but for rounding."""
+    """Return whether values at different places lie on a line, except for rounding."""
     exact = values.astype(np.float64)
     step = (exact[-1] - exact[0]) / float(index[-1] - index[0])
     rounding = np.finfo(values.dtype).eps if values.dtype.kind == "f" else 0.0
@@ -133,7 +138,7 @@ def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
 
 
 def _candidates(index: NDArray[np.int64], values: NDArray[Any]) -> Iterator[Rule]:
-    """Rules that may have made these values, the likely ones first."""
+    """Yield rules that may have produced these values, the likely ones first."""
     ends = [float(values[0]), float(values[-1])]
     steps = _steps(index, values)
     firsts = [ends[0], float(str(values[0]))] if values.dtype.kind == "f" else ends[:1]
@@ -155,6 +160,7 @@ def _candidates(index: NDArray[np.int64], values: NDArray[Any]) -> Iterator[Rule
 
 
 def _steps(index: NDArray[np.int64], values: NDArray[Any]) -> list[float]:
+    """Return candidates for the step, the likely ones first."""
     exact = values.astype(np.float64)
     mean = float((exact[-1] - exact[0]) / (index[-1] - index[0]))
     first = float((exact[1] - exact[0]) / (index[1] - index[0]))
@@ -164,19 +170,20 @@ def _steps(index: NDArray[np.int64], values: NDArray[Any]) -> list[float]:
 
 
 def neighbours(value: float) -> list[float]:
-    """A number, decimals close to it, and the numbers right beside it."""
-    found = [value, *(float(f"{value:.{digits}g}") for digits in (15, 14, 13, 12, 10, 8))]
+    """Return a number, decimals close to it, and the adjacent floats."""
+    candidates = [value, *(float(f"{value:.{digits}g}") for digits in (15, 14, 13, 12, 10, 8))]
     below = above = value
     for _ in range(3):
         below, above = float(np.nextafter(below, -np.inf)), float(np.nextafter(above, np.inf))
-        found += [below, above]
-    return list(dict.fromkeys(found))
+        candidates += [below, above]
+    return list(dict.fromkeys(candidates))
 
 
 def _stabbed(index: NDArray[np.int64], values: NDArray[Any], step: float) -> Iterator[Rule]:
-    """Lines that pass within the rounding of every value, if there are any: one that starts at the first, and any.
+    """Yield lines that pass within the rounding of every value, if any: one through the first value, and any other.
 
-    The room that a slope leaves for the origin is a concave function of the slope, so that its peak is found by thirds.
+    The length of the interval that a slope leaves for the origin is a concave function of the slope, so that ternary
+    search finds its peak.
     """
     exact = values.astype(np.float64)
     above = (np.nextafter(values, np.float32(np.inf)).astype(np.float64) - exact) / 2
@@ -189,15 +196,16 @@ def _stabbed(index: NDArray[np.int64], values: NDArray[Any], step: float) -> Ite
         yield [float(first), float(bottoms.max() + tops.min()) / 2]
 
     def origins(slope: float) -> tuple[float, float]:
+        """Return the interval of origins with which a slope is within the rounding of every value."""
         rest = exact - slope * index
         return float((rest - below).max()), float((rest + above).min())
 
     spread = 2 * float((above + below).max()) / float(index[-1] - index[0])
     low, high = step - spread, step + spread
     for _ in range(80):
-        one, two = low + (high - low) / 3, high - (high - low) / 3
-        rooms = [top - bottom for bottom, top in (origins(one), origins(two))]
-        low, high = (one, high) if rooms[0] < rooms[1] else (low, two)
+        lower, upper = low + (high - low) / 3, high - (high - low) / 3
+        rooms = [top - bottom for bottom, top in (origins(lower), origins(upper))]
+        low, high = (lower, high) if rooms[0] < rooms[1] else (low, upper)
     slope = (low + high) / 2
     bottom, top = origins(slope)
     if bottom <= top:

@@ -1,4 +1,4 @@
-"""Where the nodes of a coarser level lie on the map."""
+"""Geotransforms of coarser levels."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from ..surface import Closed
 
 __all__ = ["even_step", "level_geotransform"]
 
-#: Heights without a place of their own are drawn over their indices.
+#: Geotransform of heights without a position: coordinates are their indices.
 _INDICES = (-0.5, 1.0, 0.0, -0.5, 0.0, 1.0)
 
 
 def even_step(length: int, nodes: int, closed: bool) -> float:
-    """Samples of the full axis from one node of a level to the next, if all of these steps were equal.
+    """Return the samples of the full axis from one node of a level to the next, if all steps were equal.
 
     A closed axis of n nodes has n intervals, which make one turn; an open one has n - 1, from end to end.
     """
@@ -23,12 +23,12 @@ def even_step(length: int, nodes: int, closed: bool) -> float:
 def level_geotransform(
     transform: Sequence[float] | None, shape: tuple[int, int], coarse: tuple[int, int], closed: Closed
 ) -> list[float]:
-    """The geotransform of a level's grid as if its nodes were evenly spaced, which they are where no axis has a gap.
+    """Return the geotransform of a level's grid, as if its nodes were evenly spaced (true where no axis has a gap).
 
     Parameters
     ----------
     transform : six floats in GDAL's order, or None
-        Of the full grid: cell corners, so that point (0, 0) lies half a cell from the first number.
+        Of the full grid. It refers to cell corners: point (0, 0) lies half a cell from the first number.
     shape, coarse : (int, int)
         Rows and columns of the full grid and of the level's.
     closed : (bool, bool)

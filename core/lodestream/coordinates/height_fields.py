@@ -1,8 +1,8 @@
-"""Height fields: surfaces whose x and y are a rule, so that heights alone need to be stored.
+"""Height fields: surfaces whose x and y follow a rule, so that only heights are stored.
 
-Surfaces that come as xyz and have such an x and y are taken for heights and given back as xyz, bit for bit.
-In the metadata of a surface, ``grid`` holds the two rules of x and y where the surface came as xyz. For heights that
-came with coordinates of their own, ``axes`` is a map of the rules "x" and "y", of the "dtype" of the coordinates unless
+A surface given as xyz with such an x and y is encoded as heights, and returned as xyz bit for bit.
+In the metadata of a surface, ``grid`` holds the two rules of x and y where the surface was given as xyz. For heights
+given with coordinates, ``axes`` is a map of the rules "x" and "y", of the "dtype" of the coordinates unless
 that is float64, and of "rows": "x" where x runs along the rows. Without either, ``geotransform`` says where they lie.
 """
 
@@ -22,26 +22,26 @@ from .seams import wrapped
 
 __all__ = ["axes_at", "coordinates", "grid_at", "level_metadata", "to_heights", "to_xyz"]
 
-_STRIP = 1 << 18
+_VALUES_PER_STRIP = 1 << 18
 
-#: The metadata that say where heights lie.
-_PLACE = ("grid", "axes", "geotransform", "nodes", "angles")
+#: Metadata that give the position of heights.
+_PLACEMENT_KEYS = ("grid", "axes", "geotransform", "nodes", "angles")
 
 
 def to_heights(surface: Surface, exactly: bool = True) -> Surface | None:
-    """Take xyz over a regular lattice for heights.
+    """Convert xyz over a regular lattice to heights.
 
     Parameters
     ----------
     surface : Surface
     exactly : bool
-        The rules have to hold under the holes that are kept (`Block.kept`) as well.
+        The rules must also hold at the holes whose points are kept (`Block.kept`).
 
     Returns
     -------
     Surface or None
-        Heights with ``grid`` in the metadata, of which `to_xyz` makes every value again, bit for bit; None where x and
-        y follow no rule, or the surface is no single block of x, y, z with at least two rows and columns.
+        Heights with ``grid`` in the metadata, from which `to_xyz` restores every value bit for bit; None where x and y
+        follow no rule, or the surface is not one block of x, y, z with at least two rows and columns.
     """
     if len(surface.blocks) != 1 or surface.points.ndim != 3 or surface.points.shape[2] != 3 or min(surface.shape) < 2:
         return None
@@ -62,7 +62,7 @@ def to_heights(surface: Surface, exactly: bool = True) -> Surface | None:
 
 
 def to_xyz(surface: Surface, kept: NDArray[np.bool_] | None = None) -> Surface:
-    """Put x and y beside heights; surfaces of another kind come back as they are.
+    """Add x and y to heights; return surfaces of other kinds unchanged.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ def to_xyz(surface: Surface, kept: NDArray[np.bool_] | None = None) -> Surface:
     Returns
     -------
     Surface
-        xyz in the type of the heights where it came as xyz, otherwise in one that holds the coordinates as well
-        (float64). Float coordinates of holes that are not kept are NaN. What says where the heights lie is gone from
-        the metadata.
+        xyz in the type of the heights if it was given as xyz, otherwise in a type that also holds the coordinates
+        (float64). Float coordinates of holes that are not kept are NaN. Metadata that give the position of heights are
+        removed.
     """
     if len(surface.blocks) != 1 or surface.points.ndim != 2:
         return surface
@@ -94,7 +94,7 @@ def to_xyz(surface: Surface, kept: NDArray[np.bool_] | None = None) -> Surface:
 
 
 def coordinates(surface: Surface, rows: slice | None = None) -> tuple[NDArray[Any], NDArray[Any]]:
-    """x and y of a height field, each of shape (H, W); or of some of its rows, as a slice with a start and a stop.
+    """Compute x and y of a height field, each of shape (H, W), or of the rows of a slice with start and stop.
 
     By the metadata's ``grid`` (then in the type of the heights), ``axes`` or ``geotransform`` (of the centres of the
     cells), else x is the column and y the row; at the places that ``nodes`` gives for a coarser level.
@@ -109,12 +109,13 @@ def coordinates(surface: Surface, rows: slice | None = None) -> tuple[NDArray[An
     except InputError:
         raise
     except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
-        # Whoever made the container may have written anything.
-        said = {key: surface.metadata[key] for key in _PLACE if key in surface.metadata}
+        # Metadata of a hostile container may be anything.
+        said = {key: surface.metadata[key] for key in _PLACEMENT_KEYS if key in surface.metadata}
         raise InputError(f"expected rules of coordinates in the metadata, got {str(said)[:80]!a}") from None
 
 
 def _coordinates(surface: Surface, rows: slice) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Do what `coordinates` does, for a slice of rows and with other errors for malformed metadata."""
     metadata, shape = surface.metadata, surface.shape
     nodes = _nodes(metadata)
     row, column = (
@@ -135,7 +136,7 @@ def _coordinates(surface: Surface, rows: slice) -> tuple[NDArray[Any], NDArray[A
     planes = []
     for channel, rule in enumerate(rules):
         try:
-            at = row if rule[-1] is True else row[rows]  # that rule depends on the number of places
+            at = row if rule[-1] is True else row[rows]  # this rule depends on the number of places
             values = evaluate(rule, at[:, None], column[None, :], down=(channel == 1) != swapped)
             values = values[rows] if at is row and len(values) == len(row) else values
         except (TypeError, ValueError, IndexError):
@@ -148,12 +149,12 @@ def _coordinates(surface: Surface, rows: slice) -> tuple[NDArray[Any], NDArray[A
 
 
 def _nodes(metadata: Mapping[str, Any]) -> Any:
-    """Places of rows and of columns; None for 0, 1, 2, ..."""
+    """Return the places of rows and of columns; None for 0, 1, 2, ..."""
     return metadata.get("nodes") or [None, None]
 
 
 def _axes(axes: Any) -> tuple[list[Rule], np.dtype[Any], bool]:
-    """The two rules, the type of coordinates, and whether x runs along the rows."""
+    """Return the two rules, the type of coordinates, and whether x runs along the rows."""
     try:
         return [axes["x"], axes["y"]], np.dtype(axes.get("dtype", "float64")), axes.get("rows") == "x"
     except (TypeError, KeyError, AttributeError):
@@ -161,6 +162,7 @@ def _axes(axes: Any) -> tuple[list[Rule], np.dtype[Any], bool]:
 
 
 def _geotransform_rules(transform: Any) -> list[Rule]:
+    """Return the rules of x and y of a geotransform."""
     try:
         x0, x_column, x_row, y0, y_column, y_row = map(float, transform)
     except (TypeError, ValueError):
@@ -169,7 +171,7 @@ def _geotransform_rules(transform: Any) -> list[Rule]:
 
 
 def _fit(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rule | None:
-    """The rule of one coordinate, (H, W); `down`: it is y, whose short rules run along the rows."""
+    """Find the rule of one coordinate, (H, W); ``down``: it is y, whose short rules run along the rows."""
     for axis in (0, 1) if down else (1, 0):
         line, known = _profile(plane, mask, axis)
         if line is None:
@@ -190,7 +192,7 @@ def _fit(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rul
 def _profile(
     plane: NDArray[Any], mask: NDArray[np.bool_] | None, axis: int
 ) -> tuple[NDArray[Any] | None, NDArray[np.bool_]]:
-    """The values along an axis where they do not change along the other, and which of them are known."""
+    """Return the values along an axis if they are constant along the other, and which of them are known."""
     lines = plane if axis == 1 else plane.T
     if mask is None:
         line = lines[0]
@@ -201,7 +203,8 @@ def _profile(
 
 
 def _same(lines: NDArray[Any], line: NDArray[Any], valid: NDArray[np.bool_] | None = None) -> bool:
-    height = max(1, _STRIP // lines.shape[1])
+    """Return whether all lines equal one line bit for bit, where valid."""
+    height = max(1, _VALUES_PER_STRIP // lines.shape[1])
     wanted = bits(line)
     for start in range(0, len(lines), height):
         equal: NDArray[np.bool_] = bits(lines[start : start + height]) == wanted
@@ -213,13 +216,14 @@ def _same(lines: NDArray[Any], line: NDArray[Any], valid: NDArray[np.bool_] | No
 
 
 def _holds(rule: Rule, plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> bool:
+    """Return whether a rule gives a plane, (H, W), bit for bit, where valid."""
     rows, width = plane.shape
-    height = max(1, _STRIP // width)
+    height = max(1, _VALUES_PER_STRIP // width)
     column = np.arange(width, dtype=np.float64)[None, :]
     for start in range(0, rows, height):
         row = np.arange(start, min(start + height, rows), dtype=np.float64)[:, None]
-        made = np.broadcast_to(rounded(evaluate(rule, row, column, down), plane.dtype), (len(row), width))
-        equal: NDArray[np.bool_] = bits(made) == bits(plane[start : start + height])
+        evaluated = np.broadcast_to(rounded(evaluate(rule, row, column, down), plane.dtype), (len(row), width))
+        equal: NDArray[np.bool_] = bits(evaluated) == bits(plane[start : start + height])
         if mask is not None:
             equal |= ~mask[start : start + height]
         if not equal.all():
@@ -228,7 +232,7 @@ def _holds(rule: Rule, plane: NDArray[Any], mask: NDArray[np.bool_] | None, down
 
 
 def _fit_plane(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) -> Rule | None:
-    """The rule of a coordinate that changes along both axes, as of a rotated lattice."""
+    """Find the rule of a coordinate that varies along both axes, as in a rotated lattice."""
     if mask is not None and not mask[[0, 0, -1], [0, -1, 0]].all():
         return None
     origin, right, below = (float(plane[i, j]) for i, j in ((0, 0), (0, -1), (-1, 0)))
@@ -240,11 +244,11 @@ def _fit_plane(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) 
     spread = abs(across) + abs(by_row)
     if not 0 < spread < np.inf or not np.isfinite(origin) or np.nanmax(np.abs(near)) > spread:
         return None
-    for one in neighbours(across)[:7]:
-        for two in neighbours(by_row)[:7]:
+    for step_across in neighbours(across)[:7]:
+        for step_down in neighbours(by_row)[:7]:
             for shift in (0.0, 0.5):
-                for start in neighbours(origin - shift * (one + two))[:7]:
-                    rule = [start, one, two, shift]
+                for start in neighbours(origin - shift * (step_across + step_down))[:7]:
+                    rule = [start, step_across, step_down, shift]
                     corner = plane[:8, :8], None if mask is None else mask[:8, :8]
                     if _holds(rule, *corner, down) and _holds(rule, plane, mask, down):
                         return [plain(number) for number in rule]
@@ -254,22 +258,22 @@ def _fit_plane(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) 
 def level_metadata(
     metadata: Mapping[str, Any], shape: tuple[int, int], closed: Closed, places: Sequence[NDArray[np.int64]]
 ) -> dict[str, Any]:
-    """Metadata of the grid of a coarser level of heights: its nodes lie where they stand in the full grid.
+    """Return the metadata of a coarser level of heights, whose nodes lie at places of the full grid.
 
     Parameters
     ----------
     metadata : mapping
-        Of the whole surface.
+        Metadata of the whole surface.
     shape : (int, int)
         Of the full grid.
     closed : (bool, bool)
     places : two int64 arrays, shape (row,) and (column,)
-        The rows and the columns of the full grid at which the nodes stand, increasing.
+        The rows and columns of the full grid at which the nodes lie, ascending.
 
     Returns
     -------
     dict
-        Without ``seam`` and ``turn``: the level's own grid is what was asked for. ``axes`` have the coordinates of the
+        Without ``seam`` and ``turn``, which do not apply to a level's grid. ``axes`` have the coordinates of the
         nodes; without them ``geotransform`` is that of the level's even grid. Where the nodes are not evenly spaced,
         since an axis had a gap, ``nodes`` has the places of rows and of columns in steps of that grid, or None for an
         even axis; a geotransform beside ``axes`` is then left out.
@@ -292,20 +296,19 @@ def level_metadata(
 
 
 def grid_at(rules: Sequence[Rule], shape: tuple[int, int], places: Sequence[NDArray[np.int64]]) -> dict[str, Any]:
-    """Metadata by which heights at some rows and columns of a grid get back x and y, see `coordinates`.
+    """Return metadata that give heights at some rows and columns of a grid their x and y, see `coordinates`.
 
     Parameters
     ----------
     rules : two rules, of x and of y
-        Of the grid.
     shape : (int, int)
-        Of the grid.
+        Rows and columns of the grid.
     places : two int64 arrays, shape (row,) and (column,)
-        Which rows and columns of it.
+        The chosen rows and columns of the grid.
     """
     anywhere = []
     for rule, length, down in zip(rules, (shape[1], shape[0]), (False, True), strict=True):
-        # The last number of such a rule is that of the last place of the grid.
+        # A rule with ``last`` refers to the last place of the grid, so its values are listed.
         anywhere.append(_listed(rule, length, np.arange(length), down) if rule[-1] is True else rule)
     return {"grid": anywhere, "nodes": [line.tolist() for line in places]}
 
@@ -313,25 +316,25 @@ def grid_at(rules: Sequence[Rule], shape: tuple[int, int], places: Sequence[NDAr
 def axes_at(
     axes: Any, shape: tuple[int, int], places: Sequence[NDArray[np.int64]], closed: Closed = (False, False)
 ) -> dict[str, Any]:
-    """The ``axes`` of some rows and columns of a grid, with the same coordinates there, bit for bit.
+    """Return the ``axes`` of some rows and columns of a grid, with the same coordinates bit for bit.
 
     Parameters
     ----------
     axes : mapping
-        Of the grid.
+        Axes of the grid.
     shape : (int, int)
-        Of the grid.
+        Rows and columns of the grid.
     places : two int64 arrays, shape (row,) and (column,)
-        Which rows and columns of it. Along a closed axis they may go on after its end, where the coordinates of the
-        first places follow, one turn further. A list with one number more than the axis has places says how long the
-        step across the seam is; otherwise it is as long as the one before it.
+        The chosen rows and columns of the grid. Along a closed axis they may continue after its end, where the
+        coordinates of the first places follow, one turn further. A list with one number more than the axis has places
+        gives the step across the seam; otherwise this is as long as the step before it.
     closed : (bool, bool)
-        Which axes of these places are closed: a list with that number has it again.
+        Axes along which the places are closed: a list with a number for the next turn keeps such a number.
 
     Raises
     ------
     InputError
-        When these are no axes.
+        When ``axes`` are malformed.
     """
     rules, _, swapped = _axes(axes)
     result = dict(axes)
@@ -345,7 +348,7 @@ def axes_at(
 
 
 def _listed(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> Rule:
-    """The values of a rule at some places of its axis, as a rule."""
+    """Return the values of a rule at some places of its axis as a rule that lists them."""
     axis, still = np.arange(length, dtype=np.float64), np.zeros((1, 1))
     line = axis[:, None] if down else axis[None, :]
     values = evaluate(rule, line if down else still, still if down else line, down)
@@ -358,15 +361,15 @@ def _listed(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> R
 
 
 def _has_turn(rule: Rule, length: int) -> bool:
-    """Whether a rule of a closed axis of this length lists the first number again, one turn further."""
+    """Return whether a rule of a closed axis of this length lists the first number again, one turn further."""
     return rule[-1] == VALUES and len(rule) - 1 > length
 
 
 def _thinned(rule: Rule, length: int, places: NDArray[np.int64], down: bool) -> Rule | None:
-    """The rule of every so many places of an axis, from the first one on; None where they, or the rule, are others.
+    """Return the rule at every so many places of an axis from the first on; None where places or rule are others.
 
-    Lists of values would be too long for metadata where rules are not. The step between nodes is a power of two, and
-    multiplying by one rounds nothing.
+    Rules avoid lists of values that are too long for metadata. The step between nodes is a power of two, so that
+    multiplication by it is exact.
     """
     step = int(places[1]) if len(places) > 1 else 1
     if step & (step - 1) or rule[-1] == VALUES or not np.array_equal(places, step * np.arange(len(places))):

@@ -1,8 +1,8 @@
-"""Repeated last rows and columns, and angles that jump: smoothed on the way in, put back on the way out.
+"""Repeated last rows and columns, and angles that jump: removed before encoding, restored afterwards.
 
 A file that closes a surface by repeating its first row or column at the end stores those points twice. `merge` finds
-that bit by bit and makes the axis closed instead; `restore`, which comes before every writer, repeats the points again.
-Likewise `unwrap` adds whole turns to angles so that neighbours are near each other, and `restore` takes them away.
+that bit by bit and makes the axis closed instead; `restore`, which every writer calls first, repeats the points again.
+Likewise `unwrap` adds whole turns to angles so that neighbours are near each other, and `restore` subtracts them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ __all__ = ["merge", "restore", "shapes_in_files", "unwrap", "wrapped"]
 _WORDS: Mapping[Closed, str] = {(True, False): "rows", (False, True): "cols", (True, True): "both"}
 _AXES: Mapping[str, Closed] = {word: closed for closed, word in _WORDS.items()}
 
-#: A closed axis has at least three points, and the one that repeats the first.
-_FEWEST = 4
+#: Rows or columns with a repeated one, at least: a closed axis has at least three points.
+_MIN_LINES_WITH_SEAM = 4
 
 #: A channel of angles, and a full turn.
 Turns = tuple[int, float]
@@ -32,43 +32,43 @@ Turns = tuple[int, float]
 def merge(
     surface: Surface, closed: Closed | None = None, *, angle: Turns | None = None, room: Room = IN_MEMORY
 ) -> Surface:
-    """Merge repeated last rows and columns into closed axes, of every block.
+    """Merge repeated last rows and columns of every block into closed axes.
 
-    Points repeat where their bits do, and those of their mask and attributes. A row whose points all coincide is a pole
-    and no seam.
+    Points repeat where their bits are equal, and those of their mask and attributes. A row whose points all coincide is
+    a pole and no seam.
 
     Parameters
     ----------
     surface : Surface
-        Of a height field, whose heights say nothing of where they lie, only an axis that `closed` names is looked at.
+        Of a height field, whose heights do not show their position, only axes in ``closed`` are examined.
     closed : (bool, bool), optional
         The axes that may be merged; None: both.
     angle : (int, float), optional
         A channel, and the full turn by which its last row or column may differ from the first.
     room : Room
-        Where arrays without their last column go.
+        Where arrays without their last column are allocated.
 
     Returns
     -------
     Surface
-        The same one when nothing repeats. Otherwise with ``seam`` in the metadata: "rows", "cols" or "both", or a list
-        of these (or "") for several blocks; and ``turn``: [channel, number, axis], where a seam adds a full turn.
+        The same surface when nothing repeats. Otherwise with ``seam`` in the metadata: "rows", "cols" or "both", or a
+        list of these (or "") for several blocks; and ``turn``: [channel, number, axis], where a seam adds a full turn.
     """
     blocks, words, turn = [], [], []
     for block in surface.blocks:
-        found = [False, False]
+        merged = [False, False]
         for axis in (0, 1):
             wanted = closed[axis] if closed is not None else block.points.ndim == 3
-            if not wanted or block.closed[axis] or block.shape[axis] < _FEWEST:
+            if not wanted or block.closed[axis] or block.shape[axis] < _MIN_LINES_WITH_SEAM:
                 continue
             by = _repeats(block, axis, angle)
             if by is not None:
-                found[axis] = True
+                merged[axis] = True
                 block = _without_last(block, axis, room)
                 if angle is not None and by:
                     turn = [angle[0], by, axis]
         blocks.append(block)
-        words.append(_WORDS.get((found[0], found[1]), ""))
+        words.append(_WORDS.get((merged[0], merged[1]), ""))
     if not any(words):
         return surface
     metadata = {**surface.metadata, "seam": words[0] if len(words) == 1 else words}
@@ -78,21 +78,21 @@ def merge(
 
 
 def _repeats(block: Block, axis: int, angle: Turns | None) -> float | None:
-    """The turn by which the last line differs from the first, 0 for none; None where it does not repeat it."""
-    valid = told = np.ones(block.shape[1 - axis], np.bool_)
+    """Return the turn by which the last line differs from the first, 0 for none; None where it is no repetition."""
+    valid = compared = np.ones(block.shape[1 - axis], np.bool_)
     if block.mask is not None:
         mask = np.moveaxis(block.mask, axis, 0)
         if not np.array_equal(mask[0], mask[-1]) or not mask[0].any():
             return None
-        valid = told = mask[0]
+        valid = compared = mask[0]
         if block.kept is not None:
             kept = np.moveaxis(block.kept, axis, 0)
             if not np.array_equal(kept[0], kept[-1]):
                 return None
-            told = valid | kept[0]
+            compared = valid | kept[0]
     for array in block.attributes.values():
         lines = np.moveaxis(array, axis, 0)
-        if lines[0][told].tobytes() != lines[-1][told].tobytes():
+        if lines[0][compared].tobytes() != lines[-1][compared].tobytes():
             return None
     points = np.moveaxis(block.points, axis, 0)
     first, last, turn = points[0], points[-1], 0.0
@@ -102,7 +102,7 @@ def _repeats(block: Block, axis: int, angle: Turns | None) -> float | None:
         first = first.copy()
         with np.errstate(invalid="ignore"):  # of signalling NaN
             first[:, channel] += first.dtype.type(turn)
-    if first[told].tobytes() != last[told].tobytes():
+    if first[compared].tobytes() != last[compared].tobytes():
         return None
     first = first[valid]
     collapsed = first.ndim == 2 and len(first) > 1 and bool((first == first[0]).all())
@@ -110,13 +110,16 @@ def _repeats(block: Block, axis: int, angle: Turns | None) -> float | None:
 
 
 def _without_last(block: Block, axis: int, room: Room) -> Block:
+    """Return a block without its last row or column, closed along that axis."""
+
     def kept(array: NDArray[Any]) -> NDArray[Any]:
+        """Return an array without its last row or column."""
         if axis == 0:
             return array[:-1]
-        found = room.empty((array.shape[0], array.shape[1] - 1, *array.shape[2:]), array.dtype)
-        for rows in rows_at_once(found.shape):
-            found[rows] = array[rows, :-1]
-        return found
+        shorter = room.empty((array.shape[0], array.shape[1] - 1, *array.shape[2:]), array.dtype)
+        for rows in rows_at_once(shorter.shape):
+            shorter[rows] = array[rows, :-1]
+        return shorter
 
     return Block(
         kept(block.points),
@@ -132,8 +135,8 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
     Parameters
     ----------
     surface : Surface
-        Of one block of planar points or xyz. Where its type cannot hold the sums without rounding it becomes float64;
-        the type that it had is kept as ``dtype`` in the metadata.
+        One block of planar points or xyz. If its type cannot hold the sums without rounding, the result is float64, and
+        ``dtype`` in the metadata names the original type.
     channel : int
     period : float
         A full turn.
@@ -141,14 +144,15 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
     Returns
     -------
     Surface
-        The same one when no angle jumps or the turns could not be taken away bit by bit; otherwise with ``angles`` in
-        the metadata: a list of {"channel", "period", "low"}, where angles lie between low and low + period.
+        The same surface when no angle jumps, or when subtracting the turns would not restore every bit; otherwise with
+        ``angles`` in the metadata: a list of {"channel", "period", "low"}, where angles lie between low and
+        low + period.
     """
     angles = surface.points[..., channel]
     valid = np.isfinite(angles) if surface.mask is None else surface.mask
-    told = valid if surface.blocks[0].kept is None else valid | surface.blocks[0].kept
+    compared = valid if surface.blocks[0].kept is None else valid | surface.blocks[0].kept
     least, greatest = angles[valid].min(), angles[valid].max()
-    # The angle of a hole is often known, and then tells how its neighbours hang together.
+    # The angle of a hole is often known, and then connects its neighbours.
     known = valid | ((angles >= least) & (angles <= greatest))
     turns = _turns(np.where(known, angles, np.nan).astype(np.float64), period)
     if not turns.any():
@@ -159,7 +163,7 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
             points = surface.points.astype(dtype)
             points[..., channel] += (turns * period).astype(dtype)
             back = wrapped(points[..., channel], period, low).astype(surface.dtype)
-        if back[told].tobytes() == angles[told].tobytes():
+        if back[compared].tobytes() == angles[compared].tobytes():
             break
     else:
         return surface
@@ -170,7 +174,7 @@ def unwrap(surface: Surface, channel: int, period: float) -> Surface:
 
 
 def _turns(angles: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-    """Whole turns to add, (H, W): along the first column, and from it along every row; holes are stepped over."""
+    """Compute the whole turns to add, (H, W): along the first column, then along every row; holes are skipped."""
     filled = _filled(angles)
     smooth = np.unwrap(filled, period=period, axis=1)
     smooth += (np.unwrap(filled[:, 0], period=period) - filled[:, 0])[:, None]
@@ -182,7 +186,7 @@ def _turns(angles: NDArray[np.float64], period: float) -> NDArray[np.float64]:
 
 
 def _filled(angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Take for a missing angle the one before it in its row, or the first of the row, or that of the row before."""
+    """Fill missing angles: from the point before in the row, else the first of the row, else the row before."""
     holes = np.isnan(angles)
     if not holes.any():
         return angles
@@ -196,11 +200,12 @@ def _filled(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _jumps(angles: NDArray[np.float64], period: float) -> int:
+    """Count the neighbours that differ by more than half a turn."""
     return sum(int((np.abs(np.diff(angles, axis=axis)) > period / 2).sum()) for axis in (0, 1))
 
 
 def wrapped(angles: NDArray[Any], period: float, low: float) -> NDArray[np.float64]:
-    """Angles of any shape between low and low + period, by whole turns; what is no number stays as it is."""
+    """Bring angles of any shape between low and low + period, by whole turns; keep NaN and infinities."""
     values = angles.astype(np.float64)
     with np.errstate(invalid="ignore"):
         values -= np.where(np.isfinite(values), period * np.floor((values - low) / period), 0.0)
@@ -208,9 +213,9 @@ def wrapped(angles: NDArray[Any], period: float, low: float) -> NDArray[np.float
 
 
 def restore(surface: Surface) -> Surface:
-    """Give a surface the rows, columns, angles and type that it came with; its metadata no longer say so then.
+    """Restore repeated rows and columns, angles and type of a surface, and remove their entries in the metadata.
 
-    The ``angles`` of a height field stay: they are those of coordinates that are made where they are needed.
+    The ``angles`` of a height field stay, because its coordinates are computed later.
 
     Raises
     ------
@@ -224,7 +229,7 @@ def restore(surface: Surface) -> Surface:
     if not angles and seam is None and dtype is None:
         return surface
     if dtype is not None and dtype not in DTYPES:
-        # Whoever made the container may have written anything: a long text, of which each point would be one.
+        # A hostile container may name any type, such as long strings, of which every point would be one.
         raise InputError(f"expected a type of points in the metadata, got {dtype!a:.80}")
     blocks, nodes = [], []
     for block, repeat in zip(surface.blocks, _repeated(surface), strict=True):
@@ -246,7 +251,7 @@ def restore(surface: Surface) -> Surface:
 
 
 def shapes_in_files(surface: Surface) -> list[tuple[int, int]]:
-    """Rows and columns of each block with those that `restore` repeats."""
+    """Return rows and columns of each block, including those that `restore` repeats."""
     return [
         (block.shape[0] + rows, block.shape[1] + columns)
         for block, (rows, columns) in zip(surface.blocks, _repeated(surface), strict=True)
@@ -254,7 +259,7 @@ def shapes_in_files(surface: Surface) -> list[tuple[int, int]]:
 
 
 def _repeated(surface: Surface) -> list[Closed]:
-    """For each block, whether its first row and its first column are repeated at the end."""
+    """Return for each block whether its first row and its first column are repeated at the end."""
     seam = surface.metadata.get("seam")
     words = [seam] if isinstance(seam, str) else list(seam or ())
     words += [""] * (len(surface.blocks) - len(words))
@@ -262,6 +267,7 @@ def _repeated(surface: Surface) -> list[Closed]:
 
 
 def _with_last(array: NDArray[Any], repeat: Closed, turn: tuple[int, float, int] | None = None) -> NDArray[Any]:
+    """Repeat the first row or column of an array at the end, with the turn added if there is one."""
     for axis in (0, 1):
         if repeat[axis]:
             line = np.take(array, [0], axis=axis)
