@@ -2,11 +2,11 @@
 
 `recognise` finds the grids that the faces of a mesh make, whatever the order of its vertices and faces; `weld`
 finds the mesh of any surface, which is what every format for meshes writes. Between the two, two keys of a
-surface's metadata say what a grid alone does not tell about the mesh that it came from, so that it goes out as it came.
-Both hold at every level of the surface and both may be missing.
+surface's metadata keep what a grid does not show of the mesh that it came from, so that it is written as it was read.
+Both apply at every level of the surface, and both are optional.
 
 ``faces``
-    A map for all blocks, or a list with one map for each block. Its keys, all of which may be missing:
+    A map for all blocks, or a list with one map for each block. Its keys, all optional:
 
     ``diagonal`` : "main" or "anti"
         Each cell is cut into two triangles, from (r, c) to (r + 1, c + 1) or from (r, c + 1) to (r + 1, c). Missing: a
@@ -16,8 +16,8 @@ Both hold at every level of the surface and both may be missing.
         (r + 1, c + 1), (r + 1, c).
     ``joined`` : bool
         Whether points on the block's open sides that lie at the same place are one vertex. Missing: true when the
-        surface has several blocks. What comes out of a container knows those from its header (`Surface.joints`); of
-        other surfaces they are those with the same coordinates.
+        surface has several blocks. For a surface from a container, the header says which points these are
+        (`Surface.joints`); for other surfaces, they are the points with the same coordinates.
     ``part`` : int
         Blocks of different parts share no vertex even where they touch. Missing: 0.
     ``left_out`` : map
@@ -25,8 +25,8 @@ Both hold at every level of the surface and both may be missing.
     ``crossed`` : map
         Cells that are cut along the other diagonal.
 
-    The last two hold the shape of the grid of cells and a text, see `pack_cells`. They are for a grid of that shape
-    only, and say nothing about coarser levels.
+    The last two hold the shape of the grid of cells and a text, see `pack_cells`. They apply to a grid of that shape
+    only, not to coarser levels.
 
 ``poles``
     A list of the sides of blocks that are collapsed to one point, each a map of ``block`` (its number from 0), ``side``
@@ -39,7 +39,7 @@ Both hold at every level of the surface and both may be missing.
         The side is one vertex, and each cell beside it a quad that names this vertex twice in a row, with the
         attributes of two points of the side.
     "repeated"
-        The side is as many vertices as it has points; nothing has to be done on the way out.
+        The side is as many vertices as it has points; the writer treats it as any other side.
 
 A cell with a corner that is a hole has no face.
 """

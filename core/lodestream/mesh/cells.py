@@ -1,4 +1,4 @@
-"""Sets of cells of a grid as text, small where they are regular, for a surface's metadata."""
+"""Sets of cells of a grid as compressed text for a surface's metadata."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def pack_cells(cells: NDArray[np.bool_]) -> dict[str, Any]:
 
 
 def unpack_cells(entry: Any, shape: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Read what `pack_cells` wrote for a grid of so many rows and columns of cells; None when it was for
-    another one. The array is bool, of that shape.
+    """Decode a set of cells of `pack_cells`; return bool of ``shape``, or None if it belongs to another shape.
 
     Raises
     ------
     InputError
-        When it is of another form.
+        When it is malformed.
+
     """
     try:
         if not isinstance(entry, Mapping) or tuple(entry["shape"]) != shape:

@@ -13,7 +13,7 @@ __all__ = ["irregular", "trace"]
 
 
 def irregular(valence: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Which umbrellas are no part of a grid: inner ones without four quads, outer ones with more than two.
+    """Return which umbrellas are no part of a grid: inner ones without four quads, outer ones with more than two.
 
     `valence`, shape (umbrella,), is the number of quads, negative at a border.
     """
@@ -27,7 +27,7 @@ def trace(
     umbrella: NDArray[np.int32],
     valence: NDArray[np.int32],
     starts: NDArray[np.int32],
-    whole: bool,
+    lines_cross: bool,
     cut: NDArray[np.bool_],
 ) -> None:
     """Trace the grid lines that leave irregular vertices, all one edge at a time in turn.
@@ -49,6 +49,6 @@ def trace(
     state = np.array([0, 0, len(starts)])
     walk(
         kernels.mesh_trace,
-        *(corners, twins, umbrella, valence, whole, passed, starts.copy(), cut.view(np.uint8)),
+        *(corners, twins, umbrella, valence, lines_cross, passed, starts.copy(), cut.view(np.uint8)),
         state,
     )

@@ -1,4 +1,4 @@
-"""What is known of recognised grids beside their nodes: cells, poles, joints, and words for all of it."""
+"""Properties of recognised grids besides their nodes: cells, poles, joints, and a description in words."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RecognisedBlock:
     rows : mapping of str to int64 arrays of shape (H, W)
         For each attribute of corners the row of its values at each node; -1 at holes.
     faces, poles
-        What `lodestream.mesh` describes, for this block.
+        The metadata of this block, see `lodestream.mesh`.
     """
 
     vertices: NDArray[np.int64]
@@ -42,7 +42,7 @@ class RecognisedBlock:
 
 
 def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
-    """Say how faces go round, which cells have none although their corners are there, and how they are cut in two."""
+    """Describe how faces go round, which cells with valid corners have none, and how they are cut in two."""
     faces: dict[str, Any] = {"reversed": True} if grid.reversed else {}
     there = grid.corners >= 0
     full = there.copy()
@@ -58,9 +58,9 @@ def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
     if not cut.any():
         return faces
     # A diagonal joins the first and third corners of its quad.
-    own = quads.corners.reshape(-1)[grid.corners[: cut.shape[0], : cut.shape[1]]]
+    node_vertices = quads.corners.reshape(-1)[grid.corners[: cut.shape[0], : cut.shape[1]]]
     rows = quads.corners[grid.faces]
-    main = cut & ((rows[..., 0] == own) | (rows[..., 2] == own))
+    main = cut & ((rows[..., 0] == node_vertices) | (rows[..., 2] == node_vertices))
     anti = cut & ~main
     mostly_main = bool(main.sum() >= anti.sum())
     faces["diagonal"] = "main" if mostly_main else "anti"
@@ -71,7 +71,7 @@ def describe_cells(grid: Grid, quads: Quads) -> dict[str, Any]:
 
 
 def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -> NDArray[np.int32]:
-    """The corners of a grid, where each node of a fan's side is that of the triangle in its own row or column.
+    """Return the corners of a grid in which each node of a fan's side is that of the triangle in its row or column.
 
     `corners` are half-edges, int32 of shape (H, W), `faces` int32 of shape (H or H - 1,
     W or W - 1); -1: none.
@@ -86,7 +86,7 @@ def with_tips(corners: NDArray[np.int32], faces: NDArray[np.int32], side: str) -
 def poles_of(
     vertices: NDArray[np.int64], closed: Closed, points: NDArray[Any], kinds: Mapping[str, str]
 ) -> tuple[Mapping[str, str], ...]:
-    """The sides of a grid that are collapsed to a point; `kinds` are those that are one vertex.
+    """Return the sides of a grid that are collapsed to a point; ``kinds`` are those that are one vertex.
 
     `vertices` has shape (H, W), -1 for none; `points` shape (V, C).
     """
@@ -105,10 +105,10 @@ def poles_of(
 def join_blocks(
     blocks: Sequence[RecognisedBlock], grids: Sequence[Grid], points: NDArray[Any]
 ) -> tuple[list[RecognisedBlock], int]:
-    """Say of each block whether its border is joined to others, or to itself.
+    """Record for each block whether its border is joined to others, or to itself.
 
-    `points` has shape (V, C). The second result is the number of vertices that will be joined although they only lie
-    at the same place.
+    `points` has shape (V, C). The second result is the number of vertices that will be joined because they lie at the
+    same place, although the mesh has them as different vertices.
     """
     borders = [_border(block, grid) for block, grid in zip(blocks, grids, strict=True)]
     shared = np.bincount(np.concatenate(borders), minlength=1) > 1
@@ -129,7 +129,7 @@ def join_blocks(
 
 
 def _border(block: RecognisedBlock, grid: Grid) -> NDArray[np.int64]:
-    """Vertices on the border of a block, each node once and each pole once."""
+    """Return the vertices on the border of a block, int64, shape (vertex,), each node and each pole once."""
     border = on_border(grid.faces >= 0, block.vertices.shape)
     poles = []
     for pole in block.poles:
@@ -141,7 +141,7 @@ def _border(block: RecognisedBlock, grid: Grid) -> NDArray[np.int64]:
 
 
 def shape_words(blocks: Sequence[Block], poles: int) -> str:
-    """Such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"; `poles` are sides of blocks that are one vertex."""
+    """Describe blocks, such as "torus, 96 x 24" or "6 blocks, 33 x 33 each"; ``poles`` counts collapsed sides."""
     if len(blocks) == 1:
         closed = sum(blocks[0].closed)
         kind = ("grid", ("cylinder", "cap", "sphere")[poles if closed == 1 else 0], "torus")[closed]
@@ -153,4 +153,5 @@ def shape_words(blocks: Sequence[Block], poles: int) -> str:
 
 
 def _by(shape: tuple[int, int]) -> str:
+    """Format rows and columns, such as "96 x 24"."""
     return f"{shape[0]} x {shape[1]}"

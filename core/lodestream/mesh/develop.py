@@ -1,7 +1,7 @@
-"""Laying faces out in the plane, one beside the other, as cells of a lattice.
+"""Development of faces into the plane, one beside the other, as cells of a lattice.
 
-Where every inner vertex is regular this gives each face of a connected piece a place of its own, up to *periods*: the
-steps by which a way round the surface comes back to the same face. Without periods a piece is a plane grid; one period
+Where every inner vertex is regular, each face of a connected piece gets a distinct place, up to *periods*: the steps
+after which a way round the surface comes back to the same face. Without periods a piece is a plane grid; one period
 along an axis makes a cylinder, one along each a torus.
 """
 
@@ -44,14 +44,14 @@ class Development:
     periods: NDArray[np.int64]
 
 
-#: Pieces that there is room for at first, and what the kernel says when there are more.
-_PIECES, _NO_ROOM = 64, 2
+#: Pieces for which memory is allocated at first, and the kernel's result when there are more.
+_INITIAL_PIECES, _NO_ROOM = 64, 2
 
 
 def develop_quads(twins: NDArray[np.int32]) -> Development:
     """Lay out quads that are wound alike, of twins of shape (4 F,).
 
-    Where an inner vertex has not four quads, the piece `turns` or overlaps.
+    Where an inner vertex does not have four quads, the piece `turns` or overlaps.
     """
     return _laid_out(4, twins)
 
@@ -62,11 +62,12 @@ def develop_triangles(twins: NDArray[np.int32]) -> Development:
 
 
 def _laid_out(sides: int, twins: NDArray[np.int32]) -> Development:
+    """Lay out faces of 3 or 4 sides that are wound alike."""
     faces = len(twins) // 4
     piece = np.empty(faces, np.int32)
     first = np.empty((faces, 2), np.int32)
     heading = np.full(faces, -1, np.int8)
-    turns, periods = np.zeros(_PIECES, np.bool_), np.zeros((_PIECES, 3), np.int64)
+    turns, periods = np.zeros(_INITIAL_PIECES, np.bool_), np.zeros((_INITIAL_PIECES, 3), np.int64)
     stack, state = np.empty(faces, np.int32), np.zeros(3, np.int64)
     arrays = (piece, first, heading)
     while walk(kernels.mesh_develop, sides, twins, *arrays, turns.view(np.uint8), periods, stack, state) == _NO_ROOM:

@@ -1,4 +1,4 @@
-"""Grids of the quads that were laid out, turned to the order of the file."""
+"""Grids of quads that were laid out, turned to the order of the file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from .walks import batches
 
 __all__ = ["Grid", "make_grid"]
 
-#: A grid of which fewer cells have a face is no grid with holes but a mesh of another shape.
-_LEAST_FULL = 0.1
+#: Share of the cells that must have a face: below it, a piece is not treated as a grid with holes.
+_MIN_SHARE_OF_FACES = 0.1
 
 _MIN_CLOSED = 3
 
@@ -45,13 +45,13 @@ class Grid:
 
 
 def _bounds(faces: NDArray[np.int64], laid: Development, down: int, across: int) -> tuple[int, int, int, int]:
-    """Lowest and highest row and column of the nodes, after the periods `down` and `across` (0: none)."""
+    """Return the lowest and highest row and column of nodes, modulo the periods ``down`` and ``across`` (0: none)."""
     bounds = np.tile([np.iinfo(np.int64).max, np.iinfo(np.int64).min], 2)
     for batch in batches(len(faces)):
         kernels.mesh_bounds(faces[batch], laid.first, laid.heading, bounds)
-    top, bottom, left, right = (int(bound) for bound in bounds)
-    rows = (0, down - 1) if down else (top, bottom + 1)
-    columns = (0, across - 1) if across else (left, right + 1)
+    first_row, last_row, first_column, last_column = (int(bound) for bound in bounds)
+    rows = (0, down - 1) if down else (first_row, last_row + 1)
+    columns = (0, across - 1) if across else (first_column, last_column + 1)
     return *rows, *columns
 
 
@@ -83,36 +83,37 @@ def make_grid(
     a, b, d = (int(value) for value in laid.periods[piece])
     if laid.turns[piece] or b or (a and a < _MIN_CLOSED) or (d and d < _MIN_CLOSED):
         return None
-    top, bottom, left, right = _bounds(faces, laid, a, d)
-    height, width = bottom - top + 1, right - left + 1
+    top, bottom, first, last = _bounds(faces, laid, a, d)
+    height, width = bottom - top + 1, last - first + 1
     closed = (a > 0, d > 0)
     down, across = height - (not closed[0]), width - (not closed[1])
-    if len(faces) < _LEAST_FULL * down * across:
+    if len(faces) < _MIN_SHARE_OF_FACES * down * across:
         return None
     nodes = np.full((height, width), -1, np.int32)
     cells = np.full((down, across), -1, np.int32)
     for batch in batches(len(faces)):
         run = faces[batch]
-        if kernels.mesh_fill(run, laid.first, laid.heading, identity, top, left, *closed, nodes, cells) < len(run):
+        if kernels.mesh_fill(run, laid.first, laid.heading, identity, top, first, *closed, nodes, cells) < len(run):
             return None
     return _in_order(Grid(nodes, cells, closed, False), vertex)
 
 
 class _Turn(NamedTuple):
-    """A grid transposed, then reversed along some axes, then rolled by so many nodes along both."""
+    """An operation on a grid: transpose, then reverse some axes, then roll both axes by numbers of nodes."""
 
     transposed: bool
     flips: tuple[bool, bool]
     shifts: tuple[int, int] = (0, 0)
 
     def of(self, values: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Apply the operation to an array, shape (row, column)."""
         turned = values.T if self.transposed else values
         turned = turned[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1]
         return np.roll(turned, self.shifts, (0, 1)) if any(self.shifts) else turned
 
 
 def _in_order(grid: Grid, vertex: NDArray[np.int32]) -> Grid:
-    """Transpose, reverse and roll a grid so that its vertices come in the order of their numbers, as far as may be."""
+    """Transpose, reverse and roll a grid so that its vertices come in the order of their numbers as far as possible."""
     numbers = np.where(grid.corners < 0, np.int32(-1), vertex[grid.corners])
     best: tuple[NDArray[np.int32], _Turn] | None = None
     for transposed, *flips in product((False, True), repeat=3):
@@ -129,11 +130,13 @@ def _in_order(grid: Grid, vertex: NDArray[np.int32]) -> Grid:
 
 
 def _precedes(order: NDArray[np.int32], other: NDArray[np.int32]) -> bool:
+    """Return whether the first difference of two orders of vertices favours the first one."""
     different = np.flatnonzero(order != other)
     return bool(different.size and order[different[0]] < other[different[0]])
 
 
 def _turned(grid: Grid, turn: _Turn) -> Grid:
+    """Apply an operation to nodes and faces of a grid."""
     closed = grid.closed[::-1] if turn.transposed else grid.closed
     # On a closed axis that is reversed, the cell behind the last node is now before the first.
     rows, columns = (
@@ -145,14 +148,14 @@ def _turned(grid: Grid, turn: _Turn) -> Grid:
 
 
 def _start(lines: NDArray[np.int32]) -> int:
-    """Where most closed lines of numbers may begin so that the first of each is its lowest; -1 where there is none."""
+    """Find where most closed lines of numbers may begin with their lowest number; -1 where there is none."""
     length = lines.shape[1]
     most = lines.max(axis=1)
     lines = np.ascontiguousarray(lines)
     place = lines.view(np.uint32).argmin(axis=1)
     several = most > lines[np.arange(len(lines)), place]  # no pole, and not empty
     lines, place = lines[several], place[several]
-    # A line may begin at its lowest number, or where there is none before that.
+    # A line may begin at its lowest number, or anywhere in the gap before that.
     begin = place.copy()
     gaps = np.flatnonzero(lines[np.arange(len(lines)), place - 1] < 0)
     before = np.take_along_axis(lines[gaps], (place[gaps, None] - 1 - np.arange(length)) % length, axis=1)

@@ -1,4 +1,4 @@
-"""Half-edges of triangles and quads: who is beside whom, on which side, and around which vertex.
+"""Half-edges of triangles and quads: which faces are adjacent, across which edge, and around which vertex.
 
 Faces are rows of four corners, the last of which is -1 in a triangle. Half-edge ``4 f + k`` runs from corner k of face
 f to the next one; its *twin* is the half-edge of the face beside it, or -1 where there is none.
@@ -19,10 +19,10 @@ __all__ = ["Corners", "find_pieces", "find_twins", "find_umbrellas", "join_piece
 
 Corners = NDArray[np.int32]
 
-#: More than any half-edge.
+#: A number above that of any half-edge.
 _NO_HALF_EDGE = 2**31 - 1
 
-#: What `orient` has not seen yet.
+#: Mark of faces that `orient` has not visited.
 _UNSEEN = 2
 
 
@@ -61,7 +61,7 @@ def find_twins(corners: Corners, vertices: int) -> tuple[NDArray[np.int32], int,
 def find_pieces(twins: NDArray[np.int32], piece: NDArray[np.int32]) -> int:
     """Number faces by the connected piece that they belong to, in the order of the pieces' first faces.
 
-    Fills `piece`, int32 of shape (F,), and gives the number of pieces.
+    Fills `piece`, int32 of shape (F,), and returns the number of pieces.
     """
     piece[:] = -1
     state = np.zeros(4, np.int64)
@@ -70,7 +70,7 @@ def find_pieces(twins: NDArray[np.int32], piece: NDArray[np.int32]) -> int:
 
 
 def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertices: int) -> NDArray[np.int64]:
-    """Number pieces that share a vertex alike: for each piece the number of its part, in order, shape (piece,).
+    """Give pieces that share a vertex the same number of a part; parts are numbered in order, shape (piece,).
 
     `corners` has shape (F, 3) or (F, 4), `piece` shape (F,).
     """
@@ -79,17 +79,17 @@ def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertice
         return part
     there = corners >= 0
     corner, home = corners[there], np.broadcast_to(piece[:, None], corners.shape)[there]
-    some = np.empty(vertices, np.int32)
-    some[corner] = home
-    beside = some[corner]
+    any_piece = np.empty(vertices, np.int32)
+    any_piece[corner] = home
+    beside = any_piece[corner]
     apart = beside != home
-    one, other = np.divmod(np.unique(beside[apart].astype(np.int64) * pieces + home[apart]), pieces)
+    piece_a, piece_b = np.divmod(np.unique(beside[apart].astype(np.int64) * pieces + home[apart]), pieces)
     while True:
         # Each piece, and the one that stands for it, gets the least of the numbers beside it.
-        least = np.minimum(part[one], part[other])
+        least = np.minimum(part[piece_a], part[piece_b])
         less = part.copy()
-        np.minimum.at(less, part[one], least)
-        np.minimum.at(less, part[other], least)
+        np.minimum.at(less, part[piece_a], least)
+        np.minimum.at(less, part[piece_b], least)
         less = less[less]
         if np.array_equal(less, part):
             return np.unique(part, return_inverse=True)[1].reshape(-1)
@@ -99,7 +99,7 @@ def join_pieces(corners: Corners, piece: NDArray[np.int32], pieces: int, vertice
 def orient(corners: Corners, twins: NDArray[np.int32], turned: NDArray[np.bool_]) -> int:
     """Find the faces to turn round so that all of a piece are wound alike: the fewer of the two possible sets.
 
-    Fills `turned`, of shape (F,). Gives -1, or the first face at which a surface with only one side was noticed.
+    Fills `turned`, of shape (F,). Returns -1, or the first face at which the surface was seen to have only one side.
     """
     sides = turned.view(np.uint8)
     sides[:] = _UNSEEN
@@ -108,7 +108,7 @@ def orient(corners: Corners, twins: NDArray[np.int32], turned: NDArray[np.bool_]
 
 
 def turn(corners: Corners, turned: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Where each half-edge and, for the second result, each corner is after faces were turned round.
+    """Return where each half-edge is after faces were turned round.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def find_umbrellas(
     Returns
     -------
     int
-        How many there are.
+        The number of umbrellas.
     """
     umbrella[:] = -1
     state = np.zeros(6, np.int64)

@@ -1,7 +1,7 @@
-"""Which points of a surface are one vertex of its mesh.
+"""Points of a surface that are one vertex of its mesh.
 
-Of a surface that comes out of a container, `Surface.joints` says which points lie at one place, so that a mesh has the
-same faces however rough its values still are. Of any other the values say it, and the encoder keeps what they say.
+For a surface from a container, `Surface.joints` says which points lie at one place, so that a mesh has the same faces
+even while its values are approximate. For any other surface the values decide, and the encoder stores the result.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Pole(NamedTuple):
 
 @dataclass(frozen=True)
 class NumberedBlock:
-    """A block whose points have numbers among those of all blocks, and what is said of its faces.
+    """A block whose points are numbered across all blocks, and the metadata of its faces.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class NumberedBlock:
         The number of its first point.
     faces : mapping
     joins : bool
-        Whether its border is joined to others at the same place.
+        Whether points on its border are joined to others at the same place.
     """
 
     block: Block
@@ -74,7 +74,7 @@ class NumberedBlock:
 
     @staticmethod
     def of(block: Block, start: int, faces: Mapping[str, Any], blocks: int) -> NumberedBlock:
-        """A block of so many, whose points are numbered from `start`."""
+        """Make the numbered block of one of ``blocks`` blocks, whose points are numbered from ``start``."""
         return NumberedBlock(block, start, faces, bool(faces.get("joined", blocks > 1)))
 
     @cached_property
@@ -98,17 +98,17 @@ class NumberedBlock:
         return cells
 
     def side(self, name: str) -> NDArray[np.int64]:
-        """The numbers of the points of one of the `SIDES`, shape (point,)."""
+        """Return the numbers of the points of one of the `SIDES`, int64, shape (point,)."""
         rows, columns = (np.arange(n)[k] for n, k in zip(self.block.shape, SIDES[name], strict=True))
         return self.start + np.atleast_1d(rows * self.block.shape[1] + columns)
 
     def border(self) -> NDArray[np.int64]:
-        """The points that may lie at the place of others, shape (point,): valid ones with fewer than four faces."""
+        """Return the points that may coincide with others, int64, (point,): valid ones with fewer than four faces."""
         block = self.block
         if not self.joins or block.points.ndim != 3:
             return np.empty(0, np.int64)
         if block.mask is None and self.faces.get("left_out") is None:
-            # All cells have a face: those points are the sides of open axes, and nothing of all points is needed.
+            # All cells have a face: those points are the sides of open axes, so no array of all points is needed.
             names = [name for axis, pair in enumerate(_SIDES_ACROSS) if not wraps(block, axis) for name in pair]
             return np.unique(np.concatenate([np.empty(0, np.int64), *map(self.side, names)]))
         border = on_border(self.cells, block.shape)
@@ -118,12 +118,12 @@ class NumberedBlock:
 
 
 def wraps(block: Block, axis: int) -> bool:
-    """Whether faces join the last line of a block to the first."""
+    """Return whether faces join the last line of a block to the first."""
     return block.closed[axis] and block.shape[axis] >= _MIN_CLOSED
 
 
 def on_border(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which nodes of a grid of this shape have fewer than four faces, from the cells that have one.
+    """Return which nodes of a grid have fewer than four faces, bool of ``shape``, given the cells with a face.
 
     `cells` is bool of shape (row of cells, column of cells), one fewer on open axes.
     """
@@ -135,7 +135,7 @@ def on_border(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bo
 
 
 def _face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[str, Any]:
-    """What the metadata's ``faces`` say about a block of so many; empty where they say nothing.
+    """Return the metadata's ``faces`` of one of ``blocks`` blocks; empty where there are none.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def _face_map(metadata: Mapping[str, Any], block: int, blocks: int) -> Mapping[s
 
 
 def numbered_blocks(surface: Surface) -> list[NumberedBlock]:
-    """The blocks of a surface.
+    """Number the points of the blocks of a surface.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def numbered_blocks(surface: Surface) -> list[NumberedBlock]:
 
 
 def poles_of(surface: Surface) -> list[Pole]:
-    """The sides that the metadata name as one vertex.
+    """Return the sides that the metadata name as one vertex.
 
     Raises
     ------
@@ -191,26 +191,26 @@ def poles_of(surface: Surface) -> list[Pole]:
 def join_points(
     surface: Surface, numbered: Sequence[NumberedBlock], poles: Sequence[Pole]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], list[Pole]]:
-    """Find the points that are one.
+    """Find the points that are one vertex.
 
     Returns
     -------
     joined : int64 array, shape (N,)
-        For each point of all blocks the first at its place that it is joined with, whatever its attributes.
+        For each point of all blocks, the first point at its place with which it is joined, whatever its attributes.
     vertex : int64 array, shape (N,)
         The first of those with the same attributes.
     poles : list of Pole
-        Those that lie at one place, as in a window of the surface they need not.
+        The poles whose points coincide, which need not be so in a window of a surface.
     """
-    joined = np.arange(sum(own.points.size for own in numbered))
-    numbers = _that_count(numbered, poles)
+    joined = np.arange(sum(block.points.size for block in numbered))
+    numbers = _joinable_points(numbered, poles)
     if not numbers.size:
         return joined, joined, []
     place = np.full(len(joined), -1)
     place[numbers] = _places(surface, numbers)
     borders: dict[int, list[NDArray[np.int64]]] = {}
-    for own in numbered:
-        borders.setdefault(int(own.faces.get("part", 0)), []).append(own.border())
+    for block in numbered:
+        borders.setdefault(int(block.faces.get("part", 0)), []).append(block.border())
     for several in borders.values():
         index = np.concatenate(several)
         if not index.size:
@@ -233,7 +233,7 @@ def join_points(
 
 
 def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
-    """How the points that are one by their values differ from those that the arrangement of blocks says.
+    """Return how points that are one by their values differ from those that are one by the arrangement of blocks.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
     if all(block.points.ndim == 2 for block in surface.blocks):
         return nothing, nothing  # heights lie beside each other
     try:
-        numbers = _that_count(numbered_blocks(surface), poles_of(surface))
+        numbers = _joinable_points(numbered_blocks(surface), poles_of(surface))
     except InputError:
         return nothing, nothing  # its metadata make no mesh
     if not numbers.size:
@@ -261,45 +261,45 @@ def change_of(surface: Surface, places: Groups) -> tuple[Change, Change]:
     return first, find_change(numbers, places.changed(first), numbers[_first_equal(columns)])
 
 
-def _that_count(numbered: Sequence[NumberedBlock], poles: Sequence[Pole]) -> NDArray[np.int64]:
-    """The points that may be joined with others, increasing."""
+def _joinable_points(numbered: Sequence[NumberedBlock], poles: Sequence[Pole]) -> NDArray[np.int64]:
+    """Return the points that may be joined with others, int64, shape (point,), ascending."""
     sides = [numbered[pole.block].side(pole.side) for pole in poles]
-    return np.unique(np.concatenate([*(own.border() for own in numbered), *sides]))
+    return np.unique(np.concatenate([*(block.border() for block in numbered), *sides]))
 
 
 def _places(surface: Surface, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers that are equal where points lie at one place."""
+    """Number points, equal numbers where they lie at one place; int64, shape (point,)."""
     if surface.joints is None:
         return _equal(surface, numbers, 3)
-    return surface.joints.places.first(_whole(surface, surface.joints, numbers))
+    return surface.joints.places.first(_surface_numbers(surface, surface.joints, numbers))
 
 
 def _vertices(surface: Surface, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Numbers that are equal where points at one place have the same attributes."""
+    """Number points, equal numbers where they are at one place with equal attributes; int64, shape (point,)."""
     if surface.joints is None:
         return _equal(surface, numbers, None)
-    return surface.joints.vertices.first(_whole(surface, surface.joints, numbers))
+    return surface.joints.vertices.first(_surface_numbers(surface, surface.joints, numbers))
 
 
-def _whole(surface: Surface, joints: Joints, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The numbers that points have in the whole surface."""
-    found, start = [], 0
+def _surface_numbers(surface: Surface, joints: Joints, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the numbers that points of a window have in the whole surface, int64, shape (point,)."""
+    parts, start = [], 0
     for number, block in enumerate(surface.blocks):
         rows, columns = block.shape
         inside = _inside(numbers, start, rows * columns)
-        found.append(joints.number(number, *np.divmod(inside, columns)))
+        parts.append(joints.number(number, *np.divmod(inside, columns)))
         start += rows * columns
-    return np.concatenate(found)
+    return np.concatenate(parts)
 
 
 def _inside(numbers: NDArray[np.int64], start: int, count: int) -> NDArray[np.int64]:
-    """Those of some points, increasing, that are among `count` from `start` on, counted from there."""
+    """Return those of some points, ascending, that are among ``count`` from ``start`` on, relative to ``start``."""
     first, end = np.searchsorted(numbers, (start, start + count))
     return numbers[first:end] - start
 
 
 def _equal(surface: Surface, numbers: NDArray[np.int64], channels: int | None) -> NDArray[np.int64]:
-    """For each of some points, increasing, the first with the same values: coordinates, or attributes too."""
+    """Return for each of some points, ascending, the first with equal coordinates, or also equal attributes."""
     start, keys = 0, []
     for block in surface.blocks:
         count = block.shape[0] * block.shape[1]
@@ -312,10 +312,10 @@ def _equal(surface: Surface, numbers: NDArray[np.int64], channels: int | None) -
 
 
 def _first_equal(columns: list[NDArray[Any]]) -> NDArray[np.int64]:
-    """For each row of arrays side by side, the first row that is equal to it, bit for bit but for the sign of zero."""
+    """Return for each row of adjacent arrays the first row that is equal bit for bit, except the sign of zero."""
     rows = []
     for column in columns:
-        # Both zeros are one place. A signalling NaN, which an attribute may hold, is no number to warn of.
+        # Both zeros are one place. Attributes may hold signalling NaN, of which numpy would warn.
         with np.errstate(invalid="ignore"):
             plain = np.ascontiguousarray(column + 0 if column.dtype.kind == "f" else column)
         rows.append(plain.reshape(len(column), -1).view(np.uint8).reshape(len(column), -1))

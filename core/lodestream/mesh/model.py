@@ -1,4 +1,4 @@
-"""A mesh of triangles and quads, as files hold it."""
+"""A mesh of triangles and quads, as files store it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..errors import InputError
 
 __all__ = ["CornerAttribute", "Mesh", "name_faces"]
 
-#: How many of the faces that are wrong a message names.
-_NAMED = 4
+#: Faces that an error message names, at most.
+_MAX_NAMED_FACES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class CornerAttribute:
-    """Values that belong to the corners of faces, not to vertices: two faces may see different ones at one vertex.
+    """Values of the corners of faces, not of vertices: two faces may have different ones at one vertex.
 
     Attributes
     ----------
@@ -33,6 +33,7 @@ class CornerAttribute:
 
 
 def _number(face: int) -> str:
+    """Name a face by its 1-based number."""
     return f"face {face + 1}"
 
 
@@ -46,13 +47,13 @@ class Mesh:
     corners : int32 array of shape (F, 4)
         0-based vertices of each face, going round it; -1 in the last place of a triangle.
     attributes : mapping of str to arrays of shape (V,) or (V, K)
-        What belongs to the vertices.
+        Values of the vertices.
     corner_attributes : mapping of str to CornerAttribute
-        What belongs to the corners of faces.
+        Values of the corners of faces.
     face_name : callable
-        How to name a face in messages, from its 0-based number: "face 12 (line 31)".
+        Returns the name of a face in messages from its 0-based number: "face 12 (line 31)".
     notes : tuple of str
-        What the file holds beside it that a surface cannot keep, in words.
+        Descriptions of contents of the file that a surface cannot keep.
     """
 
     vertices: NDArray[Any]
@@ -96,7 +97,7 @@ class Mesh:
 def name_faces(mesh: Mesh, faces: ArrayLike) -> str:
     """Name the first few of some faces, whose numbers have any shape."""
     numbers = np.unique(np.asarray(faces)).tolist()
-    words = [mesh.face_name(number) for number in numbers[:_NAMED]]
-    if len(numbers) > _NAMED:
-        return f"{', '.join(words)} and {len(numbers) - _NAMED:,} more"
+    words = [mesh.face_name(number) for number in numbers[:_MAX_NAMED_FACES]]
+    if len(numbers) > _MAX_NAMED_FACES:
+        return f"{', '.join(words)} and {len(numbers) - _MAX_NAMED_FACES:,} more"
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -1,4 +1,4 @@
-"""Meshes of triangles and quads made meshes of quads: fans unfolded at their poles, triangles paired."""
+"""Conversion of meshes of triangles and quads into quads: fans unfolded at their poles, triangles paired."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ __all__ = ["Quads", "make_quads"]
 
 _REGULAR = 6
 
-#: Vertices that are tried first as poles, where several may be; fewer of them in larger meshes.
-_TRIES, _TRIES_OF_MANY, _FEW_FACES = 32, 2, 50_000
+#: Orders in which vertices are tried as poles, where there is a choice; fewer in meshes from so many faces on.
+_MAX_TRIES, _MAX_TRIES_OF_LARGE_MESH, _LARGE_MESH_FACES = 32, 2, 50_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Quads:
         Vertices from the number of the mesh's vertices on stand for one at a pole.
     twins : int32 array of shape (4 Q,)
     origin : int64 array of shape (Q,)
-        The face of the file that each is, or the first of two triangles that it is made of.
+        The face of the file from which each quad is made, or the first of two triangles.
     cut : bool array of shape (Q,)
         Quads made of two triangles, which meet between their first and third corners.
     attributes : int32 array of shape (A, Q, 4)
@@ -61,7 +61,7 @@ class Quads:
 
 
 def make_quads(mesh: Mesh, polygons: Polygons) -> Quads:
-    """Make a mesh all quads.
+    """Convert all faces of a mesh into quads.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def make_quads(mesh: Mesh, polygons: Polygons) -> Quads:
 def _poles_and_pairs(
     mesh: Mesh, polygons: Polygons, umbrella: NDArray[np.int32], valence: NDArray[np.int32]
 ) -> tuple[NDArray[np.bool_], NDArray[np.int32], tuple[str, ...]]:
-    """Which umbrellas are poles; a half-edge on the diagonal of each pair of triangles; choices in words."""
+    """Find poles and pairs: which umbrellas are poles, a half-edge on each pair's diagonal, choices in words."""
     corners, twins = polygons.corners, polygons.twins
     piece = np.empty(len(corners), np.int32)
     pieces = find_pieces(twins, piece)
@@ -133,35 +133,35 @@ def _poles_and_pairs(
         points = mesh.vertices.astype(np.float64)
     halves = triangle & ~mixed
     open_faces = halves & ~polygons.folded
-    # First as they are, where every inner vertex has six triangles; then without poles; then in the order of the file.
+    # First pair all triangles where every inner vertex has six; then try poles; then pair in the order of the file.
     inner_wrong = (valence >= 0) & (valence != _REGULAR)
     uneven = np.zeros(pieces, np.bool_)
     wrong_corners = (umbrella >= 0) & inner_wrong[umbrella]
     uneven[piece[wrong_corners.reshape(-1, 4).any(axis=1)]] = True
     uneven[piece[polygons.folded]] = True
-    edges, left, choices = _pair(corners, twins, points, np.flatnonzero(open_faces & ~uneven[piece]))
-    left = np.concatenate([left, np.flatnonzero(halves & uneven[piece])])
+    edges, unpaired, choices = _pair(corners, twins, points, np.flatnonzero(open_faces & ~uneven[piece]))
+    unpaired = np.concatenate([unpaired, np.flatnonzero(halves & uneven[piece])])
     missing = np.empty(len(valence), np.int32)
-    for order in _pole_orders(polygons, umbrella, valence, piece, left):
-        _forget_poles(umbrella, piece, left, pole)
+    for order in _pole_orders(polygons, umbrella, valence, piece, unpaired):
+        _forget_poles(umbrella, piece, unpaired, pole)
         leaving = leaving_half_edges(twins, umbrella, valence)
         find_poles(corners, twins, umbrella, valence, leaving, order, True, pole, missing)
         fan = ((umbrella >= 0) & pole[umbrella]).reshape(-1, 4).any(axis=1)
-        stuck = np.isin(piece, piece[left]) & triangle
+        stuck = np.isin(piece, piece[unpaired]) & triangle
         edges = edges[~stuck[edges >> 2]]
-        more, left, why = _pair(corners, twins, points, np.flatnonzero(stuck & ~fan))
-        edges, choices = np.concatenate([edges, more]), choices + why
+        new_edges, unpaired, new_choices = _pair(corners, twins, points, np.flatnonzero(stuck & ~fan))
+        edges, choices = np.concatenate([edges, new_edges]), choices + new_choices
         short = stuck & ((umbrella >= 0) & (missing != 0)[umbrella]).reshape(-1, 4).any(axis=1)
-        left = np.concatenate([left, np.flatnonzero(short)])
-        if not left.size:
+        unpaired = np.concatenate([unpaired, np.flatnonzero(short)])
+        if not unpaired.size:
             break
-    if left.size:
-        _forget_poles(umbrella, piece, left, pole)
-        stuck = np.isin(piece, piece[left]) & triangle
+    if unpaired.size:
+        _forget_poles(umbrella, piece, unpaired, pole)
+        stuck = np.isin(piece, piece[unpaired]) & triangle
         edges = edges[~stuck[edges >> 2]]
         in_order = None if polygons.folded[stuck].any() else pair_in_order(corners, twins, np.flatnonzero(stuck))
         if in_order is None:
-            raise FormatError(_unpaired(mesh, polygons, umbrella, valence, left))
+            raise FormatError(_unpaired(mesh, polygons, umbrella, valence, unpaired))
         edges = np.concatenate([edges, in_order])
     return pole, edges, choices
 
@@ -187,12 +187,12 @@ def _pole_orders(
     umbrella: NDArray[np.int32],
     valence: NDArray[np.int32],
     piece: NDArray[np.int32],
-    left: NDArray[np.int64],
+    unpaired: NDArray[np.int64],
 ) -> Iterator[NDArray[np.int32]]:
-    """Orders in which to try the vertices of some pieces as poles: each piece begins with another one each time."""
-    if not left.size:
+    """Yield orders in which to try the vertices of some pieces as poles; each begins with another vertex."""
+    if not unpaired.size:
         return
-    faces = np.isin(piece, piece[left])
+    faces = np.isin(piece, piece[unpaired])
     corner_of = leaving_half_edges(polygons.twins, umbrella, valence)
     order = np.unique(umbrella.reshape(-1, 4)[faces][:, :3])
     feasible = np.zeros(len(valence), np.bool_)
@@ -209,16 +209,16 @@ def _pole_orders(
     _, start, size = np.unique(home[by_piece], return_index=True, return_counts=True)
     rank = np.arange(len(candidates)) - np.repeat(start, size)
     sizes = np.repeat(size, size)
-    tries = _TRIES if faces.sum() < _FEW_FACES else _TRIES_OF_MANY
+    tries = _MAX_TRIES if faces.sum() < _LARGE_MESH_FACES else _MAX_TRIES_OF_LARGE_MESH
     for first in range(min(tries, int(size.max(initial=0)))):
         yield candidates[by_piece][np.argsort((rank - first) % sizes, kind="stable")].astype(np.int32)
 
 
 def _forget_poles(
-    umbrella: NDArray[np.int32], piece: NDArray[np.int32], left: NDArray[np.int64], pole: NDArray[np.bool_]
+    umbrella: NDArray[np.int32], piece: NDArray[np.int32], unpaired: NDArray[np.int64], pole: NDArray[np.bool_]
 ) -> None:
-    """Take poles back in pieces that are no grid with them either."""
-    stuck = np.isin(piece, piece[left])
+    """Remove the poles of pieces that are no grid with them either."""
+    stuck = np.isin(piece, piece[unpaired])
     corners = umbrella.reshape(-1, 4)[stuck]
     pole[corners[corners >= 0]] = False
 
@@ -228,17 +228,18 @@ def _unpaired(
     polygons: Polygons,
     umbrella: NDArray[np.int32],
     valence: NDArray[np.int32],
-    left: NDArray[np.int64],
+    unpaired: NDArray[np.int64],
 ) -> str:
-    rows = umbrella.reshape(-1, 4)[left, :3]
+    """Return the error message for triangles that could not be paired."""
+    rows = umbrella.reshape(-1, 4)[unpaired, :3]
     wrong = (valence[rows] >= 0) & (valence[rows] != _REGULAR)
     faces, corner = np.nonzero(wrong)
     if not faces.size:
         return (
             f"expected triangles that are the halves of a grid's quads, got a border along which some have no "
-            f"partner: {name_faces(mesh, polygons.origin[left])}"
+            f"partner: {name_faces(mesh, polygons.origin[unpaired])}"
         )
-    face, k = left[faces[0]], corner[0]
+    face, k = unpaired[faces[0]], corner[0]
     count = int(valence[rows[faces[0], k]])
     irregular = len(np.unique(rows[wrong]))
     return (
@@ -256,7 +257,7 @@ def _join_pairs(
     kept: NDArray[np.bool_],
     cut: NDArray[np.bool_],
 ) -> tuple[int, ...]:
-    """Make the first triangle of each pair the quad, drop the other; which attributes differ along diagonals."""
+    """Turn the first triangle of each pair into the quad, drop the other; return attributes torn by diagonals."""
     beside = polygons.twins[edges]
     ours, k, other, m = edges >> 2, edges & 3, beside >> 2, beside & 3
     old = polygons.corners

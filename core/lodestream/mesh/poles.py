@@ -1,4 +1,4 @@
-"""Poles: fans of triangles round one vertex, taken for quads along a side that is collapsed to this vertex."""
+"""Poles: fans of triangles round a vertex, treated as quads along a side that is collapsed to this vertex."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def find_fans(
     corners, umbrella, valence
         See `find_umbrellas`.
     mixed : bool array of shape (F,)
-        Faces of the pieces to look at.
+        Faces of the pieces that are examined.
 
     Returns
     -------
@@ -48,7 +48,7 @@ def find_fans(
 def leaving_half_edges(
     twins: NDArray[np.int32], umbrella: NDArray[np.int32], valence: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """A half-edge that leaves each umbrella; with no face before it where the umbrella is open.
+    """Return a half-edge that leaves each umbrella, with no face before it where the umbrella is open.
 
     `twins` and `umbrella` have an entry a half-edge, shape (4 F,), `valence` and the result one an umbrella, shape
     (U,).
@@ -85,9 +85,9 @@ def find_poles(
     order : int32 array
         The umbrellas that may be poles.
     together : bool
-        Take them one after another, each only if it fits to those before; or else each for itself.
+        Add them one after another, each only if it is consistent with those before; otherwise test each alone.
     pole : bool array of shape (U,)
-        Filled with those that are.
+        Filled: True at poles.
     missing : int32 array of shape (U,)
         Filled with the triangles by which inner vertices are short of six, those of poles beside them counted.
     """
@@ -123,7 +123,7 @@ def unfold(
         Triangles that are quads with a repeated vertex, which is their first: the values at its second mention are in
         the fourth place of `attributes`.
     attributes : int32 array of shape (A, F, 4)
-        What the corners have beside their vertices.
+        Numbers of the attribute values of the corners.
     vertices : int
         New vertices are numbered from here.
     new_corners, new_attributes
@@ -135,7 +135,7 @@ def unfold(
     Returns
     -------
     int
-        How many new vertices there are.
+        The number of new vertices.
     """
     state = np.zeros(4, np.int64)
     walk(
@@ -148,7 +148,7 @@ def unfold(
 
 
 def _first_of_fans(twins: NDArray[np.int32], umbrella: NDArray[np.int32], pole: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """A half-edge that leaves each pole, the one at the border or else the lowest; in the order of the lowest ones."""
+    """Return a half-edge that leaves each pole, at the border or else the lowest; in the order of the lowest ones."""
     tips = np.flatnonzero((umbrella >= 0) & pole[umbrella]).astype(np.int32)
     first = np.full(len(pole), -1, np.int32)
     first[umbrella[tips[::-1]]] = tips[::-1]

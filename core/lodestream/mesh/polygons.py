@@ -1,4 +1,4 @@
-"""Faces wound alike, of which grids can be made."""
+"""Faces that are wound alike, the input for finding grids."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Polygons:
     twins : int32 array of shape (4 F,)
         See `find_twins`.
     origin : int64 array of shape (F,)
-        The face of the file that each is, or the first of two triangles that it is made of.
+        The face of the file from which each face is made, or the first of two triangles.
     folded : bool array of shape (F,)
         Triangles that are quads with a vertex repeated: it comes first.
     names : tuple of str
-        Corner attributes that are not the same all round each vertex.
+        Corner attributes that differ around some vertex.
     attributes : int32 array of shape (A, F, 4)
         For each of them and each corner a number, equal where values are equal. Of a folded quad the fourth is that of
         the repeated vertex at the side of the triangle's last corner.
@@ -70,6 +70,7 @@ def prepare(mesh: Mesh, names: tuple[str, ...], attributes: NDArray[np.int32]) -
 
 
 def _fold(mesh: Mesh, attributes: NDArray[np.int32]) -> tuple[Corners, NDArray[np.int32], NDArray[np.bool_]]:
+    """Make triangles of quads that name a vertex twice; return corners, attributes and which faces were folded."""
     corners = mesh.corners
     pairs = [corners[:, k] == corners[:, (k + 1) % 4] for k in range(4)]
     pairs[3] |= (corners[:, 3] < 0) & (corners[:, 2] == corners[:, 0])
@@ -98,6 +99,7 @@ def _fold(mesh: Mesh, attributes: NDArray[np.int32]) -> tuple[Corners, NDArray[n
 
 
 def _crossing(mesh: Mesh, corners: Corners, half: int) -> str:
+    """Return the error message for an edge with more than two faces."""
     sides = 3 if corners[half >> 2, 3] < 0 else 4
     a, b = int(corners[half >> 2, half & 3]), int(corners[half >> 2, ((half & 3) + 1) % sides])
     faces = np.flatnonzero((corners == a).any(axis=1) & (corners == b).any(axis=1))
@@ -108,6 +110,7 @@ def _crossing(mesh: Mesh, corners: Corners, half: int) -> str:
 
 
 def _wound_alike(mesh: Mesh, polygons: Polygons) -> Polygons:
+    """Turn faces round so that all of a piece are wound alike."""
     corners, twins = polygons.corners, polygons.twins
     turned = np.zeros(len(corners), np.bool_)
     wrong = orient(corners, twins, turned)

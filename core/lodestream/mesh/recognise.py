@@ -1,4 +1,4 @@
-"""Grids from the connectivity of a mesh."""
+"""Recognition of grids from the connectivity of a mesh."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Recognised:
     triangles : bool
         Whether quads were made of triangles.
     notes : tuple of str
-        What else there is to say about it.
+        Remarks about the mesh.
     left_out : tuple of str
-        Those of the notes that say what the blocks do not have.
+        The notes about contents of the mesh that the blocks do not have.
     """
 
     mesh: Mesh
@@ -51,9 +51,9 @@ class Recognised:
     left_out: tuple[str, ...]
 
     def words(self, surface: Surface) -> str:
-        """Say what was recognised, such as "torus, 96 x 24, from triangles; 2304 vertices".
+        """Describe what was recognised, such as "torus, 96 x 24, from triangles; 2304 vertices".
 
-        `surface` is that of the blocks, or what it has become since.
+        `surface` is that of the blocks, or one derived from it.
         """
         poles = sum(pole["kind"] != "repeated" for block in self.blocks for pole in block.poles)
         return "; ".join([shape_words(surface.blocks, poles) + ", from triangles" * self.triangles, *self.notes])
@@ -72,6 +72,7 @@ class Recognised:
         return surface
 
     def _block(self, block: RecognisedBlock) -> Block:
+        """Make the block of a surface from a recognised one."""
         valid = block.vertices >= 0
         attributes = {name: values[block.vertices] for name, values in self.mesh.attributes.items()}
         for name, rows in block.rows.items():
@@ -90,7 +91,7 @@ def recognise(mesh: Mesh) -> Recognised:
     A mesh whose inner vertices have four quads is one grid for each connected piece, open or closed; triangles may be
     the halves of quads, or fans round a pole. Any other mesh is cut along the grid lines that leave its irregular
     vertices. Where the corners of faces have different values at a vertex, the surface has a seam. Attributes for which
-    there is no grid with such seams are left out, which `Recognised.words` says.
+    there is no grid with such seams are left out, as `Recognised.notes` states.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ def recognise(mesh: Mesh) -> Recognised:
 
 
 class _Recognition:
-    """What is known of a mesh of quads on the way to its blocks."""
+    """State of a mesh of quads while its blocks are being found."""
 
     def __init__(
         self,
@@ -154,13 +155,13 @@ class _Recognition:
         valence = np.empty(4 * len(corners), np.int32)
         self.valence = valence[: find_umbrellas(corners, self.twins, self.umbrella, valence)].copy()
         self.identity = self._nodes() if self.seams else corners.reshape(-1)
-        whole = np.concatenate([np.arange(len(mesh.vertices), dtype=np.int32), quads.pole_of])
-        self.vertex = whole[corners.reshape(-1)]
+        mesh_vertices = np.concatenate([np.arange(len(mesh.vertices), dtype=np.int32), quads.pole_of])
+        self.vertex = mesh_vertices[corners.reshape(-1)]
         self.piece = np.empty(0, np.int32)
         self.cuts = 0
 
     def _nodes(self) -> NDArray[np.int32]:
-        """For each corner its node: one for all corners of a vertex with the same attributes, seam between or not."""
+        """Return the node of each corner: one for all corners of a vertex with equal attributes, across seams too."""
         corners = self.quads.corners.reshape(-1)
         first = np.empty(len(self.valence), np.int64)
         first[self.umbrella[::-1]] = np.arange(len(corners))[::-1]
@@ -185,6 +186,7 @@ class _Recognition:
         return Recognised(self.mesh, tuple(blocks), bool(self.quads.cut.any()), notes, left_out)
 
     def _grids(self) -> list[Grid]:
+        """Find the grids of all pieces, cutting pieces that are no grid."""
         laid = develop_quads(self.twins)
         self.piece = laid.piece
         runs = _runs(laid.piece, len(laid.turns))
@@ -202,13 +204,15 @@ class _Recognition:
         return sorted(grids, key=_first_face)
 
     def _check_count(self, count: int) -> None:
+        """Raise an error for too many or too small pieces."""
         check_pieces(count, len(self.quads.corners), 1 if self.seams else SMALL_PIECES, self._seam_words())
 
     def _seam_words(self) -> str:
+        """Return the part of a message that names the seams."""
         return f" between seams in {' and '.join(self.seams)}" if self.seams else ""
 
     def _poles_fit(self, grid: Grid) -> bool:
-        """Whether the nodes at poles fill sides of the grid."""
+        """Return whether the nodes at poles fill sides of the grid."""
         if not len(self.quads.pole_of):
             return True
         pole = self._at_pole(grid)
@@ -218,16 +222,17 @@ class _Recognition:
         return not pole.any()
 
     def _at_pole(self, grid: Grid) -> NDArray[np.bool_]:
+        """Return which nodes of a grid are at poles, bool, shape (row, column)."""
         corners = self.quads.corners.reshape(-1)
         return (grid.corners >= 0) & (corners[grid.corners] >= len(self.mesh.vertices))
 
     def _starts(self, laid: Development, runs: list[NDArray[np.int64]], chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
-        """Half-edges from which to cut the pieces of the chosen faces."""
+        """Return half-edges from which to cut the pieces of the chosen faces."""
         halves = np.repeat(chosen, 4) & (self.twins >= 0)
         starts = [np.flatnonzero(halves & irregular(self.valence)[self.umbrella])]
         has_start = np.bincount(laid.piece[starts[0] >> 2], minlength=len(runs)) > 0
         for number in np.unique(laid.piece[chosen & ~has_start[laid.piece]]).tolist():
-            # A torus that winds, so that it is no torus of rows and columns: along the shorter line it is cut open.
+            # A torus whose lines wind, so that it has no rows and columns, is cut open along the shorter line.
             a, b, d = (int(value) for value in laid.periods[number])
             along_rows = d > 0 and d <= a * d // gcd(b, d)
             inside = (4 * runs[number][:, None] + np.arange(4)).reshape(-1)
@@ -243,9 +248,9 @@ class _Recognition:
         starts = self._starts(laid, runs, chosen)
         piece = np.empty(len(corners), np.int32)
         best: tuple[int, NDArray[np.int32]] | None = None
-        for whole in (True, False):
+        for lines_cross in (True, False):
             cut = np.zeros(4 * len(corners), np.bool_)
-            trace(corners, self.twins, self.umbrella, self.valence, starts, whole, cut)
+            trace(corners, self.twins, self.umbrella, self.valence, starts, lines_cross, cut)
             apart = np.where(cut, -1, self.twins).astype(np.int32)
             find_pieces(apart, piece)
             count = len(np.unique(piece[chosen]))
@@ -272,8 +277,9 @@ class _Recognition:
         return grids
 
     def _too_small(self, chosen: NDArray[np.bool_], count: int, wrong: NDArray[np.bool_]) -> str:
+        """Return the error message for blocks that would be too small."""
         at = np.flatnonzero(np.repeat(chosen, 4) & wrong[self.umbrella])
-        irregular_ones = len(np.unique(self.umbrella[at]))
+        n_irregular = len(np.unique(self.umbrella[at]))
         size = int(chosen.sum())
         where = "and winds or lies on itself"
         if at.size:
@@ -285,11 +291,12 @@ class _Recognition:
         return (
             f"expected a grid, or a mesh that grid lines cut into at most {most_blocks(size):,} blocks of "
             f"{LEAST_QUADS} quads or more on average, got {size:,} quads in {count:,} blocks{self._seam_words()}: the "
-            f"mesh has {irregular_ones:,} irregular vertices (inner ones without four quads, outer ones with three or "
+            f"mesh has {n_irregular:,} irregular vertices (inner ones without four quads, outer ones with three or "
             f"more), {where}; make it again with fewer of them, or with finer quads"
         )
 
     def _block(self, grid: Grid, part: int) -> RecognisedBlock:
+        """Make the block of a grid."""
         quads = self.quads
         faces = describe_cells(grid, quads)
         if part:
@@ -313,6 +320,7 @@ class _Recognition:
         return RecognisedBlock(vertices, grid.closed, kept, faces, poles)
 
     def _notes(self, blocks: list[RecognisedBlock], merged: int) -> list[str]:
+        """List remarks: vertices, holes, poles, seams, cuts, choices, turned faces, merged vertices."""
         used = np.zeros(len(self.mesh.vertices), np.bool_)
         used[self.vertex] = True
         notes = [_counted(int(used.sum()), "vertex", "vertices")]
@@ -332,7 +340,7 @@ class _Recognition:
         return notes
 
     def _left_out(self) -> tuple[str, ...]:
-        """What of the mesh the blocks do not have, in words."""
+        """List what the blocks do not have of the mesh, in words."""
         used = np.zeros(len(self.mesh.vertices), np.bool_)
         used[self.vertex] = True
         alone = len(used) - int(used.sum())
@@ -341,12 +349,13 @@ class _Recognition:
         return (*words, *self.mesh.notes)
 
 
-def _counted(count: int, one: str, many: str = "") -> str:
-    return f"{count} {one if count == 1 else many or one + 's'}"
+def _counted(count: int, singular: str, plural: str = "") -> str:
+    """Format a count with its noun, such as "1 vertex"."""
+    return f"{count} {singular if count == 1 else plural or singular + 's'}"
 
 
 def _runs(piece: NDArray[np.int32], pieces: int) -> list[NDArray[np.int64]]:
-    """The faces of each piece."""
+    """Return the faces of each piece, int64, shape (face,) each."""
     if pieces == 1:
         return [np.arange(len(piece))]
     order = np.argsort(piece, kind="stable")
@@ -354,4 +363,5 @@ def _runs(piece: NDArray[np.int32], pieces: int) -> list[NDArray[np.int64]]:
 
 
 def _first_face(grid: Grid) -> int:
+    """Return the lowest number of a face of a grid."""
     return int(grid.faces[grid.faces >= 0].min())

@@ -1,4 +1,4 @@
-"""Attributes of faces' corners: those that are the same round each vertex, and those that make seams."""
+"""Attributes of faces' corners: those that agree around each vertex, and those that make seams."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["equal_rows", "sort_attributes", "tear"]
 def rows_of_vertices(corners: Corners, rows: NDArray[np.int32], row_of: NDArray[np.int32]) -> bool:
     """Find the one row of values that all corners at each vertex have; False when they differ somewhere.
 
-    Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face; of no use when they differ.
+    Fills `row_of`, int32 of shape (V,), with -1 where a vertex has no face; undefined when they differ.
     """
     row_of[:] = -1
     return all(kernels.mesh_rows(corners[batch], rows[batch], row_of) for batch in batches(len(corners)))
@@ -34,7 +34,7 @@ def equal_rows(values: NDArray[Any]) -> NDArray[np.int32]:
 
 
 def sort_attributes(mesh: Mesh) -> tuple[dict[str, NDArray[np.int32]], dict[str, NDArray[np.int32]], dict[str, str]]:
-    """Tell attributes of corners that agree at each vertex from those that do not.
+    """Separate attributes of corners that agree at each vertex from those that do not.
 
     Returns
     -------
@@ -67,9 +67,9 @@ def sort_attributes(mesh: Mesh) -> tuple[dict[str, NDArray[np.int32]], dict[str,
 
 
 def tear(quads: Quads, twins: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Part faces in `twins`, shape (4 F,), where an attribute differs across their edge.
+    """Separate faces in ``twins``, shape (4 F,), where an attribute differs across their edge.
 
-    Gives for each attribute the number of such edges, shape (attribute,).
+    Returns for each attribute the number of such edges, int64, shape (attribute,).
     """
     torn, there = np.zeros(len(quads.attributes), np.int64), np.empty(len(quads.attributes), np.int64)
     for batch in batches(len(quads.corners)):

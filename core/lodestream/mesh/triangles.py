@@ -1,4 +1,4 @@
-"""Pairing the triangles of a grid whose cells are cut in two."""
+"""Pairing of the triangles of a grid whose cells are cut in two."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["Pairing", "pair_in_order", "pair_triangles"]
 #: diagonals.
 _AXES = np.array([[[1, 1], [-1, 0]], [[0, 1], [-1, -1]], [[-1, 0], [0, -1]]])
 
-#: Which of x, y and x + y goes along them.
+#: Which of x, y and x + y runs along these directions.
 _ALONG = np.array([[2, 0], [1, 2], [0, 1]])
 
-#: Poles that are none cut a mesh into more pieces than are looked at one by one.
-_MOST_PIECES = 1 << 14
+#: Wrong poles cut a mesh into many pieces; more than so many are not examined one by one.
+_MAX_PIECES = 1 << 14
 
-#: Mean lengths that differ by less decide nothing.
-_EQUAL_LENGTHS = 1e-9
+#: Mean lengths that differ relatively by less count as equal.
+_RELATIVE_LENGTH_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,16 +49,16 @@ class Pairing:
 
 @dataclass(frozen=True, slots=True)
 class _Survey:
-    """What there is of the triangles of each piece.
+    """Extents, borders and lengths of the triangles of each piece.
 
     Attributes
     ----------
     extent : int64 array of shape (P, 3)
-        Of their corners along x, y and x + y.
+        Extent of the corners along x, y and x + y.
     single : bool array of shape (P, 3)
         Whether a half-edge of each of the three directions has no twin.
     length : float64 array of shape (P, 3)
-        Of all half-edges of each direction.
+        Total length of the half-edges of each direction.
     """
 
     extent: NDArray[np.int64]
@@ -67,6 +67,7 @@ class _Survey:
 
     @staticmethod
     def of(corners: Corners, twins: NDArray[np.int32], points: NDArray[np.float64], laid: Development) -> _Survey:
+        """Survey triangles that were laid out."""
         shape = (len(laid.turns), 3)
         low, high = np.full(shape, np.iinfo(np.int64).max), np.full(shape, np.iinfo(np.int64).min)
         single, length = np.zeros(shape, np.uint8), np.zeros(shape)
@@ -95,7 +96,7 @@ def pair_triangles(corners: Corners, twins: NDArray[np.int32], points: NDArray[n
     """
     laid = develop_triangles(twins)
     pieces = len(laid.turns)
-    if pieces > _MOST_PIECES:
+    if pieces > _MAX_PIECES:
         return Pairing(np.zeros(0, np.int32), np.ones(len(corners), np.bool_), ())
     survey = _Survey.of(corners, twins, points, laid)
     sizes = np.bincount(laid.piece, minlength=pieces)
@@ -128,7 +129,7 @@ _Box = tuple[int, int, bool, bool, bool]
 
 
 def _box(periods: NDArray[np.int64], choice: int, extent: NDArray[np.int64]) -> _Box:
-    """Intervals along both axes, which of them wrap, and whether the periods lie along the axes."""
+    """Return intervals along both axes, which of them wrap, and whether the periods lie along the axes."""
     a, b, d = (int(value) for value in periods)
     steps = [_AXES[choice] @ step for step in ((a, b), (0, d)) if any(step)]
     lengths, wraps = [int(value) for value in extent], [False, False]
@@ -148,12 +149,14 @@ def _box(periods: NDArray[np.int64], choice: int, extent: NDArray[np.int64]) -> 
 
 
 def _gcd(a: int, b: int) -> int:
+    """Return the greatest common divisor."""
     while b:
         a, b = b, a % b
     return abs(a)
 
 
 def _cells(box: _Box) -> tuple[bool, float]:
+    """Return a sort key of a box: grids before others, then by the number of cells."""
     rows, columns, _, _, straight = box
     return not straight, float(rows) * float(columns) if straight else 0.0
 
@@ -166,7 +169,7 @@ def _choose(
     boxes: dict[int, _Box],
     lengths: NDArray[np.float64],
 ) -> tuple[int, str]:
-    """Choose one of the directions that fit, and say why."""
+    """Choose one of the directions that fit, and give the reason."""
     way = laid.heading[faces][:, None] + np.array([0, 2, 4])
     a = corners[faces, :3].astype(np.int64)
     strides = np.abs(a - np.roll(a, -1, axis=1))
@@ -177,7 +180,7 @@ def _choose(
         if (along, across) in ((1.0, rows + (not wraps_rows)), (columns + (not wraps_columns), 1.0)):
             return choice, "chosen by the order of the vertices"
     longest = max(lengths[choice] for choice in fits)
-    long = [choice for choice in fits if lengths[choice] > (1 - _EQUAL_LENGTHS) * longest]
+    long = [choice for choice in fits if lengths[choice] > (1 - _RELATIVE_LENGTH_TOLERANCE) * longest]
     if len(long) == 1:
         return long[0], "the longest chosen"
     last = int(way[0, 2]) % 3

@@ -1,4 +1,4 @@
-"""Kernels over whole meshes, called for a batch at a time: between calls whoever waits can interrupt them."""
+"""Calls of kernels over whole meshes in batches, between which Python can handle an interrupt."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from ..kernels import Kernel
 __all__ = ["batches", "walk"]
 
 #: Faces or steps of one call: some hundredths of a second where memory is read at random.
-_AT_ONCE = 1 << 16
+_STEPS_PER_CALL = 1 << 16
 
 
 def batches(count: int) -> Iterator[slice]:
-    """Divide so many faces into runs for one call each."""
-    for first in range(0, count, _AT_ONCE):
-        yield slice(first, min(first + _AT_ONCE, count))
+    """Divide ``count`` faces into slices for one call each."""
+    for first in range(0, count, _STEPS_PER_CALL):
+        yield slice(first, min(first + _STEPS_PER_CALL, count))
 
 
 def walk(kernel: Kernel, *arguments: Any) -> int:
-    """Call a kernel until it is done; its arrays hold what it knows. Returns what it says then, which is not 0."""
+    """Call a kernel until it is done, and return its last result, which is not 0; its arrays hold the state."""
     result = 0
     while not result:
-        result = kernel(*arguments, _AT_ONCE)
+        result = kernel(*arguments, _STEPS_PER_CALL)
     return result

@@ -16,13 +16,13 @@ __all__ = ["Weld", "weld"]
 
 @dataclass(frozen=True, slots=True)
 class Weld:
-    """Which points of a surface are the vertices of its mesh, and the faces over them.
+    """The vertices of a surface's mesh as points of the surface, and the faces over them.
 
     Attributes
     ----------
     source : int64 array of shape (V,)
-        For each vertex, the point that it is: its index among the points of all blocks, one block after another, each
-        in row order. Increasing.
+        For each vertex, the index of its point among the points of all blocks, block by block in row-major order.
+        Ascending.
     quads : int64 array of shape (Q, 4)
         0-based vertices of each quad, going round it.
     triangles : int64 array of shape (T, 3)
@@ -30,8 +30,8 @@ class Weld:
     edges : int64 array of shape (E, 2)
         0-based vertices of each edge of the blocks that are curves.
     joined : int64 array of shape (V,)
-        For each vertex, the first vertex at the same place that is the same vertex but for its attributes; itself where
-        there is no other. A format whose faces name places and attributes separately, like OBJ, writes the places of
+        For each vertex, the first vertex at the same place that differs only in its attributes; itself where there is
+        no other. A format whose faces name places and attributes separately, like OBJ, writes the places of
         these alone.
     """
 
@@ -58,37 +58,37 @@ def weld(surface: Surface) -> Weld:
     numbered = numbered_blocks(surface)
     joined, vertex, poles = join_points(surface, numbered, poles_of(surface))
     quads, triangles = [], []
-    for number, own in enumerate(numbered):
+    for number, block in enumerate(numbered):
         degenerate = any(pole.block == number and pole.kind == "degenerate" for pole in poles)
-        own_quads, own_triangles = _faces(own, joined, degenerate)
-        quads.append(own_quads)
-        triangles.append(own_triangles)
-    edges = np.concatenate([_edges(own) for own in numbered])
+        block_quads, block_triangles = _faces(block, joined, degenerate)
+        quads.append(block_quads)
+        triangles.append(block_triangles)
+    edges = np.concatenate([_edges(block) for block in numbered])
     edges = edges[joined[edges[:, 0]] != joined[edges[:, 1]]]
     return _compressed(surface.blocks, vertex, joined, np.concatenate(quads), np.concatenate(triangles), edges)
 
 
-def _edges(own: NumberedBlock) -> NDArray[np.int64]:
-    """The edges of a block that is a curve, over the points of the surface; of others none."""
-    block, count = own.block, own.points.size
+def _edges(numbered: NumberedBlock) -> NDArray[np.int64]:
+    """Return the edges of a block that is a curve, int64, shape (edge, 2); no edges for other blocks."""
+    block, count = numbered.block, numbered.points.size
     if 1 not in block.shape:
         return np.empty((0, 2), np.int64)
     closed = wraps(block, 0 if block.shape[1] == 1 else 1)
-    one = np.arange(count if closed else count - 1)
-    ends = np.stack((one, (one + 1) % count), axis=-1)
+    first = np.arange(count if closed else count - 1)
+    ends = np.stack((first, (first + 1) % count), axis=-1)
     if block.mask is not None:
         ends = ends[block.mask.reshape(-1)[ends].all(axis=1)]
-    return own.points.reshape(-1)[ends]
+    return numbered.points.reshape(-1)[ends]
 
 
 def _faces(
-    own: NumberedBlock, joined: NDArray[np.int64], degenerate: bool
+    numbered: NumberedBlock, joined: NDArray[np.int64], degenerate: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Quads and triangles of a block in the order of its cells, over the points of the surface."""
-    rows, width = own.block.shape
-    r, c = np.nonzero(own.cells)
+    """Return quads and triangles of a block in the order of its cells, over the points of the surface."""
+    rows, width = numbered.block.shape
+    r, c = np.nonzero(numbered.cells)
     below, right = (r + 1) % rows, (c + 1) % width
-    points, faces = own.points, own.faces
+    points, faces = numbered.points, numbered.faces
     corners = np.stack([points[r, c], points[r, right], points[below, right], points[below, c]], axis=-1)
     collapsed = np.zeros(len(corners), np.bool_)
     for k in range(4):
@@ -102,9 +102,9 @@ def _faces(
     diagonal = faces.get("diagonal")
     if diagonal is not None:
         main = np.full(len(quads), diagonal == "main")
-        crossed = unpack_cells(faces.get("crossed"), own.cells.shape)
+        crossed = unpack_cells(faces.get("crossed"), numbered.cells.shape)
         if crossed is not None:
-            main ^= crossed[own.cells][~collapsed]
+            main ^= crossed[numbered.cells][~collapsed]
         quads, fans = quads[:0], np.concatenate([_halves(quads, main), fans])
     quads = np.concatenate([quads, folded]) if len(folded) else quads
     if faces.get("reversed"):
@@ -113,22 +113,22 @@ def _faces(
 
 
 def _halves(quads: NDArray[np.int64], main: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Two triangles for each quad, cut from its first to its third corner, or else from its second to its fourth."""
+    """Cut each quad into two triangles, from its first to its third corner, or from its second to its fourth."""
     turned = np.where(main[:, None], quads, np.roll(quads, -1, axis=1))
     return turned[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
 
 
 def _fans(corners: NDArray[np.int64], ends: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Cells with a collapsed edge, as triangles and as quads that name a vertex twice.
+    """Convert cells with a collapsed edge into triangles, and into quads that name a vertex twice.
 
     Of the two ends of such an edge, the one in the cell's own row and column stays in the triangle. Cells that collapse
     to a line or a point have no face.
     """
-    gone = np.zeros(corners.shape, np.bool_)
+    dropped = np.zeros(corners.shape, np.bool_)
     for stays, goes in ((0, 1), (0, 3), (1, 2), (3, 2)):
-        gone[:, goes] |= ends[:, stays] == ends[:, goes]
-    single = (gone.sum(axis=1) == 1) & (ends[:, 0] != ends[:, 2]) & (ends[:, 1] != ends[:, 3])
-    return corners[single][~gone[single]].reshape(-1, 3), corners[single]
+        dropped[:, goes] |= ends[:, stays] == ends[:, goes]
+    single = (dropped.sum(axis=1) == 1) & (ends[:, 0] != ends[:, 2]) & (ends[:, 1] != ends[:, 3])
+    return corners[single][~dropped[single]].reshape(-1, 3), corners[single]
 
 
 def _compressed(
@@ -139,7 +139,7 @@ def _compressed(
     triangles: NDArray[np.int64],
     edges: NDArray[np.int64],
 ) -> Weld:
-    """Number the vertices without gaps: those in faces, and the other valid points that stand for themselves."""
+    """Number the vertices without gaps: those in faces, and the other valid points that are not joined to others."""
     quads, triangles, edges = vertex[quads], vertex[triangles], vertex[edges]
     used: NDArray[np.bool_] = np.equal(joined, np.arange(len(joined)))
     start = 0

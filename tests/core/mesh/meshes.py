@@ -189,5 +189,5 @@ def wound_alike(seed: int, kind: str = "") -> tuple[Polygons, int]:
 def calls_of(steps: int) -> Iterator[None]:
     """Let kernels over meshes take so many steps or faces in a call."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(walks, "_AT_ONCE", steps)
+        patch.setattr(walks, "_STEPS_PER_CALL", steps)
         yield
