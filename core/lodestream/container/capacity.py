@@ -83,8 +83,8 @@ class Capacity:
         needed = masked * _MASKS + tables * _TABLE
         for (rows, columns), sizes in grids:
             edges = (1 + _EDGE / rows) * (1 + _EDGE / columns)
-            each = sum(_RECONSTRUCTION + 2 * size + _COEFFICIENT * edges for size in sizes)
-            needed += int(rows * columns * each)
+            bytes_per_point = sum(_RECONSTRUCTION + 2 * size + _COEFFICIENT * edges for size in sizes)
+            needed += int(rows * columns * bytes_per_point)
         if needed > _LEAST and needed > self.bytes:  # the limit of the machine takes files to read
             enough = -(-(needed - _LEAST) // BYTES_PER_VERTEX)
             raise TooLargeError(
@@ -115,11 +115,12 @@ class Capacity:
 
 
 def memory_limit() -> int:
-    """Memory available to this process, in bytes: the least of the limits of machine, control group and process."""
+    """Return the memory available to this process in bytes: the least limit of machine, control group and process."""
     return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
 
 
 def _physical() -> int:
+    """Return the machine's memory in bytes, 0 where it is unknown."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (OSError, ValueError):
@@ -127,6 +128,7 @@ def _physical() -> int:
 
 
 def _own_limits() -> Iterator[int]:
+    """Yield the limits of this process in bytes."""
     try:
         import resource
     except ImportError:  # not on Windows
@@ -138,7 +140,7 @@ def _own_limits() -> Iterator[int]:
 
 
 def _group_limits(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
-    """The limits of the control group that this process is in, and of those above it."""
+    """Yield the limits of the control groups of this process in bytes."""
     try:
         lines = proc.read_text().splitlines()
     except OSError:
@@ -162,4 +164,5 @@ def _group_limits(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sy
 
 
 def _size(count: int) -> str:
+    """Format a size in MiB."""
     return f"{count / 2**20:,.0f} MiB"

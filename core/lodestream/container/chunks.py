@@ -1,4 +1,4 @@
-"""The chunks of a residual section: one for each channel in each window of each block."""
+"""Chunks of a residual section: one for each channel in each window of each block."""
 
 from __future__ import annotations
 
@@ -28,25 +28,24 @@ class ChunkPlace(NamedTuple):
 def chunk_places(
     header: Header, within: tuple[int, int] | None = None, blocks: range | None = None
 ) -> Iterator[ChunkPlace]:
-    """All chunks in the order of the file: block by block, row by row of places, channel by channel.
+    """Yield all chunks in the order of the file: block by block, row by row of places, channel by channel.
 
-    A block of which holes are kept has as many chunks again, in the same order, of these. With ``within``, those alone
-    that begin in these rows, half-open, of which the first begins chunks; with
-    ``blocks`` those of these.
+    A block with kept holes has as many chunks again, in the same order, for these. ``within`` restricts the result to
+    chunks that begin in these rows, half-open, whose first row begins chunks; ``blocks`` to chunks of these blocks.
     """
     height, width = (1 << exponent for exponent in header.chunk)
     for block in range(len(header.blocks)) if blocks is None else blocks:
         rows, columns = header.blocks[block][0]
         for kept in (False, True) if header.kept and header.kept[block] else (False,):
             for top in range(*((0, rows) if within is None else within), height):
-                for left in range(0, columns, width):
-                    down, across = (top, min(top + height, rows)), (left, min(left + width, columns))
+                for first in range(0, columns, width):
+                    down, across = (top, min(top + height, rows)), (first, min(first + width, columns))
                     for channel in range(header.channels):
                         yield ChunkPlace(channel, block, down, across, kept)
 
 
 def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which chunks a selection touches: bool, shape (chunk,), in the order of `chunk_places`.
+    """Return which chunks a selection touches: bool, shape (chunk,), in the order of `chunk_places`.
 
     Parameters
     ----------
@@ -54,7 +53,7 @@ def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.b
     region : ((int, int), (int, int)) or None
         Rows and columns of the only block, half-open, across the seam of a closed axis too. None: all of all blocks.
     channels : bool, shape (channel,)
-        Which channels are wanted.
+        The selected channels.
     """
     if region is None:
         return np.tile(channels, chunks_of_a_channel(header))
@@ -68,7 +67,7 @@ def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.b
 
 
 def first_chunks(header: Header) -> list[int]:
-    """The number of the first chunk of each block, and how many chunks there are."""
+    """Return the number of the first chunk of each block, and the number of chunks."""
     height, width = (1 << exponent for exponent in header.chunk)
     ends = [0]
     for block, ((rows, columns), _) in enumerate(header.blocks):
@@ -80,7 +79,7 @@ def first_chunks(header: Header) -> list[int]:
 def chunks_within(
     header: Header, block: int, first: int, window: tuple[tuple[int, int], tuple[int, int]]
 ) -> Iterator[tuple[int, ChunkPlace]]:
-    """The chunks that a window of a block has, in the order of the file, each with its number in the section.
+    """Yield the chunks of a window of a block in the order of the file, each with its number in the section.
 
     Parameters
     ----------
@@ -89,7 +88,7 @@ def chunks_within(
     first : int
         The number of the block's first chunk, see `first_chunks`.
     window : ((int, int), (int, int))
-        Rows and columns, half-open, made of whole chunks; along a closed axis they may go on across the seam.
+        Rows and columns, half-open, consisting of whole chunks; along a closed axis they may cross the seam.
     """
     shape = header.blocks[block][0]
     counts = [-(-length >> exponent) for length, exponent in zip(shape, header.chunk, strict=True)]
@@ -110,5 +109,5 @@ def chunks_within(
 
 
 def chunks_of_a_channel(header: Header) -> int:
-    """How many chunks each channel has; those of kept holes count for themselves."""
+    """Return the number of chunks of each channel, chunks of kept holes included."""
     return first_chunks(header)[-1] // header.channels

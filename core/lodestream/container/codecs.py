@@ -1,4 +1,4 @@
-"""The codecs that a container needs: a reader that lacks one refuses it at its header, whatever else stands there."""
+"""Codecs that a container needs: a reader that lacks a codec refuses the container at its header."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ KNOWN = {
     DIFFERENCES: "differences",
     OFFSETS: "offsets",
 }
-# Of a chunk of residual by its rule; raw values need none.
+# The codec of a chunk of residual by its rule; raw values need none.
 _OF_RULE = (None, DIFFERENCES, DIFFERENCES, OFFSETS)
 
 
 def needed_codecs(header: Header, chunks: Iterable[bytes | memoryview]) -> tuple[int, ...]:
-    """What a container of this header with these chunks of residual needs, by rising number."""
+    """Return the codec numbers that a reader of this container needs, ascending."""
     needed = {codec for chunk in chunks if (codec := chunk_codec(chunk)) is not None}
     if header.masked:
         needed.add(MASKS)
@@ -38,26 +38,26 @@ def needed_codecs(header: Header, chunks: Iterable[bytes | memoryview]) -> tuple
 
 
 def chunk_codec(chunk: bytes | memoryview) -> int | None:
-    """What a chunk of residual needs; None: nothing."""
+    """Return the codec that a chunk of residual needs; None: none."""
     return _OF_RULE[chunk[0] & 3] if chunk else None
 
 
 def serialize_codecs(out: FieldWriter, needed: tuple[int, ...]) -> None:
-    """The list at the start of a header."""
+    """Write the list of codecs at the start of a header."""
     out.varint(len(needed))
     for codec in needed:
         out.varint(codec)
 
 
 def parse_codecs(fields: FieldReader) -> tuple[int, ...]:
-    """Undo `serialize_codecs`.
+    """Read the list of codecs that `serialize_codecs` writes.
 
     Raises
     ------
     UnsupportedVersionError
-        When one of them is not known.
+        When a codec is not known.
     CorruptStreamError
-        If they are not in rising order, or too many.
+        If they are not ascending, or too many.
     """
     start = fields.at
     count = fields.varint()

@@ -18,10 +18,10 @@ DIGEST = "values_sha256"
 
 
 def values_digest(blocks: Iterable[Block]) -> str:
-    """SHA-256 of all values, in hexadecimal digits.
+    """Compute the SHA-256 of all values, in hexadecimal digits.
 
     Values are hashed in C order, little-endian, in their own types: block by block the points, then each attribute.
-    Holes count with the values that they have in decoded `Block` objects.
+    Holes are hashed with the values that they have in decoded `Block` objects.
     """
     digest = hashlib.sha256()
     for block in blocks:
@@ -31,5 +31,5 @@ def values_digest(blocks: Iterable[Block]) -> str:
 
 
 def little_endian(array: NDArray[Any]) -> memoryview:
-    """The bytes of an array that are hashed, of any shape."""
+    """Return the bytes of an array, of any shape, that are hashed."""
     return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).data

@@ -1,4 +1,4 @@
-"""Numbers in bytes: little-endian, whole numbers in groups of seven bits (LEB128), floats without their last bytes."""
+"""Fields of numbers: little-endian, integers in groups of seven bits (LEB128), floats without trailing zero bytes."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ __all__ = ["LARGEST", "FieldReader", "FieldWriter", "told", "told_roughly"]
 
 #: The largest whole number that a field holds.
 LARGEST = 2**63 - 1
-# An error is the highest of the 63 bits below the sign of a float64, so many of them, in so many bytes.
-_TOLD, _TOLD_ROUGHLY = (31, 4), (16, 2)
+# A field of an error holds the highest bits below the sign of a float64: their number, and the field's bytes.
+_ERROR_FIELD, _ROUGH_ERROR_FIELD = (31, 4), (16, 2)
 _PATTERN, _FLOAT = struct.Struct(">Q"), struct.Struct(">d")
 _INFINITY = 0x7FF << 52
 
 
 def told(error: float) -> float:
-    """The least number that a field of an error holds and is not below this one; at most the largest it holds."""
-    return _from_upper(_upper(error, _TOLD[0]), _TOLD[0])
+    """Round an error up to the next number that a field of an error holds, or down to the largest it holds."""
+    return _from_upper(_upper(error, _ERROR_FIELD[0]), _ERROR_FIELD[0])
 
 
 def told_roughly(error: float) -> float:
-    """As `told`, of a field of two bytes."""
-    return _from_upper(_upper(error, _TOLD_ROUGHLY[0]), _TOLD_ROUGHLY[0])
+    """Round an error as `told` does, for a field of two bytes."""
+    return _from_upper(_upper(error, _ROUGH_ERROR_FIELD[0]), _ROUGH_ERROR_FIELD[0])
 
 
 def _upper(error: float, bits: int) -> int:
-    """The highest bits below the sign of a number of 0 or more, rounded up."""
+    """Return the highest bits below the sign of a number of 0 or more, rounded up."""
     pattern, shift = int.from_bytes(struct.pack(">d", error)), 63 - bits
     return min(-(-pattern >> shift), (_INFINITY >> shift) - 1)
 
 
 def _from_upper(upper: int, bits: int) -> float:
+    """Return the float64 whose highest bits below the sign are given."""
     number: float = _FLOAT.unpack(_PATTERN.pack(upper << 63 - bits))[0]
     return number
 
@@ -44,39 +45,39 @@ class FieldWriter:
         self.data = bytearray()
 
     def varint(self, number: int) -> None:
-        """A whole number of 0 to `LARGEST`: seven bits a byte, least significant first; the eighth bit: more follow."""
+        """Write an integer of 0 to `LARGEST`: seven bits a byte, lowest first; the eighth bit says that more follow."""
         while number > 127:
             self.data.append(number & 127 | 128)
             number >>= 7
         self.data.append(number)
 
     def byte(self, number: int) -> None:
-        """A whole number of 0 to 255."""
+        """Write an integer of 0 to 255."""
         self.data.append(number)
 
     def pack(self, layout: str, *numbers: float) -> None:
-        """Numbers by a layout of `struct`, little-endian."""
+        """Write numbers by a layout of `struct`, little-endian."""
         self.data += struct.pack("<" + layout, *numbers)
 
     def number(self, value: float) -> None:
-        """A float64: a count of bytes, then so many of them, the highest first; those left out are 0."""
+        """Write a float64: a count of bytes, then so many bytes, the highest first; omitted bytes are 0."""
         pattern = struct.pack(">d", value).rstrip(b"\0")
         self.data.append(len(pattern))
         self.data += pattern
 
     def errors(self, *errors: float) -> None:
-        """Errors of 0 or more, rounded up to what four bytes each hold, see `told`."""
+        """Write errors of 0 or more, each rounded up to what four bytes hold, see `told`."""
         for error in errors:
-            self.data += _upper(error, _TOLD[0]).to_bytes(_TOLD[1], "little")
+            self.data += _upper(error, _ERROR_FIELD[0]).to_bytes(_ERROR_FIELD[1], "little")
 
     def rough_errors(self, *errors: float) -> None:
-        """Errors of 0 or more, rounded up to what two bytes each hold, see `told_roughly`."""
+        """Write errors of 0 or more, each rounded up to what two bytes hold, see `told_roughly`."""
         for error in errors:
-            self.data += _upper(error, _TOLD_ROUGHLY[0]).to_bytes(_TOLD_ROUGHLY[1], "little")
+            self.data += _upper(error, _ROUGH_ERROR_FIELD[0]).to_bytes(_ROUGH_ERROR_FIELD[1], "little")
 
 
 class FieldReader:
-    """Takes fields from bytes that stand at ``offset`` of a container.
+    """Reads fields from bytes at ``offset`` of a container.
 
     Every method raises `CorruptStreamError` where the bytes end too early.
     """
@@ -93,11 +94,11 @@ class FieldReader:
 
     @property
     def left(self) -> int:
-        """Bytes that were not taken."""
+        """Number of bytes that remain."""
         return len(self.data) - self.place
 
     def take(self, count: int) -> memoryview:
-        """The next bytes.
+        """Read the next bytes.
 
         Raises
         ------
@@ -110,12 +111,12 @@ class FieldReader:
         return self.data[self.place - count : self.place]
 
     def byte(self) -> int:
-        """A whole number of 0 to 255.
+        """Read an integer of 0 to 255.
 
         Raises
         ------
         CorruptStreamError
-            If there is none left.
+            If there is no byte left.
         """
         try:
             value = self.data[self.place]
@@ -125,7 +126,7 @@ class FieldReader:
         return value
 
     def varint(self, limit: int = LARGEST) -> int:
-        """A whole number that must not exceed ``limit``.
+        """Read an integer of at most ``limit``.
 
         Raises
         ------
@@ -147,11 +148,11 @@ class FieldReader:
         return number
 
     def unpack(self, layout: str) -> tuple[float, ...]:
-        """Numbers by a layout of `struct`, little-endian."""
+        """Read numbers by a layout of `struct`, little-endian."""
         return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout)))
 
     def number(self) -> float:
-        """A float64 without its last bytes, see `FieldWriter.number`; it may be infinite or no number.
+        """Read a float64 without its trailing bytes, see `FieldWriter.number`; it may be infinite or NaN.
 
         Raises
         ------
@@ -165,14 +166,15 @@ class FieldReader:
         return float(value)
 
     def errors(self) -> tuple[float, float]:
-        """RMS and maximum error in four bytes each."""
-        return self._errors(*_TOLD)
+        """Read RMS and maximum error in four bytes each."""
+        return self._errors(*_ERROR_FIELD)
 
     def rough_errors(self) -> tuple[float, float]:
-        """RMS and maximum error in two bytes each."""
-        return self._errors(*_TOLD_ROUGHLY)
+        """Read RMS and maximum error in two bytes each."""
+        return self._errors(*_ROUGH_ERROR_FIELD)
 
     def _errors(self, bits: int, size: int) -> tuple[float, float]:
+        """Read two errors of ``bits`` bits in ``size`` bytes each."""
         start, limit = self.place, _INFINITY >> 63 - bits
         rms, worst = int.from_bytes(self.take(size), "little"), int.from_bytes(self.take(size), "little")
         if rms >= limit or worst >= limit:
@@ -182,7 +184,7 @@ class FieldReader:
         return _from_upper(rms, bits), _from_upper(worst, bits)
 
     def end(self) -> None:
-        """Raises `CorruptStreamError` unless every byte was taken."""
+        """Raise `CorruptStreamError` unless every byte was read."""
         if self.place != len(self.data):
             raise CorruptStreamError(
                 f"expected the end of the section, got {len(self.data) - self.place} more bytes", self.at

@@ -1,4 +1,4 @@
-"""A container as it arrives: sections however its bytes are cut, each checked before it is handed on."""
+"""Sections of a container as it arrives in pieces of any length, each checked before it is passed on."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = [
     "whole_section",
 ]
 
-_START = len(sections.SIGNATURE)
-#: The kind and length of a section take at most so many bytes.
-_LONGEST_START = 10
-_CRC = 4  # bytes at the end of a section
+_SIGNATURE_BYTES = len(sections.SIGNATURE)
+#: Bytes of the kind and length of a section, at most.
+_MAX_START_BYTES = 10
+_CRC_BYTES = 4  # at the end of a section
 _KNOWN = frozenset(
     {
         sections.HEADER,
@@ -49,14 +49,14 @@ class Frame(NamedTuple):
 
 
 class _Passing:
-    """A section whose bytes are checked as they pass, and not kept.
+    """A section whose bytes are checked as they arrive, and not kept.
 
     Parameters
     ----------
     kind, offset : int
-        Of the section.
+        Kind of the section and its offset in the container.
     length : int
-        Bytes of all of it, the CRC included.
+        Bytes of the whole section, the CRC included.
     """
 
     def __init__(self, kind: int, offset: int, length: int) -> None:
@@ -64,35 +64,35 @@ class _Passing:
         self._crc, self._end = 0, b""
 
     def take(self, data: bytes | memoryview) -> None:
-        """Take the next bytes, at most as many as are left."""
-        checked = max(min(len(data), self.left - _CRC), 0)
+        """Process the next bytes, at most as many as remain."""
+        checked = max(min(len(data), self.left - _CRC_BYTES), 0)
         self._crc = zlib.crc32(memoryview(data)[:checked], self._crc)
         self._end += bytes(memoryview(data)[checked:])
         self.left -= len(data)
 
     def check(self) -> None:
-        """Refuse a section that does not match its CRC, or that is not known and must be; all bytes have passed."""
+        """Raise an error for a section that fails its CRC, or that is unknown and not optional."""
         _check(self._crc == int.from_bytes(self._end, "little"), self.kind, self._offset)
 
 
 class FrameReader:
     """Sections in file order.
 
-    Memory grows with what has arrived, never with what a length promises: a section that lies whole in the bytes of
-    one call is a window of these, others are put together. Sections that nobody asked for are not put together, but
-    checked as they pass. Metadata that are too long are refused as soon as they say so.
+    Memory grows with the bytes that have arrived, never with a length that a section announces: a section within the
+    bytes of one call is a view of these, others are assembled. Sections that are not in ``keeps`` are not assembled,
+    only checked as they pass. Metadata that are too long are refused as soon as their length is known.
 
     Parameters
     ----------
     keeps : collection of int
-        Kinds of the sections that are wanted; all others pass.
+        Kinds of the sections that are yielded; all others are only checked.
     """
 
     def __init__(self, keeps: Collection[int] = _KNOWN) -> None:
         self._keeps = keeps
-        self._data: bytes | bytearray = b""  # of one call; or, while a section waits for its rest, of several
-        self._place = 0  # of what was not taken yet, in bytes of one call
-        self._offset = 0  # of the same in the container
+        self._data: bytes | bytearray = b""  # of one call; or of several, while a section is incomplete
+        self._place = 0  # of the first byte in `_data` that is not yet processed
+        self._offset = 0  # of the same byte in the container
         self._passing: _Passing | None = None
         self._optional = self._windows = 0  # optional sections so far, and those of errors of windows
         self._started = False
@@ -114,15 +114,14 @@ class FrameReader:
         return self.pending > 0 or self._passing is not None
 
     def feed(self, data: bytes | memoryview) -> Iterator[Frame]:
-        """Take bytes, yield the sections that are now complete.
+        """Process bytes and yield the sections that they complete.
 
         Raises
         ------
         CorruptStreamError
-            Where the bytes are no container, a section fails its CRC, or there are more optional ones than a container
-            may have.
+            If the bytes are no container, a section fails its CRC, or there are more optional sections than allowed.
         UnsupportedVersionError
-            Where the container is of another version, or a section that must be understood is not known.
+            If the container has another version, or an unknown section that is not optional.
         """
         if not self.pending:
             self._data, self._place = bytes(data), 0
@@ -141,19 +140,19 @@ class FrameReader:
                 return
 
     def rest(self) -> bytes:
-        """Take the bytes after the index, once it was read."""
+        """Return the bytes after the index, once it was read."""
         rest, self._data, self._place = bytes(self._ahead()), b"", 0
         return rest
 
     def _begin(self) -> bool:
-        """Look at the start of the next section, unless one is passing; False: not enough of it has come."""
+        """Examine the start of the next section, unless one is passing; return False if more bytes are needed."""
         if self._passing is not None:
             return True
         if not self._started and not self._start():
             return False
-        first = self._ahead(_LONGEST_START)
-        if self._offset == _START and first and first[0] != sections.HEADER:
-            raise CorruptStreamError(f"expected the header section first, got kind {first[0]}", _START)
+        first = self._ahead(_MAX_START_BYTES)
+        if self._offset == _SIGNATURE_BYTES and first and first[0] != sections.HEADER:
+            raise CorruptStreamError(f"expected the header section first, got kind {first[0]}", _SIGNATURE_BYTES)
         extent = section_extent(first, self._offset)
         if extent is None:
             return False
@@ -166,7 +165,7 @@ class FrameReader:
         return True
 
     def _pass(self, passing: _Passing) -> bool:
-        """Let bytes of a section pass; False: there are more to come."""
+        """Check bytes of a passing section; return False if there are more to come."""
         passing.take(self._take(min(self.pending, passing.left)))
         if passing.left:
             return False
@@ -175,7 +174,8 @@ class FrameReader:
         return True
 
     def _next(self) -> Frame | None:
-        first, offset = self._ahead(_LONGEST_START), self._offset
+        """Return the next section if it is complete."""
+        first, offset = self._ahead(_MAX_START_BYTES), self._offset
         extent = section_extent(first, offset)
         if extent is None or self.pending < extent[1]:
             return None
@@ -183,37 +183,38 @@ class FrameReader:
         return checked(self._take(length), first[0], offset, start)
 
     def _start(self) -> bool:
-        first = self._ahead(_START)
+        """Check the signature; return False if more bytes are needed."""
+        first = self._ahead(_SIGNATURE_BYTES)
         sections.check_signature(bytes(first))
-        if len(first) < _START:
+        if len(first) < _SIGNATURE_BYTES:
             return False
-        self._take(_START)
+        self._take(_SIGNATURE_BYTES)
         self._started = True
         return True
 
     def _ahead(self, length: int | None = None) -> bytes | bytearray:
-        """So many of the bytes that wait, or all."""
+        """Return the next ``length`` unprocessed bytes, or all, without consuming them."""
         return self._data[self._place : None if length is None else self._place + length]
 
     def _take(self, length: int) -> bytes | memoryview:
-        """Bytes that wait, and wait no longer."""
-        taken: bytes | memoryview
+        """Consume and return the next bytes."""
+        consumed: bytes | memoryview
         if isinstance(self._data, bytes):
-            taken = memoryview(self._data)[self._place : self._place + length]
+            consumed = memoryview(self._data)[self._place : self._place + length]
             self._place += length
         else:
-            taken = bytes(self._data[:length])
+            consumed = bytes(self._data[:length])
             del self._data[:length]  # without a copy of what is left
         self._offset += length
-        return taken
+        return consumed
 
 
 def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """The kind of each section of a container in a file, and how many bytes of payload it announces.
+    """Return the kind of each section of a container in a file, and its announced payload length in bytes.
 
     Nothing else is read or checked; it ends with the root of the index, or where the bytes are no section any more.
     """
-    place, size = _START, file.seek(0, 2)
+    place, size = _SIGNATURE_BYTES, file.seek(0, 2)
     while place < size:
         file.seek(place)
         head = file.read(10)
@@ -231,7 +232,7 @@ def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
 
 
 def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | None:
-    """Where the payload of the section at the start of ``data`` begins and the section ends; None: not yet to be told.
+    """Return where the payload of the first section of ``data`` begins and the section ends; None: unknown yet.
 
     ``offset`` is the section's place in the container.
 
@@ -254,32 +255,32 @@ def section_extent(data: bytes | bytearray, offset: int) -> tuple[int, int] | No
 
 
 def index_extent(data: bytes | bytearray, offset: int) -> int | None:
-    """Where the index ends that stands at the start of ``data``: its pages and its root; None: not yet to be told."""
-    pages = section_extent(data[:_LONGEST_START], offset)
+    """Return where the index at the start of ``data`` ends, pages and root; None: unknown yet."""
+    pages = section_extent(data[:_MAX_START_BYTES], offset)
     if pages is None:
         return None
-    root = section_extent(data[pages[1] : pages[1] + _LONGEST_START], offset + pages[1])
+    root = section_extent(data[pages[1] : pages[1] + _MAX_START_BYTES], offset + pages[1])
     return None if root is None else pages[1] + root[1]
 
 
 def index_sections(data: bytes, offset: int) -> tuple[Frame, Frame]:
-    """The pages and the root of an index that was fetched by itself.
+    """Return the pages and the root of an index that was fetched by itself.
 
     Raises
     ------
     CorruptStreamError
         When these are not two whole sections.
     """
-    pages = section_extent(data[:_LONGEST_START], offset)
+    pages = section_extent(data[:_MAX_START_BYTES], offset)
     end = len(data) if pages is None else pages[1]
     root = whole_section(data[end:], offset + end, sections.INDEX)
     return whole_section(data[:end], offset, sections.PAGES), root
 
 
 def checked(frame: bytes | memoryview, kind: int, offset: int, start: int) -> Frame:
-    """A whole section, whose payload starts at ``start`` of it, after its CRC was checked."""
-    payload, crc = memoryview(frame)[start:-_CRC], int.from_bytes(frame[-_CRC:], "little")
-    _check(zlib.crc32(memoryview(frame)[:-_CRC]) == crc, kind, offset)
+    """Return a whole section, whose payload starts at ``start``, after checking its CRC."""
+    payload, crc = memoryview(frame)[start:-_CRC_BYTES], int.from_bytes(frame[-_CRC_BYTES:], "little")
+    _check(zlib.crc32(memoryview(frame)[:-_CRC_BYTES]) == crc, kind, offset)
     return Frame(kind, offset, offset + start, payload, offset + len(frame))
 
 
@@ -295,7 +296,7 @@ def _check(sound: bool, kind: int, offset: int) -> None:
 
 
 def whole_section(data: bytes, offset: int, kind: int) -> Frame:
-    """A section that was fetched by itself.
+    """Return a section that was fetched by itself.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The bytes of the header section, and of the masks that may follow it. `docs/format.md` specifies them."""
+"""Bytes of the header section, and of the masks that may follow it, specified in `docs/format.md`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _RULES = ("affine", "decimal")
 
 
 def serialize_header(header: Header) -> bytes:
-    """Signature, header section and, where there are holes, the section of masks."""
+    """Serialize signature, header section and, where there are holes, the section of masks."""
     out = FieldWriter()
     codecs.serialize_codecs(out, header.codecs)
     extras = serialize_extras(header.attributes, header.plane, header.joint_changes)
@@ -68,9 +68,9 @@ def serialize_header(header: Header) -> bytes:
         out.varint(levels)
     fitted = fitted_steps(header.layout)
     for channel, predictors in enumerate(header.predictors):
-        own = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < header.geometric]
-        out.varint(len(own))
-        for level, axis in own:
+        channel_steps = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < header.geometric]
+        out.varint(len(channel_steps))
+        for level, axis in channel_steps:
             out.pack("bb", *(int(x) for x in predictors[level, axis]))
     data = SIGNATURE + section(HEADER, bytes(out.data))
     if not header.masked:
@@ -79,6 +79,7 @@ def serialize_header(header: Header) -> bytes:
 
 
 def _serialize_masks(header: Header) -> bytes:
+    """Serialize the payload of the section of masks."""
     out = FieldWriter()
     out.pack("q", header.hole)
     for holes, data in zip(header.holes, header.mask_data, strict=True):
@@ -95,7 +96,7 @@ def _serialize_masks(header: Header) -> bytes:
 
 
 def parse_masks(header: Header, frame: Frame) -> Header:
-    """The header with the masks of their section.
+    """Return the header with the masks of their section.
 
     Raises
     ------
@@ -129,7 +130,7 @@ def parse_masks(header: Header, frame: Frame) -> Header:
 
 
 def parse_header(payload: memoryview, offset: int, length: int) -> Header:
-    """Header section's payload, which stands at ``offset``; the header ends at ``length``.
+    """Parse the header section's payload, which is at ``offset``; the header ends at ``length``.
 
     Raises
     ------
@@ -219,6 +220,7 @@ def _check_sizes(blocks: Blocks, tile: tuple[int, int], chunk: tuple[int, int], 
 
 
 def _parse_lattice(fields: FieldReader) -> Lattice:
+    """Parse the lattice of a channel."""
     start, rule = fields.at, fields.byte()
     origin, step = fields.number(), fields.number()
     if rule >= len(_RULES) or not (math.isfinite(origin) and math.isfinite(step) and step > 0):
@@ -229,16 +231,16 @@ def _parse_lattice(fields: FieldReader) -> Lattice:
 def _parse_predictors(
     fields: FieldReader, layout: Layout, channels: int, geometric: int, offset: int
 ) -> NDArray[np.int8]:
-    """Predictors of shape (channel, level, axis, 2); interfaces have some of the ``geometric`` channels only."""
+    """Parse predictors, int8, (channel, level, axis, 2); those of interfaces only for ``geometric`` channels."""
     predictors = np.stack([default_predictors(layout)] * channels)
     fitted = fitted_steps(layout)
     for channel in range(channels):
-        own = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < geometric]
+        channel_steps = [(level, axis) for level, axis in fitted if axis < INTERFACES or channel < geometric]
         start, count = fields.at, fields.varint()
-        if count != len(own):
-            raise CorruptStreamError(f"expected predictors of {len(own)} steps, got {count}", start)
-        if own:
-            levels, axes = zip(*own, strict=True)
+        if count != len(channel_steps):
+            raise CorruptStreamError(f"expected predictors of {len(channel_steps)} steps, got {count}", start)
+        if channel_steps:
+            levels, axes = zip(*channel_steps, strict=True)
             predictors[channel, levels, axes] = np.frombuffer(fields.take(2 * count), np.int8).reshape(-1, 2)
     if (predictors == -128).any():
         raise CorruptStreamError("expected predictors of at most 127 in magnitude, got -128", offset)
@@ -246,4 +248,5 @@ def _parse_predictors(
 
 
 def _exponents(byte: int) -> tuple[int, int]:
+    """Return the two exponents in a byte."""
     return byte & 15, byte >> 4

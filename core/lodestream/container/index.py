@@ -1,4 +1,4 @@
-"""The index: a root, which tells where all sections and pages stand, and pages, which tell it of segments and chunks.
+"""The index: a root, which locates all sections and pages, and pages, which locate segments and chunks.
 
 A page tells of a run of tiles, or of windows of residual, and needs no other to be understood: who wants a part of a
 large surface reads the root and the pages of that part.
@@ -35,12 +35,12 @@ __all__ = ["PAGE", "PagePlace", "Root", "parse_index", "parse_root", "serialize_
 #: Tiles, or windows of residual, that a page tells of.
 PAGE = 256
 # In the first byte of an entry: passes - 1 and layers skipped from which on more bytes tell the rest.
-_PASSES, _SKIP = 7, 31
+_MAX_SHORT_PASSES, _MAX_SHORT_SKIP = 7, 31
 _CRC = 4  # bytes at the end of a section
 
 
 def serialize_index(index: Index) -> tuple[bytes, bytes]:
-    """Payloads of the pages and of the root; levels' byte counts and shapes follow from the rest."""
+    """Serialize the pages and the root; levels' byte counts and shapes follow from the rest."""
     segments, chunks = _segment_pages(index), _chunk_pages(index)
     out = FieldWriter()
     out.varint(len(index.layers))
@@ -67,6 +67,7 @@ def serialize_index(index: Index) -> tuple[bytes, bytes]:
 
 
 def _segment_pages(index: Index) -> list[bytes]:
+    """Serialize the pages of segments."""
     channels = index.header.channels
     units: list[dict[int, list[Segment]]] = [{} for _ in range(_count_pages(len(index.header.layout.tiles)))]
     rests = [0] * len(index.layers)
@@ -75,17 +76,17 @@ def _segment_pages(index: Index) -> list[bytes]:
         units[segment.tile // PAGE].setdefault(number, []).append(segment)
         rests[segment.layer] += segment.range.length
     pages = []
-    for number, own in enumerate(units):
+    for number, page_units in enumerate(units):
         out = FieldWriter()
         for rest in rests:
             out.varint(rest)
         unit = number * PAGE * channels
-        for place in sorted(own):
+        for place in sorted(page_units):
             if place > unit:
                 out.varint(0)
                 out.varint(place - unit - 1)
-            _write_unit(out, own[place])
-            for segment in own[place]:
+            _write_unit(out, page_units[place])
+            for segment in page_units[place]:
                 rests[segment.layer] -= segment.range.length
             unit = place + 1
         pages.append(bytes(out.data))
@@ -93,22 +94,24 @@ def _segment_pages(index: Index) -> list[bytes]:
 
 
 def _write_unit(out: FieldWriter, segments: list[Segment]) -> None:
+    """Write the segments of one unit."""
     out.varint(len(segments))
     out.byte(segments[0].top)
     layer = -1
     for segment in segments:
         passes, skip = segment.passes - 1, segment.layer - layer - 1
-        out.byte(min(passes, _PASSES) | min(skip, _SKIP) << 3)
-        if passes >= _PASSES:
-            out.varint(passes - _PASSES)
-        if skip >= _SKIP:
-            out.varint(skip - _SKIP)
+        out.byte(min(passes, _MAX_SHORT_PASSES) | min(skip, _MAX_SHORT_SKIP) << 3)
+        if passes >= _MAX_SHORT_PASSES:
+            out.varint(passes - _MAX_SHORT_PASSES)
+        if skip >= _MAX_SHORT_SKIP:
+            out.varint(skip - _MAX_SHORT_SKIP)
         out.varint(segment.range.length)
         out.pack("H", segment.check)
         layer = segment.layer
 
 
 def _chunk_pages(index: Index) -> list[bytes]:
+    """Serialize the pages of chunks."""
     pages, size = [], PAGE * index.header.channels
     rest = sum(chunk.range.length for chunk in index.chunks)
     for first in range(0, len(index.chunks), size):
@@ -124,11 +127,12 @@ def _chunk_pages(index: Index) -> list[bytes]:
 
 
 def _count_pages(things: int) -> int:
+    """Return the number of pages of ``things`` tiles or chunks of a channel."""
     return -(-things // PAGE)
 
 
 class PagePlace(NamedTuple):
-    """A page by its place in the container and its CRC-32, which stands at ``told`` of the container."""
+    """A page's place in the container, and its CRC-32, which is stored at ``told`` of the container."""
 
     range: ByteRange
     crc: int
@@ -137,9 +141,9 @@ class PagePlace(NamedTuple):
 
 @dataclass(frozen=True)
 class Root:
-    """What the root tells; of segments and chunks it names the pages only.
+    """Contents of the root; for segments and chunks it locates only the pages.
 
-    ``layers`` are places and errors, ``levels`` errors. ``index`` is the place of pages and root.
+    ``layers`` holds places and errors, ``levels`` errors. ``index`` is the place of pages and root.
     """
 
     layers: tuple[tuple[ByteRange, Errors], ...]
@@ -153,7 +157,7 @@ class Root:
 
 
 def parse_root(frame: Frame, header: Header) -> Root:
-    """The root of the index of a container with this header, from its section.
+    """Parse the root of the index of a container with this header.
 
     Raises
     ------
@@ -190,83 +194,88 @@ def parse_root(frame: Frame, header: Header) -> Root:
     first = pages + section_start(length)
     if places.left or first + length + _CRC != frame.offset:
         raise CorruptStreamError("expected sections that fill the container up to its index, got others", frame.offset)
-    found = []
+    page_places = []
     for directory in directories:
         starts = accumulate((size for size, _, _ in directory), initial=first)
-        own = [
-            PagePlace(ByteRange(at, size), crc, told) for at, (size, crc, told) in zip(starts, directory, strict=False)
+        places_of_kind = [
+            PagePlace(ByteRange(at, size), crc, crc_offset)
+            for at, (size, crc, crc_offset) in zip(starts, directory, strict=False)
         ]
         first += sum(size for size, _, _ in directory)
-        found.append(tuple(own))
+        page_places.append(tuple(places_of_kind))
     index = ByteRange(pages, frame.end - pages)
-    return Root(placed, tuple(levels), exact, where, tuple(optional), found[0], found[1], index)
+    return Root(placed, tuple(levels), exact, where, tuple(optional), page_places[0], page_places[1], index)
 
 
 def parse_index(pages: Frame, root: Frame, header: Header) -> Index:
-    """The index of a container with this header, from its sections.
+    """Parse the index of a container with this header from its sections.
 
     Raises
     ------
     CorruptStreamError
         When they contradict each other or the header.
     """
-    told = parse_root(root, header)
-    if pages.offset != told.index.offset or pages.end != root.offset:
+    contents = parse_root(root, header)
+    if pages.offset != contents.index.offset or pages.end != root.offset:
         raise CorruptStreamError("expected the pages of an index before its root, got others", pages.offset)
-    segments = _parse_segments(_pages_of(pages, told.segment_pages), header, [place for place, _ in told.layers])
-    check_filled((bool(own) for own in segments), len(segments), pages.offset)
+    segments = _parse_segments(
+        _pages_of(pages, contents.segment_pages), header, [place for place, _ in contents.layers]
+    )
+    check_filled((bool(layer_segments) for layer_segments in segments), len(segments), pages.offset)
     finest, layers = 0, []
-    for number, ((place, errors), own) in enumerate(zip(told.layers, segments, strict=True)):
-        finest = max(finest, header.layout.level_of(max([0, *(segment.tile for segment in own)])))
+    for number, ((place, errors), layer_segments) in enumerate(zip(contents.layers, segments, strict=True)):
+        finest = max(finest, header.layout.level_of(max([0, *(segment.tile for segment in layer_segments)])))
         layers.append(LayerRecord(number, place.offset, place.end, finest, *errors))
     return Index(
         header,
         tuple(layers),
-        tuple(LevelRecord(level, header.level_shape(level), 0, *errors) for level, errors in enumerate(told.levels)),
-        tuple(segment for own in segments for segment in own),
-        told.residual,
-        _parse_chunks(_pages_of(pages, told.chunk_pages), header, told.residual) if told.residual else (),
-        told.metadata,
-        told.index,
+        tuple(
+            LevelRecord(level, header.level_shape(level), 0, *errors) for level, errors in enumerate(contents.levels)
+        ),
+        tuple(segment for layer_segments in segments for segment in layer_segments),
+        contents.residual,
+        _parse_chunks(_pages_of(pages, contents.chunk_pages), header, contents.residual) if contents.residual else (),
+        contents.metadata,
+        contents.index,
         root.end + FOOTER_LENGTH,
-        optional=told.optional,
+        optional=contents.optional,
     )
 
 
 class _Places:
-    """Places of sections one after another, with optional ones anywhere between them."""
+    """Places of consecutive sections, with optional sections anywhere between them."""
 
     def __init__(self, start: int, optional: Sequence[OptionalSection]) -> None:
         self._place, self._optional = start, list(optional)[::-1]
 
     @property
     def left(self) -> int:
-        """Optional sections that stand nowhere between the others."""
+        """Number of optional sections that are not between the others."""
         return len(self._optional)
 
     def end(self) -> int:
-        """Where the sections end that were taken, and optional ones after them."""
+        """Return where the sections so far end, including optional ones after them."""
         while self._optional and self._optional[-1].range.offset == self._place:
             self._place += self._optional.pop().range.length
         return self._place
 
     def next(self, length: int) -> ByteRange:
-        """The place of the next section, which is so long."""
+        """Return the place of the next section, of this length."""
         place = ByteRange(self.end(), length)
         self._place = place.end
         return place
 
 
 def _told(fields: FieldReader, count: int, what: str) -> int:
-    """A count that is known already, so that nothing is read by another."""
-    start, told = fields.at, fields.varint()
-    if told != count:
-        raise CorruptStreamError(f"expected {count} {what} of an index, got {told}", start)
-    return told
+    """Read a count and raise an error unless it is the expected one."""
+    start, actual = fields.at, fields.varint()
+    if actual != count:
+        raise CorruptStreamError(f"expected {count} {what} of an index, got {actual}", start)
+    return actual
 
 
 def _empty_layer(channels: int) -> int:
-    """Bytes of the section of a layer that has no segments."""
+    """Return the section bytes of a layer without segments."""
     out = FieldWriter()
     write_errors(out, Errors(0.0, 0.0, ((0.0, 0.0),) * (channels if channels > 1 else 0)))
     payload = len(out.data) + 1  # the number of segments
@@ -274,46 +283,47 @@ def _empty_layer(channels: int) -> int:
 
 
 def _parse_optional(fields: FieldReader) -> list[OptionalSection]:
+    """Parse the places of optional sections."""
     start, count = fields.at, fields.varint()
     limits.check_count(count, limits.OPTIONAL, "optional sections", start)
-    found = []
+    sections = []
     for _ in range(count):
         at, kind = fields.at, fields.byte()
         place = ByteRange(fields.varint(), fields.varint())
         if kind < OPTIONAL or place.length < 6:
             raise CorruptStreamError(f"expected an optional section, got kind {kind} of {place.length} bytes", at)
-        found.append(OptionalSection(kind, place))
-    windows = sum(optional.kind == WINDOW_ERRORS for optional in found)
+        sections.append(OptionalSection(kind, place))
+    windows = sum(optional.kind == WINDOW_ERRORS for optional in sections)
     limits.check_count(windows, 1, "sections of errors of windows", start)
-    return found
+    return sections
 
 
 def _parse_directory(fields: FieldReader, count: int) -> list[tuple[int, int, int]]:
-    """Length and CRC-32 of each page, and where that stands."""
-    found = []
+    """Parse length and CRC-32 of each page, and the offset of the CRC."""
+    entries = []
     for _ in range(_told(fields, count, "pages")):
-        length, told = fields.varint(), fields.at
+        length, crc_offset = fields.varint(), fields.at
         (crc,) = fields.unpack("I")
-        found.append((length, int(crc), told))
-    return found
+        entries.append((length, int(crc), crc_offset))
+    return entries
 
 
 def _pages_of(frame: Frame, places: Sequence[PagePlace]) -> list[FieldReader]:
-    """Pages out of their section, each checked by its CRC."""
-    found = []
+    """Return readers of the pages in their section, each checked by its CRC."""
+    readers = []
     for place, crc, _ in places:
         start = place.offset - frame.payload_offset
         page = frame.payload[start : start + place.length]
         if zlib.crc32(page) != crc:
             raise CorruptStreamError("expected a page that matches its CRC, got other bytes", place.offset)
-        found.append(FieldReader(page, place.offset))
-    return found
+        readers.append(FieldReader(page, place.offset))
+    return readers
 
 
 def _parse_segments(pages: list[FieldReader], header: Header, layers: list[ByteRange]) -> list[list[Segment]]:
-    """The segments of each layer, by rising number of the unit."""
+    """Parse the segments of each layer, by ascending number of the unit."""
     tiles = len(header.layout.tiles)
-    found: list[list[Segment]] = [[] for _ in layers]
+    segments: list[list[Segment]] = [[] for _ in layers]
     ends = [place.end - _CRC for place in layers]
     expected: list[int] | None = None
     for number, fields in enumerate(pages):
@@ -324,19 +334,19 @@ def _parse_segments(pages: list[FieldReader], header: Header, layers: list[ByteR
         if not inside or (expected is not None and at != expected):
             raise CorruptStreamError("expected segments within their layers, one after another, got others", start)
         units = (min(tiles - number * PAGE, PAGE)) * header.channels
-        _parse_units(fields, number * PAGE * header.channels, units, header.channels, at, found)
+        _parse_units(fields, number * PAGE * header.channels, units, header.channels, at, segments)
         if any(place > end for place, end in zip(at, ends, strict=True)):
             raise CorruptStreamError("expected segments that fill their layers, got longer ones", start)
         expected = at
     if expected != ends:
         raise CorruptStreamError("expected segments that fill their layers, got shorter ones", header.length)
-    return found
+    return segments
 
 
 def _parse_units(
-    fields: FieldReader, first: int, units: int, channels: int, at: list[int], found: list[list[Segment]]
+    fields: FieldReader, first: int, units: int, channels: int, at: list[int], segments: list[list[Segment]]
 ) -> None:
-    """The units of a page; ``at`` is where the next segment of each layer stands."""
+    """Parse the units of a page; ``at`` holds the offset of the next segment of each layer, and is updated."""
     unit = 0
     while fields.left:
         start, count = fields.at, fields.varint(len(at))
@@ -345,23 +355,23 @@ def _parse_units(
             continue
         tile, channel = divmod(first + unit, channels)
         top, layer = fields.byte(), -1
-        left = 2 * top - 1
+        remaining = 2 * top - 1
         if unit >= units or not 1 <= top <= COEFFICIENT_BITS:
             raise CorruptStreamError(f"expected one of {units} units and 1 to 28 planes, got {unit}, {top}", start)
         for _ in range(count):
             code = fields.byte()
             passes, skip = (code & 7) + 1, code >> 3
-            if passes > _PASSES:
+            if passes > _MAX_SHORT_PASSES:
                 passes += fields.varint(2 * COEFFICIENT_BITS)
-            if skip == _SKIP:
+            if skip == _MAX_SHORT_SKIP:
                 skip += fields.varint(len(at))
-            layer, left = layer + 1 + skip, left - passes
+            layer, remaining = layer + 1 + skip, remaining - passes
             length = fields.varint()
             (check,) = fields.unpack("H")
-            if layer >= len(at) or left < 0 or not length:
+            if layer >= len(at) or remaining < 0 or not length:
                 raise CorruptStreamError(f"expected passes and layers of unit {first + unit}, got others", start)
             place = ByteRange(at[layer], length)
-            found[layer].append(Segment(layer, tile, channel, top, passes, place, int(check)))
+            segments[layer].append(Segment(layer, tile, channel, top, passes, place, int(check)))
             at[layer] += length
         unit += 1
     if unit > units:
@@ -369,9 +379,9 @@ def _parse_units(
 
 
 def _parse_chunks(pages: list[FieldReader], header: Header, residual: ByteRange) -> tuple[Chunk, ...]:
-    """The chunks of the residual section."""
+    """Parse the chunks of the residual section."""
     count = chunks_of_a_channel(header) * header.channels
-    found: list[Chunk] = []
+    chunks: list[Chunk] = []
     at, end = -1, residual.end - _CRC
     for fields in pages:
         start = fields.at
@@ -380,12 +390,12 @@ def _parse_chunks(pages: list[FieldReader], header: Header, residual: ByteRange)
         if first < residual.offset or at not in (-1, first):
             raise CorruptStreamError("expected chunks within their section, one after another, got others", start)
         at = first
-        for _ in range(min(PAGE * header.channels, count - len(found))):
+        for _ in range(min(PAGE * header.channels, count - len(chunks))):
             length = fields.varint(residual.length)
             (check,) = fields.unpack("H") if length else (0,)
-            found.append(Chunk(ByteRange(at, length), int(check)))
+            chunks.append(Chunk(ByteRange(at, length), int(check)))
             at += length
         fields.end()
     if at != end:
         raise CorruptStreamError("expected chunks that fill their section, got others", residual.offset)
-    return tuple(found)
+    return tuple(chunks)

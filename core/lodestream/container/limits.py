@@ -1,4 +1,4 @@
-"""What a container may have at most, so that its index and description stay small: section 14 of `docs/format.md`.
+"""Limits on the counts of a container, so that its index and description stay small: section 14 of `docs/format.md`.
 
 Writers keep these limits, and readers refuse a file that does not. They stand far above what most surfaces need: the
 encoder makes some 20 layers of 30 kB and 60 of 3 MB. Only of surfaces with hundreds of channels it makes fewer than it
@@ -82,7 +82,7 @@ def check_names(names: Iterable[tuple[str, int]], offset: int | None = None) -> 
 
 
 def most_layers(channels: int, levels: int) -> int:
-    """How many layers a container may have, 0 if none; ``levels`` counts the coarsest too."""
+    """Return how many layers a container may have, 0 if none; ``levels`` includes the coarsest one."""
     return max(0, min(LAYERS, ERRORS // channels - levels))
 
 

@@ -35,7 +35,7 @@ _Path = tuple[str | int, ...]
 
 
 def packed(metadata: Mapping[str, Any]) -> bytes:
-    """Metadata as a MessagePack map, as they stand in a container.
+    """Encode metadata as a MessagePack map, as a container stores them.
 
     Raises
     ------
@@ -114,8 +114,9 @@ def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str,
         return result, []
     result |= {key: deepcopy(result[key]) for key in _DEPTHS if key in result}
     single = [path for key, value in result.items() for path in _paths(value, (key,), _DEPTHS.get(key, 0))]
-    whole: list[_Path] = [(key,) for key in result if key in _DEPTHS]  # of maps that are all keys, or very many
-    for paths in (single, whole):
+    # Maps of large keys, or of very many entries.
+    whole_entries: list[_Path] = [(key,) for key in result if key in _DEPTHS]
+    for paths in (single, whole_entries):
         sizes = {path: len(_packed(path[-1])) + len(_packed(_at(result, path))) for path in paths}
         for path in sorted(paths, key=lambda path: -sizes[path]):
             if size <= most:
@@ -142,6 +143,7 @@ def with_notes(metadata: Mapping[str, Any], notes: Sequence[str]) -> dict[str, A
 
 
 def _packed(value: Any) -> bytes:
+    """Encode a value with MessagePack."""
     try:
         return bytes(msgpack.packb(value, use_bin_type=True))
     except (TypeError, ValueError, OverflowError) as error:
@@ -149,7 +151,7 @@ def _packed(value: Any) -> bytes:
 
 
 def _paths(value: Any, path: _Path, depth: int) -> Iterator[_Path]:
-    """The places of the entries that are dropped one by one."""
+    """Yield the paths of the entries that are dropped one by one."""
     if depth and isinstance(value, Mapping) and value:
         for key, inner in value.items():
             yield from _paths(inner, (*path, key), depth - 1)
@@ -162,7 +164,7 @@ def _paths(value: Any, path: _Path, depth: int) -> Iterator[_Path]:
 
 
 def _drop(metadata: dict[str, Any], path: _Path) -> None:
-    """Drop an entry, and the maps that have no other."""
+    """Delete an entry, and the maps that it leaves empty."""
     del _at(metadata, path[:-1])[path[-1]]
     while len(path) > 2 and isinstance(path[-2], str) and not _at(metadata, path[:-1]):
         path = path[:-1]
@@ -170,6 +172,7 @@ def _drop(metadata: dict[str, Any], path: _Path) -> None:
 
 
 def _at(value: Any, path: _Path) -> Any:
+    """Return the entry at a path."""
     for part in path:
         value = value[part]
     return value

@@ -1,4 +1,4 @@
-"""What a container says of itself: header, layers, levels, segments, their places. `docs/format.md` has the bytes."""
+"""Contents of a container's header and index: layers, levels, segments and their places; bytes in `docs/format.md`."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class AttributeKind:
 
 
 def count_rectangles(blocks: Sequence[tuple[tuple[int, int], Closed]], exponents: tuple[int, int]) -> int:
-    """About how many rectangles, with rows and columns of these exponents of two, the blocks are cut into."""
+    """Estimate how many rectangles, with rows and columns of these binary logarithms, the blocks are cut into."""
     return sum(max(1, rows >> exponents[0]) * max(1, columns >> exponents[1]) for (rows, columns), _ in blocks)
 
 
@@ -280,17 +280,17 @@ class Header:
             return (None,) * len(self.blocks)
         from ..entropy.mask import decode_mask  # only where there is one: it loads the kernels
 
-        found: list[NDArray[np.bool_] | None] = []
+        kept_masks: list[NDArray[np.bool_] | None] = []
         for mask, count, data, (shape, _) in zip(self.masks, self.kept, self.kept_data, self.blocks, strict=True):
             if mask is None or not count:
-                found.append(None)
+                kept_masks.append(None)
                 continue
             kept = decode_mask(data, shape, self.length) if data else ~mask
             holes = np.count_nonzero(kept & ~mask)
             if not np.count_nonzero(kept) == holes == count:
                 raise CorruptStreamError(f"expected {count} holes that are kept, got {holes}", self.length)
-            found.append(kept)
-        return tuple(found)
+            kept_masks.append(kept)
+        return tuple(kept_masks)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A complete container with random access: its index, and what `lodestream info` tells of it."""
+"""Random access to a complete container: its index, and the description that `lodestream info` prints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FIRST_READ, _MOST_AT_ONCE = 512, 1 << 22
 
 
 def read_index(read: Callable[[int, int], bytes], size: int, capacity: Capacity | None = None) -> Index:
-    """Index of a complete container.
+    """Read the index of a complete container.
 
     Parameters
     ----------
@@ -66,6 +66,7 @@ def read_index(read: Callable[[int, int], bytes], size: int, capacity: Capacity 
 
 
 def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacity | None) -> Header:
+    """Read the header of a container."""
     reader, wanted = FrameReader(), _FIRST_READ
     header: Header | None = None
     position = 0
@@ -90,12 +91,12 @@ def _read_header(read: Callable[[int, int], bytes], size: int, capacity: Capacit
 
 
 def index_from(data: bytes, place: ByteRange, header: Header) -> Index:
-    """Index from its bytes, pages and root, with what `plan` sends for each level."""
+    """Parse an index from its bytes, pages and root, with the bytes that `plan` sends for each level."""
     return index_of(*index_sections(data, place.offset), header)
 
 
 def index_of(pages: Frame, root: Frame, header: Header) -> Index:
-    """Index from its two sections, with each level's bytes.
+    """Parse an index from its two sections, with each level's bytes.
 
     These are header and segments up to the level; for the last one the complete stream.
     """
@@ -113,23 +114,24 @@ def index_of(pages: Frame, root: Frame, header: Header) -> Index:
 
 
 def read_metadata(data: bytes, place: ByteRange) -> dict[str, Any]:
-    """The values of a metadata section that stands at ``place``."""
+    """Parse the metadata section at ``place``."""
     frame = whole_section(data, place.offset, sections.METADATA)
     return sections.parse_metadata(frame.payload, frame.payload_offset)
 
 
 def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
-    """What is known of a surface, in plain values: the keys of ``lodestream info --json``.
+    """Describe a surface in plain values: the keys of ``lodestream info --json``.
 
-    ``levels`` are the states that hold all of the levels up to one and nothing finer, ``layers`` the steps of quality
+    ``levels`` are the states that hold all levels up to one and nothing finer, ``layers`` the steps of quality
     in file order; ``bytes`` are lengths of the container's prefix (layers), of what `plan` sends (levels), and of the
     whole file. With ``channels`` each of them has RMS and maximum of every channel too, where there are several, and
     ``channel_names`` says which.
     """
 
     def errors(record: LayerRecord | LevelRecord) -> dict[str, Any]:
-        own = {"channels": [list(pair) for pair in record.channels]} if channels and record.channels else {}
-        return {"rms": record.rms, "max": record.max_error, **own}
+        """Return RMS and maximum of a record, and those of each channel if requested."""
+        by_channel = {"channels": [list(pair) for pair in record.channels]} if channels and record.channels else {}
+        return {"rms": record.rms, "max": record.max_error, **by_channel}
 
     header = index.header
     blocks = [{"shape": list(shape), "closed": list(closed)} for shape, closed in header.blocks]

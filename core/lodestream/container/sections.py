@@ -1,4 +1,4 @@
-"""The bytes of each section, by a pair of functions that write and read it. `docs/format.md` specifies them."""
+"""Bytes of each section, by a pair of functions that write and read it, specified in `docs/format.md`."""
 
 from __future__ import annotations
 
@@ -77,12 +77,12 @@ class Entry(NamedTuple):
 
 
 def section_start(length: int) -> int:
-    """Bytes of a section before a payload of so many."""
+    """Return the bytes of a section before a payload of this length."""
     return 1 + max(1, -(-length.bit_length() // 7))
 
 
 def check_of(data: bytes | memoryview) -> int:
-    """What tells that a segment or a chunk by itself is whole: the lower half of its CRC-32."""
+    """Return the check of a single segment or chunk: the lower half of its CRC-32."""
     return zlib.crc32(data) & 0xFFFF
 
 
@@ -97,14 +97,14 @@ def section(kind: int, payload: bytes) -> bytes:
 
 
 def write_errors(out: FieldWriter, errors: Errors) -> None:
-    """Errors of the distances and, where there are several channels, of each."""
+    """Write errors of the distances and, where there are several channels, of each."""
     out.errors(errors.rms, errors.maximum)
     for pair in errors.channels:
         out.rough_errors(*pair)
 
 
 def read_errors(fields: FieldReader, channels: int) -> Errors:
-    """Undo `write_errors`."""
+    """Read errors that `write_errors` wrote."""
     distances = fields.errors()
     return Errors(*distances, tuple(fields.rough_errors() for _ in range(channels)) if channels > 1 else ())
 
@@ -121,7 +121,7 @@ def check_filled(filled: Iterable[bool], layers: int, offset: int) -> None:
 
 
 def serialize_layer(errors: Errors, entries: Sequence[Entry], channels: int) -> bytes:
-    """A layer's errors and table; the segments follow it in the section's payload."""
+    """Serialize a layer's errors and table; the segments follow it in the section's payload."""
     out = FieldWriter()
     write_errors(out, errors)
     out.varint(len(entries))
@@ -143,7 +143,7 @@ def serialize_layer(errors: Errors, entries: Sequence[Entry], channels: int) -> 
 
 
 def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[Entry], int]:
-    """Errors, entries (``top`` is 0 where an earlier layer told it) and where in the payload the segments start.
+    """Parse errors and entries (``top`` is 0 if an earlier layer has it), and the offset of segments in the payload.
 
     Raises
     ------
@@ -192,18 +192,18 @@ def parse_layer(payload: memoryview, offset: int, header: Header) -> tuple[Error
 
 
 def _varint(fields: FieldReader, place: int, limit: int) -> tuple[int, int]:
-    """A whole number that stands at ``place``, and where the next field does."""
+    """Read an integer at ``place``; return it and where the next field is."""
     fields.place = place
     return fields.varint(limit), fields.place
 
 
 def serialize_metadata(values: dict[str, Any]) -> bytes:
-    """A MessagePack map."""
+    """Serialize metadata as a MessagePack map."""
     return packed(values)
 
 
 def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
-    """The map of a metadata section.
+    """Parse the map of a metadata section.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def parse_metadata(payload: memoryview, offset: int) -> dict[str, Any]:
 
 
 def serialize_chunk_table(errors: Errors, chunks: Iterable[bytes | memoryview]) -> bytes:
-    """What the payload of the residual section begins with: the errors that are left, the chunks' lengths."""
+    """Serialize the start of the residual section's payload: the remaining errors and the chunks' lengths."""
     out = FieldWriter()
     write_errors(out, errors)
     for chunk in chunks:
@@ -230,7 +230,7 @@ def serialize_chunk_table(errors: Errors, chunks: Iterable[bytes | memoryview]) 
 
 
 def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Errors, list[tuple[memoryview, int]]]:
-    """The errors that a residual section, which stands at ``offset``, leaves; its chunks in it, and their places."""
+    """Parse the remaining errors, the chunks and their places of a residual section at ``offset``."""
     fields = FieldReader(payload, offset)
     errors = read_errors(fields, header.channels)
     lengths = [fields.varint(len(payload)) for _ in chunk_places(header)]
@@ -243,7 +243,7 @@ def parse_chunks(payload: memoryview, offset: int, header: Header) -> tuple[Erro
 
 
 def serialize_footer(index: int, root: int) -> bytes:
-    """The last bytes of a container: how long the index is that stands before them, and its root at the end."""
+    """Serialize the last bytes of a container: the length of the index before them, and of its root."""
     out = FieldWriter()
     out.pack("QQ", index, root)
     out.pack("I", zlib.crc32(out.data))
@@ -251,7 +251,7 @@ def serialize_footer(index: int, root: int) -> bytes:
 
 
 def parse_footer(data: bytes, offset: int) -> tuple[ByteRange, ByteRange]:
-    """The places of the index and of its root, from the last bytes of a container, which stand at ``offset``.
+    """Parse the places of the index and its root from the last bytes of a container, which are at ``offset``.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def parse_footer(data: bytes, offset: int) -> tuple[ByteRange, ByteRange]:
 
 
 def is_container(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a container, of whichever version."""
+    """Return whether the first bytes of a file are those of a container, of any version."""
     return head.startswith((MAGIC, _EARLIER_MAGIC))
 
 

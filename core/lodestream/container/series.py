@@ -1,4 +1,4 @@
-"""The place of a surface in a series, as its metadata tell it: of the steps along a dimension, or of variables."""
+"""The place of a surface in a series, as its metadata give it: along a dimension, or among variables."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Place:
     value : float, int or str
         The coordinate there, as the file has it, or the name of the variable.
     unit : str
-        Unit of the coordinate, such as ``days since 2000-01-01``, or of the variable; empty: it is not told.
+        Unit of the coordinate, such as ``days since 2000-01-01``, or of the variable; empty: unknown.
     """
 
     name: str
@@ -44,17 +44,17 @@ class Place:
     unit: str = ""
 
     def told(self) -> dict[str, Any]:
-        """The map that metadata have under `SERIES`."""
+        """Return the map that metadata have under `SERIES`."""
         return asdict(self)
 
 
 def place_of(metadata: Mapping[str, Any]) -> Place | None:
-    """Read the place of a surface from its metadata; None: it has none, or somebody has put something else there."""
-    told = metadata.get(SERIES)
-    if not isinstance(told, Mapping):
+    """Read the place of a surface from its metadata; None if there is none, or if it is malformed."""
+    entry = metadata.get(SERIES)
+    if not isinstance(entry, Mapping):
         return None
-    name, along, index, value = (told.get(key) for key in ("name", "along", "index", "value"))
-    unit = told.get("unit", "")
+    name, along, index, value = (entry.get(key) for key in ("name", "along", "index", "value"))
+    unit = entry.get("unit", "")
     if not all(isinstance(text, str) and len(text) <= LONGEST for text in (name, along, unit)) or not name:
         return None
     if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index <= _LAST:

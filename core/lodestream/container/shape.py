@@ -1,4 +1,4 @@
-"""The part of a header that says what a surface is made of: blocks, interfaces, patches and attributes."""
+"""The part of a header that describes the shape of a surface: blocks, interfaces, patches and attributes."""
 
 from __future__ import annotations
 
@@ -37,11 +37,12 @@ Blocks = tuple[tuple[tuple[int, int], Closed], ...]
 
 
 def _bits(*flags: bool) -> int:
+    """Pack flags into an integer, the first one lowest."""
     return sum(1 << place for place, flag in enumerate(flags) if flag)
 
 
 def serialize_arrangement(out: FieldWriter, blocks: Blocks, arrangement: Arrangement) -> None:
-    """Blocks, interfaces and patches."""
+    """Serialize blocks, interfaces and patches."""
     out.varint(len(blocks))
     for shape, closed in blocks:
         out.varint(shape[0])
@@ -67,7 +68,7 @@ def serialize_arrangement(out: FieldWriter, blocks: Blocks, arrangement: Arrange
 
 
 def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
-    """Undo `serialize_arrangement`, checking that patches cover the blocks and fit their interfaces.
+    """Parse blocks, interfaces and patches; check that patches cover the blocks and fit their interfaces.
 
     Raises
     ------
@@ -94,20 +95,21 @@ def parse_arrangement(fields: FieldReader) -> tuple[Blocks, Arrangement]:
         raise CorruptStreamError(
             f"expected interfaces that are sides of patches, got {len(interfaces) - len(used)} others", start
         )
-    own: list[list[Patch]] = [[] for _ in blocks]
+    patches_of_block: list[list[Patch]] = [[] for _ in blocks]
     for patch in patches:
-        own[patch.block].append(patch)
+        patches_of_block[patch.block].append(patch)
     for number, (shape, closed) in enumerate(blocks):
-        if not covers(shape, closed, own[number]):
+        if not covers(shape, closed, patches_of_block[number]):
             raise CorruptStreamError(f"expected patches that cover block {number} once, got others", start)
     return tuple(blocks), Arrangement(tuple(patches), tuple(interfaces))
 
 
 def _count(fields: FieldReader, most: int, what: str, least: int = 1) -> int:
+    """Read a count within limits."""
     start = fields.at
     count = fields.varint()
     limits.check_count(count, most, what, start)
-    # Each takes a byte at least: nothing is made that was not sent.
+    # Every item takes at least a byte, so memory cannot exceed what was sent.
     if not least <= count <= len(fields.data):
         raise CorruptStreamError(f"expected {least} to {len(fields.data)} {what}, got {count}", start)
     return count
@@ -116,16 +118,20 @@ def _count(fields: FieldReader, most: int, what: str, least: int = 1) -> int:
 def _parse_patch(
     fields: FieldReader, blocks: list[tuple[tuple[int, int], Closed]], interfaces: list[Interface]
 ) -> Patch:
+    """Parse a patch and check it against its block and its interfaces."""
     start = fields.at
     block = fields.varint(len(blocks) - 1)
     flags, ends = fields.byte(), fields.byte()
-    shape, whole = blocks[block]
+    shape, closed_of_block = blocks[block]
     spans = [(0, shape[0]), (0, shape[1])]
     if flags & 64:
         for axis in range(2):
             first = fields.varint(shape[axis] - 1)
-            # Along an axis that wraps, a window may go on from the last sample to the first, and to that one again.
-            spans[axis] = first, first + fields.varint(shape[axis] + 1 if whole[axis] else shape[axis] - first)
+            # Along an axis that wraps, a window may continue from the last sample to the first, and up to that one.
+            spans[axis] = (
+                first,
+                first + fields.varint(shape[axis] + 1 if closed_of_block[axis] else shape[axis] - first),
+            )
     rows, columns = spans
     closed = bool(flags & 1), bool(flags & 2)
     lengths = columns[1] - columns[0], rows[1] - rows[0]
@@ -150,24 +156,24 @@ def _parse_patch(
                 f"expected an interface of {length} points at a clamped side, got {interface}", start
             )
         sides.append(side)
-    wraps = [w and n == count for w, n, count in zip(whole, lengths[::-1], shape, strict=True)]
+    wraps = [w and n == count for w, n, count in zip(closed_of_block, lengths[::-1], shape, strict=True)]
     if flags > 127 or min(lengths) < 1 or (closed[0] and not wraps[0]) or (closed[1] and not wraps[1]):
         raise CorruptStreamError(f"expected a patch of a block of {shape[0]} x {shape[1]}, got another", start)
-    top, bottom, left, right = sides
+    first_row, last_row, first_column, last_column = sides
     return Patch(
         block,
         rows,
         columns,
         closed,
         (bool(flags & 4), bool(flags & 8)),
-        (top, bottom, left, right),
+        (first_row, last_row, first_column, last_column),
         (bool(ends & 1), bool(ends & 2), bool(ends & 4), bool(ends & 8)),
         stops,
     )
 
 
 class Extras(NamedTuple):
-    """What few surfaces have, see `Header`."""
+    """Header fields that few surfaces have, see `Header`."""
 
     attributes: tuple[AttributeKind, ...] = ()
     plane: Mapping[str, Any] | None = None
@@ -177,7 +183,7 @@ class Extras(NamedTuple):
 def serialize_extras(
     attributes: tuple[AttributeKind, ...], plane: Mapping[str, Any] | None, changes: JointChanges | None
 ) -> bytes:
-    """A MessagePack map of what few surfaces have."""
+    """Serialize the optional header fields as a MessagePack map."""
     values: dict[str, Any] = {}
     if attributes:
         values["attributes"] = [[kind.name, DTYPES.index(kind.dtype), kind.components] for kind in attributes]
@@ -189,12 +195,12 @@ def serialize_extras(
 
 
 def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
-    """Undo `serialize_extras`, of a surface of so many points.
+    """Parse the optional header fields of a surface of ``points`` points.
 
     Raises
     ------
     CorruptStreamError
-        If they are no map of MessagePack, say what cannot be of such a surface, or are too long.
+        If they are no map of MessagePack, do not fit the surface, or are too long.
     """
     limits.check_count(len(data), limits.EXTRAS, "bytes of extras", offset)
     try:
@@ -212,11 +218,11 @@ def parse_extras(data: memoryview, offset: int, points: int) -> Extras:
             raise ValueError("two attributes of one name")
         changes = None
         if "joints" in values:
-            one, two = (
+            places, vertices = (
                 (check_runs(dissolved, 1, points), check_runs(joined, 2, points))
                 for dissolved, joined in values["joints"]
             )
-            changes = one, two
+            changes = places, vertices
     except (ValueError, TypeError, IndexError, AttributeError, msgpack.UnpackException) as error:
         raise CorruptStreamError(
             f"expected attributes, a plane and joints in MessagePack, got {error}", offset

@@ -1,4 +1,4 @@
-"""Slices of a container whose index is known: which segments they complete, and which states those make."""
+"""Slices of a container whose index is known: which segments they complete, and which states those give."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ class Slices:
         self._by_level = _Groups(self._levels, self._level + 1)
 
     def continue_file(self, position: int) -> None:
-        """Begin where a file was read in its order as far as a section that ends at ``position``.
+        """Begin where a file was read in order up to a section that ends at ``position``.
 
         All bytes of the surface count from there on, not only those of segments and chunks.
         """
@@ -108,7 +108,7 @@ class Slices:
                 self._count(item)
 
     def focus(self, tiles: NDArray[np.bool_] | None) -> None:
-        """Notice from now on when a layer or level is whole in these tiles too; bool, (tile,); None: in no tiles."""
+        """From now on, detect complete layers and levels in these tiles too; bool, (tile,); None: in no tiles."""
         self._near_tiles, self._near = tiles, ()
         if tiles is not None:
             missing = [
@@ -123,7 +123,7 @@ class Slices:
         self._reached = self._groups_reached()
 
     def add(self, offset: int, data: bytes) -> None:
-        """Take bytes; they continue the run of them that ends where they begin, if one does."""
+        """Add bytes; they are appended to the run of bytes that ends where they begin, if there is one."""
         if self._run_start + len(self._run) != offset:
             if self._run:
                 self._runs[self._run_start + len(self._run)] = self._run_start, self._run
@@ -133,7 +133,7 @@ class Slices:
             self._bytes += max(min(offset + len(data), self._index.surface_end) - offset, 0)
 
     def items(self) -> Iterator[tuple[Segment | Chunk, bytes]]:
-        """Segments and chunks that are whole now, in the order of the file."""
+        """Yield segments and chunks that are complete now, in the order of the file."""
         end = self._run_start + len(self._run)
         first = bisect_left(self._starts, self._run_start)
         last = bisect_right(self._starts, end)
@@ -146,11 +146,11 @@ class Slices:
         self._drop(end)
 
     def number(self, chunk: Chunk) -> int:
-        """The number of a chunk of residual."""
+        """Return the number of a chunk of residual."""
         return self._numbers[chunk.range.offset]
 
     def _drop(self, end: int) -> None:
-        """Forget bytes that belong to whole items only."""
+        """Delete bytes of complete items."""
         keep = end
         place = self._metadata
         if not self._has_metadata:
@@ -165,7 +165,7 @@ class Slices:
         self._run_start = keep
 
     def metadata(self) -> Frame | None:
-        """The metadata, once, when they are whole."""
+        """Return the metadata section once, when it is complete."""
         place = self._metadata
         start = place.offset - self._run_start
         if self._has_metadata or start < 0 or place.end > self._run_start + len(self._run):
@@ -174,13 +174,14 @@ class Slices:
         return whole_section(bytes(self._run[start : start + place.length]), place.offset, sections.METADATA)
 
     def hold(self, segment: Segment) -> State | None:
-        """Note a segment; the state that it completes, if there is one."""
+        """Record a segment; return the state that it completes, if there is one."""
         if not self._in_file:
             self._bytes += segment.range.length
         self._count(segment)
         return self.state()
 
     def _count(self, segment: Segment) -> None:
+        """Count a segment in its layer, its level, and the focus."""
         level = self._level_of[segment.tile]
         self._received += 1
         self._finest = max(self._finest, level)
@@ -191,7 +192,7 @@ class Slices:
                 groups.hold(number)
 
     def state(self) -> State | None:
-        """The state that is complete now, if it is one; the first ones may need no segment at all."""
+        """Return the state that is complete now, if there is one; the first ones may need no segment at all."""
         risen = self._risen()
         layer, level = (groups.whole(self._received) for groups in (self._by_layer, self._by_level))
         ended = level == self._level < self._index.header.levels
@@ -207,36 +208,37 @@ class Slices:
         if level is not None and level < self._index.header.levels and not self._in_file:
             known = self._index.levels[level].errors
             return State(level, level, self._bytes, *known[:2], False, False, level, channels=known.channels)
-        # Out of order, what is whole stands beside parts of what comes later.
+        # Out of order, complete layers are mixed with parts of later ones.
         if not risen:
             return None
         whole_near = bool(self._near) and self._near[0].reached == len(self._index.layers) - 1
         return State(max(risen), self._finest, self._bytes, math.nan, math.nan, False, False, whole_near=whole_near)
 
     def _risen(self) -> list[int]:
-        """What has become whole since this was asked last; nothing while all comes in order."""
+        """Return the groups completed since the last call; none while everything arrives in order."""
         if self._reached is None:
             return []
         before, self._reached = self._reached, self._groups_reached()
         return [now for was, now in zip(before, self._reached, strict=True) if now > was]
 
     def _groups_reached(self) -> list[int]:
-        """How far layers are whole everywhere and in the focus; and levels, where these are what comes in turn."""
+        """Return the last complete layer (and level, if not in file order), everywhere and in the focus."""
         kinds = 1 if self._in_file else 2
         return [groups.reached for pair in ((self._by_layer, self._by_level), self._near) for groups in pair[:kinds]]
 
     def _end(self, number: int) -> State:
+        """Return the final state."""
         last = self._index.levels[-1]
         size = self._index.surface_end if self._in_file else self._bytes
         return State(number, last.level, size, last.rms, last.max_error, True, True, channels=last.channels)
 
     def hold_chunk(self, chunk: Chunk) -> State | None:
-        """Note a chunk of residual; the complete state, if everything is there.
+        """Record a chunk of residual; return the complete state, if everything has arrived.
 
         Raises
         ------
         CorruptStreamError
-            If a segment is still missing: the residual is of the whole lattice.
+            If a segment is still missing: the residual refers to the complete lattice.
         """
         if self._received != self._segments:
             raise CorruptStreamError("expected all segments before residual, got fewer", chunk.range.offset)
@@ -252,7 +254,7 @@ class Slices:
 
 
 def _running_levels(layers: Collection[int], levels: Collection[int], count: int) -> list[int]:
-    """The finest level with a segment in each layer or before it."""
+    """Return the finest level with a segment in each layer or before it."""
     finest = [0] * count
     for layer, level in zip(layers, levels, strict=True):
         finest[layer] = max(finest[layer], level)
@@ -262,7 +264,7 @@ def _running_levels(layers: Collection[int], levels: Collection[int], count: int
 
 
 class _Groups:
-    """Segments by layer, or by level: when are the first groups whole, and nothing else received?"""
+    """Counts segments by layer, or by level: which first groups are complete, and whether nothing else was received."""
 
     def __init__(self, groups: list[int], count: int) -> None:
         self._missing = [0] * count
@@ -274,10 +276,12 @@ class _Groups:
         self._pass()
 
     def _pass(self) -> None:
+        """Advance over complete groups."""
         while self._next < len(self._missing) and self._missing[self._next] == 0:
             self._next += 1
 
     def hold(self, group: int) -> None:
+        """Count a segment of a group."""
         self._missing[group] -= 1
         self._pass()
 
@@ -287,6 +291,6 @@ class _Groups:
         return self._next - 1
 
     def whole(self, received: int) -> int | None:
-        """The last of the groups that are whole, if these are all that is received."""
+        """Return the last complete group, if the groups up to it are all that was received."""
         last = self._next - 1
         return last if last >= 0 and self._ends[last] == received else None

@@ -1,4 +1,4 @@
-"""Coded layers into a container: section after section, as they come."""
+"""Writing coded layers into a container, section by section."""
 
 from __future__ import annotations
 
@@ -71,8 +71,10 @@ class ContainerWriter:
         where = self._section(sections.LAYER, table, (s.data for s in layer.segments), sum(e.length for e in entries))
         place = where.offset + where.length - 4 - sum(e.length for e in entries)
         for s in layer.segments:
-            own = ByteRange(place, len(s.data))
-            self._segments.append(Segment(number, s.tile, s.channel, s.top, s.passes, own, sections.check_of(s.data)))
+            extent = ByteRange(place, len(s.data))
+            self._segments.append(
+                Segment(number, s.tile, s.channel, s.top, s.passes, extent, sections.check_of(s.data))
+            )
             place += len(s.data)
             self._finest = max(self._finest, header.layout.level_of(s.tile))
         end = where.offset + where.length
@@ -134,6 +136,7 @@ class ContainerWriter:
         return ByteRange(start, self._place - start)
 
     def _write(self, data: bytes | bytearray | memoryview) -> None:
+        """Write bytes and count them."""
         self._out.write(data)
         self._place += len(data)
 
