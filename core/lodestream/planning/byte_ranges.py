@@ -1,4 +1,4 @@
-"""Sets of byte ranges of a file: which bytes of a container are cached, and which are missing."""
+"""Sets of byte ranges of a file: the bytes of a container that are cached, and those that are missing."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ class RangeSet:
         self._ends[first:last] = [end]
 
     def run(self, offset: int) -> int:
-        """Number of bytes from `offset` on that are in the set without a gap."""
+        """Return the number of consecutive bytes from `offset` on that are in the set."""
         number = bisect_right(self._starts, offset) - 1
         return max(self._ends[number] - offset, 0) if number >= 0 else 0
 
     def missing(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """The parts of a range that are not in the set, as (offset, length) in order."""
+        """Return the parts of a range that are not in the set, as (offset, length) in order."""
         position, end = offset, offset + length
         number = bisect_right(self._ends, position)
         while position < end:
@@ -62,7 +62,7 @@ class RangeSet:
             number += 1
 
     def overlap(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """The parts of a range that are in the set, as (offset, length) in order."""
+        """Return the parts of a range that are in the set, as (offset, length) in order."""
         position = offset
         for start, size in self.missing(offset, length):
             if position < start:
@@ -72,7 +72,7 @@ class RangeSet:
             yield position, offset + length - position
 
     def covers(self, offset: int, length: int) -> bool:
-        """Whether a whole range is in the set."""
+        """Return whether a whole range is in the set."""
         return self.run(offset) >= length
 
     @property
@@ -86,10 +86,10 @@ class RangeSet:
         return self._ends[-1] if self._ends else 0
 
     def copy(self) -> RangeSet:
-        """A copy that can change independently."""
-        made = RangeSet()
-        made._starts, made._ends = self._starts[:], self._ends[:]
-        return made
+        """Return a copy that can change independently."""
+        duplicate = RangeSet()
+        duplicate._starts, duplicate._ends = self._starts[:], self._ends[:]
+        return duplicate
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         return ((start, end - start) for start, end in zip(self._starts, self._ends, strict=True))

@@ -1,4 +1,4 @@
-"""What a plan costs: how many things it walks, told from the index and the target before it is made."""
+"""Cost of a plan: the steps that making it takes, bounded from index and target before it is made."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AT_ONCE = 64
 
 
 def plan_cost(index: Index, target: Target, ranges: int, *, bounded: bool = False) -> int:
-    """Steps that `planner.plan` takes at most; each takes about a microsecond.
+    """Return the steps that `planner.plan` takes at most; each takes about a microsecond.
 
     It counts layers and levels, and for each of them the channels whose errors are compared and the cells whose bounds
     are added up; and what is walked once: segments, tiles, chunks of the residual, attributes, names, ranges.
@@ -74,7 +74,7 @@ def check_cost(steps: int) -> None:
 
 
 def _compared(target: Target, header: Header) -> int:
-    """Channels whose errors are compared with limits, counted once for each limit."""
+    """Return the number of channels whose errors are compared with limits, counted once for each limit."""
     channels = Counter(header.channel_names)
     for kind in header.attributes:
         if kind.components:

@@ -1,4 +1,4 @@
-"""Errors at which a stream stops, of one surface: what a target names, as numbers and channels."""
+"""Error limits at which a stream of a surface stops: those that a target names, as numbers and channels."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ class NamedLimit(NamedTuple):
     most: float
 
     def error(self, errors: Sequence[tuple[float, float]]) -> float:
-        """What the error is at most where these are RMS and maximum of each channel; NaN where they are not known."""
+        """Return a bound of the error, given RMS and maximum of each channel; NaN where they are unknown."""
         if max(self.channels) >= len(errors):
             return math.nan
-        found = [errors[channel][self.which == "max"] for channel in self.channels]
-        largest = max(found)
-        if len(found) == 1 or not 0 < largest < math.inf:
+        channel_errors = [errors[channel][self.which == "max"] for channel in self.channels]
+        largest = max(channel_errors)
+        if len(channel_errors) == 1 or not 0 < largest < math.inf:
             return largest
-        total = 0.0  # in this order, since clients in other languages have to stop at the same layer
-        for error in found:
+        total = 0.0  # in this order, so that clients in other languages stop at the same layer
+        for error in channel_errors:
             total += (error / largest) * (error / largest)
         return largest * math.sqrt(total)
 
@@ -58,7 +58,7 @@ class ErrorLimits:
 
     @classmethod
     def of(cls, target: Target, header: Header) -> ErrorLimits:
-        """The limits of a target, for a surface with this header.
+        """Return the limits of a target, for a surface with this header.
 
         Raises
         ------
@@ -77,40 +77,40 @@ class ErrorLimits:
         return cls(rms, worst, tuple(channels))
 
     def met(self, rms: float, max_error: float, channels: Sequence[tuple[float, float]]) -> Met | None:
-        """The first limit that a state with these errors meets; errors that are not known are NaN, or no channels."""
+        """Return the first limit that a state with these errors meets; unknown errors are NaN, or no channels."""
         if self.rms is not None and rms <= self.rms:
             return "rms"
         if self.max_error is not None and max_error <= self.max_error:
             return "max"
-        # A surface of one channel tells its errors once.
-        own = channels or ((rms, max_error),)
-        if self.channels and all(limit.error(own) <= limit.most for limit in self.channels):
+        # A surface of one channel has no separate errors of channels.
+        by_channel = channels or ((rms, max_error),)
+        if self.channels and all(limit.error(by_channel) <= limit.most for limit in self.channels):
             return "channels"
         return None
 
     def unmet(
         self, rms: float, max_error: float, channels: Sequence[tuple[float, float]]
     ) -> Iterator[tuple[Literal["rms", "max"], str | None, float]]:
-        """Which error, of what (None: the whole surface), and how large it is, of each that is above its limit."""
+        """Yield every error above its limit: which one, its name (None: the whole surface), and its value."""
         if self.rms is not None and rms > self.rms:
             yield "rms", None, rms
         if self.max_error is not None and max_error > self.max_error:
             yield "max", None, max_error
-        own = channels or ((rms, max_error),)
+        by_channel = channels or ((rms, max_error),)
         for limit in self.channels:
-            if limit.error(own) > limit.most:
-                yield limit.which, limit.name, limit.error(own)
+            if limit.error(by_channel) > limit.most:
+                yield limit.which, limit.name, limit.error(by_channel)
 
 
 def _missing(name: str, header: Header) -> str:
-    """A name that is not wanted or not there, with the reason if it is there."""
+    """Quote a name that is not selected or does not exist, with the reason if it exists."""
     kinds = {kind.name for kind in header.attributes}
     there = name in kinds or name in header.channel_names
     return f"{name[:80]!r}" + (", which is left out: it is not among the attributes asked for" if there else "")
 
 
 def _named(target: Target, header: Header) -> dict[str, list[tuple[int, ...]]]:
-    """The channels that each name stands for; a name that several have stands for each of them."""
+    """Return the groups of channels of each name; a name that several groups have applies to each of them."""
     wanted = selection_of(target).channels(header)
     groups: list[tuple[str, tuple[int, ...]]] = [(name, (number,)) for number, name in enumerate(header.channel_names)]
     first = header.point_channels
@@ -118,8 +118,8 @@ def _named(target: Target, header: Header) -> dict[str, list[tuple[int, ...]]]:
         if kind.components:
             groups.append((kind.name, tuple(range(first, first + kind.channels))))
         first += kind.channels
-    found: dict[str, list[tuple[int, ...]]] = {}
+    by_name: dict[str, list[tuple[int, ...]]] = {}
     for name, group in groups:
         if wanted[list(group)].all():
-            found.setdefault(name, []).append(group)
-    return found
+            by_name.setdefault(name, []).append(group)
+    return by_name

@@ -1,4 +1,4 @@
-"""What to send of a container, and in which order: one pure function for server and client.
+"""Planning what is sent of a container, and in which order: one pure function for server and client.
 
 Only slices of the file are ever sent. So WebSocket streams, HTTP Range, resuming and caching share this module.
 """
@@ -31,7 +31,7 @@ def plan(
     windows: WindowErrors | None = None,
     bounded: bool = True,
 ) -> Plan:
-    """The slices that a receiver with this target gets, if it has cached these bytes of the container.
+    """Plan the slices for a receiver with this target that has cached these bytes of the container.
 
     Of a window, errors before its end are bounds, see `window_errors.WindowFigures`; limits are met where these are.
 
@@ -59,6 +59,7 @@ def plan(
 
 
 def _whole(index: Index, target: Target, windows: WindowErrors | None, bounded: bool) -> Plan:
+    """Plan a stream of the whole surface."""
     if target.region is not None or target.attributes is not None:
         return _selected(index, target, windows, bounded)
     if target.level is not None:
@@ -75,7 +76,7 @@ def _whole(index: Index, target: Target, windows: WindowErrors | None, bounded: 
 
 
 def _prefix(index: Index, target: Target) -> Plan:
-    """Quality order: the file's own."""
+    """Plan in quality order, which is the order of the file."""
     marks = [Mark(r.end, r.number, r.level, r.end, *r.errors) for r in index.layers]
     if index.residual:
         marks.append(_exact(index, len(marks), index.surface_end))
@@ -84,12 +85,13 @@ def _prefix(index: Index, target: Target) -> Plan:
 
 
 def _exact(index: Index, number: int, size: int) -> Mark:
+    """Return the final mark of an exact stream."""
     last = index.levels[-1]
     return Mark(size, number, last.level, size, *last.errors)
 
 
 def _until(marks: list[Mark], target: Target, header: Header) -> tuple[list[Mark], Reason]:
-    """The marks up to the first limit met."""
+    """Return the marks up to the first one that meets a limit."""
     limits = ErrorLimits.of(target, header)
     kept: list[Mark] = []
     for mark in marks:
@@ -108,7 +110,7 @@ def _until(marks: list[Mark], target: Target, header: Header) -> tuple[list[Mark
 
 
 def _slices_of_layers(index: Index, level: int) -> Plan:
-    """Quality order of the levels up to one: of each layer the segments that belong to them, which stand together."""
+    """Return the slices of levels up to one in quality order: each layer's segments of these levels are contiguous."""
     levels = index.header.layout.tile_levels.data
     ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
@@ -128,7 +130,7 @@ def _slices_of_layers(index: Index, level: int) -> Plan:
 
 
 def _by_level(index: Index, target: Target, level: int) -> Plan:
-    """Level order: level by level, the segments of all layers; the complete surface also has its residual."""
+    """Plan in level order: level by level the segments of all layers; the complete surface also has its residual."""
     levels = index.header.layout.tile_levels.data
     ranges, size = [ByteRange(0, index.header.length)], index.header.length
     marks: list[Mark] = []
@@ -150,7 +152,7 @@ def _by_level(index: Index, target: Target, level: int) -> Plan:
 
 
 def _selected(index: Index, target: Target, windows: WindowErrors | None, bounded: bool) -> Plan:
-    """A window, or some attributes only: segments in file order or level by level, then chunks of residual."""
+    """Plan a window, or some attributes: segments in file order or level by level, then chunks of residual."""
     chosen = select(index, selection_of(target))
     windows = windows if wants_window_errors(target, index.header) else None
     levels, within = index.header.layout.tile_levels.data, _figures(index, target.region, windows, bounded)
@@ -165,15 +167,15 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
     for number, segment in enumerate(segments):
         _append(ranges, segment.range)
         size += segment.range.length
-        own = levels[segment.tile]
-        level = max(level, own)
+        segment_level = levels[segment.tile]
+        level = max(level, segment_level)
         after = segments[number + 1] if number + 1 < len(segments) else None
         if target.order == "level":
-            if after is None or levels[after.tile] > own:
-                state = index.levels[own]
-                marks.append(Mark(size, own, own, size, *within(state.errors)))
+            if after is None or levels[after.tile] > segment_level:
+                state = index.levels[segment_level]
+                marks.append(Mark(size, segment_level, segment_level, size, *within(state.errors)))
         elif after is None or after.layer > segment.layer:
-            # Layers of which nothing is wanted are there as well.
+            # Layers without a selected segment are complete as well.
             record = index.layers[-1 if after is None else after.layer - 1]
             if record.level <= finest:
                 marks.append(Mark(size, record.number, level, size, *within(record.errors, record.number)))
@@ -199,7 +201,7 @@ def _selected(index: Index, target: Target, windows: WindowErrors | None, bounde
 
 
 def _figures(index: Index, region: Region | None, windows: WindowErrors | None, bounded: bool) -> Callable[..., Errors]:
-    """What a receiver knows of the errors of its selection, from those of the whole surface (and the layer)."""
+    """Return a function from errors of the whole surface (and the layer) to those known of the selection."""
     if region is None:
         return lambda errors, layer=None: errors
     if not bounded:
@@ -209,10 +211,12 @@ def _figures(index: Index, region: Region | None, windows: WindowErrors | None, 
 
 
 def _level_end(index: Index, level: int) -> Reason:
+    """Return the reason for the end of a stream at a level."""
     return "complete" if level == index.header.levels else "level"
 
 
 def _append(ranges: list[ByteRange], place: ByteRange) -> None:
+    """Append a range, merging it with the last one if they are adjacent."""
     if ranges and ranges[-1].end == place.offset:
         ranges[-1] = ByteRange(ranges[-1].offset, ranges[-1].length + place.length)
     else:
@@ -220,24 +224,25 @@ def _append(ranges: list[ByteRange], place: ByteRange) -> None:
 
 
 def _cut(ranges: list[ByteRange], length: int) -> tuple[ByteRange, ...]:
+    """Cut ranges after ``length`` bytes."""
     kept = []
     for place in ranges:
-        taken = min(place.length, length)
-        if taken:
-            kept.append(ByteRange(place.offset, taken))
-        length -= taken
+        kept_length = min(place.length, length)
+        if kept_length:
+            kept.append(ByteRange(place.offset, kept_length))
+        length -= kept_length
     return tuple(kept)
 
 
 def _less(chosen: Plan, cached: RangeSet) -> Plan:
-    """The plan without what is cached; each mark stands where the last missing byte before it does."""
+    """Return the plan without cached bytes; each mark follows the last missing byte before it."""
     missing = [(place, _missing(place, cached)) for place in chosen.ranges]
     marks: list[Mark] = []
     todo = iter(chosen.marks)
     mark = next(todo, None)
     planned = sent = 0
     for place, gaps in missing:
-        # Marks and gaps both go forward: each gap is looked at once, however many marks there are.
+        # Marks and gaps both ascend: each gap is visited once, however many marks there are.
         passed = 0
         while mark is not None and mark.sent <= planned + place.length:
             end = place.offset + mark.sent - planned
@@ -245,7 +250,7 @@ def _less(chosen: Plan, cached: RangeSet) -> Plan:
                 sent += gaps[passed].length
                 passed += 1
             begun = max(end - gaps[passed].offset, 0) if passed < len(gaps) else 0
-            # A mark inside a gap stands that far into it; one behind what is cached, where the gap before it ends.
+            # A mark inside a gap is that far into it; a mark in cached bytes is at the end of the gap before it.
             marks.append(replace(mark, sent=sent + begun))
             mark = next(todo, None)
         planned += place.length
@@ -254,11 +259,12 @@ def _less(chosen: Plan, cached: RangeSet) -> Plan:
         tuple(gap for place in part for gap in _missing(place, cached)) for part in (chosen.before, chosen.after)
     )
     ranges = tuple(gap for _, gaps in missing for gap in gaps)
-    # What is cached beyond a state that has no figures of its own counts too.
+    # For a state without errors, cached bytes beyond it count too.
     ahead = chosen.bytes - sent
     marks = [replace(mark, bytes=ahead + mark.sent) if math.isnan(mark.rms) else mark for mark in marks]
     return replace(chosen, before=before, ranges=ranges, after=after, marks=tuple(marks))
 
 
 def _missing(place: ByteRange, cached: RangeSet) -> list[ByteRange]:
+    """Return the parts of a range that are not cached."""
     return [ByteRange(*gap) for gap in cached.missing(place.offset, place.length)]

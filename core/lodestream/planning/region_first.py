@@ -1,4 +1,4 @@
-"""Reordering a plan: what a region needs comes first, the rest after it."""
+"""Reordering of a plan so that the data of a region come first."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class _Step(NamedTuple):
 
 
 def _between(chosen: Plan) -> Iterator[tuple[Mark, list[ByteRange]]]:
-    """Each mark with the slices between the one before and itself."""
+    """Yield each mark with the slices between the previous mark and itself."""
     todo = list(reversed(chosen.ranges))
     sent = 0
     for mark in chosen.marks:
@@ -92,7 +92,7 @@ def _between(chosen: Plan) -> Iterator[tuple[Mark, list[ByteRange]]]:
 
 
 def _marks(steps: list[_Step]) -> Iterator[Mark]:
-    """The marks, counted in bytes of the surface in their new order."""
+    """Yield the marks, counted in bytes of the surface in their new order."""
     unknown = float("nan")
     end = steps[-1]
     for in_region in (True, False):

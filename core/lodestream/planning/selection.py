@@ -1,4 +1,4 @@
-"""Which segments and chunks of a container are needed for a window or for some attributes."""
+"""Selections: the segments and chunks of a container that a window or some attributes need."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Selection:
         return window
 
     def check_surface(self, header: Header) -> Region | None:
-        """As `check`, and refuse a region that has one point of the level only, which is no surface.
+        """Do what `check` does, and refuse a region with a single point of the level, which is no surface.
 
         Raises
         ------
@@ -100,14 +100,14 @@ class Selection:
         return window
 
     def channels(self, header: Header) -> NDArray[np.bool_]:
-        """Which channels are wanted: bool, shape (channel,)."""
+        """Return which channels are selected: bool, shape (channel,)."""
         chosen, names = [True] * header.point_channels, frozenset(self.attributes or ())
         for kind in header.attributes:
             chosen += [self.attributes is None or kind.name in names] * kind.channels
         return np.array(chosen)
 
     def finest(self, header: Header) -> int:
-        """The finest level that is wanted."""
+        """Return the finest level that is selected."""
         return header.levels if self.level is None else self.level
 
     def check_size(self, header: Header, capacity: Capacity) -> None:
@@ -131,7 +131,7 @@ class Selection:
         capacity.promise(vertices, ((shape, sizes) for shape in shapes), masked=masked, tables=header.tables)
 
     def tiles(self, header: Header, window: Region | None = None) -> NDArray[np.bool_]:
-        """Which tiles are wanted: bool, shape (tile,).
+        """Return which tiles are selected: bool, shape (tile,).
 
         ``window`` is what `check` has returned; None: it is found again.
         """
@@ -147,7 +147,7 @@ class Selection:
 
 
 def region_at(header: Header, region: Region, level: int) -> Region:
-    """The rows and columns of a level of the only block that stand in a region, half-open.
+    """Return the rows and columns, half-open, of a level of the only block that lie in a region.
 
     Along a closed axis they may go on across the seam, as those of the region.
 
@@ -170,7 +170,7 @@ def region_at(header: Header, region: Region, level: int) -> Region:
 
 
 def restored(header: Header, region: Region, level: int) -> Region:
-    """Rows and columns of a level that have to be decoded for a region of the only block.
+    """Return the rows and columns of a level that have to be decoded for a region of the only block.
 
     At full resolution a chunk of the residual restores all of its own window.
     """
@@ -180,7 +180,7 @@ def restored(header: Header, region: Region, level: int) -> Region:
 
 
 def selection_of(target: Target) -> Selection:
-    """The selection in a target."""
+    """Return the selection in a target."""
     return Selection(target.region, target.attributes, target.level)
 
 
@@ -197,7 +197,7 @@ class SelectedSlices:
 
 
 def select(index: Index, selection: Selection) -> SelectedSlices:
-    """What of a container a selection takes.
+    """Select segments and chunks of a container.
 
     Raises
     ------

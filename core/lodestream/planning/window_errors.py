@@ -1,4 +1,4 @@
-"""Errors of windows: for each cell of a surface and each layer a bound of its errors, in an optional section.
+"""Errors of windows: a bound for each cell of a surface and each layer, in an optional section.
 
 A reader that needs a window can tell from them how many layers are enough for it, before it has any of them.
 """
@@ -48,7 +48,7 @@ _LARGEST = 4.0  # times the extent: code 0
 MOST_SHARE = 8
 _NOTHING = 255
 # Rounding of sums, quotients and roots is far below the steps of the codes; a bound stays one all the same.
-_UPWARDS = 1 + 2.0**-40
+_ROUND_UP_FACTOR = 1 + 2.0**-40
 _FRACTIONS = np.array([_LARGEST * _STEPS[k % 8] * 2.0 ** (-16 - k // 8) for k in range(_NOTHING)] + [0.0])
 
 Floats = NDArray[np.float64]
@@ -72,7 +72,7 @@ class WindowErrors:
     codes: NDArray[np.uint8]
 
     def bounds(self, region: Region, layer: int) -> tuple[float, float]:
-        """What RMS and maximum error of a window of the only block do not exceed after a layer.
+        """Return bounds of RMS and maximum error of a window of the only block after a layer.
 
         Parameters
         ----------
@@ -97,16 +97,16 @@ class WindowErrors:
             inside = int(np.count_nonzero(taken(mask, region, self.header.shape)))
         if not inside:
             return 0.0, 0.0
-        # A cell that the window only touches counts whole: all that its errors come from may lie inside.
+        # A cell that the window only touches counts as a whole, because all its errors may lie inside.
         squares = float((counts * fractions[..., 0] ** 2).sum())
-        rms = math.sqrt(squares / inside) * _UPWARDS
+        rms = math.sqrt(squares / inside) * _ROUND_UP_FACTOR
         worst = float(fractions[..., 1].max())
         return min(rms, worst) * self.header.extent, worst * self.header.extent
 
     def cells(
         self, region: Region, layer: int, mask: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.int64], Floats]:
-        """The cells that a window of the only block touches, after a layer.
+        """Return the cells that a window of the only block touches, after a layer.
 
         Returns
         -------
@@ -157,10 +157,10 @@ class WindowFigures:
         self.whole = is_whole(region, header.shape)
         # Points of a surface that touches itself are not all vertices: how many a window has is not counted.
         self._least = 0 if header.arrangement is not None else max(inside - holes, 0)
-        self._root = math.sqrt((points - holes) / self._least) * _UPWARDS if self._least else math.inf
+        self._root = math.sqrt((points - holes) / self._least) * _ROUND_UP_FACTOR if self._least else math.inf
 
     def within(self, rms: float, max_error: float, layer: int | None = None) -> tuple[float, float]:
-        """Bounds of the window's RMS and maximum error from those of the whole surface.
+        """Return bounds of the window's RMS and maximum error from those of the whole surface.
 
         Parameters
         ----------
@@ -177,12 +177,12 @@ class WindowFigures:
             max_error = min(max_error, float(fractions[..., 1].max()) * self._extent)
             if self._least:
                 squares = float(np.add.accumulate((counts * fractions[..., 0] ** 2).ravel())[-1])
-                rms = min(rms, math.sqrt(squares / self._least) * _UPWARDS * self._extent)
+                rms = min(rms, math.sqrt(squares / self._least) * _ROUND_UP_FACTOR * self._extent)
         return min(rms, max_error), max_error
 
 
 def _cell_counts(shape: tuple[int, int], cell: tuple[int, int], mask: NDArray[np.bool_] | None) -> NDArray[np.int64]:
-    """How many valid points each cell of a block has, shape (row of cells, column of cells)."""
+    """Count the valid points in each cell of a block, int64, shape (row of cells, column of cells)."""
     edges = [np.arange(0, length, 1 << exponent) for length, exponent in zip(shape, cell, strict=True)]
     if mask is None:
         rows, columns = (np.diff(starts, append=length) for starts, length in zip(edges, shape, strict=True))
@@ -193,7 +193,7 @@ def _cell_counts(shape: tuple[int, int], cell: tuple[int, int], mask: NDArray[np
 
 
 def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:
-    """The codes of the cells of the only block after a layer, or after several at once.
+    """Return the codes of the cells of the only block after a layer, or after several at once.
 
     Parameters
     ----------
@@ -208,10 +208,11 @@ def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:
     together = (1 << CELL[0]) // PART_ROWS, (1 << CELL[1]) // PART_COLUMNS
     places = [np.arange(0, count, size) for count, size in zip(figures.shape[-3:-1], together, strict=True)]
 
-    def gathered(combine: np.ufunc, own: Floats) -> Floats:
-        down: Floats = combine.reduceat(own, places[0], axis=-2)
+    def gathered(combine: np.ufunc, part_figures: Floats) -> Floats:
+        """Reduce figures of the measurement's cells to those of the section's cells."""
+        down: Floats = combine.reduceat(part_figures, places[0], axis=-2)
         cells: Floats = combine.reduceat(down, places[1], axis=-1)
-        return cells.reshape(*own.shape[:-2], -1)
+        return cells.reshape(*part_figures.shape[:-2], -1)
 
     counts = _cell_counts(header.shape, CELL, header.masks[0]).ravel()
     rms = np.sqrt(gathered(np.add, figures[..., 0]) / np.maximum(counts, 1))
@@ -225,18 +226,18 @@ def layer_codes(figures: Floats, header: Header) -> NDArray[np.uint8] | None:
 
 
 def is_divided(header: Header) -> bool:
-    """Whether the only block has more than one cell."""
+    """Return whether the only block has more than one cell."""
     return any(length > 1 << exponent for length, exponent in zip(header.shape, CELL, strict=True))
 
 
 def no_errors(header: Header) -> NDArray[np.uint8]:
-    """As `layer_codes` of a layer without errors: shape (cell, 2)."""
+    """Return the codes of a layer without errors, as `layer_codes` does: shape (cell, 2)."""
     count = _cell_counts(header.shape, CELL, None).size
     return np.full((count, 2), _NOTHING, np.uint8)
 
 
 def serialize_window_errors(layers: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Payload of the section from the codes of each layer, shape (cell, 2), see `layer_codes`."""
+    """Serialize the section from the codes of each layer, shape (cell, 2), see `layer_codes`."""
     out = FieldWriter()
     out.byte(CELL[0] | CELL[1] << 4)
     for row in np.stack(layers, axis=1):
@@ -246,7 +247,7 @@ def serialize_window_errors(layers: Sequence[NDArray[np.uint8]]) -> bytes:
 
 
 def parse_window_errors(payload: memoryview, offset: int, header: Header) -> WindowErrors:
-    """Undo `serialize_window_errors`, of a section whose payload stands at ``offset``.
+    """Parse a section of `serialize_window_errors` whose payload is at ``offset``.
 
     Raises
     ------
@@ -268,22 +269,22 @@ def parse_window_errors(payload: memoryview, offset: int, header: Header) -> Win
 
 
 def _checks(rows: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """`check_of` each row, shape (row, byte): uint16, shape (row,).
+    """Compute `check_of` of each row, uint8, shape (row, byte): uint16, shape (row,).
 
-    Cells may be as small as points, and a call for each of millions would hold up all other threads.
+    Cells may be as small as points, and millions of calls would block all other threads.
     """
     if len(rows) <= rows.shape[1]:
         return np.array([check_of(row.tobytes()) for row in rows], np.uint16)
     table = _crc_table()
-    found = np.full(len(rows), 0xFFFFFFFF, np.uint32)
+    crc = np.full(len(rows), 0xFFFFFFFF, np.uint32)
     for column in rows.T:
-        found = table[(found ^ column) & 0xFF] ^ (found >> 8)
-    return (~found & 0xFFFF).astype(np.uint16)
+        crc = table[(crc ^ column) & 0xFF] ^ (crc >> 8)
+    return (~crc & 0xFFFF).astype(np.uint16)
 
 
 @lru_cache(maxsize=1)
 def _crc_table() -> NDArray[np.uint32]:
-    """What CRC-32 makes of each byte, uint32, shape (byte,)."""
+    """Return the CRC-32 step of each byte, uint32, shape (byte,)."""
     table = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         table = np.where(table & 1, np.uint32(0xEDB88320), np.uint32(0)) ^ (table >> 1)
@@ -291,7 +292,7 @@ def _crc_table() -> NDArray[np.uint32]:
 
 
 def wants_window_errors(target: Target, header: Header) -> bool:
-    """Whether a target needs the bounds of the errors of windows: that of a window at full resolution.
+    """Return whether a target needs bounds of the errors of windows: a window at full resolution does.
 
     That of a coarser level has no limits that they could meet sooner, and often takes fewer bytes than they do.
     """
@@ -299,13 +300,13 @@ def wants_window_errors(target: Target, header: Header) -> bool:
 
 
 def window_section(index: Index) -> ByteRange | None:
-    """Where a container tells errors of windows; None where it does not, or at a length that is not worth it."""
+    """Return the place of the section of errors of windows; None where there is none, or where it is too long."""
     place = next((optional.range for optional in index.optional if optional.kind == KIND), None)
     return place if place is not None and place.length <= index.size // MOST_SHARE else None
 
 
 def read_window_errors(index: Index, read: Callable[[int, int], bytes]) -> WindowErrors | None:
-    """The errors of windows of a container; None: it does not tell them, see `window_section`.
+    """Read the errors of windows of a container; None where there are none, see `window_section`.
 
     Parameters
     ----------
