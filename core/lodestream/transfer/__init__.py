@@ -1,1 +1,1 @@
-"""Both ends of one transmission, without I/O: the sender, downloads, and what has been received."""
+"""Both ends of a transmission, without I/O: the sender, downloads, and received data."""

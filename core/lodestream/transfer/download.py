@@ -144,7 +144,7 @@ class Download:
         return []
 
     def data_to_send(self) -> list[bytes]:
-        """The messages to send now, in order; each is returned once."""
+        """Return the messages to send now, in order; each is returned once."""
         messages, self._outbox = self._outbox, []
         return messages
 
@@ -212,11 +212,11 @@ class Download:
             self._opened = now
         if self.reception.stopped_for is not None or self.ended is not None:
             return None
-        left = self.reception.tick(now)
-        if left == 0:
+        remaining = self.reception.tick(now)
+        if remaining == 0:
             self.stop("seconds")
             return None
-        return left
+        return remaining
 
     def connection_lost(self, code: int | None = None, reason: str = "") -> None:
         """Declare that the connection is closed; does nothing if the stream has ended.
@@ -248,12 +248,14 @@ class Download:
         )
 
     def _open(self, cached: tuple[tuple[int, int], ...] = (), container: str | None = None) -> bytes:
+        """Queue the opening message."""
         self.window.grant(self.window.size)  # untimed: the answer to `Open` measures the first round trip
         target = self.reception.target
         asks = None if target.region is None else True
         return self._connection.send(Open(target, self.window.size, cached, container, window_errors=asks))
 
     def _begin(self, event: Opened, now: float | None) -> list[DownloadEvent]:
+        """Process the start of a transmission."""
         self.answer = event
         if now is not None and self._opened is not None:
             self.window.heard(now - self._opened)
@@ -266,6 +268,7 @@ class Download:
         return [*self._until_met(self.reception.expect(event.planned, *places, prefix=event.prefix))]
 
     def _take(self, event: Segments, now: float | None) -> list[DownloadEvent]:
+        """Process a slice and yield its views."""
         stopped = self._connection.state is State.STOPPING
         shown = not stopped or self._turning
         views = self.reception.take(event.offset, event.data)
@@ -274,7 +277,7 @@ class Download:
         return [*self._until_met(views)] if shown else []
 
     def _until_met(self, views: list[View]) -> list[View]:
-        """The views up to the first that meets errors of channels, where the server does not know these: the last."""
+        """Yield views up to the first that meets limits of channels, which the server cannot check."""
         header = self.decoder.header
         if not self.target.channels or self._turning or header is None or self.answer is None or self.answer.channels:
             return views
@@ -288,6 +291,7 @@ class Download:
         return views
 
     def _grant(self, now: float | None) -> None:
+        """Queue a grant of credit when one is due."""
         grant = self.window.due(self._connection.credit)
         if grant and self._connection.state is State.STREAMING:
             self._outbox.append(self._connection.send(Credit(grant)))
@@ -295,7 +299,7 @@ class Download:
 
 
 def _largest(reception: ReceiverState) -> tuple[tuple[int, int], ...]:
-    """What is cached, the smallest ranges left out where there are more than a message may name."""
+    """Return the cached ranges, without the smallest ones where there are more than a message may contain."""
     ranges = list(reception.cached)
     if len(ranges) > MAX_HELD:
         ranges = sorted(sorted(ranges, key=lambda place: place[1], reverse=True)[:MAX_HELD])

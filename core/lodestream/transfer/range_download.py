@@ -1,4 +1,4 @@
-"""Receiving a surface over HTTP Range, without I/O.
+"""Reception of a surface over HTTP Range, without I/O.
 
 The client makes the plan that a server would follow over WebSocket. The first bytes of the file tell what it is and how
 long, the last bytes contain its index. What the target needs of the rest is requested in few requests. Layers within
@@ -114,7 +114,7 @@ class RangeDownload:
         return self._validator
 
     def request(self, now: float | None = None) -> tuple[RangeRequest | None, list[DownloadEvent]]:
-        """The next request, or None if none is needed; and the views that follow from what has arrived.
+        """Return the next request, or None if none is needed, and the views that follow from received data.
 
         Parameters
         ----------
@@ -155,10 +155,10 @@ class RangeDownload:
         return self._asked, events
 
     def ahead(self) -> RangeRequest | None:
-        """A request to make beside the one whose answer is coming, if it is known what is needed after that.
+        """Return a request to make beside the current one, if it is known what is needed after that.
 
-        Only when so little is left of the answer that the link would be idle soon: until then both would share it, and
-        what comes first would come late.
+        Only when little of the answer remains, so that the link would soon be idle: before that, both answers would
+        share the link, and the first one would be late.
         """
         if self._asked is None or self._ahead is not None or self.ended is not None or self.reception.size is None:
             return None
@@ -171,6 +171,7 @@ class RangeDownload:
         return self._ahead
 
     def _make(self, place: tuple[int, int]) -> RangeRequest:
+        """Make a request for a range."""
         headers = {"Range": f"bytes={place[0]}-{place[0] + place[1] - 1}", "Accept-Encoding": "identity"}
         if self._etag is not None:
             headers["If-Range"] = self._etag
@@ -178,7 +179,7 @@ class RangeDownload:
         return RangeRequest(*place, headers)
 
     def answer(self, status: int, headers: Mapping[str, str], now: float | None = None) -> None:
-        """Take the status and headers of an answer.
+        """Process the status and headers of an answer.
 
         Parameters
         ----------
@@ -213,14 +214,16 @@ class RangeDownload:
             raise RemoteProtocolError(
                 f"expected bytes of the file itself, got them encoded with {headers['content-encoding']}"
             )
-        found = _CONTENT_RANGE.fullmatch(headers.get("content-range", ""))
-        if found is None or int(found[1]) != asked.offset:
+        content_range = _CONTENT_RANGE.fullmatch(headers.get("content-range", ""))
+        if content_range is None or int(content_range[1]) != asked.offset:
             raise RemoteProtocolError(
                 f"expected Content-Range to be bytes {asked.offset}-..., got {headers.get('content-range')!a}"
             )
-        size = int(found[3])
-        if int(found[2]) != min(asked.offset + asked.length, size) - 1:
-            raise RemoteProtocolError(f"expected {asked.length} bytes from {asked.offset} on, got bytes {found[0]}")
+        size = int(content_range[3])
+        if int(content_range[2]) != min(asked.offset + asked.length, size) - 1:
+            raise RemoteProtocolError(
+                f"expected {asked.length} bytes from {asked.offset} on, got bytes {content_range[0]}"
+            )
         tag = _CONTAINER_TAG.fullmatch(self._etag or "")
         self.reception.identify(tag[1] if tag else None, size)
 
@@ -240,7 +243,7 @@ class RangeDownload:
         if asked is None or self._position > asked.offset + asked.length:
             raise RemoteProtocolError(f"expected {asked.length if asked else 0} bytes of the file, got more")
         events: list[DownloadEvent] = []
-        # Until the index is known everything may be of use; then what lies between two slices is not kept.
+        # Until the index is known, every byte may be needed; then bytes between two slices are dropped.
         places = self.reception.wanted(start, len(data)) if self.reception.plan else [(start, len(data))]
         for offset, length in list(places):
             events += self.reception.take(offset, data[offset - start : offset - start + length])
@@ -269,7 +272,7 @@ class RangeDownload:
         return self._asked.offset + self._asked.length - self._position if self._asked is not None else 0
 
     def leave(self) -> None:
-        """Declare that nothing more of what was asked for is read: the rest of the answer, and what comes ahead."""
+        """Declare that the rest of the answer, and requests ahead, will not be read."""
         self._asked = self._ahead = None
 
     def stop(self, why: str = "stopped") -> None:
@@ -285,7 +288,7 @@ class RangeDownload:
             self.reception.end("stopped")
 
     def _measure(self, got: int, now: float | None) -> None:
-        """Bytes that come in one round trip: skipping fewer would cost more than taking them."""
+        """Return the bytes that arrive in a round trip: skipping fewer costs more than reading them."""
         if now is None or self._asked_at is None or self._answered_at is None:
             return
         round_trip, seconds = self._answered_at - self._asked_at, now - self._answered_at
@@ -294,6 +297,7 @@ class RangeDownload:
             self._gap = round(min(max(rate * round_trip, MIN_WINDOW), BASE_CREDIT))
 
     def _check_same(self, headers: Mapping[str, str], status: int) -> None:
+        """Raise an error if the answer belongs to another version of the file."""
         etag = headers.get("etag", "")
         strong = etag if etag.startswith('"') else None
         changed = strong is not None and self._etag is not None and strong != self._etag
@@ -305,7 +309,7 @@ class RangeDownload:
         self._etag, self._validator = strong or self._etag, validator or self._validator
 
     def _first(self, cached: RangeSet) -> tuple[int, int] | None:
-        """What to ask for before the index can be looked for, where these bytes are cached or coming."""
+        """Return the requests before the index can be located, in which bytes are cached or coming."""
         size = self.reception.size
         if size is None:
             return 0, self._beginning()
@@ -317,7 +321,7 @@ class RangeDownload:
         return None
 
     def _beginning(self) -> int:
-        """How many bytes to ask for first, of a file of which nothing is known."""
+        """Return the bytes of the first request, for a file of which nothing is known."""
         from .safe_prefix import in_file_order
 
         target = self.reception.target
@@ -329,6 +333,7 @@ class RangeDownload:
         return _FIRST if limited else _FIRST_MOST
 
     def _read_index(self) -> list[DownloadEvent]:
+        """Read the index from bytes that have arrived."""
         from ..container import read_index
         from ..container.capacity import Capacity
         from ..planning.window_errors import read_window_errors, wants_window_errors
@@ -336,6 +341,7 @@ class RangeDownload:
         store, size = self.reception.keep(), self.reception.size or 0
 
         def read(offset: int, length: int) -> bytes:
+            """Read cached bytes; raise _MissingError for the first gap."""
             for gap in store.ranges.missing(offset, min(length, size - offset)):
                 raise _MissingError(*gap)  # asked for next; reading, which costs little, then starts again
             return store.read(offset, min(length, size - offset))
@@ -349,12 +355,12 @@ class RangeDownload:
             self._needed = missing.place
             return []
         except TruncatedStreamError as error:
-            # All bytes that the host has were looked at: others would not follow.
+            # All bytes of the file have been examined, so no others can follow.
             raise CutShortError(f"the file was cut short: {error}") from error
         return [*self.reception.follow(index, windows)]
 
     def _next_slices(self, cached: RangeSet) -> tuple[int, int] | None:
-        """The next slice that is missing, with those after it that are near and nothing between that is cached."""
+        """Return the next missing slice, merged with near ones with no cached bytes between."""
         missing = self.reception.missing(cached)
         first = next(missing, None)
         if first is None:

@@ -1,4 +1,4 @@
-"""What has come of a surface over one or several connections.
+"""State of the reception of a surface over one or several connections.
 
 Bytes of the container go in, views come out. A `Download` or a `RangeDownload` is one connection and ends with it. The
 reception is handed to the next connection, so that bytes that have arrived are not requested again.
@@ -67,12 +67,12 @@ class Store(Protocol):
         ...
 
     def used(self, offset: int, length: int) -> None:
-        """Called when the decoder has been given these bytes; they are not read again."""
+        """Record that the decoder has these bytes, so that they are not read again."""
         ...
 
 
 class MemoryStore:
-    """Bytes that came before their turn."""
+    """Bytes that arrived before the decoder could use them."""
 
     def __init__(self) -> None:
         self.ranges = RangeSet()
@@ -80,21 +80,21 @@ class MemoryStore:
         self._used = RangeSet()
 
     def read(self, offset: int, length: int) -> bytes:
-        """Bytes that are kept."""
-        found = bytearray(length)
+        """Return stored bytes."""
+        joined = bytearray(length)
         for start, data in self._slices:
             first, last = max(start, offset), min(start + len(data), offset + length)
             if first < last:
-                found[first - offset : last - offset] = data[first - start : last - start]
-        return bytes(found)
+                joined[first - offset : last - offset] = data[first - start : last - start]
+        return bytes(joined)
 
     def write(self, offset: int, data: bytes) -> None:
-        """Keep bytes that are not kept yet."""
+        """Store bytes that are not stored yet."""
         self.ranges.add(offset, len(data))
         self._slices.append((offset, data))
 
     def used(self, offset: int, length: int) -> None:
-        """Forget what is read no more."""
+        """Delete bytes that are not read again."""
         self._used.add(offset, length)
         self._slices = [(at, data) for at, data in self._slices if not self._used.covers(at, len(data))]
 
@@ -251,18 +251,19 @@ class ReceiverState:
         return self._advance()
 
     def _plan(self, index: Index) -> None:
+        """Make the plan, now that the index is known."""
         from ..planning.planner import plan
 
         chosen = plan(index, self.target, windows=self._windows, bounded=self._bounded)
-        # Where a server stops may stand in bounds that it sends and that were not known when the index was read.
+        # A server's stop may depend on bounds that it sends, unknown when the index was read.
         self.index, self._learning = index, self._section is not None
         surface, before, after = (
             [(place.offset, place.length) for place in part] for part in (chosen.ranges, chosen.before, chosen.after)
         )
         if self._section is not None:
             before.append(self._section)
-        own = index.index.offset, index.index.length
-        self._service = own, *after, *(place for place in before if place != own)
+        index_place = index.index.offset, index.index.length
+        self._service = index_place, *after, *(place for place in before if place != index_place)
         self.planned, self.plan = chosen.bytes, chosen
         self._follow(surface, before, after)
 
@@ -317,19 +318,19 @@ class ReceiverState:
         return views + self._advance()
 
     def missing(self, cached: RangeSet | None = None) -> Iterator[tuple[int, int]]:
-        """The bytes that are still to come, as (offset, length) in order; once the index is known.
+        """Yield the bytes that are still missing, as (offset, length) in order; once the index is known.
 
-        ``cached`` is what is not asked for again, by default what is cached.
+        ``cached`` are the bytes that are not requested again, by default those that are cached.
         """
         for place in self._order or ():
             yield from (self.cached if cached is None else cached).missing(*place)
 
     def wanted(self, offset: int, length: int) -> Iterator[tuple[int, int]]:
-        """The parts of a range that the target needs, cached or not; before that is known, the whole range."""
+        """Yield the parts of a range that the target needs, cached or not; before that is known, the whole range."""
         return iter([(offset, length)]) if self._wanted is None else self._wanted.overlap(offset, length)
 
     def keep(self) -> Store:
-        """Keep bytes that the decoder cannot use yet, and in any case those of header, index and metadata."""
+        """Store bytes that the decoder cannot use yet, and always those of header, index and metadata."""
         if self._store is None:
             self._store = self._aside
         return self._store
@@ -371,6 +372,7 @@ class ReceiverState:
     def _follow(
         self, surface: list[tuple[int, int]], before: list[tuple[int, int]], after: list[tuple[int, int]]
     ) -> None:
+        """Set the order in which bytes are fed to the decoder."""
         self._surface = RangeSet(surface)
         self.received = 0
         for place in self.cached:
@@ -380,7 +382,7 @@ class ReceiverState:
             self._order = deque(gap for place in (*before, *surface, *after) for gap in self._fed.missing(*place))
 
     def _count(self, offset: int, length: int) -> None:
-        """Add to `received` what of a range belongs to the surface, once that is known."""
+        """Add the bytes of a range that belong to the surface to `received`, once that is known."""
         if self.planned is None:
             return
         if self._surface is not None:
@@ -390,14 +392,14 @@ class ReceiverState:
         self.received += sum(size for _, size in belongs)
 
     def _copy(self, offset: int, data: bytes) -> None:
-        """Keep of what the decoder is given at once the parts that tell where things stand."""
+        """Store the parts of fed bytes that locate others: header, index and metadata."""
         for start, length in ((0, _HEAD), *self._service):
             first, last = max(start, offset), min(start + length, offset + len(data))
             if first < last:
                 self._aside.write(first, data[first - offset : last - offset])
 
     def _advance(self) -> list[View]:
-        """Feed the decoder with what is kept, as far as it goes on."""
+        """Feed the decoder with stored bytes as far as they are contiguous in its order."""
         if self._store is None:
             return []
         if self._order is None and not self._service:
@@ -422,7 +424,7 @@ class ReceiverState:
         return views
 
     def _begin(self) -> list[View]:
-        """Feed the decoder with what is in the plan for certain, before that is made."""
+        """Feed the decoder with bytes that are certainly in the plan, before the plan is made."""
         from .safe_prefix import in_file_order, sure
 
         store, views = self._store, []
@@ -437,7 +439,7 @@ class ReceiverState:
         return views
 
     def _learn(self) -> list[View] | None:
-        """The order of slices stands in the index, which needs the header to be read; None: not all is there."""
+        """Read the order of slices from the index, which needs the header; None: some of it is missing."""
         from ..container import ByteRange, index_from
         from ..container.reader import INDEX_GROWTH
         from ..decoding.decoder import Decoder
@@ -450,22 +452,22 @@ class ReceiverState:
         place = self._service[0]
         header = self.decoder.header
         if header is None:
-            # Only to read the header: the real decoder must be fed in the order that is not known yet.
+            # Only for the header: the real decoder must be fed in the order of the plan, which is not known yet.
             scratch = Decoder(self.target, max_vertices=self.decoder.capacity.max_vertices)
             scratch.feed(store.read(0, min(store.ranges.run(0), MAX_DATA)))
             header = scratch.header
         if header is None or (header.masked and not header.holes):
-            return None  # the section of masks, without which the index cannot be counted through, is not there yet
+            return None  # the section of masks, which the index needs, is missing
         self.decoder.capacity.take(INDEX_GROWTH * place[1])
         index = index_from(store.read(*place), ByteRange(*place), header)
         return self.follow(index, self._errors_of_windows(store, index))
 
     def _needed(self) -> tuple[tuple[int, int], ...]:
-        """What the order of slices stands in: the index, and bounds of the errors of windows where they come."""
+        """Return the ranges that give the order of slices: the index, and bounds of window errors if sent."""
         return self._service[:1] + self._service[2:]
 
     def _errors_of_windows(self, store: Store, index: Index) -> WindowErrors | None:
-        """The bounds that the other side has sent, if it has."""
+        """Return the bounds of window errors that the other side has sent, if any."""
         from ..planning.window_errors import read_window_errors, window_section
 
         place = window_section(index)

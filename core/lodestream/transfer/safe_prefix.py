@@ -1,4 +1,4 @@
-"""The beginning of a container before its index has come: what a receiver may decode of it at once.
+"""The prefix of a container that a receiver may decode before its index has arrived.
 
 A plan in the file's order has every layer up to the one that meets the target, and layers carry their errors. So a
 layer that ends within the bytes allowed, and stands behind none that meets the target, is in the plan, come what may.
@@ -19,32 +19,32 @@ if TYPE_CHECKING:
 
 __all__ = ["in_file_order", "sure"]
 
-_SIGNATURE = len(sections.SIGNATURE)
-_LONGEST_START = 10
-_BEGINNING = (sections.HEADER, sections.MASKS, sections.KEPT_MASKS, sections.LAYER)
+_SIGNATURE_BYTES = len(sections.SIGNATURE)
+_MAX_START_BYTES = 10
+_PREFIX_SECTIONS = (sections.HEADER, sections.MASKS, sections.KEPT_MASKS, sections.LAYER)
 
 
 def in_file_order(target: Target) -> bool:
-    """Whether what the target needs is a prefix of the file, and its metadata."""
-    elsewhere = (target.level, target.region, target.attributes, target.first)
-    return target.order == "quality" and all(each is None for each in elsewhere)
+    """Return whether a target needs a prefix of the file, and its metadata."""
+    options = (target.level, target.region, target.attributes, target.first)
+    return target.order == "quality" and all(option is None for option in options)
 
 
 def sure(target: Target, decoder: Decoder, position: int, run: int, read: Callable[[int, int], bytes]) -> int:
-    """How many bytes from `position` on, where a section begins, the plan is sure to have; 0 where none, or not yet.
+    """Return how many bytes from `position`, a section's start, are certainly planned; 0 if none, or if unknown yet.
 
     Parameters
     ----------
     target : Target
-        One that is `in_file_order`.
+        A target that is `in_file_order`.
     decoder : Decoder
-        It has been given everything before `position`, and nothing else.
+        The decoder was fed with everything before `position`, and nothing else.
     position : int
         0, or the end of what was sure before.
     run : int
-        How many bytes have come from there on.
+        Number of consecutive bytes that have arrived from there on.
     read : callable (offset, length) -> bytes
-        Gives bytes that have come.
+        Returns bytes that have arrived.
 
     Raises
     ------
@@ -54,17 +54,17 @@ def sure(target: Target, decoder: Decoder, position: int, run: int, read: Callab
         When the surface has no channel that the target names.
     """
     if position == 0:
-        return _SIGNATURE if run >= _SIGNATURE else 0
-    start = read(position, min(run, _LONGEST_START))
+        return _SIGNATURE_BYTES if run >= _SIGNATURE_BYTES else 0
+    start = read(position, min(run, _MAX_START_BYTES))
     extent = section_extent(start, position)
-    if extent is None or run < extent[1] or start[0] not in _BEGINNING:
+    if extent is None or run < extent[1] or start[0] not in _PREFIX_SECTIONS:
         return 0
     end = position + extent[1]
     return 0 if start[0] == sections.LAYER and _met(target, decoder, end) else extent[1]
 
 
 def _met(target: Target, decoder: Decoder, end: int) -> bool:
-    """Whether the target is met without the layer that ends there."""
+    """Return whether the target is met without the layer that ends at ``end``."""
     if target.max_bytes is not None and end > target.max_bytes:
         return True
     if decoder.header is None:

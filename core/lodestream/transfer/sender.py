@@ -97,7 +97,7 @@ class Sender:
         return self._connection.state
 
     def cost(self, message: bytes) -> int:
-        """Steps of the plan that `receive` of this message makes, see `plan_cost`; 0 if it makes none.
+        """Return the steps of the plan that `receive` of this message makes, see `plan_cost`; 0 if it makes none.
 
         Raises
         ------
@@ -110,11 +110,12 @@ class Sender:
         return self._cost(event) if isinstance(event, Open) else 0
 
     def _cost(self, event: Open) -> int:
+        """Return the steps of the plan for an opening message."""
         ranges = len(event.held) + len(self.cached) + len(self._given)
         return plan_cost(self._index, event.target, ranges, bounded=bool(event.window_errors))
 
     def receive(self, message: bytes) -> Event:
-        """Take one message; returns its event.
+        """Process one message; return its event.
 
         Raises
         ------
@@ -139,7 +140,7 @@ class Sender:
             self._outbox = deque([Error(code, CODES[code].title, detail)])
 
     def next_message(self) -> bytes | None:
-        """The message to send now, or None.
+        """Return the message to send now, or None.
 
         Messages are returned one at a time, so that a `stop` takes effect before the next one.
         """
@@ -156,10 +157,10 @@ class Sender:
         return self._connection.send(event)
 
     def wanted(self) -> ByteRange | None:
-        """The slice to read now, limited by the credit and the size of a message; None if there is none."""
+        """Return the slice to read now, limited by the credit and the size of a message; None if there is none."""
         if not self._ready():
             return None
-        # A message ends where a layer does: on a slow link the layer is then drawn before the next one is under way.
+        # A message ends where a layer ends, so that on a slow link the layer is drawn before the next one is sent.
         until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
         credit = self._connection.credit
         self._window = max(self._window, credit)
@@ -168,7 +169,7 @@ class Sender:
         return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
 
     def _ready(self) -> bool:
-        """Whether something may be read now."""
+        """Return whether a slice may be read now."""
         return self.state is State.STREAMING and not self._outbox and bool(self._slices and self._connection.credit)
 
     def provide(self, wanted: ByteRange, data: bytes) -> None:
@@ -195,6 +196,7 @@ class Sender:
         self._end_if_done()
 
     def _plan(self, event: Open) -> None:
+        """Plan the slices of an opening message, and queue the answer."""
         index = self._index
         bounded = bool(event.window_errors) and event.target.region is not None
         try:
@@ -224,12 +226,13 @@ class Sender:
         self._end_if_done()
 
     def _follow(self, slices: Sequence[ByteRange], marks: Sequence[Mark], before: int) -> None:
+        """Set the slices and marks to be sent."""
         self._slices = deque(slice_ for slice_ in slices if slice_.length)
-        # Of the states that what is cached makes already, there is nothing to say.
+        # States that consist of cached bytes only are not announced.
         self._marks = deque((self._provided + before + mark.sent, mark) for mark in marks if mark.sent)
 
     def _said(self, event: Open) -> RangeSet:
-        """What the client has: what it says that it holds, or else what it said before and what it was sent since."""
+        """Return the ranges that the client has: those in the message, or those of its last message and sent since."""
         if not event.held and event.container is None:
             return RangeSet((*self.cached, *self._given))
         if event.held and event.container is None:
@@ -243,23 +246,26 @@ class Sender:
         return cached
 
     def _mark(self) -> None:
+        """Queue messages for the layers whose bytes were sent."""
         while self._marks and self._marks[0][0] <= self._provided:
             mark = self._marks.popleft()[1]
             self._outbox.append(Layer(mark.number, mark.level, mark.bytes, mark.rms, mark.max_error))
 
     def _end_if_done(self) -> None:
+        """Queue the end message if no slice remains."""
         if not self._slices:
             self._outbox.append(End(self._ended))
 
 
 def _place(section: ByteRange | None) -> tuple[int, int]:
+    """Return offset and length of a section, zeros if there is none."""
     return (0, 0) if section is None else (section.offset, section.length)
 
 
 def _as_cached(chosen: Plan) -> list[Mark]:
-    """The marks of a plan after another one, whose slices the client has decoded as they came.
+    """Return the marks of a plan that follows another one whose slices the client has decoded.
 
-    A state beyond which more is cached is not shown by itself: its figures are not known.
+    A state beyond which more is cached is never shown alone, so its errors are unknown.
     """
     ahead, unknown = chosen.bytes - sum(place.length for place in chosen.ranges), float("nan")
     cached = [ahead + mark.sent for mark in chosen.marks]
