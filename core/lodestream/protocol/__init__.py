@@ -1,1 +1,1 @@
-"""Messages of a stream, their bytes, and the state machine of a connection. No I/O."""
+"""Messages of a stream, their bytes, and the state machine of a connection, without I/O."""

@@ -161,7 +161,7 @@ class Connection:
         self.credit = 0
 
     def send(self, event: Event) -> bytes:
-        """The message for an event that this side sends now.
+        """Return the bytes of an event that this side sends now, and change the state.
 
         Raises
         ------
@@ -174,7 +174,7 @@ class Connection:
         if isinstance(event, Segments):
             self._spend(len(event.data))
         elif isinstance(event, Open):
-            self.credit = 0  # what was left of the last one's ended with it
+            self.credit = 0  # the rest of the previous credit ended with the previous `Open`
             self._grant(event.credit, least=0)
         elif isinstance(event, Credit):
             self._grant(event.bytes, least=1)
@@ -182,7 +182,7 @@ class Connection:
         return serialize(event)
 
     def receive(self, message: bytes) -> Event:
-        """The event of a message from the other side.
+        """Parse a message from the other side, and change the state; return the event.
 
         Raises
         ------
@@ -203,7 +203,7 @@ class Connection:
         elif isinstance(event, Open):
             self.credit = min(event.credit, self.most)
         elif isinstance(event, Credit):
-            # What goes beyond the cap is forgotten rather than refused: a client that grants generously loses nothing.
+            # Credit beyond the cap is ignored, not refused: a client may grant generously.
             self.credit = min(self.credit + event.bytes, self.most)
         elif isinstance(event, Opened):
             self.most = min(event.credit or BASE_CREDIT, MAX_CREDIT)
@@ -211,17 +211,20 @@ class Connection:
         return event
 
     def _spend(self, size: int) -> None:
+        """Deduct the bytes that this side sends from the credit."""
         most = min(self.credit, MAX_DATA)
         if not 0 < size <= most:
             raise LocalProtocolError(f"expected 1 to {most} bytes (the credit is {self.credit}), got {size}")
         self.credit -= size
 
     def _grant(self, size: int, least: int) -> None:
+        """Add to the credit, within its cap."""
         most = self.most - self.credit
         if not least <= size <= most:
             raise LocalProtocolError(f"expected {least} to {most} bytes of credit on top of {self.credit}, got {size}")
         self.credit += size
 
     def _allowed(self, moves: _Moves) -> str:
+        """Describe the events that are allowed now."""
         names = " or ".join(kind.type for kind in moves) or "nothing"
         return f"{names} (the {self.side.value} is {self.state.value})"

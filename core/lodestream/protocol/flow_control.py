@@ -1,4 +1,4 @@
-"""How much credit a client keeps outstanding, measured from the link.
+"""Flow control of a client: how much credit it keeps outstanding, measured from the link.
 
 With too little credit the link is idle between grants. With too much, data queue in front of the slowest part of the
 link, and still have to be received after a `stop`. A link is busy with as many bytes in flight as it carries in one
@@ -35,11 +35,11 @@ FIRST_WINDOW = 32 * 1024
 _GAIN = 1.1
 _GROWTH = 2.0
 # The most that a window grows by its spread, and of how many times what the client used in a round trip.
-_MOST_GROWTH, _FASTER = 16.0, 4.0
+_MAX_GROWTH, _FASTER = 16.0, 4.0
 # How long both ends together may take to answer, in seconds: without it, the window of a link whose round trip is
 # shorter than that would shrink to what it carries in a round trip nobody needs as little as. A client that computes
 # longer for each message answers so much later, but of that no more counts than a part of the round trip.
-_THINKING, _MOST_THINKING = 0.005, 0.25
+_MIN_THINKING_SECONDS, _MAX_THINKING_ROUND_TRIPS = 0.005, 0.25
 # The spread counts up to so many round trips that a window takes: with more the link is nearly full, or the client so
 # slow that its waits say little of the link.
 _NEARLY = 1.5
@@ -90,46 +90,46 @@ class FlowWindow:
         self._messages = self._largest = 0
 
     def allow(self, most: int) -> None:
-        """The server keeps so much credit: `BASE_CREDIT` or more."""
+        """Set the credit that the server keeps, `BASE_CREDIT` or more."""
         self._most = most
         if self._fixed is not None:
             self.size = min(self._fixed, most)
 
     def began(self, asked: float, now: float) -> None:
-        """The first window was asked for, and is now answered: it is measured from there on, and can then grow."""
+        """Start measuring: the first window was requested at ``asked``, and its answer arrived at ``now``."""
         if not self._rounds:
             self._rounds.append((self._arrived, asked))
             self._waits = now - asked, now - asked
 
     def heard(self, seconds: float) -> None:
-        """A round trip took at most this long."""
+        """Record a round trip that took at most this long."""
         if seconds > 0 and (self.round_trip is None or seconds < self.round_trip):
             self.round_trip = seconds
 
     def waited(self, seconds: float) -> None:
-        """The client waited so long for a message, with nothing else to do."""
+        """Record that the client waited so long for a message, with nothing else to do."""
         together, longest = self._waits
         self._waits = together + seconds, max(longest, seconds)
 
     def due(self, credit: int) -> int:
-        """Bytes to grant now, where so many are outstanding; 0 as long as they are not worth a message."""
+        """Return the bytes to grant now, with ``credit`` outstanding; 0 as long as they are not worth a message."""
         missing = self.size - credit
         return missing if missing >= max(self.size / _GRANTS, min(self.size / 4, SMALL_MESSAGE)) else 0
 
     def grant(self, size: int, now: float | None = None) -> None:
-        """This many bytes have just been granted."""
+        """Record that this many bytes have been granted."""
         if now is not None and self._granted:
             self._grants.append((self._granted, now))
         self._granted += size
 
     def restart(self) -> None:
-        """Forget what was granted and has not arrived; it will not arrive any more."""
+        """Forget credit that was granted and not used; the data for it will not arrive."""
         self._granted = self._arrived
         self._grants.clear()
         self._rounds.clear()
 
     def arrive(self, size: int, now: float | None = None) -> None:
-        """This many bytes have arrived and been used."""
+        """Record that this many bytes have arrived and been used."""
         self._arrived += size
         self._messages += 1
         self._largest = max(self._largest, size)
@@ -165,11 +165,11 @@ class FlowWindow:
         self._waits, self._messages, self._largest = (0.0, 0.0), 0, 0
 
     def _growth(self, took: float, round_trip: float) -> float:
-        """How many windows like the last one are used in a round trip."""
+        """Return how many windows like the last one are used in a round trip."""
         together, longest = self._waits
-        return round_trip / max(together - longest, (took - together) / _FASTER, round_trip / _MOST_GROWTH)
+        return round_trip / max(together - longest, (took - together) / _FASTER, round_trip / _MAX_GROWTH)
 
     def _thinking(self, took: float, round_trip: float) -> float:
-        """Seconds between a message and the grant that answers it."""
+        """Return the seconds between a message and the grant that answers it."""
         computing = (took - self._waits[0]) / self._messages
-        return max(_THINKING, min(computing, _MOST_THINKING * round_trip))
+        return max(_MIN_THINKING_SECONDS, min(computing, _MAX_THINKING_ROUND_TRIPS * round_trip))

@@ -14,18 +14,18 @@ __all__ = ["MAX_OPENING", "PARAMETER", "from_address", "to_address"]
 #: Where it stands in the query of the address.
 PARAMETER = "open"
 
-#: The most characters of it. Proxies take addresses of 4 to 8 KiB.
+#: Its maximum length in characters. Proxies accept addresses of 4 to 8 KiB.
 MAX_OPENING = 2048
 
 
 def to_address(message: bytes) -> str | None:
-    """The query string with this message; None if it is too long for an address and must be sent as a message."""
+    """Return the query string with this message; None if it is too long for an address."""
     text = urlsafe_b64encode(message).rstrip(b"=").decode()
     return f"{PARAMETER}={text}" if len(text) <= MAX_OPENING else None
 
 
 def from_address(text: str) -> bytes:
-    """The message in a value of the query parameter.
+    """Decode the message in a value of the query parameter.
 
     Raises
     ------

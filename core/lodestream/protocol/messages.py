@@ -1,4 +1,4 @@
-"""The messages of a stream, one frozen dataclass each, and the error codes.
+"""The messages of a stream, a frozen dataclass for each, and the error codes.
 
 An event that one side sends is received as the same event by the other side. `wire` has the bytes of messages,
 `connection` their order; `docs/protocol.md` is the specification.

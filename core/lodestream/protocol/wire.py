@@ -1,4 +1,4 @@
-"""Messages as bytes: one MessagePack map each, with a ``type``.
+"""Messages as bytes: a MessagePack map for each, with a ``type``.
 
 Keys that a receiver does not know are ignored, so that later versions can add some; everything else is checked, since
 the other side is a stranger.
@@ -44,27 +44,31 @@ _Read: TypeAlias = Callable[[Any], Any]
 
 
 class _MismatchError(Exception):
-    """What a field should have been."""
+    """A field has another value than expected; the text says what was expected."""
 
 
 def _integer(value: Any, least: int = 0) -> int:
-    # bool is an int to Python and not to anybody else.
+    """Check an integer from ``least`` to 2**53."""
+    # bool is a subclass of int only in Python.
     if type(value) is not int or not least <= value <= _MAX_INTEGER:
         raise _MismatchError(f"an integer from {least} to 2^53")
     return value
 
 
 def _positive(value: Any) -> int:
+    """Check an integer from 1 to 2**53."""
     return _integer(value, 1)
 
 
 def _credit(value: Any) -> int:
+    """Check an amount of credit."""
     if type(value) is not int or not BASE_CREDIT <= value <= _MAX_INTEGER:
         raise _MismatchError(f"an integer from {BASE_CREDIT} to 2^53")
     return value
 
 
 def _number(value: Any) -> float:
+    """Check a finite number."""
     # Other languages write 2.0 as the integer 2.
     if type(value) not in (int, float) or not math.isfinite(value):
         raise _MismatchError("a finite number")
@@ -72,24 +76,28 @@ def _number(value: Any) -> float:
 
 
 def _text(value: Any) -> str:
+    """Check a text."""
     if not isinstance(value, str):
         raise _MismatchError("text")
     return value
 
 
 def _data(value: Any) -> bytes:
+    """Check the bytes of a slice."""
     if not isinstance(value, bytes) or not 0 < len(value) <= MAX_DATA:
         raise _MismatchError(f"1 to {MAX_DATA} bytes")
     return value
 
 
 def _digest(value: Any) -> str:
+    """Check a SHA-256 in hexadecimal digits."""
     if not isinstance(value, str) or not re.fullmatch("[0-9a-f]{64}", value):
         raise _MismatchError("64 hexadecimal digits")
     return value
 
 
 def _held(value: Any) -> tuple[tuple[int, int], ...]:
+    """Check the ranges that a client has cached."""
     if not isinstance(value, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in value):
         raise _MismatchError("a list of [offset, length]")
     if len(value) > MAX_HELD:
@@ -98,30 +106,35 @@ def _held(value: Any) -> tuple[tuple[int, int], ...]:
 
 
 def _place(value: Any) -> tuple[int, int]:
+    """Check the offset and length of a range that is not empty."""
     if not isinstance(value, list) or len(value) != 2:
         raise _MismatchError("[offset, length]")
     return _integer(value[0]), _positive(value[1])
 
 
 def _section(value: Any) -> tuple[int, int]:
+    """Check the offset and length of a range that may be empty."""
     if not isinstance(value, list) or len(value) != 2:
         raise _MismatchError("[offset, length]")
     return _integer(value[0]), _integer(value[1])
 
 
 def _flag(value: Any) -> bool:
+    """Check a boolean."""
     if not isinstance(value, bool):
         raise _MismatchError("true or false")
     return value
 
 
 def _tolerance(value: Any) -> Tolerance:
+    """Check a tolerance."""
     if not isinstance(value, list) or len(value) != 2 or not isinstance(value[1], bool):
         raise _MismatchError("[number, whether it is relative]")
     return Tolerance(_number(value[0]), value[1])
 
 
 def _region(value: Any) -> Region:
+    """Check a region."""
     if not isinstance(value, list) or len(value) != 2:
         raise _MismatchError("[[first row, past the last], [first column, past the last]]")
     spans = []
@@ -133,12 +146,14 @@ def _region(value: Any) -> Region:
 
 
 def _names(value: Any) -> tuple[str, ...]:
+    """Check a list of names."""
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise _MismatchError("a list of names")
     return tuple(value)
 
 
 def _channels(value: Any) -> tuple[ChannelLimit, ...]:
+    """Check limits of channels."""
     if not isinstance(value, list) or not all(isinstance(limit, list) and len(limit) == 3 for limit in value):
         raise _MismatchError("a list of [name, rms or max, number]")
     for name, which, _ in value:
@@ -148,6 +163,7 @@ def _channels(value: Any) -> tuple[ChannelLimit, ...]:
 
 
 def _error(value: Any) -> float:
+    """Check an error; None stands for an unknown one, NaN."""
     return math.nan if value is None else _number(value)
 
 
@@ -165,6 +181,7 @@ _TARGET: Mapping[str, _Read] = {
 
 
 def _target(value: Any) -> Target:
+    """Check a target."""
     if not isinstance(value, dict):
         raise _MismatchError("a map")
     fields = {
@@ -227,12 +244,12 @@ _OPTIONAL = {
     (Opened, "window_errors"),
     (Opened, "channels"),
 }
-#: What is left out where it is not known.
+#: Fields that are omitted where their value is unknown.
 _UNKNOWN = {(Layer, "rms"), (Layer, "max")}
 
 
 def serialize(event: Event) -> bytes:
-    """The bytes of a message."""
+    """Serialize a message."""
     fields: dict[str, Any] = {"type": event.type}
     if isinstance(event, Open):
         fields["version"] = VERSION
@@ -245,7 +262,7 @@ def serialize(event: Event) -> bytes:
 
 
 def parse(message: bytes) -> Event:
-    """The event that a message stands for.
+    """Parse a message into its event.
 
     Raises
     ------
@@ -273,9 +290,10 @@ def parse(message: bytes) -> Event:
 
 
 def _unpack(message: bytes) -> dict[str, Any]:
+    """Decode the MessagePack map of a message."""
     try:
         fields = msgpack.unpackb(message, raw=False, strict_map_key=True)
-    # The decoder of MessagePack has no common base for what it raises on bytes that are not MessagePack.
+    # The exceptions of the MessagePack decoder have no common base class.
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError(
             "bad-message", f"expected one MessagePack map, got {len(message)} bytes that are not: {error}"
@@ -286,6 +304,7 @@ def _unpack(message: bytes) -> dict[str, Any]:
 
 
 def _check_version(fields: dict[str, Any]) -> None:
+    """Check the protocol version of an opening message."""
     version = fields.get("version")
     if type(version) is not int:
         raise MessageError("bad-message", f"expected open.version to be an integer, got {_show(version)}")
@@ -294,6 +313,7 @@ def _check_version(fields: dict[str, Any]) -> None:
 
 
 def _values(kind: type[Event], fields: dict[str, Any]) -> dict[str, Any]:
+    """Check all fields of a message."""
     values = {}
     for name, read in _FIELDS[kind].items():
         if name in fields:
@@ -306,6 +326,7 @@ def _values(kind: type[Event], fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _value(place: str, read: _Read, value: Any) -> Any:
+    """Check a field; the error names its place."""
     try:
         return read(value)
     except _MismatchError as expected:
@@ -313,6 +334,7 @@ def _value(place: str, read: _Read, value: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
+    """Convert a value of an event into what MessagePack encodes."""
     if isinstance(value, Target):
         chosen = {name: _plain(getattr(value, name)) for name in _TARGET}
         chosen["channels"] = value.channels or None
@@ -320,11 +342,12 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Tolerance):
         return [value.value, value.relative]
     if isinstance(value, Mapping):
-        return None  # errors of channels have a key of their own
-    # An error that is not known, of a window that is not complete.
+        return None  # errors of channels have a separate key
+    # NaN is an unknown error of an incomplete window.
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _show(value: Any) -> str:
-    # What a stranger sent may be long, deep or unprintable: it is shortened and escaped before it is repeated.
+    """Shorten and escape a value for an error message."""
+    # Received values may be long, deeply nested or unprintable.
     return reprlib.repr(value).encode("ascii", "backslashreplace").decode()
