@@ -1,9 +1,8 @@
-"""Which points of a surface are one point, by number and not by value.
+"""Points of a surface that are one point, by number and not by value.
 
 Points are numbered over all blocks of the whole surface at full resolution, block after block, each in row order.
-Two of them may lie at one place, and then also be one vertex: at one place with the same attributes. Of a surface that
-comes out of a container both are known from its header, so that a coarse reconstruction of it
-hangs together as the exact one.
+Two points may lie at one place, and may then also be one vertex: at one place with the same attributes. For a surface
+from a container, its header has both, so that a coarse reconstruction is connected as the exact surface is.
 """
 
 from __future__ import annotations
@@ -18,21 +17,21 @@ from numpy.typing import NDArray
 __all__ = ["Change", "Groups", "Joints", "Nodes", "Runs", "check_runs", "find_change"]
 
 Numbers = NDArray[np.int64]
-#: Rows of numbers one after another, as `to_runs` writes them.
+#: Rows of numbers as encoded by `to_runs`.
 Runs = tuple[int, ...]
-#: Rows and columns of a block that a grid shows, in order.
+#: Rows and columns of a block that are the nodes of a grid, in order.
 Nodes = tuple[Numbers, Numbers]
 
 
 class Change(NamedTuple):
-    """What turns groups of points into others.
+    """Difference between two groupings of points.
 
     Attributes
     ----------
     dissolved : int64 array, shape (D,)
-        Points whose groups are no more: their members stand alone.
+        Points whose groups are dissolved: their members become single.
     joined : int64 array, shape (J, 2)
-        Pairs of points whose groups become one after that.
+        Pairs of points whose groups are joined after that.
     """
 
     dissolved: Numbers
@@ -40,23 +39,23 @@ class Change(NamedTuple):
 
     @property
     def runs(self) -> tuple[Runs, Runs]:
-        """Both as `to_runs` writes them."""
+        """Both arrays as encoded by `to_runs`."""
         return to_runs(self.dissolved[:, np.newaxis]), to_runs(self.joined)
 
     @staticmethod
     def of(runs: tuple[Runs, Runs]) -> Change:
-        """Undo `runs`."""
+        """Decode `runs`."""
         return Change(from_runs(runs[0], 1)[:, 0], from_runs(runs[1], 2))
 
 
 @dataclass(frozen=True)
 class Groups:
-    """Points that are one.
+    """Groups of points that are one.
 
     Attributes
     ----------
     points, firsts : int64 arrays, shape (K,)
-        Points in groups of two or more, increasing, and the lowest of the group of each. All others stand alone.
+        Points in groups of two or more, ascending, and the lowest point of the group of each. Other points are single.
     """
 
     points: Numbers
@@ -64,18 +63,18 @@ class Groups:
 
     @staticmethod
     def none() -> Groups:
-        """All points stand alone."""
+        """Return groups in which all points are single."""
         return Groups(np.empty(0, np.int64), np.empty(0, np.int64))
 
     @staticmethod
     def of(pairs: Numbers) -> Groups:
-        """The groups that pairs of points make, shape (J, 2)."""
+        """Return the groups that pairs of points, shape (J, 2), make."""
         points, place = np.unique(pairs.reshape(-1), return_inverse=True)
-        one, other = place.reshape(-1, 2).T
+        left, right = place.reshape(-1, 2).T
         label = np.arange(len(points))
-        while (label[one] != label[other]).any():
-            low = np.minimum(label[one], label[other])
-            for end in (one, other):
+        while (label[left] != label[right]).any():
+            low = np.minimum(label[left], label[right])
+            for end in (left, right):
                 np.minimum.at(label, label[end], low)
             while (label != label[label]).any():
                 label = label[label]
@@ -83,14 +82,14 @@ class Groups:
         return Groups(points[several], points[label[several]])
 
     def first(self, numbers: Numbers) -> Numbers:
-        """The lowest point of the group of each, shape (point,) as ``numbers``."""
+        """Return the lowest point of each point's group, int64, the shape of ``numbers``."""
         if not self.points.size:
             return numbers
         place = np.minimum(np.searchsorted(self.points, numbers), self.points.size - 1)
         return np.where(self.points[place] == numbers, self.firsts[place], numbers)
 
     def changed(self, change: Change) -> Groups:
-        """The groups after a change."""
+        """Return the groups after a change."""
         if not change.dissolved.size and not change.joined.size:
             return self
         kept = ~np.isin(self.firsts, self.first(change.dissolved))
@@ -99,15 +98,15 @@ class Groups:
 
 
 def find_change(numbers: Numbers, groups: Groups, wanted: Numbers) -> Change:
-    """What makes groups tell some points apart as equal numbers do.
+    """Find the change after which groups distinguish some points as given numbers do.
 
     Parameters
     ----------
     numbers : int64 array, shape (N,)
-        The points that count, each once.
+        The points that are compared, each once.
     groups : Groups
     wanted : int64 array, shape (N,)
-        Equal for points that shall be one.
+        Equal for points that are to be one.
     """
     now = groups.first(numbers)
     held, place = np.unique(now, return_inverse=True)
@@ -124,8 +123,8 @@ def find_change(numbers: Numbers, groups: Groups, wanted: Numbers) -> Change:
 
 
 def to_runs(rows: Numbers) -> Runs:
-    """Rows of numbers, shape (N, D), as runs with even steps: for each its first row, its steps, and how many rows."""
-    found: list[int] = []
+    """Encode rows of numbers, shape (N, D), as runs with even steps: first row, steps, and number of rows of each."""
+    runs: list[int] = []
     steps = np.diff(rows, axis=0).tolist()
     start = 0
     while start < len(rows):
@@ -133,34 +132,34 @@ def to_runs(rows: Numbers) -> Runs:
         while stop < len(rows) and steps[stop - 1] == steps[start]:
             stop += 1
         step = steps[start] if stop - start > 1 else [0] * rows.shape[1]
-        found += [*rows[start].tolist(), *step, stop - start]
+        runs += [*rows[start].tolist(), *step, stop - start]
         start = stop
-    return tuple(found)
+    return tuple(runs)
 
 
 def check_runs(runs: Any, width: int, points: int) -> Runs:
-    """Runs of rows of ``width`` numbers from 0 to ``points`` - 1, and no more rows than points, as they came.
+    """Check runs of rows of ``width`` numbers from 0 to ``points`` - 1, with at most ``points`` rows; return them.
 
     Raises
     ------
     ValueError
-        When they are of another form.
+        When they are malformed.
     """
-    one = 2 * width + 1
-    if not isinstance(runs, list) or len(runs) % one or not all(type(number) is int for number in runs):
-        raise ValueError(f"expected runs of {one} whole numbers, got others")
+    run_length = 2 * width + 1
+    if not isinstance(runs, list) or len(runs) % run_length or not all(type(number) is int for number in runs):
+        raise ValueError(f"expected runs of {run_length} whole numbers, got others")
     total = 0
-    for start in range(0, len(runs), one):
-        *numbers, count = runs[start : start + one]
+    for start in range(0, len(runs), run_length):
+        *numbers, count = runs[start : start + run_length]
         total += max(count, 1)
         ends = [a + (count - 1) * b for a, b in zip(numbers[:width], numbers[width:], strict=True)]
         if count < 1 or total > points or not all(0 <= end < points for end in (*numbers[:width], *ends)):
-            raise ValueError(f"expected runs of points below {points}, got {runs[start : start + one]}")
+            raise ValueError(f"expected runs of points below {points}, got {runs[start : start + run_length]}")
     return tuple(runs)
 
 
 def from_runs(runs: Runs, width: int) -> Numbers:
-    """Undo `to_runs`, for rows of ``width`` numbers, which `check_runs` has seen."""
+    """Decode runs of `to_runs` that `check_runs` has accepted, for rows of ``width`` numbers; int64, shape (N, D)."""
     rows = [np.empty((0, width), np.int64)]
     for start in range(0, len(runs), 2 * width + 1):
         *numbers, count = runs[start : start + 2 * width + 1]
@@ -171,7 +170,7 @@ def from_runs(runs: Runs, width: int) -> Numbers:
 
 @dataclass(frozen=True)
 class Joints:
-    """What is known of the points that a surface's grids show: which lie at one place, and which are one vertex.
+    """The points of a surface's grids that lie at one place, and those that are one vertex.
 
     Attributes
     ----------
@@ -179,7 +178,7 @@ class Joints:
         Rows and columns of each block of the whole surface at full resolution.
     places, vertices : Groups
     nodes : tuple of (int64 array, int64 array), one for each block, or None
-        Which rows and columns the grids show, as at a level or in a window; None: all.
+        Rows and columns that are the nodes of the grids, as at a level or in a window; None: all.
     """
 
     shapes: tuple[tuple[int, int], ...]
@@ -188,7 +187,7 @@ class Joints:
     nodes: tuple[Nodes, ...] | None = None
 
     def at(self, nodes: Sequence[Nodes]) -> Joints:
-        """What is known of grids that show these rows and columns of those that this is of."""
+        """Return the joints of the subgrids given by these rows and columns."""
         if self.nodes is None:
             return Joints(self.shapes, self.places, self.vertices, tuple(nodes))
         composed = tuple(
@@ -197,7 +196,7 @@ class Joints:
         return Joints(self.shapes, self.places, self.vertices, composed)
 
     def number(self, block: int, rows: Numbers, columns: Numbers) -> Numbers:
-        """Numbers in the whole surface of points of a grid; all of one shape, or of shapes that broadcast."""
+        """Return the numbers in the whole surface of points of a grid; rows and columns broadcast."""
         if self.nodes is not None:
             rows, columns = self.nodes[block][0][rows], self.nodes[block][1][columns]
         start = sum(height * width for height, width in self.shapes[:block])

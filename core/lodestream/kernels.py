@@ -1,8 +1,8 @@
-"""The compiled kernels, each as a function of arrays: what ``core/kernels/lodestream.h`` declares, which says more.
+"""The compiled kernels as functions of arrays, declared and documented in ``core/kernels/lodestream.h``.
 
 A call checks that each array has the dtype declared, lies in one piece, and may be written where the kernel writes it;
 then the kernel runs without the interpreter's lock. What a kernel refuses raises ValueError: lengths and places that do
-not fit each other are a fault of the caller, never of a stream.
+not fit each other are an error of the caller, never of a stream.
 """
 
 from __future__ import annotations
@@ -81,18 +81,18 @@ __all__ = [
 
 _REFUSED = -(2**63)
 
-#: Bits of `numpy.ndarray.flags`: in one piece, every value at an address that its dtype may have, not read-only.
+#: Bits of `numpy.ndarray.flags`: contiguous, aligned, writeable.
 _IN_ONE_PIECE, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400
 
-#: The types that the values of a surface may have, by the number that kernels know them by.
+#: The types that values of a surface may have; kernels identify them by their index.
 VALUE_TYPES = [np.dtype(name) for name in ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")]
 
-#: What ctypes takes for the address of a buffer: numpy takes four times as long to tell the number.
+#: A ctypes type whose instances pass the address of a buffer; `numpy.ndarray.ctypes` takes four times as long.
 _Start: Any = ctypes.c_char * 0
 
 
 class Array:
-    """An array in one piece, of any shape: a pointer and its number of elements."""
+    """A contiguous array of any shape, passed as a pointer and its number of elements."""
 
     types = (ctypes.c_void_p, ctypes.c_int64)
 
@@ -101,7 +101,7 @@ class Array:
         self._needed = _IN_ONE_PIECE | _ALIGNED | (_WRITEABLE if written else 0)
 
     def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
-        """What the function is given for an array; TypeError or ValueError where it is not such a one."""
+        """Convert an array into C arguments; raise TypeError or ValueError if it is not as declared."""
         flags = value.flags.num
         if value.dtype is not self.dtype or ~flags & self._needed:
             _check(value, self.dtype, self._needed)
@@ -109,7 +109,7 @@ class Array:
 
 
 class Plane:
-    """Rows of values that lie side by side, however far apart the rows: a pointer, rows, columns, pitch."""
+    """Rows of adjacent values at any distance from each other, passed as a pointer, rows, columns and pitch."""
 
     types = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
 
@@ -118,7 +118,7 @@ class Plane:
         self._needed = _ALIGNED | (_WRITEABLE if written else 0)
 
     def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
-        """What the function is given for an array of two axes."""
+        """Convert an array of two axes into C arguments."""
         flags = value.flags.num
         if value.dtype is not self.dtype or ~flags & self._needed:
             _check(value, self.dtype, self._needed)
@@ -128,12 +128,12 @@ class Plane:
         pitch, rest = divmod(down, value.itemsize) if rows > 1 else (columns, 0)
         if (columns > 1 and across != value.itemsize) or pitch < 0 or rest:
             raise ValueError(f"expected values of a row side by side, got strides {value.strides}")
-        whole = flags & _WRITEABLE and flags & _IN_ONE_PIECE
-        return (_Start.from_buffer(value) if whole else value.ctypes.data, rows, columns, pitch)
+        contiguous = flags & _WRITEABLE and flags & _IN_ONE_PIECE
+        return (_Start.from_buffer(value) if contiguous else value.ctypes.data, rows, columns, pitch)
 
 
 class Values:
-    """An array in one piece, of any shape and any of `VALUE_TYPES`: a pointer, elements, the number of its type."""
+    """A contiguous array of any shape and any of `VALUE_TYPES`, passed as pointer, elements and number of its type."""
 
     types = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64)
 
@@ -142,7 +142,7 @@ class Values:
         self._arrays = [Array(dtype, written) for dtype in VALUE_TYPES]
 
     def passed(self, value: NDArray[Any]) -> tuple[Any, ...]:
-        """What the function is given for an array."""
+        """Convert an array into C arguments."""
         if value.dtype not in VALUE_TYPES:
             raise TypeError(f"expected an array of numbers in this machine's order, got one of {value.dtype}")
         number = VALUE_TYPES.index(value.dtype)
@@ -150,6 +150,7 @@ class Values:
 
 
 def _check(value: NDArray[Any], dtype: np.dtype[Any], needed: int) -> None:
+    """Raise an error if an array is not as declared."""
     # numpy may have several objects for one dtype.
     if value.dtype != dtype:
         raise TypeError(f"expected an array of {dtype}, got one of {value.dtype}")
@@ -167,6 +168,7 @@ class _Integer:
 
     @staticmethod
     def passed(value: Any) -> tuple[int]:
+        """Convert an integer into a C argument."""
         number = index(value)
         if not -(2**63) <= number < 2**63:  # ctypes would leave out the bits beyond
             raise ValueError(f"expected an integer of 64 bits, got {number}")
@@ -180,36 +182,37 @@ class _Real:
 
     @staticmethod
     def passed(value: Any) -> tuple[float]:
+        """Convert a number into a C argument."""
         return (float(value),)
 
 
 def reads(dtype: DTypeLike) -> Array:
-    """An array that a kernel reads."""
+    """Declare an array that a kernel reads."""
     return Array(dtype, False)
 
 
 def writes(dtype: DTypeLike) -> Array:
-    """An array that a kernel changes."""
+    """Declare an array that a kernel changes."""
     return Array(dtype, True)
 
 
 def reads_plane(dtype: DTypeLike) -> Plane:
-    """Rows that a kernel reads."""
+    """Declare rows that a kernel reads."""
     return Plane(dtype, False)
 
 
 def writes_plane(dtype: DTypeLike) -> Plane:
-    """Rows that a kernel changes."""
+    """Declare rows that a kernel changes."""
     return Plane(dtype, True)
 
 
 def reads_values() -> Values:
-    """Values of any type that a kernel reads."""
+    """Declare values of any type that a kernel reads."""
     return Values(False)
 
 
 def writes_values() -> Values:
-    """Values of any type that a kernel changes."""
+    """Declare values of any type that a kernel changes."""
     return Values(True)
 
 
@@ -225,8 +228,8 @@ class Kernel:
     ----------
     name : str
         Without ``lode_``.
-    arguments : what each argument is
-        The function takes each as one or more of its own, as said there, and returns int64.
+    arguments : declarations of the arguments
+        Each is passed as one or more C arguments, see its class. The function returns int64.
 
     Raises
     ------
@@ -241,7 +244,7 @@ class Kernel:
         self._function: Any = None
 
     def __call__(self, *values: Any) -> int:
-        """Call it; ValueError or TypeError where the values are not what was declared."""
+        """Call the kernel; raise ValueError or TypeError if the values are not as declared."""
         if self._function is None:
             function = library()[f"lode_{self.name}"]
             function.argtypes, function.restype = self.types, ctypes.c_int64
@@ -258,7 +261,7 @@ class Kernel:
         return result
 
     def _refusal(self, values: tuple[Any, ...], first: Exception) -> Exception:
-        """The error, with the place of what is wrong."""
+        """Return the error with the place of the wrong argument."""
         if len(values) != len(self._passed):
             return TypeError(f"{self.name}: expected {len(self._passed)} arguments, got {len(values)}")
         for place, (passed, value) in enumerate(zip(self._passed, values, strict=True)):
@@ -272,6 +275,7 @@ class Kernel:
 
 
 def _described(values: tuple[Any, ...]) -> str:
+    """Format the shapes of arrays, and other values."""
     return ", ".join(str(v.shape) if isinstance(v, np.ndarray) else str(v) for v in values)
 
 

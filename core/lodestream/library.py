@@ -1,4 +1,4 @@
-"""Loads the compiled kernels: the shared library that stands in ``native`` since the package was installed.
+"""Loading of the compiled kernels: the shared library in ``native``, compiled when the package is installed.
 
 ``core/kernels/build.py`` imports this module before anything is installed: it needs the standard library alone.
 """
@@ -34,25 +34,25 @@ _COMPILE = "run `make kernels` in the working tree, or `python core/kernels/buil
 
 
 def library_name(system: str = sys.platform, machine: str | None = None) -> str:
-    """What the library of a platform is called; of this one, unless another is named."""
+    """Return the file name of the library of a platform, by default of this one."""
     suffix = {"darwin": "dylib", "win32": "dll"}.get(system, "so")
     return f"lodestream-{system}-{(machine or platform.machine()).lower()}.{suffix}"
 
 
 def wide_name(system: str = sys.platform, machine: str | None = None) -> str | None:
-    """What the second library is called, which is compiled for x86-64-v3; None where there is none.
+    """Return the file name of the second library, for x86-64-v3; None where there is none.
 
-    It holds the kernels that take 1.3 to 2 times as long without its wider registers: transforms, values.
+    It contains the kernels that are 1.3 to 2 times as fast with wider registers: transforms, values.
     """
     name = (machine or platform.machine()).lower()
     return library_name(system, f"{name}-v3") if name in ("x86_64", "amd64") else None
 
 
 def fingerprint() -> str | None:
-    """A hash of all that the library is made from, 16 hexadecimal digits; None where there are no sources."""
+    """Return a hash of the library's sources, 16 hexadecimal digits; None where there are no sources."""
     if not (KERNELS / "lodestream.h").exists():
         return None
-    import hashlib  # programs that are installed do without
+    import hashlib  # not needed by an installed package
 
     digest = hashlib.sha256()
     for path in sorted([*KERNELS.glob("*.[ch]"), KERNELS / "build.py"]):
@@ -61,7 +61,7 @@ def fingerprint() -> str | None:
 
 
 class _Library(ctypes.CDLL):
-    """A library, and where it has no function of a name, that of another one."""
+    """A library that takes functions it does not have from another one."""
 
     other: ctypes.CDLL | None = None
 
@@ -76,6 +76,7 @@ class _Library(ctypes.CDLL):
 
 @cache
 def _load() -> ctypes.CDLL | str:
+    """Load the library for this machine; return the reason if it cannot be loaded."""
     loaded = _load_from(NATIVE / library_name())
     wide = wide_name()
     if not isinstance(loaded, str) and wide and loaded.lode_runs_v3() and (NATIVE / wide).exists():
@@ -87,12 +88,13 @@ def _load() -> ctypes.CDLL | str:
 
 
 def _load_from(path: Path) -> _Library | str:
+    """Load a library; return the reason if it cannot be loaded."""
     wanted = fingerprint()
     remedy = _COMPILE if wanted else _REMEDY
     if not path.exists():
         others = sorted(other.name for other in NATIVE.glob("lodestream-*"))
-        found = f"found those of other platforms: {', '.join(others)}" if others else "found none"
-        return f"expected the compiled kernels of this platform, {path.name}; {found}: {remedy}"
+        other_libraries = f"found those of other platforms: {', '.join(others)}" if others else "found none"
+        return f"expected the compiled kernels of this platform, {path.name}; {other_libraries}: {remedy}"
     try:
         if is_cut_off(path):
             raise OSError("its end is missing")
@@ -107,7 +109,7 @@ def _load_from(path: Path) -> _Library | str:
 
 
 def is_cut_off(path: Path) -> bool:
-    """Whether the end of a library is missing, as after a copy onto a full disk: to load it would end the process."""
+    """Return whether a library is truncated, as after a copy onto a full disk: loading it would crash the process."""
     with path.open("rb") as file:
         head = file.read(64)
         length = file.seek(0, 2)
@@ -118,13 +120,13 @@ def is_cut_off(path: Path) -> bool:
 
 
 def why_missing() -> str | None:
-    """Why the compiled kernels cannot be used here, in a line; None where they can."""
+    """Return the reason why the compiled kernels cannot be used here, in a line; None if they can."""
     loaded = _load()
     return loaded if isinstance(loaded, str) else None
 
 
 def require(what: str) -> None:
-    """Refuse, before any of it is done, what cannot be done without the kernels: ``"encoding"``.
+    """Raise an error if the kernels, which ``what`` needs, are missing.
 
     Raises
     ------
@@ -136,12 +138,12 @@ def require(what: str) -> None:
 
 
 def library() -> ctypes.CDLL:
-    """The library.
+    """Return the loaded library.
 
     Raises
     ------
     UnavailableError
-        Where it cannot be loaded.
+        If it cannot be loaded.
     """
     loaded = _load()
     if isinstance(loaded, str):

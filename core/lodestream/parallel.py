@@ -1,4 +1,4 @@
-"""Threads for the kernels, which let go of Python's lock: how many there are, and work spread over them."""
+"""Threads for the kernels, which release Python's lock: their number, and work distributed over them."""
 
 from __future__ import annotations
 
@@ -18,46 +18,46 @@ __all__ = ["VARIABLE", "spread", "threads"]
 #: The environment variable that says how many threads work; unset or empty: one for each processor.
 VARIABLE = "LODESTREAM_THREADS"
 
-_MOST = 256
+_MAX_THREADS = 256
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 
 def threads() -> int:
-    """How many threads work on one surface, the caller's included: 1 or more.
+    """Return how many threads work on one surface, the caller's included: 1 or more.
 
     Raises
     ------
     OptionError
         If ``LODESTREAM_THREADS`` is set to something else than a whole number from 1 to 256.
     """
-    told = os.environ.get(VARIABLE, "").strip()
-    if not told:
-        return min(_processors(), _MOST)
-    if told.isascii() and told.isdigit() and 1 <= int(told) <= _MOST:
-        return int(told)
-    raise OptionError(f"expected {VARIABLE} to be a whole number from 1 to {_MOST}, got {told[:40]!r}")
+    setting = os.environ.get(VARIABLE, "").strip()
+    if not setting:
+        return min(_processors(), _MAX_THREADS)
+    if setting.isascii() and setting.isdigit() and 1 <= int(setting) <= _MAX_THREADS:
+        return int(setting)
+    raise OptionError(f"expected {VARIABLE} to be a whole number from 1 to {_MAX_THREADS}, got {setting[:40]!r}")
 
 
 def _processors() -> int:
-    """Processors that this process may use."""
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return max(1, len(os.sched_getaffinity(0)))
     return os.cpu_count() or 1
 
 
 def spread(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """``[work(item) for item in items]``, by the caller's thread and as many others as `threads` allows.
+    """Return ``[work(item) for item in items]``, computed by the caller's thread and up to `threads` - 1 others.
 
-    Items are begun in their order, and results stand in the order of the items. The caller takes part and waits only
-    for items that others have begun, so `work` may call this itself, and all callers share the threads.
+    Items are started in order, and results are in the order of the items. The caller takes part and waits only for
+    items that others have started, so `work` may call `spread` itself, and all callers share the threads.
 
     Raises
     ------
     Exception
-        Whatever `work` raises for the first item, in their order, for which it does. No item is begun after that, and
-        none is still being worked on when it is raised. An interruption of the caller's thread ends it alike.
+        The exception that `work` raises for the first item, in order, that fails. No item is started after that, and
+        none is running when it is raised. An interrupt of the caller's thread has the same effect.
     """
     queue = list(items)
     if len(queue) < 2 or (count := min(threads(), len(queue))) < 2:
@@ -83,7 +83,7 @@ class _Spread(Generic[_Item, _Result]):
         self._errors: dict[int, BaseException] = {}
 
     def results(self, others: int) -> list[_Result]:
-        """All results in order, with the help of so many other threads."""
+        """Return all results in order, with the help of ``others`` threads."""
         self._places.extend([None] * others)
         try:
             _pool().ask(self, others)
@@ -101,17 +101,18 @@ class _Spread(Generic[_Item, _Result]):
         return [self._found[number] for number in range(self._count)]
 
     def help(self) -> None:
-        """Take items in another thread. After the end there is no place, and nothing is done."""
+        """Process items in another thread. After the end there is no place, and this does nothing."""
         try:
             self._places.pop()
         except IndexError:
             return
-        with suppress(BaseException):  # it stands among the errors, for the caller
+        with suppress(BaseException):  # it is in `_errors`, for the caller
             self._take()
         self._left.append(None)
         self._woken.put(None)
 
     def _take(self) -> None:
+        """Process items until none is waiting."""
         while True:
             try:
                 number, item = self._waiting.popleft()
@@ -126,7 +127,7 @@ class _Spread(Generic[_Item, _Result]):
                     raise
 
     def _close(self) -> int:
-        """Places that nobody has taken, and nobody will."""
+        """Remove the places that no thread has taken; return their number."""
         free = 0
         with suppress(IndexError):
             while True:
@@ -135,26 +136,27 @@ class _Spread(Generic[_Item, _Result]):
         return free
 
     def _wait(self, helping: int) -> None:
-        """Wait until so many threads have left; it may be interrupted and called again."""
+        """Wait until ``helping`` threads have finished; it may be interrupted and called again."""
         while len(self._left) < helping:
             self._woken.get()
 
 
 class _Pool:
-    """Threads that begin when there is something to do, and end with the process."""
+    """Threads that start when there is work, and end with the process."""
 
     def __init__(self, most: int) -> None:
-        # References are weak: an end does not wait for a thread that has not come to it, which then finds nothing.
+        # References are weak, so that finished work need not wait for a thread that has not started on it.
         self._asked: SimpleQueue[ref[_Spread[Any, Any]]] = SimpleQueue()
         self._unborn = deque(range(most))
 
     def ask(self, work: _Spread[Any, Any], count: int) -> None:
-        """Have so many threads help when they are free. Where no thread can be started, nobody does."""
+        """Ask ``count`` threads to help when they are free. Where no thread can be started, the caller works alone."""
         for _ in range(count):
             self._asked.put(ref(work))
             self._start()
 
     def _start(self) -> None:
+        """Start a thread if there are fewer than the maximum."""
         try:
             number = self._unborn.pop()
         except IndexError:
@@ -165,11 +167,13 @@ class _Pool:
             self._unborn.append(number)
 
     def _serve(self) -> None:
+        """Process requests for help."""
         while True:
             self._help(self._asked.get()())
 
     @staticmethod
     def _help(work: _Spread[Any, Any] | None) -> None:
+        """Help with work that still exists."""
         if work is not None:
             work.help()
 
@@ -179,6 +183,7 @@ _pools: dict[int, _Pool] = {}
 
 
 def _pool() -> _Pool:
+    """Return the pool for the current number of threads."""
     most = threads() - 1
     return _pools.get(most) or _pools.setdefault(most, _Pool(most))
 

@@ -1,4 +1,4 @@
-"""How closely a container keeps a surface, whoever asks: a caller, the command line, or the query of an upload."""
+"""How closely a container keeps a surface, as a caller, the command line, or the query of an upload requests it."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Quality:
         rms: Limit | None = None,
         attributes: Mapping[str, Limit] | None = None,
     ) -> Quality:
-        """A quality from tolerances, numbers in the surface's unit, or texts.
+        """Make a quality from tolerances, numbers in the surface's unit, or texts.
 
         Raises
         ------
@@ -66,7 +66,7 @@ class Quality:
 
     @classmethod
     def parse(cls, precisions: Iterable[str] = (), rms: str | None = None) -> Quality:
-        """A quality from the texts of a command line or a query, which `texts` gives back.
+        """Parse a quality from the texts of a command line or a query, which `texts` returns.
 
         >>> Quality.parse(["1e-4d", "depth=0.5"]) == Quality.of("1e-4d", attributes={"depth": 0.5})
         True
@@ -83,19 +83,19 @@ class Quality:
         OptionError
             If a text is no tolerance, one is given twice, or both a precision and a root mean square error are given.
         """
-        found: dict[str | None, Tolerance] = {}
+        tolerances: dict[str | None, Tolerance] = {}
         for text in precisions:
             name, equals, tolerance = text.rpartition("=")
             key = name if equals else None
-            if key in found:
+            if key in tolerances:
                 raise OptionError(f"expected each precision once, {_shown(key)} given twice")
-            found[key] = Tolerance.parse(tolerance)
-        points = found.pop(None, None)
-        attributes = {name: tolerance for name, tolerance in found.items() if name is not None}
+            tolerances[key] = Tolerance.parse(tolerance)
+        points = tolerances.pop(None, None)
+        attributes = {name: tolerance for name, tolerance in tolerances.items() if name is not None}
         return cls(precision=points, rms=None if rms is None else Tolerance.parse(rms), attributes=attributes)
 
     def texts(self) -> tuple[list[str], str | None]:
-        """What `parse` reads back: the precisions and the root mean square error, in canonical spelling.
+        """Return the texts that `parse` reads: the precisions and the RMS error, in canonical spelling.
 
         >>> Quality.of(attributes={"depth": 0.5}, rms="0.10d").texts()
         (['depth=0.5'], '0.1d')
@@ -106,4 +106,5 @@ class Quality:
 
 
 def _shown(name: str | None) -> str:
+    """Quote the name of an attribute for a message; P stands for the points."""
     return "P" if name is None else f"{name[:80]!a}"

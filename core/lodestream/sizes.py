@@ -13,20 +13,20 @@ _SIZE = re.compile(r"\s*(\d{1,18})(\.\d{1,9})?\s*([a-z]{0,3})\s*", re.ASCII)
 
 
 def parse_size(text: str) -> int:
-    """The number of bytes that a text such as ``20000``, ``20kB`` or ``1.5 GiB`` says.
+    """Parse a number of bytes such as ``20000``, ``20kB`` or ``1.5 GiB``.
 
     Raises
     ------
     ValueError
-        If it says something else.
+        If the text is no such number.
 
     Examples
     --------
     >>> parse_size("1.5 MiB")
     1572864
     """
-    found = _SIZE.fullmatch(text.lower())
-    unit = None if found is None else _UNITS.get(found[3].removesuffix("b"))
-    if found is None or unit is None:
+    parts = _SIZE.fullmatch(text.lower())
+    unit = None if parts is None else _UNITS.get(parts[3].removesuffix("b"))
+    if parts is None or unit is None:
         raise ValueError(f"expected a number of bytes such as 20000, 20kB or 1MiB, got {text[:80]!r}")
-    return int(found[1]) * unit + round(float(found[2] or 0) * unit)
+    return int(parts[1]) * unit + round(float(parts[2] or 0) * unit)

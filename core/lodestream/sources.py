@@ -1,4 +1,4 @@
-"""Arrays that lie somewhere else, read window by window: files of simulations, Zarr, Dask, xarray, HDF5."""
+"""Arrays stored elsewhere that are read window by window: files of simulations, Zarr, Dask, xarray, HDF5."""
 
 from __future__ import annotations
 
@@ -48,16 +48,14 @@ class Source(Protocol):
         """The type of the values."""
 
     def read(self, window: tuple[slice, slice]) -> NDArray[Any]:
-        """The values of some rows and columns, shape (row, column) or (row, column, channel).
+        """Return the values of some rows and columns, shape (row, column) or (row, column, channel).
 
         Both slices have a start and a stop.
         """
 
 
 def is_source(value: object) -> TypeGuard[Source]:
-    """Whether this is read by windows: a `Source`, or an array of another library, which is indexed (h5py, Zarr, Dask,
-    xarray), and is no array of numpy.
-    """
+    """Return whether a value is read by windows: a `Source`, or an array of h5py, Zarr, Dask or xarray."""
     if isinstance(value, np.ndarray | list | tuple | str | bytes | memoryview):
         return False
     shaped = hasattr(value, "shape") and hasattr(value, "dtype")
@@ -65,7 +63,7 @@ def is_source(value: object) -> TypeGuard[Source]:
 
 
 def read_source(source: Source, room: Room) -> NDArray[Any]:
-    """All values of a source, shape (row, column) or (row, column, channel), where there is room for them.
+    """Read all values of a source, shape (row, column) or (row, column, channel), into an array of ``room``.
 
     Raises
     ------
@@ -78,13 +76,13 @@ def read_source(source: Source, room: Room) -> NDArray[Any]:
     values = room.empty(shape, np.dtype(source.dtype).newbyteorder("="))
     here = _holds_arrays(source)
     for window in windows(shape, _chunk(source)):
-        found = _part(source, window, here)
-        if np.ma.is_masked(found):
+        read = _part(source, window, here)
+        if np.ma.is_masked(read):
             raise InputError(
                 f"expected values in all of a source of shape {shape}, got masked ones: fill them with NaN"
             )
-        part = np.asarray(found)
-        expected = (*(own.stop - own.start for own in window), *shape[2:])
+        part = np.asarray(read)
+        expected = (*(span.stop - span.start for span in window), *shape[2:])
         if part.shape != expected:
             raise InputError(f"expected a window of shape {expected} of a source of shape {shape}, got {part.shape}")
         if part.dtype.newbyteorder("=") != values.dtype:
@@ -94,33 +92,34 @@ def read_source(source: Source, room: Room) -> NDArray[Any]:
 
 
 def _part(source: Any, window: tuple[slice, slice], here: bool) -> Any:
+    """Read or compute a window."""
     part = source.read(window) if callable(getattr(source, "read", None)) else source[window]
     return part.compute(scheduler="threads") if here else part
 
 
 def _holds_arrays(source: Any) -> bool:
-    """Whether this is an array of Dask, or xarray with Dask, made of arrays in memory.
+    """Return whether a source is an array of Dask, or of xarray with Dask, made of arrays in memory.
 
-    The workers of a cluster would be sent all of them for each window; so threads of this process compute it.
+    A cluster would receive all of them for each window, so threads of this process compute such a source.
     """
     graph = getattr(source, "__dask_graph__", lambda: None)()
     return graph is not None and any(isinstance(task, np.ndarray) for task in graph.values())
 
 
 def _chunk(source: Any) -> tuple[int, int]:
-    """Rows and columns of the chunks that a source has, 1 where it does not say."""
+    """Return rows and columns of the chunks of a source, 1 where they are unknown."""
     chunks = getattr(source, "chunks", None)
-    found = [*(chunks if isinstance(chunks, tuple) else ())][:2]
-    sides = [max(side, default=1) if isinstance(side, tuple) else side for side in found]  # Dask lists all of them
+    lengths = [*(chunks if isinstance(chunks, tuple) else ())][:2]
+    sides = [max(side, default=1) if isinstance(side, tuple) else side for side in lengths]  # Dask lists all of them
     rows, columns = [*(side if isinstance(side, int) and side > 0 else 1 for side in sides), 1, 1][:2]
     return rows, columns
 
 
 def windows(shape: tuple[int, ...], chunk: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
-    """All windows of an array of this shape, (row, column, ...), each of a few million values.
+    """Yield all windows of an array of this shape, (row, column, ...), each of a few million values.
 
-    They consist of whole chunks (rows, columns), none of which is in two, and so of one at least: a chunk is read, or
-    computed, as a whole. They have all columns where there is room for them.
+    They consist of whole chunks (rows, columns), because a chunk is read, or computed, as a whole. They have all
+    columns if these are not too many.
     """
     rows, columns = (max(1, min(side, length)) for side, length in zip(chunk, shape, strict=False))
     others = max(1, math.prod(shape[2:]))
@@ -128,5 +127,5 @@ def windows(shape: tuple[int, ...], chunk: tuple[int, int]) -> Iterator[tuple[sl
     across = shape[1] if across == shape[1] else across // columns * columns
     down = max(rows, _AT_ONCE // (across * others) // rows * rows)
     for top in range(0, shape[0], down):
-        for left in range(0, shape[1], across):
-            yield slice(top, min(top + down, shape[0])), slice(left, min(left + across, shape[1]))
+        for first in range(0, shape[1], across):
+            yield slice(top, min(top + down, shape[0])), slice(first, min(first + across, shape[1]))

@@ -79,6 +79,7 @@ class Block:
         self.attributes = {name: self._attribute(name, values) for name, values in (attributes or {}).items()}
 
     def _attribute(self, name: str, values: ArrayLike) -> NDArray[Any]:
+        """Check an attribute and return it in the form that a block stores."""
         array = np.asarray(values)
         if array.shape[:2] != self.shape or array.ndim > 3 or array.size == 0:
             raise InputError(
@@ -88,7 +89,7 @@ class Block:
         return shown if hidden is None else self._shown(shown, hidden, f"attribute {name!r}")
 
     def _shown(self, values: NDArray[Any], hidden: NDArray[np.bool_], what: str) -> NDArray[Any]:
-        """Values that are NaN where they are hidden."""
+        """Return values with NaN where they are hidden."""
         if values.dtype.kind == "f":
             return np.where(hidden, values.dtype.type(np.nan), values)
         anywhere: NDArray[np.bool_] = hidden if hidden.ndim == 2 else np.asarray(hidden.any(axis=2))
@@ -99,6 +100,7 @@ class Block:
         return values
 
     def _valid(self, mask: ArrayLike | None, hidden: NDArray[np.bool_] | None) -> NDArray[np.bool_] | None:
+        """Return the mask of valid points; None if all are."""
         valid: NDArray[np.bool_] | None = None
         if hidden is not None:
             valid = ~(hidden if hidden.ndim == 2 else np.asarray(hidden[..., :3].any(axis=2)))
@@ -224,6 +226,7 @@ class Surface:
                 )
 
     def _only(self) -> Block:
+        """Return the only block."""
         if len(self.blocks) != 1:
             raise InputError(f"expected a surface of one block, got {len(self.blocks)} blocks")
         return self.blocks[0]
@@ -259,7 +262,7 @@ class Surface:
         return self.blocks[0].points.dtype
 
     def to_xarray(self) -> xarray.Dataset | xarray.DataTree:
-        """This surface for xarray (extra ``xarray``): a Dataset, or a DataTree of ``block_0``, ... for several blocks.
+        """Convert into xarray (extra ``xarray``): a Dataset, or a DataTree of ``block_0``, ... for several blocks.
 
         Heights become a variable over y and x, with coordinates from the geotransform; it is named as the metadata's
         ``variable``, or z. x, y, z become z over row and column with coordinates x and y. Attributes are variables.
@@ -287,7 +290,7 @@ class Surface:
         nodata: int | float | str | None = None,
         **options: str,
     ) -> Surface:
-        """A surface of an xarray Dataset or DataArray; of a DataTree one block for each node with variables.
+        """Convert an xarray Dataset or DataArray; a DataTree has one block for each node with variables.
 
         Parameters
         ----------
@@ -317,7 +320,7 @@ class Surface:
         return from_xarray(data, attributes=attributes, closed=closed, nodata=nodata, **options)
 
     def to_pyvista(self) -> pyvista.StructuredGrid | pyvista.MultiBlock:
-        """This surface for pyvista (extra ``pyvista``): a StructuredGrid, or a MultiBlock of them for several blocks.
+        """Convert into pyvista (extra ``pyvista``): a StructuredGrid, or a MultiBlock of them for several blocks.
 
         Heights stand over their coordinates. Holes are hidden points, and cells without a face or with a hole for a
         corner are hidden cells. A closed axis repeats its first points at the end; longitudes, and the places of
@@ -337,7 +340,7 @@ class Surface:
 
     @staticmethod
     def from_pyvista(data: pyvista.DataObject) -> Surface:
-        """A surface of a structured grid of pyvista, of a MultiBlock of them, or of a mesh of polygons that is a grid.
+        """Convert a structured grid of pyvista, a MultiBlock of them, or a mesh of polygons that is a grid.
 
         Parameters
         ----------
@@ -359,7 +362,7 @@ class Surface:
         return from_pyvista(data)
 
     def to_trimesh(self) -> trimesh.Trimesh:
-        """This surface for trimesh (extra ``trimesh``): its welded mesh, quads cut into two triangles each.
+        """Convert into trimesh (extra ``trimesh``): the welded mesh, quads cut into two triangles each.
 
         Blocks are joined where they touch, closed axes by faces, holes left open. Colours, normals and places in a
         texture go where trimesh has them, other attributes to ``vertex_attributes``, metadata to ``metadata``.
@@ -377,7 +380,7 @@ class Surface:
 
     @staticmethod
     def from_trimesh(mesh: trimesh.Trimesh) -> Surface:
-        """A surface of a mesh of triangles that is a structured surface, found as in an OBJ or a PLY.
+        """Convert a mesh of triangles that is a structured surface, found as in an OBJ or a PLY.
 
         Parameters
         ----------
@@ -404,7 +407,7 @@ class Surface:
         return from_trimesh(mesh)
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a small picture and sizes."""
+        """Return what a notebook shows: a small picture and sizes."""
         from .interop.html import surface_html
 
         return surface_html(self)
@@ -416,7 +419,7 @@ class Surface:
 def finite_block(
     points: NDArray[Any], closed: Closed, mask: NDArray[np.bool_] | None, attributes: dict[str, NDArray[Any]]
 ) -> Block:
-    """A block of points that are known to be finite where they are valid, as some are: they are not looked through.
+    """Make a block of points that are known to be finite where they are valid, without examining them.
 
     Raises
     ------
@@ -431,7 +434,7 @@ def finite_block(
 
 
 def _checked(points: ArrayLike, closed: Closed) -> tuple[NDArray[Any], Closed]:
-    """What a block keeps of both, if they may be those of one."""
+    """Return points and closed axes in the form that a block stores, after checking them."""
     array = np.asarray(points)
     if array.ndim not in (2, 3) or (array.ndim == 3 and array.shape[2] < 2):
         raise InputError(
@@ -445,7 +448,7 @@ def _checked(points: ArrayLike, closed: Closed) -> tuple[NDArray[Any], Closed]:
 
 
 def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:
-    """What is masked of a masked array, of its shape; None where nothing is."""
+    """Return the mask of a masked array, bool, of its shape; None where nothing is masked."""
     if type(values) is np.ndarray or not isinstance(values, np.ma.MaskedArray):  # a plain array need not load numpy.ma
         return None
     hidden = values.mask
@@ -453,7 +456,7 @@ def _hidden(values: ArrayLike) -> NDArray[np.bool_] | None:
 
 
 def _is_mapped(array: object) -> bool:
-    """Whether an array is memory-mapped, or a view of one that is."""
+    """Return whether an array is memory-mapped, or a view of one that is."""
     while isinstance(array, np.ndarray):
         if isinstance(array, np.memmap):
             return True
@@ -462,6 +465,7 @@ def _is_mapped(array: object) -> bool:
 
 
 def _native(array: NDArray[Any], what: str) -> NDArray[Any]:
+    """Return an array in this machine's byte order, C-contiguous; raise InputError for other types."""
     dtype = array.dtype.newbyteorder("=")
     if dtype.name not in DTYPES:
         raise InputError(f"expected {what} as integers of 8 to 64 bits or float32 or float64, got {array.dtype}")
@@ -472,10 +476,12 @@ _Kind = tuple[str, tuple[int, ...], tuple[tuple[str, str, tuple[int, ...]], ...]
 
 
 def _kind(block: Block) -> _Kind:
+    """Return the types and channels of a block's arrays."""
     attributes = tuple((name, array.dtype.name, array.shape[2:]) for name, array in block.attributes.items())
     return block.points.dtype.name, block.points.shape[2:], attributes
 
 
 def _words(kind: _Kind) -> str:
+    """Describe the types and channels of a block's arrays."""
     points = f"{kind[0]} with {kind[1][0]} channels" if kind[1] else f"{kind[0]} heights"
     return points + "".join(f", {name} ({dtype}{list(shape) if shape else ''})" for name, dtype, shape in kind[2])

@@ -20,7 +20,7 @@ Region = tuple[tuple[int, int], tuple[int, int]]
 
 
 def check_integer(what: str, value: Any) -> int:
-    """A number of a level or the like as a plain int, whichever library's integer it is.
+    """Return the number of a level or the like as int, whichever library's integer it is.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Tolerance:
 
     @classmethod
     def of(cls, error: Tolerance | float | str) -> Tolerance:
-        """What somebody wrote for an error: a tolerance, a number in the surface's unit, or a text for `parse`.
+        """Convert an error: a tolerance, a number in the surface's unit, or a text for `parse`.
 
         >>> Tolerance.of("1e-3d")
         Tolerance(value=0.001, relative=True)
@@ -114,11 +114,11 @@ class Tolerance:
             raise OptionError(f"expected a number such as 0.5, or 1e-3d (times the extent), got {text!r}") from None
 
     def __str__(self) -> str:
-        """The canonical text of this tolerance, which `parse` reads back."""
+        """Return the canonical text of this tolerance, which `parse` reads."""
         return f"{float(self.value)!r}{'d' if self.relative else ''}"
 
     def absolute(self, extent: float) -> float:
-        """The tolerance in the unit of a surface with this extent."""
+        """Return the tolerance in the unit of a surface with this extent."""
         return self.value * extent if self.relative else self.value
 
 
@@ -226,15 +226,16 @@ class Target:
     @property
     def channels(self) -> tuple[ChannelLimit, ...]:
         """The errors of channels at which to stop, by name."""
-        found: list[ChannelLimit] = []
+        limits: list[ChannelLimit] = []
         if isinstance(self.until_rms, Mapping):
-            found += [(name, "rms", Tolerance.of(limit).value) for name, limit in self.until_rms.items()]
+            limits += [(name, "rms", Tolerance.of(limit).value) for name, limit in self.until_rms.items()]
         if isinstance(self.until_max, Mapping):
-            found += [(name, "max", Tolerance.of(limit).value) for name, limit in self.until_max.items()]
-        return tuple(sorted(found))
+            limits += [(name, "max", Tolerance.of(limit).value) for name, limit in self.until_max.items()]
+        return tuple(sorted(limits))
 
 
 def _limits(given: Limits | None) -> Tolerance | dict[str, Tolerance] | None:
+    """Check error limits, of the whole surface or of channels."""
     if given is None:
         return None
     if not isinstance(given, Mapping):
@@ -242,9 +243,9 @@ def _limits(given: Limits | None) -> Tolerance | dict[str, Tolerance] | None:
     for name in given:
         if not isinstance(name, str):
             raise OptionError(f"expected errors by the names of channels, such as {{'z': 0.5}}, got the key {name!r}")
-    found = {name: Tolerance.of(limit) for name, limit in given.items()}
-    for name, limit in found.items():
+    limits = {name: Tolerance.of(limit) for name, limit in given.items()}
+    for name, limit in limits.items():
         if limit.relative:
             # The extent is one of lengths; a channel has its own unit.
             raise OptionError(f"expected an error of {name!r} in its own unit, got {limit}, which is times the extent")
-    return found or None
+    return limits or None

@@ -1,4 +1,4 @@
-"""Making text from files and servers safe to print; names in a text."""
+"""Escaping of text from files and servers for printing; names in a text."""
 
 from __future__ import annotations
 
@@ -50,4 +50,5 @@ def printable(text: str) -> str:
 
 
 def _escaped(char: str) -> str:
+    """Escape a character as Python does."""
     return char.encode("unicode_escape").decode("ascii")
