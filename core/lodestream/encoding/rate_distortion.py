@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from .. import kernels
 from ..entropy.band_fields import COLUMNS, ROWS
 from ..entropy.tiles import TileTable
-from ..entropy.trellis import TRANSITIONS
 from ..kernels import CLASSES, INDICES, RATES
-from ..quantization.band_steps import MOST_BASE
+from ..quantization.band_steps import MOST_BASE, TRANSITIONS
 
 __all__ = ["MOST_TRIES", "IndexChooser", "longest_base"]
 

@@ -117,7 +117,7 @@ def code_passes(
     costs : float64
         The bits written when each pass ended, by its number; or empty, unless a large unit is written.
     trellis : bool
-        The coefficients are indices with a trellis, see `trellis`; ``models`` are of a trellis.
+        The coefficients are indices with a trellis, see `quantization.band_steps`; ``models`` are of a trellis.
     state : int64, shape (`kernels.PASSES_STATE`,), optional
         How far the runs are, zeros at first; updated. A call that was interrupted goes on from there when it is made
         again with the same arrays.

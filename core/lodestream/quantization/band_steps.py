@@ -1,8 +1,11 @@
 """Quantization steps of bands, for a stream that is encoded for one RMS error, in place of lattice steps.
 
 Each band has a step, so that one of any coefficient changes the surface by about as much. What is coded, plane by
-plane, are the *indices*: a coefficient is its index times its band's step. A *trellis* halves the distance between the
-values that are within reach without longer indices, see `trellis`.
+plane, are the *indices*: a coefficient is its index times its band's step.
+
+A *trellis* of dependent quantisation halves the distance between values without longer indices. There are two
+quantisers, the even and the odd multiples of half a step, 0 in both. Which one applies to a coefficient follows from
+the parity of the indices before it, as in JPEG 2000 part 2 and H.266; the states are those of the latter's successor.
 """
 
 from __future__ import annotations
@@ -13,10 +16,15 @@ import numpy as np
 
 from ..grid.layout import Layout
 
-__all__ = ["MOST_BASE", "Quantiser", "band_step", "lifting_steps_along"]
+__all__ = ["MOST_BASE", "ODD", "TRANSITIONS", "Quantiser", "band_step", "lifting_steps_along"]
 
 #: Largest `Quantiser.base`.
 MOST_BASE = (1 << 24) - 1
+
+#: The state after an even and after an odd index, by the state before; every band of a tile begins in state 0.
+TRANSITIONS = np.array([[0, 2], [5, 7], [1, 3], [6, 4], [2, 0], [4, 6], [3, 1], [7, 5]], np.int64)
+#: Whether a coefficient is one of the odd multiples, by the state before it.
+ODD = np.array([0, 1, 0, 1, 0, 1, 0, 1], np.int64)
 
 #: Of a node and of a detail along an axis: 2**16 over the norm of its synthesis function with the four-point rule, by
 #: the axis's lifting steps from there to the finest level; further ones halve it for each two of them.

@@ -80,7 +80,7 @@ class Lattice:
         return to_dtype(q, dtype)
 
     def coordinates(self, values: NDArray[Any], out: NDArray[np.int32] | None = None) -> NDArray[np.int32]:
-        """Return nearest lattice coordinates of values of any dtype, int32, in ``out`` or a new array."""
+        """Return nearest lattice coordinates of values of any dtype, int32, of their shape, in ``out`` if given."""
         if out is None:
             out = np.empty(values.shape, np.int32)
         height = max(1, _VALUES_PER_STRIP * len(values) // values.size)

@@ -30,10 +30,9 @@ from lodestream.entropy.band_fields import (
     STRIDE,
 )
 from lodestream.entropy.tiles import TileTable
-from lodestream.entropy.trellis import ODD, TRANSITIONS
 from lodestream.grid.layout import Grid, Layout
 from lodestream.kernels import CLASSES, INDICES, RATES
-from lodestream.quantization.band_steps import MOST_BASE, Quantiser
+from lodestream.quantization.band_steps import MOST_BASE, ODD, TRANSITIONS, Quantiser
 from lodestream.transform.predictors import COEFFICIENT_BITS
 
 WORTH = 0.05

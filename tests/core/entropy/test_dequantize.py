@@ -14,7 +14,7 @@ from lodestream import kernels
 from lodestream.entropy import dequantize
 from lodestream.entropy.band_fields import BAND_FIELDS, COLUMNS, OFFSET, ROWS, STRIDE
 from lodestream.entropy.dequantize import UNANNOUNCED, spread_bands
-from lodestream.entropy.trellis import ODD, TRANSITIONS
+from lodestream.quantization.band_steps import ODD, TRANSITIONS
 
 LARGEST = 2**28
 
