@@ -95,7 +95,7 @@ LAID_OUT := $(C) $(wildcard client/web/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
 C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
 
-lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, and the warnings of gcc and clang
+lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, warnings of gcc and clang; lines of code
 	@status=0; \
 	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
 	$(CLANG_FORMAT) --dry-run -Werror $(LAID_OUT) || status=1; \
@@ -106,6 +106,7 @@ lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-for
 			echo "lint: there is no $$compiler, so nobody has seen its warnings"; \
 		fi; \
 	done; \
+	$(BIN)/python .ci/lines.py; \
 	exit $$status
 
 format: $(STAMP) ## let ruff lay out the code and sort its imports, and clang-format lay out the C

@@ -196,7 +196,7 @@ class Joints:
         return Joints(self.shapes, self.places, self.vertices, composed)
 
     def number(self, block: int, rows: Numbers, columns: Numbers) -> Numbers:
-        """Return the numbers in the whole surface of points of a grid; rows and columns of any shapes that broadcast."""
+        """Return the numbers in the whole surface of points of a grid; rows and columns of shapes that broadcast."""
         if self.nodes is not None:
             rows, columns = self.nodes[block][0][rows], self.nodes[block][1][columns]
         start = sum(height * width for height, width in self.shapes[:block])
