@@ -13,6 +13,7 @@ from threading import Lock
 import numpy as np
 
 from ..container.model import Header
+from ..decoding.measurer import Figures
 from ..decoding.values import Values
 from ..encoding.lattice_coordinates import Lattices, strips
 from ..encoding.prepared import Prepared
@@ -62,9 +63,10 @@ class Build:
         self.points, self._core_points = points, core_points
         #: Of the coordinates, where the stream is made for one error; known when they are transformed.
         self.quantiser: Quantiser | None = None
-        #: What the last layer shows of each block, of a build in one piece, from when it is known until it is used.
-        self.last: Mapping[int, Values] | None = None
+        #: Of a build in one piece its errors, and what the last layer shows of each block, until both are used.
+        self.last: tuple[Figures, Mapping[int, Values]] | None = None
         self._header: Header | None = None
+        self._tables: dict[bool, TileTable] = {}
 
     @cached_property
     def pieces(self) -> Pieces:
@@ -75,8 +77,12 @@ class Build:
         return Pieces(prepared.layout, self.points, self._core_points, strips(prepared) if with_holes else None)
 
     def table(self, channel: int) -> TileTable:
-        """Of all tiles of a channel: points of interfaces are coordinates."""
-        return TileTable.of(self.prepared.layout, channel < self.prepared.geometric)
+        """Of all tiles of a channel, the same object each time: points of interfaces are coordinates.
+
+        Tables of a few layouts are remembered, and a process may be at work on surfaces of many.
+        """
+        kind = channel < self.prepared.geometric
+        return self._tables.get(kind) or self._tables.setdefault(kind, TileTable.of(self.prepared.layout, kind))
 
     def quantiser_of(self, channel: int) -> Quantiser | None:
         """The quantiser of a channel, if it has one."""

@@ -255,7 +255,7 @@ def goes_by_bands(surface: Surface, quality: Quality, memory: int, wanted: bool 
     TooLargeError
         If it is refused.
     """
-    needed = whole_memory(surface)
+    needed = whole_memory(surface, quality.rms is not None)
     reason = _in_one_piece(surface, quality)
     if reason is None:
         return wanted or needed > memory

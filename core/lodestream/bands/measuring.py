@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
-from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer
+from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer, distances_of
 from ..decoding.region import Region, core_level
 from ..decoding.values import Values, region_of_blocks, values_of
 from ..encoding.prepared import Prepared
@@ -22,7 +22,7 @@ from ..entropy.tiles import Tiles
 from ..kernels import PART_ROWS
 from ..parallel import spread
 from .build import Build
-from .stored import known_tiles
+from .stored import forget_known, known_tiles
 
 __all__ = [
     "RUNS_TOGETHER",
@@ -89,14 +89,29 @@ class Residual:
 
 def measure(build: Build, header: Header, run: range) -> tuple[Figures, Residual]:
     """Measure a run in all states, and code its residual."""
+    figures, values = _measured(build, header, run)
+    build.last = None
+    return figures, _residual(build.prepared, header, run, values)
+
+
+def _measured(build: Build, header: Header, run: range) -> tuple[Figures, Mapping[int, Values]]:
+    """Measure a run in all states, and then make its values after the last layer: they would stand beside the states.
+
+    Of a build in one piece both are kept, since the size of chunks is chosen by the values before they are coded. What
+    a reader knows is then needed no more.
+    """
+    if build.last is not None:
+        return build.last
     region = _region(build, header, run)
     tiles = _tiles(build, region)
     states = list(np.array(build.scratch.read("states")))
     figures = Measurer(header, region, tiles, build.prepared.comparisons(region)).figures(states)
-    del tiles  # before values take as much
-    values = last_values(build, header, run)
-    build.last = None
-    return figures, _residual(build.prepared, header, run, values)
+    values = values_of(header, region, tiles, np.array(build.scratch.read("last-state")))
+    if build.is_whole:
+        build.last = figures, values
+        if all(distances_of(header, [figures], state) for state in range(len(states))):  # else see `exact_errors`
+            forget_known(build)
+    return figures, values
 
 
 def _region(build: Build, header: Header, run: range) -> Region:
@@ -118,17 +133,11 @@ def exact_errors(build: Build, header: Header, state: NDArray[np.int8]) -> Measu
 
 
 def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values]:
-    """Return rows of the only block, or some blocks, as they are after the last layer.
-
-    Of a build in one piece it is the surface, and kept: the size of chunks is chosen by them before they are coded.
-    """
-    if build.last is not None:
-        return build.last
-    region = _region(build, header, run)
-    values = values_of(header, region, _tiles(build, region), np.array(build.scratch.read("last-state")))
+    """Return rows of the only block, or some blocks, as they are after the last layer; all of a build in one piece."""
     if build.is_whole:
-        build.last = values
-    return values
+        return _measured(build, header, run)[1]
+    region = _region(build, header, run)
+    return values_of(header, region, _tiles(build, region), np.array(build.scratch.read("last-state")))
 
 
 def _tiles(build: Build, region: Region) -> list[Tiles]:

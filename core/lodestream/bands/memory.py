@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from operator import index
+from typing import Any
+
+from numpy.typing import NDArray
 
 from ..container.capacity import memory_limit
 from ..encoding.arranging import may_share
@@ -25,6 +30,10 @@ __all__ = [
 
 #: Bytes that encoding takes for each value: in one piece, with holes, and for each value of a band.
 WHOLE, _WHOLE_WITH_HOLES, OF_BAND = 16, 40, 32
+#: In one piece the values as they are after the last layer are a part of these, or come on top of so many.
+_WITHOUT_VALUES = 14
+#: For one error: for each point while the indices of one coordinate are chosen, and for each coordinate.
+_CHOICE, _LOOP = 28, 18
 #: Bytes that masks take for each point of a surface with holes, whatever the band.
 _MASKS = 6
 #: What a process takes besides, and the least that may be asked for.
@@ -57,11 +66,23 @@ def checked_memory(memory: int | str) -> int:
     return size
 
 
-def whole_memory(surface: Surface) -> int:
-    """About what encoding a surface in one piece takes, in bytes."""
-    values = sum(array.size for block in surface.blocks for array in (block.points, *block.attributes.values()))
+def whole_memory(surface: Surface, rms: bool = False) -> int:
+    """Return about what encoding a surface in one piece takes, in bytes; with ``rms``, into a stream for one error."""
     holes = any(block.mask is not None for block in surface.blocks)
-    return values * (_WHOLE_WITH_HOLES if holes else WHOLE)
+    if holes:
+        needed = _WHOLE_WITH_HOLES * sum(array.size for array in _arrays(surface))
+    else:
+        needed = sum(array.size * max(WHOLE, _WITHOUT_VALUES + array.itemsize) for array in _arrays(surface))
+    if not rms:
+        return needed
+    points, first = sum(math.prod(block.shape) for block in surface.blocks), surface.blocks[0].points
+    coordinates = 1 if first.ndim == 2 else min(first.shape[2], 3)
+    copies = 2 * first.itemsize if holes else 0  # filled ones, and the valid ones alone
+    return max(needed, points * (_CHOICE + coordinates * (_LOOP + copies)))
+
+
+def _arrays(surface: Surface) -> Iterator[NDArray[Any]]:
+    return (array for block in surface.blocks for array in (block.points, *block.attributes.values()))
 
 
 def least_memory(surface: Surface) -> int:

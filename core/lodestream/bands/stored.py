@@ -18,6 +18,7 @@ from .coding import Units
 __all__ = [
     "CORE",
     "PLAIN",
+    "forget_known",
     "keep_known",
     "kind_of",
     "known_tiles",
@@ -33,6 +34,9 @@ __all__ = [
 
 #: The file that says which channels are transformed with the default predictors, bool, shape (channel,).
 PLAIN = "plain"
+
+#: What a reader knows of a channel in the end, see `Tiles`; kept of a build in one piece.
+_KNOWN = ("known", "sign", "early")
 
 #: What stands for the number of a band where a level has none: the core is one piece.
 CORE = 0
@@ -102,11 +106,18 @@ def keep_known(build: Build, channel: int, units: Units) -> None:
     These are the coder's arrays: measuring then takes nothing more for them.
     """
     scratch, core, tiles = build.scratch, build.pieces.core, units.coder.tiles[0]
-    for kind, array in (("known", tiles.known), ("sign", tiles.sign), ("early", tiles.early)):
+    arrays: tuple[NDArray[Any], ...] = tiles.known, tiles.sign, tiles.early
+    for kind, array in zip(_KNOWN, arrays, strict=True):
         scratch.write(name_of(kind, channel, core, CORE), array)
     small = flat_span(build.table(channel), range(build.first_large(channel, int(scratch.read("large")))))
     name = name_of(transformed(build, "coefficients", channel), channel, core, CORE)
     scratch.write(name, units.channel.true[small])
+
+
+def forget_known(build: Build) -> None:
+    """Forget what a reader knows in the end: a build in one piece is measured."""
+    for kind in _KNOWN:
+        build.scratch.remove(kind)
 
 
 def known_tiles(build: Build, part: Part, channel: int) -> Tiles:
@@ -115,9 +126,7 @@ def known_tiles(build: Build, part: Part, channel: int) -> Tiles:
     if build.is_whole:
         assert part.table is build.table(channel)
         piece = channel, build.pieces.core, CORE
-        tiles.known, tiles.sign, tiles.early = (
-            build.scratch.read(name_of(kind, *piece)) for kind in ("known", "sign", "early")
-        )
+        tiles.known, tiles.sign, tiles.early = (build.scratch.read(name_of(kind, *piece)) for kind in _KNOWN)
         return tiles
     coefficients = transformed(build, "coefficients", channel)
     for run, span in part.spans:

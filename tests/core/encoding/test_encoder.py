@@ -351,6 +351,14 @@ def test_holes_have_a_nodata_value_that_attributes_cannot_hold(memory: str | Non
     assert not decoded.attributes["kind"][~mask].any()
 
 
+def test_surfaces_of_many_shapes_are_encoded_side_by_side() -> None:
+    # More layouts than are remembered: each asks for tables that the others have made the process forget.
+    surfaces = [np.rint(300 * terrain((40 + 7 * number, 33 + 5 * number))).astype(np.int16) for number in range(8)]
+    expected = [ls.encode(surface) for surface in surfaces]
+    with ThreadPoolExecutor(len(surfaces)) as executor:
+        assert list(executor.map(ls.encode, 3 * surfaces)) == 3 * expected
+
+
 def test_axes_that_are_too_long_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lodestream.encoding.encoder.LONGEST_AXIS", 10)
     ls.encode(np.zeros((10, 4)))
