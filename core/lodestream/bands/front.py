@@ -185,6 +185,8 @@ def encode(
             made = Made(surface, chosen, limit, executor, told, read is not None).container(folder.open())
             if made is not None:
                 return _given(made, out)
+            if memory is not None:
+                _check_whole(surface, chosen, limit, "float64 does not hold the squares of its errors")
         return _in_memory(surface, chosen, told, out)
 
 
@@ -259,12 +261,19 @@ def goes_by_bands(surface: Surface, quality: Quality, memory: int, wanted: bool 
     reason = _in_one_piece(surface, quality)
     if reason is None:
         return wanted or needed > memory
-    if strict and needed > memory:
+    if strict:
+        _check_whole(surface, quality, memory, reason)
+    return False
+
+
+def _check_whole(surface: Surface, quality: Quality, memory: int, reason: str) -> None:
+    """Refuse a surface that takes more memory in one piece and, for a reason, cannot be built by bands."""
+    needed = whole_memory(surface, quality.rms is not None)
+    if needed > memory:
         raise TooLargeError(
             f"expected a surface that takes at most {memory >> 20:,} MiB to encode, got one that takes about "
             f"{-(-needed >> 20):,} MiB and cannot be built by bands: {reason}"
         )
-    return False
 
 
 def _in_one_piece(surface: Surface, quality: Quality) -> str | None:

@@ -167,6 +167,17 @@ def test_what_has_no_bands_says_so() -> None:
         ls.encode(surface, memory=LITTLE, rms="1e-3d")
 
 
+def test_numbers_whose_squares_are_no_float64_keep_to_the_memory(tmp_path: Path) -> None:
+    heights = 1e290 * terrain((300, 280))
+    with pytest.raises(ls.TooLargeError, match=r"at most 1 MiB to encode, got one that takes about 2 MiB .* squares"):
+        ls.encode(heights, out=tmp_path / "a.lode", memory=1 << 20)
+    assert not any(tmp_path.iterdir())
+    ls.encode(heights, out=tmp_path / "a.lode", memory=2 << 20)
+    assert np.array_equal(ls.decode(tmp_path.joinpath("a.lode").read_bytes()).points, heights)
+    with ThreadPoolExecutor(1) as executor:  # nobody has said how much memory there is
+        assert ls.encode(heights, executor=executor) == (tmp_path / "a.lode").read_bytes()
+
+
 def test_more_memory_than_needed_means_one_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(front, "Made", None)
     ls.encode(_heights(), out=tmp_path / "a.lode")
