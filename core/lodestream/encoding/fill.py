@@ -90,6 +90,7 @@ def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, 
     for rows in strips:
         hidden = ~known[rows]
         clipped = np.clip(heights[rows][hidden], float(low), float(high))
+        clipped[np.isnan(clipped)] = low  # sums beyond float64: values that large are refused with their lattice
         inside = to_dtype(clipped, values.dtype)  # the largest integers are no float64, which may be beyond them
         values[rows][hidden] = np.clip(inside, low, high)
 

@@ -351,6 +351,15 @@ def test_holes_have_a_nodata_value_that_attributes_cannot_hold(memory: str | Non
     assert not decoded.attributes["kind"][~mask].any()
 
 
+def test_values_that_are_too_large_are_refused_beside_missing_ones_too() -> None:
+    speed = np.random.default_rng(1).choice([-1.7e308, 1.7e308], (30, 20))
+    with pytest.raises(InputError, match=r"at most 1e\+300 in magnitude, got 1\.7e\+308"):
+        ls.encode(ls.Surface(terrain((30, 20)), attributes={"speed": speed}))
+    speed[3:9, 4:12] = np.nan
+    with pytest.raises(InputError, match=r"at most 1e\+300 in magnitude, got 1\.7e\+308"):
+        ls.encode(ls.Surface(terrain((30, 20)), attributes={"speed": speed}))
+
+
 def test_surfaces_of_many_shapes_are_encoded_side_by_side() -> None:
     # More layouts than are remembered: each asks for tables that the others have made the process forget.
     surfaces = [np.rint(300 * terrain((40 + 7 * number, 33 + 5 * number))).astype(np.int16) for number in range(8)]
