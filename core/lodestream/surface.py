@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -339,7 +339,7 @@ class Surface:
         return to_pyvista(self)
 
     @staticmethod
-    def from_pyvista(data: pyvista.DataObject) -> Surface:
+    def from_pyvista(data: pyvista.DataObject, **remeshing: Any) -> Surface:
         """Convert a structured grid of pyvista, a MultiBlock of them, or a mesh of polygons that is a grid.
 
         Parameters
@@ -349,6 +349,8 @@ class Surface:
             and cells are holes. A last row or column that repeats the first makes a closed axis. Of polygons see
             `from_trimesh`. Data of cells are left out, with a `FormatWarning`. A grid of `to_pyvista` whose places,
             holes and cells are as they were becomes heights with their place again, of their type if it holds them.
+        **remeshing
+            For polygons that are no grid, see `from_mesh`.
 
         Raises
         ------
@@ -359,7 +361,7 @@ class Surface:
         """
         from .interop.pyvista_grids import from_pyvista
 
-        return from_pyvista(data)
+        return from_pyvista(data, **remeshing)
 
     def to_trimesh(self) -> trimesh.Trimesh:
         """Convert into trimesh (extra ``trimesh``): the welded mesh, quads cut into two triangles each.
@@ -379,13 +381,15 @@ class Surface:
         return to_trimesh(self)
 
     @staticmethod
-    def from_trimesh(mesh: trimesh.Trimesh) -> Surface:
+    def from_trimesh(mesh: trimesh.Trimesh, **remeshing: Any) -> Surface:
         """Convert a mesh of triangles that is a structured surface, found as in an OBJ or a PLY.
 
         Parameters
         ----------
         mesh : trimesh.Trimesh
             Grids whose cells are two triangles each, in any order; open, closed, with poles or holes, one or several.
+        **remeshing
+            For a mesh that is no grid, see `from_mesh`.
 
         Returns
         -------
@@ -404,7 +408,54 @@ class Surface:
         """
         from .interop.trimesh_meshes import from_trimesh
 
-        return from_trimesh(mesh)
+        return from_trimesh(mesh, **remeshing)
+
+    @staticmethod
+    def from_mesh(
+        vertices: ArrayLike,
+        faces: ArrayLike | Sequence[Sequence[int]],
+        attributes: Mapping[str, ArrayLike] | None = None,
+        **remeshing: Any,
+    ) -> Surface:
+        """Convert a mesh of triangles and quads: its grids, or blocks that resample it.
+
+        Parameters
+        ----------
+        vertices : array of shape (V, 2) or (V, 3)
+        faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int
+            0-based vertices of each face, going round it.
+        attributes : mapping of str to arrays of shape (V,) or (V, K), optional
+        **remeshing
+            ``remesh=True``: a mesh that is no grid is resampled into watertight blocks of (2^k + 1)^2 points (extra
+            ``remesh``; docs/remeshing.md). ``blocks``: about how many; 100 by default, fewer for small meshes.
+            ``remesh_error``: root mean square distance to the mesh that is aimed at, in parts of the diagonal of the
+            bounding box; 2e-4 by default. ``remesh_normals=True``: the attribute "normal" is interpolated; otherwise
+            it is left out.
+
+        Returns
+        -------
+        Surface
+            Of a mesh that was resampled the metadata have ``remesh``: a map with the measured distances.
+
+        Raises
+        ------
+        InputError
+            If the arrays have other shapes, or faces name vertices that do not exist.
+        FormatError
+            If the mesh is no structured surface, and shall not be resampled or is no surface at all.
+        UnavailableError
+            If it shall be resampled, and the extra ``remesh`` is not installed.
+
+        Examples
+        --------
+        >>> import lodestream
+        >>> places = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
+        >>> lodestream.Surface.from_mesh(places, [(0, 1, 3, 2)]).shape
+        (2, 2)
+        """
+        from .interop.meshes import from_mesh
+
+        return from_mesh(vertices, faces, attributes, remeshing)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: a small picture and sizes."""

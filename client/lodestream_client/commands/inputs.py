@@ -81,14 +81,14 @@ def option_hints(names: Sequence[str]) -> Iterator[None]:
 
 
 def option_words(text: str, names: Sequence[str] = ()) -> str:
-    """A message of a reader with ``-o`` before options of formats; see `option_hints`."""
+    """A message of a reader with ``-o`` before options of formats, but ``--remesh``; see `option_hints`."""
     from lodestream.formats import formats
 
     keys = {key for format_ in formats() for key in format_.options}
     called = (f"{word}: " for name in names for word in (name, Path(name).name))  # by servers without folder
     file = next((words for words in called if text.startswith(words)), "")
     hint = re.compile(rf"(?<!-o )(?<=[ (])(?:{'|'.join(sorted(keys))})=")
-    return file + hint.sub(r"-o \g<0>", text[len(file) :])
+    return file + hint.sub(r"-o \g<0>", text[len(file) :]).replace("-o remesh=yes", "--remesh")
 
 
 def no_container(file: BinaryIO) -> str:

@@ -73,7 +73,31 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
         "with a --precision of the points",
     )
+    add_remeshing_options(group)
     add_reading_options(group)
+
+
+def add_remeshing_options(group: argparse._ArgumentGroup) -> None:
+    """Add the options that decide whether and how a triangle mesh that is no grid is resampled."""
+    group.add_argument(
+        "--remesh",
+        action="store_true",
+        help="resample a mesh of triangles that is no grid into watertight blocks; the distance to it is measured both "
+        "ways. A mesh that is a grid stays as it is (needs lodestream[remesh])",
+    )
+    group.add_argument(
+        "--blocks",
+        type=int,
+        metavar="N",
+        help="with --remesh: about how many blocks (default: 100, fewer for small meshes)",
+    )
+    group.add_argument(
+        "--remesh-error",
+        type=float,
+        metavar="E",
+        help="with --remesh: root mean square distance to the mesh that is aimed at, in parts of the diagonal of its "
+        "bounding box (default: 2e-4)",
+    )
 
 
 def add_reading_options(group: argparse._ArgumentGroup) -> None:
@@ -126,9 +150,23 @@ def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOption
         if key in options:
             args.parser.error(f"argument -o: {key} given twice")
         options[key] = value
+    for key, value in _remeshing(args).items():
+        if options.setdefault(key, value) != value:
+            args.parser.error(f"argument -o: {key} given twice")
     # Every format has this one, and the query of an upload has it among the options of the format.
     nodata = options.pop("nodata", None)
     return SurfaceOptions(quality, args.closed, args.name, options, args.format_name, nodata)
+
+
+def _remeshing(args: argparse.Namespace) -> dict[str, str]:
+    """The options of formats that ``--remesh`` and what goes with it stand for."""
+    if not getattr(args, "remesh", False):
+        for name in ("blocks", "remesh_error"):
+            if getattr(args, name, None) is not None:
+                args.parser.error(f"argument --{name.replace('_', '-')}: expected --remesh with it")
+        return {}
+    given = {"blocks": args.blocks, "remesh_error": args.remesh_error}
+    return {"remesh": "yes"} | {key: str(value) for key, value in given.items() if value is not None}
 
 
 def quality_of(args: argparse.Namespace) -> Quality:

@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..coordinates.seams import merge
-from ..errors import TooLargeError
+from ..errors import FormatError, OptionError, TooLargeError
 from ..mesh import Mesh
+from ..remesh import RemeshOptions, remesh
+from ..remesh.remeshing import DEFAULT_ERROR
 from ..surface import Surface
+from .attributes import NORMAL
 from .notes import warn
-from .source import Source, number
+from .source import Source, check_allowed, number
 
-__all__ = ["MOST_FACES", "check_faces", "pad", "surface_of"]
+__all__ = ["MOST_FACES", "REMESH_OPTIONS", "check_faces", "grids_or_blocks", "pad", "remesh_options", "surface_of"]
+
+#: Options of all formats for meshes.
+REMESH_OPTIONS: Mapping[str, str] = {
+    "remesh": "yes: a mesh that is no grid is resampled into watertight blocks (default: it is refused)",
+    "blocks": "about how many blocks to remesh to (default: 100, fewer for small meshes)",
+    "remesh_error": "RMS distance to remesh to, in parts of the diagonal (default: 2e-4)",
+    "remesh_normals": "yes: normals of the file are interpolated (default: they follow from the blocks)",
+}
+_SWITCH = {"yes": True, "no": False, "true": True, "false": False, "1": True, "0": False}
 
 #: Corners of faces are numbered in 32 bits.
 MOST_FACES = 2**29 - 1
@@ -38,6 +52,43 @@ def check_faces(source: Source, count: int) -> None:
         raise TooLargeError(f"expected at most {number(most)} faces, got {number(count)} or more")
 
 
+def _switch(options: Mapping[str, object], name: str) -> bool:
+    value = str(options.get(name, "no")).lower()
+    if value not in _SWITCH:
+        raise OptionError(f"expected {name}= yes or no, got {value!r}")
+    return _SWITCH[value]
+
+
+def remesh_options(options: Mapping[str, object]) -> RemeshOptions | None:
+    """The options of `REMESH_OPTIONS`, None if the mesh shall not be resampled.
+
+    Raises
+    ------
+    OptionError
+        If a value is not valid, or there are some without ``remesh``.
+    """
+    chosen = [name for name in REMESH_OPTIONS if options.get(name) is not None]
+    if not _switch(options, "remesh"):
+        others = [name for name in chosen if name != "remesh"]
+        if others:
+            raise OptionError(f"expected {others[0]}= together with remesh=yes")
+        return None
+    values: dict[str, float] = {}
+    for name, kind in (("blocks", int), ("remesh_error", float)):
+        if name in chosen:
+            try:
+                values[name] = kind(str(options[name]))
+            except ValueError:
+                raise OptionError(f"expected {name}= a number, got {str(options[name])!r}") from None
+    blocks = values.get("blocks")
+    return RemeshOptions(
+        None if blocks is None else int(blocks),
+        values.get("remesh_error", DEFAULT_ERROR),
+        NORMAL,
+        _switch(options, "remesh_normals"),
+    )
+
+
 def surface_of(source: Source, mesh: Mesh, format_name: str, words: Mapping[str, str] | None = None) -> Surface:
     """Recognise the grids of a mesh, merge what repeats, and say so in the metadata; what is left out is a note too.
 
@@ -52,16 +103,58 @@ def surface_of(source: Source, mesh: Mesh, format_name: str, words: Mapping[str,
     Raises
     ------
     FormatError
-        When the mesh is no structured surface.
+        When the mesh is no structured surface, and is not to be resampled.
+    SwitchedOffError
+        When it is to be resampled, and that is switched off.
+    """
+    known = source.metadata(format_name) | dict(words or {})
+    options = remesh_options(source.options)
+    if options is not None:
+        check_allowed(("remesh",), source.allowed)
+        options = replace(options, most_points=source.max_vertices)
+    return grids_or_blocks(mesh, known, options, source)
+
+
+def grids_or_blocks(
+    mesh: Mesh, known: Mapping[str, Any], options: RemeshOptions | None, source: Source | None = None
+) -> Surface:
+    """The grids of a mesh, or, where it has none and that is asked for, blocks that resample it.
+
+    A mesh whose grids would lose attributes is resampled too where that is asked for.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    known : mapping of str to plain values
+        Metadata of the surface.
+    options : RemeshOptions or None
+    source : Source, optional
+        Of the mesh; limits its vertices.
+
+    Raises
+    ------
+    FormatError
+        When the mesh is no structured surface, and is not to be resampled or no surface at all.
     """
     from ..mesh.recognise import recognise  # with compiled loops, which nobody needs before
 
-    recognised = recognise(mesh)
+    try:
+        recognised = recognise(mesh)
+    except FormatError as error:
+        if options is None:
+            raise FormatError(f"{error}; remesh=yes resamples any mesh of triangles into blocks") from None
+        recognised = None
+    if options is not None and (recognised is None or set(mesh.corner_attributes) - set(recognised.blocks[0].rows)):
+        surface, notes = remesh(mesh, options, known)
+        for text in notes:
+            warn(text)
+        return surface
+    assert recognised is not None
     for text in recognised.left_out:
         warn(text)
-    vertices = sum(block.vertices.size for block in recognised.blocks)
-    source.check_vertices(vertices, f"grids of {number(vertices)} nodes")
-    surface = recognised.surface(source.metadata(format_name) | dict(words or {}))
-    merged = merge(surface, source.closed)
+    if source is not None:
+        vertices = sum(block.vertices.size for block in recognised.blocks)
+        source.check_vertices(vertices, f"grids of {number(vertices)} nodes")
+    merged = merge(recognised.surface(known), None if source is None else source.closed)
     merged.metadata["recognised"] = recognised.words(merged)
     return merged

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 from ..surface import Surface
 from . import glb, npy, npz, npz_writer, off, text_arrays
 from .member import Member
+from .meshes import REMESH_OPTIONS
 from .netcdf import reader as netcdf
 from .netcdf import writer as netcdf_writer
 from .netcdf import zarr_reader, zarr_store
@@ -175,9 +176,16 @@ FORMATS = (
     _raster("usgs-dem"),
     _raster("srtm-hgt"),
     Format(
-        name="ply", suffixes=(".ply",), sniff=ply.sniff, read=ply.read, write=ply_writer.write, blocks=True, memory=120
+        name="ply",
+        suffixes=(".ply",),
+        sniff=ply.sniff,
+        read=ply.read,
+        write=ply_writer.write,
+        blocks=True,
+        memory=120,
+        options=REMESH_OPTIONS,
     ),
-    Format(name="off", suffixes=(".off",), sniff=off.sniff, read=off.read),
+    Format(name="off", suffixes=(".off",), sniff=off.sniff, read=off.read, options=REMESH_OPTIONS),
     Format(
         name="obj",
         suffixes=(".obj",),
@@ -187,6 +195,7 @@ FORMATS = (
         memory=144,
         blocks=True,
         media_type="model/obj",
+        options=REMESH_OPTIONS,
     ),
     Format(name="pcd", suffixes=(".pcd",), sniff=pcd.sniff, read=pcd.read),
     Format(

@@ -2,35 +2,59 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from ..coordinates.seams import merge
-from ..formats.notes import warn
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..formats.meshes import grids_or_blocks, remesh_options
 from ..mesh import Mesh
 from ..surface import Surface
 
-__all__ = ["surface_of_mesh"]
+__all__ = ["from_mesh", "surface_of_mesh"]
 
 
-def surface_of_mesh(mesh: Mesh, words: Mapping[str, str]) -> Surface:
-    """Recognise the grids of a mesh and merge what repeats; what is left out is a note.
+def from_mesh(
+    vertices: ArrayLike,
+    faces: ArrayLike | Sequence[Sequence[int]],
+    attributes: Mapping[str, ArrayLike] | None,
+    remeshing: Mapping[str, object],
+) -> Surface:
+    """See `lodestream.Surface.from_mesh`.
+
+    Parameters
+    ----------
+    vertices : array of shape (V, 2) or (V, 3)
+    faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int
+    attributes : mapping of str to arrays of shape (V,) or (V, K), or None
+    remeshing : mapping of str to values
+        See `surface_of_mesh`.
+
+    Raises
+    ------
+    InputError
+        If the arrays have other shapes, or faces name vertices that do not exist.
+    FormatError
+        If the mesh is no structured surface, and is not to be resampled.
+    """
+    points = np.asarray(vertices)
+    return surface_of_mesh(Mesh.of(points, faces, attributes), {}, remeshing)
+
+
+def surface_of_mesh(mesh: Mesh, words: Mapping[str, str], remeshing: Mapping[str, object]) -> Surface:
+    """Recognise the grids of a mesh and merge what repeats, or resample it; what is left out is a note.
 
     Parameters
     ----------
     mesh : Mesh
     words : mapping of str to str
         Metadata of the surface.
+    remeshing : mapping of str to values
+        Those of `lodestream.formats.meshes.REMESH_OPTIONS`.
 
     Raises
     ------
     FormatError
-        If the mesh is no structured surface.
+        If the mesh is no structured surface, and is not to be resampled.
     """
-    from ..mesh.recognise import recognise  # with compiled loops, which nobody needs before
-
-    recognised = recognise(mesh)
-    for text in recognised.left_out:
-        warn(text)
-    merged = merge(recognised.surface(words))
-    merged.metadata["recognised"] = recognised.words(merged)
-    return merged
+    return grids_or_blocks(mesh, words, remesh_options(remeshing))

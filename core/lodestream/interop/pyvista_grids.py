@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -114,7 +115,7 @@ def _text(name: str, text: str) -> Any:
     return array
 
 
-def from_pyvista(data: pyvista.DataObject) -> Surface:
+def from_pyvista(data: pyvista.DataObject, **remeshing: Any) -> Surface:
     """See `lodestream.Surface.from_pyvista`.
 
     Raises
@@ -126,7 +127,7 @@ def from_pyvista(data: pyvista.DataObject) -> Surface:
     """
     pv = require_library("pyvista", "pyvista")
     if isinstance(data, pv.PolyData):
-        return _of_polygons(data)
+        return _of_polygons(data, remeshing)
     if isinstance(data, pv.MultiBlock):
         grids = [grid for grid in data.recursive_iterator() if grid is not None]
     else:
@@ -223,7 +224,7 @@ def _words(grid: Any) -> dict[str, str]:
     return words
 
 
-def _of_polygons(data: Any) -> Surface:
+def _of_polygons(data: Any, remeshing: Mapping[str, object]) -> Surface:
     """A surface of faces of three or four corners."""
     if not data.GetPolys().GetNumberOfCells():
         raise FormatError(f"expected faces that join points to a grid, got {data.n_points:,} points and no face")
@@ -242,4 +243,4 @@ def _of_polygons(data: Any) -> Surface:
     if left_out:
         warn(f"left out data that do not belong to points: {listing(left_out)}")
     _warn_no_numbers(_no_numbers(data))
-    return surface_of_mesh(Mesh(np.array(data.points), corners, attributes), _words(data))
+    return surface_of_mesh(Mesh(np.array(data.points), corners, attributes), _words(data), remeshing)

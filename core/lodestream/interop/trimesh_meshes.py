@@ -70,7 +70,7 @@ def _visual(tm: Any, attributes: dict[str, NDArray[Any]]) -> Any:
     return None
 
 
-def from_trimesh(mesh: trimesh.Trimesh) -> Surface:
+def from_trimesh(mesh: trimesh.Trimesh, **remeshing: Any) -> Surface:
     """See `lodestream.Surface.from_trimesh`.
 
     Raises
@@ -100,4 +100,4 @@ def from_trimesh(mesh: trimesh.Trimesh) -> Surface:
     if "vertex_normals" in mesh._cache:  # those that it came with; others follow from the points
         attributes.setdefault(NORMAL, np.array(mesh.vertex_normals))
     words = {key: str(mesh.metadata[key]) for key in _WORDS if isinstance(mesh.metadata.get(key), str)}
-    return surface_of_mesh(Mesh(np.array(mesh.vertices), corners, attributes), words)
+    return surface_of_mesh(Mesh(np.array(mesh.vertices), corners, attributes), words, remeshing)

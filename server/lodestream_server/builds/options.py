@@ -123,6 +123,8 @@ def check(
         if key not in ("precision", "rms", "closed", "nodata", *found[0].options) and not key.startswith(ATTRIBUTE):
             known = ", ".join(("precision", "rms", "closed", "nodata", "name", "filename", *found[0].options))
             raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
+    if options.chosen.get("remesh") is not None:
+        _check_allowed(("remesh",), names[0], allowed)
     return found[0]
 
 

@@ -26,7 +26,8 @@ GONE = {
     "max_client_streams": "max_streams, of which each client leaves a share for the others",
 }
 
-#: The formats that a server can read: names of `lodestream.formats` (`Format.names`), and `lode` for containers.
+#: The formats that a server can read: names of `lodestream.formats` (`Format.names`), `remesh` for meshes that are no
+#: grids, and `lode` for containers.
 FORMATS = (
     "npy",
     "npz",
@@ -46,12 +47,13 @@ FORMATS = (
     "cgns",
     "text",
     "plot3d",
+    "remesh",
     "lode",
 )
 
 # Rare formats, and formats that almost any text fits: each reader that is off is one less that a hostile file can
-# attack.
-_LEFT_OUT = ("usgs-dem", "vmec", "text")
+# attack. Remeshing takes minutes.
+_LEFT_OUT = ("usgs-dem", "vmec", "text", "remesh")
 
 _TRUE, _FALSE = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 
@@ -291,7 +293,7 @@ _SETTINGS = (
         _FORMATS,
         tuple(name for name in FORMATS if name not in _LEFT_OUT),
         f"file formats that the server reads: all, or some of {', '.join(FORMATS)} (vmec are the NetCDF files of VMEC, "
-        "lode are containers)",
+        "remesh are meshes that are no grids, which ?remesh=yes resamples, lode are containers)",
         "limits",
         usual=f"all but {', '.join(_LEFT_OUT)}",
     ),

@@ -15,12 +15,13 @@ from lodestream import formats
 from lodestream_server import Settings
 from lodestream_server.builds import worker
 from lodestream_server.operation.table import FORMATS, TABLE
+from tests.core.remesh import scenes
 from tests.server.builds import slow
 from tests.server.builds.test_builds import building, running
 from tests.server.helpers import hills, npy, problem, push, settled
 
 DEFAULT: tuple[str, ...] = TABLE["formats"].default
-LEFT_OUT = {"usgs-dem", "bpt", "vmec", "text"}
+LEFT_OUT = {"usgs-dem", "bpt", "vmec", "text", "remesh"}
 
 
 def dem() -> bytes:
@@ -59,7 +60,7 @@ def vmec() -> bytes:
 
 def test_the_setting_knows_every_format_that_is_read() -> None:
     read = {name for format_ in formats.formats() if format_.read and not format_.folder for name in format_.names}
-    assert set(FORMATS) == read | {"lode"}
+    assert set(FORMATS) == read | {"lode", "remesh"}
     assert set(DEFAULT) == set(FORMATS) - LEFT_OUT
     assert Settings().formats == DEFAULT
     assert Settings.model_validate({"formats": "all"}).formats == FORMATS
@@ -99,6 +100,26 @@ def test_what_is_switched_on_is_read(tmp_path: Path) -> None:
         answer = http.post("/v1/surfaces", content=npy(hills()))
         assert problem(answer) == (422, "bad-file")
         assert "got npy, which is switched off" in answer.json()["detail"]
+
+
+def off(points: np.ndarray, faces: np.ndarray) -> bytes:
+    """A mesh in OFF."""
+    lines = [f"OFF\n{len(points)} {len(faces)} 0", *(" ".join(map(repr, row)) for row in points.tolist())]
+    return "\n".join([*lines, *(f"3 {a} {b} {c}" for a, b, c in faces.tolist())]).encode()
+
+
+def test_meshes_that_are_no_grids_are_resampled_only_where_that_is_switched_on(tmp_path: Path) -> None:
+    pytest.importorskip("igl")
+    body = off(*scenes.sphere())
+    asked = {"filename": "ball.off", "remesh": "yes", "blocks": "12", "remesh_error": "1e-2"}
+    with running(tmp_path / "off") as http:
+        answer = http.post("/v1/surfaces", content=body, params=asked)
+        assert problem(answer) == (422, "bad-file")
+        assert "got remesh, which is switched off on this server" in answer.json()["detail"]
+    with running(tmp_path / "on", formats="off,remesh") as http:
+        surface = push(http, body, **asked)
+        assert surface["state"] == "ready"
+        assert http.get(f"/v1/surfaces/{surface['id']}").json()["metadata"]["remesh"]["blocks"] > 1
 
 
 def test_finished_containers_are_a_format_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,195 @@
+"""Maps of cells to the unit disc that stretch as little as possible and fold nowhere.
+
+The rim goes to the circle. Inside, each vertex is a weighted mean of its neighbours, with positive weights, so that
+the map is one to one (Tutte 1963; Floater 2003, mean value coordinates, equation 2.1). The weights are divided by the
+local stretch and the system solved again (Yoshizawa, Belyaev and Seidel 2004); the map of least stretch is kept for
+each cell.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .cells import Cells
+from .libraries import igl, sparse
+from .rims import Rims, places_along
+from .triangulation import Floats, Integers
+
+__all__ = ["Maps"]
+
+_TURNS = 4
+#: Power of the stretch in the new weights.
+_POWER = 0.7
+#: Weights of mean values are tangents of half angles within these bounds: flat corners would have infinite ones.
+_LEAST, _MOST = 1e-4, 1e4
+
+
+class Maps:
+    """The maps of all cells.
+
+    Parameters
+    ----------
+    cells : Cells
+    rims : Rims
+
+    Attributes
+    ----------
+    folded : int
+        Triangles that are turned over in their maps. None are, but for rounding.
+    """
+
+    def __init__(self, cells: Cells, rims: Rims) -> None:
+        self._mesh = cells.mesh
+        self._labels = cells.labels
+        self._count = cells.count
+        vertices = len(self._mesh.vertices)
+        keys = np.repeat(cells.labels, 3) * vertices + self._mesh.faces.reshape(-1)
+        nodes, inverse = np.unique(keys, return_inverse=True)
+        #: A node is a vertex as a part of a cell.
+        self._cell: Integers = nodes // vertices
+        self._faces: Integers = inverse.reshape(-1, 3)
+        self._disc = np.full((len(nodes), 2), np.nan)
+        self._pin_rims(rims, nodes, vertices)
+        self._solve()
+        side = int(np.ceil(np.sqrt(self._count)))
+        #: Maps lie apart from one another in one plane, in rows.
+        self._shift = 3.0 * np.stack([np.arange(self._count) % side, np.arange(self._count) // side], axis=-1)
+        plane = self._disc + self._shift[self._cell]
+        self._plane: Floats = np.concatenate([plane, np.zeros((len(plane), 1))], axis=1)
+        self.folded = int(np.count_nonzero(self._turned_over(self._disc)))
+
+    def _pin_rims(self, rims: Rims, nodes: Integers, vertices: int) -> None:
+        """Put the rims on the circle, and note the angles of their vertices."""
+        angles: list[Floats] = []
+        for cell, sides in enumerate(rims.sides):
+            rim: list[Floats] = []
+            for side in sides:
+                along = places_along(self._mesh.vertices[side.vertices])
+                angle = side.start + along * (side.stop - side.start)
+                place = np.searchsorted(nodes, cell * vertices + side.vertices)
+                if side.across < 0:
+                    self._disc[place, 0], self._disc[place, 1] = 2 * along - 1, 0.0
+                    angle = np.array([np.pi, 2 * np.pi])
+                else:
+                    self._disc[place, 0], self._disc[place, 1] = np.cos(angle), np.sin(angle)
+                rim.append(angle[:-1])
+            angles.append(cell * 8 + np.concatenate([*rim, [2 * np.pi]]))
+        self._rim: Floats = np.concatenate(angles)
+
+    def _mean_values(self) -> Floats:
+        """Weights of mean values of each corner of a triangle for the next and the one after that, (F, 3, 2)."""
+        weights = np.empty((len(self._faces), 3, 2))
+        corners, least = self._mesh.corners, 1e-9 * self._mesh.diagonal
+        for corner in range(3):
+            to_next = corners[:, (corner + 1) % 3] - corners[:, corner]
+            to_last = corners[:, (corner + 2) % 3] - corners[:, corner]
+            lengths = np.linalg.norm(to_next, axis=1), np.linalg.norm(to_last, axis=1)
+            cosine = (to_next * to_last).sum(axis=1) / np.maximum(lengths[0] * lengths[1], 1e-300)
+            half = np.minimum(np.arccos(np.clip(cosine, -1, 1)) / 2, np.pi / 2 - 1e-6)
+            tangent = np.clip(np.tan(half), _LEAST, _MOST)
+            for place in range(2):
+                weights[:, corner, place] = tangent / np.maximum(lengths[place], least)
+        return weights
+
+    def _matrix(self, weights: Floats) -> NDArray[np.object_]:
+        rows = np.repeat(self._faces.reshape(-1), 2)
+        columns = np.stack([np.roll(self._faces, -1, axis=1), np.roll(self._faces, -2, axis=1)], axis=-1).reshape(-1)
+        size = len(self._disc)
+        matrix = sparse().coo_matrix((weights.reshape(-1), (rows, columns)), shape=(size, size)).tocsr()
+        return self._normalized(matrix)
+
+    @staticmethod
+    def _normalized(matrix: NDArray[np.object_]) -> NDArray[np.object_]:
+        total = np.asarray(matrix.sum(axis=1)).reshape(-1)
+        result: NDArray[np.object_] = sparse().diags(1 / total) @ matrix
+        return result
+
+    def _solved(self, matrix: NDArray[np.object_], free: Integers, pinned: Integers) -> Floats:
+        from scipy.sparse.linalg import splu
+
+        disc = self._disc.copy()
+        if len(free):
+            inner = matrix[free]
+            system = sparse().identity(len(free), format="csr") - inner[:, free]
+            disc[free] = splu(system.tocsc()).solve(inner[:, pinned] @ disc[pinned])
+        return disc
+
+    def _turned_over(self, disc: Floats) -> NDArray[np.bool_]:
+        a, b, c = (disc[self._faces[:, corner]] for corner in range(3))
+        area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+        return area <= 0
+
+    def _solve(self) -> None:
+        pinned = np.isfinite(self._disc[:, 0])
+        free, fixed = np.flatnonzero(~pinned), np.flatnonzero(pinned)
+        areas = np.maximum(self._mesh.areas, 1e-14 * self._mesh.diagonal**2)
+        at_nodes = np.bincount(self._faces.reshape(-1), np.repeat(areas, 3), len(self._disc))
+        matrix = self._matrix(self._mean_values())
+        best = np.full(self._count, np.inf)
+        kept = self._disc
+        for turn in range(_TURNS + 1):
+            disc = self._solved(matrix, free, fixed)
+            stretch = areas * self._squared_stretch(disc)
+            total = np.bincount(self._labels, stretch, self._count)
+            total = total + 1e300 * np.bincount(self._labels, self._turned_over(disc), self._count)
+            better = total < best
+            kept = disc.copy() if turn == 0 else np.where(better[self._cell, np.newaxis], disc, kept)
+            best = np.minimum(best, total)
+            local = np.sqrt(np.bincount(self._faces.reshape(-1), np.repeat(stretch, 3), len(disc)) / at_nodes)
+            matrix = self._normalized(matrix @ sparse().diags(1 / np.maximum(local, 1e-12) ** _POWER))
+        if (best >= 1e300).any():  # rounding: the same with equal weights
+            disc = self._solved(self._matrix(np.ones((len(self._faces), 3, 2))), free, fixed)
+            worse = np.bincount(self._labels, self._turned_over(disc), self._count) * 1e300 < best
+            kept = np.where(((best >= 1e300) & worse)[self._cell, np.newaxis], disc, kept)
+        self._disc = kept
+
+    def _squared_stretch(self, disc: Floats) -> Floats:
+        """Mean square of the lengths that unit vectors of the disc have on the surface, for each triangle."""
+        flat, corners = disc[self._faces], self._mesh.corners
+        a, b = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+        determinant = np.maximum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], 1e-14)[:, np.newaxis]
+        u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        along_x = (u * b[:, 1:] - v * a[:, 1:]) / determinant
+        along_y = (v * a[:, :1] - u * b[:, :1]) / determinant
+        return np.asarray(((along_x**2).sum(axis=1) + (along_y**2).sum(axis=1)) / 2)
+
+    def locate(self, cells: Integers, radius: Floats, angle: Floats) -> tuple[Floats, Integers]:
+        """Points of the surface at places in the maps.
+
+        Parameters
+        ----------
+        cells : int64 array of shape (N,)
+        radius : float64 array of shape (N,)
+            From 0, the centre, to 1, the rim.
+        angle : float64 array of shape (N,)
+            From 0 to 2π; of cells at the border from 0 to π.
+
+        Returns
+        -------
+        points : float64 array of shape (N, 3)
+        triangles : int64 array of shape (N,)
+        """
+        turn = angle % (2 * np.pi)
+        turn[turn > 2 * np.pi - 1e-9] = 0
+        after = np.searchsorted(self._rim, cells * 8 + turn + 1e-11, side="right")
+        low, high = self._rim[after - 1] - cells * 8, self._rim[np.minimum(after, len(self._rim) - 1)] - cells * 8
+        # The rim is a polygon of its vertices. At the ends of the diameter there is nothing to shorten.
+        chord = np.where(high - low > np.pi - 1e-9, 1.0, np.cos((high - low) / 2) / np.cos(turn - (low + high) / 2))
+        place = (radius * chord)[:, np.newaxis] * np.stack([np.cos(turn), np.sin(turn)], axis=-1) + self._shift[cells]
+        query = np.concatenate([place, np.zeros((len(place), 1))], axis=1)
+        _, triangles, nearest = igl().point_mesh_squared_distance(query, self._plane, self._faces)
+        weights = barycentric(nearest[:, :2], self._plane[self._faces[triangles], :2])
+        return np.einsum("ij,ijk->ik", weights, self._mesh.corners[triangles]), triangles
+
+
+def barycentric(points: Floats, triangles: Floats) -> Floats:
+    """Barycentric coordinates of points, (N, 2), in triangles, (N, 3, 2): (N, 3), none of them negative."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    total = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    total = np.where(np.abs(total) < 1e-300, 1, total)
+    p = points - a
+    second = (p[:, 0] * (c[:, 1] - a[:, 1]) - p[:, 1] * (c[:, 0] - a[:, 0])) / total
+    third = ((b[:, 0] - a[:, 0]) * p[:, 1] - (b[:, 1] - a[:, 1]) * p[:, 0]) / total
+    weights = np.clip(np.stack([1 - second - third, second, third], axis=-1), 0, 1)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))

@@ -1,0 +1,279 @@
+"""From a triangle mesh to blocks of samples: all steps in order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import TooLargeError
+from .cells import LEAST_CELLS, Cells, grow_cells, place_sites
+from .cleaning import clean, refine
+from .distances import Distances, distances_of_vertices, folded_quads, measure
+from .layout import Block, lay_out
+from .maps import Maps
+from .relaxation import Relaxation
+from .rims import Rims, trace_rims
+from .samples import Grids, number_samples, place_samples, quads_of, upsample
+from .sharp_edges import sharpen
+from .triangulation import Floats, Integers, Triangulation
+
+__all__ = ["DEFAULT_ERROR", "Remeshing", "remesh_triangles"]
+
+#: Root mean square distance that is aimed at, in parts of the diagonal.
+DEFAULT_ERROR = 2e-4
+#: Quads along a side of a block: of those that are tried first, and of the largest.
+_FEWEST, _FIRST, _MOST = 8, 16, 128
+#: Edges of triangles before they are cut into cells, in parts of the side of a cell.
+_FINENESS = 5
+#: Cells of the first turn, in parts of those asked for; the others go where the distance is largest.
+_EVEN = 0.75
+#: Turns, sites that a turn adds at most, and the distance from which on it adds any, in parts of the diagonal.
+_TURNS, _SITES, _FAR = 3, 12, 3e-3
+#: Two of these sites are at least so far apart.
+_APART = 0.03
+#: Rounds of relaxation with the first samples, and after each doubling.
+_ROUNDS = (40, 8, 4)
+#: Cells beyond which a mesh is refused, unless as many are asked for.
+_MOST_CELLS = 1000
+_UNFOLDING = 4
+
+
+@dataclass(frozen=True)
+class Remeshing:
+    """Blocks of samples on a triangle mesh.
+
+    Attributes
+    ----------
+    mesh : Triangulation
+        The mesh, cleaned.
+    rows : int64 array of shape (F,)
+        For each of its triangles the one of the input that it is.
+    turned : bool array of shape (F,)
+        Triangles whose second and third corner are exchanged.
+    grids : Grids
+    points : float64 array of shape (N, 3)
+    distances : Distances
+    folds : int
+        Quads of which a half looks the other way than the surface beside it.
+    cells : int
+    sharp_edges : int
+    """
+
+    mesh: Triangulation
+    rows: Integers
+    turned: Integers
+    grids: Grids
+    points: Floats
+    distances: Distances
+    folds: int
+    cells: int
+    sharp_edges: int
+
+
+@dataclass(frozen=True)
+class _Base:
+    """Blocks without samples."""
+
+    cells: Cells
+    rims: Rims
+    maps: Maps
+    blocks: list[Block]
+
+    def sampled(self, intervals: int) -> tuple[Grids, Floats, Floats]:
+        """Samples as the maps have them: numbers, points and normals."""
+        grids = number_samples(self.rims, self.blocks, intervals)
+        points, triangles = place_samples(grids, self.rims, self.blocks, self.maps)
+        return grids, points, self.cells.mesh.normals[triangles]
+
+
+def remesh_triangles(
+    vertices: Floats,
+    faces: Integers,
+    blocks: int | None = None,
+    error: float = DEFAULT_ERROR,
+    most_points: int | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Remeshing:
+    """Resample a triangle mesh into watertight blocks of (2^k + 1)^2 points.
+
+    Parameters
+    ----------
+    vertices : float64 array of shape (V, 3)
+    faces : int64 array of shape (F, 3)
+    blocks : int, optional
+        About how many. By default 100, and fewer for meshes of less than 4,000 vertices.
+    error : float
+        Root mean square distance to be reached both ways, in parts of the diagonal of the bounding box: k is the least
+        from 3 to 7 with which it is.
+    most_points : int, optional
+        Points of all blocks together, at most; so k stays smaller.
+    progress : callable
+        Is told the part that is done, from 0 to 1.
+
+    Raises
+    ------
+    FormatError
+        If the mesh is no surface, or has handles or holes that are smaller than a cell.
+    TooLargeError
+        If there were more points than `most_points` with the least k.
+    UnavailableError
+        If the extra ``remesh`` is not installed.
+    """
+    mesh, rows, turned = clean(vertices, faces)
+    progress(0.05)
+    wanted = min(100, max(24, len(mesh.vertices) // 40)) if blocks is None else blocks
+    base = _adapted(mesh, wanted, progress)
+    most = np.inf if most_points is None else most_points
+    if len(base.blocks) * (_FIRST + 1) ** 2 > most:
+        raise TooLargeError(
+            f"expected at most {most_points:,} points, got {len(base.blocks):,} blocks of {_FIRST + 1}^2"
+        )
+    relaxation = Relaxation(mesh)
+    grids, points, normals = base.sampled(_FIRST)
+    points, normals = relaxation.relax(grids, points, normals, _ROUNDS[0])
+    used, place = np.unique(grids.numbers[:, ::2, ::2], return_inverse=True)
+    halved = Grids(place.reshape(len(base.blocks), _FEWEST + 1, _FEWEST + 1), len(used))
+    result = _finished(mesh, base, halved, points[used])
+    doublings = 0
+    while True:
+        progress(0.6 + 0.1 * doublings)
+        if result[2].rms > error:
+            result = _finished(mesh, base, grids, points)
+        larger = len(base.blocks) * (2 * grids.intervals + 1) ** 2
+        if result[2].rms <= error or grids.intervals == _MOST or larger > most:
+            break
+        doublings += 1
+        fine = number_samples(base.rims, base.blocks, 2 * grids.intervals)
+        points, normals = upsample(grids, fine, points), upsample(grids, fine, normals)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        grids = fine
+        points, normals = relaxation.project(grids, points, normals)
+        points, normals = relaxation.relax(grids, points, normals, _ROUNDS[min(doublings, len(_ROUNDS) - 1)])
+    kept, places, distances, folds, sharp = result
+    progress(1.0)
+    return Remeshing(mesh, rows, turned, kept, places, distances, folds, base.cells.count, sharp)
+
+
+def _shares(mesh: Triangulation, wanted: float) -> Integers:
+    """Cells of each component, by area, for so many blocks in all.
+
+    n cells of a closed surface with Euler characteristic χ make n - χ blocks.
+    """
+    areas = np.bincount(mesh.components, mesh.areas)
+    closed = np.ones(len(areas), np.bool_)
+    closed[mesh.components[mesh.sides[mesh.border].max(axis=1)]] = False
+    share = wanted * areas / areas.sum() + np.where(closed, mesh.characteristic(), 0)
+    return np.asarray(np.maximum(np.round(share), LEAST_CELLS), np.int64)
+
+
+def _adapted(mesh: Triangulation, wanted: int, progress: Callable[[float], None]) -> _Base:
+    """Cells that lie evenly, and more of them where the surface of their blocks is far from the mesh."""
+    areas = np.bincount(mesh.components, mesh.areas)
+    shares = _shares(mesh, _EVEN * wanted)
+    fine, parents = refine(mesh, np.sqrt(areas / shares) / _FINENESS)
+    # Components of the finer mesh may be numbered otherwise.
+    number = np.empty(len(shares), np.int64)
+    number[fine.components] = mesh.components[parents]
+    sites = place_sites(fine, shares[number])
+    most = max(_MOST_CELLS, 4 * wanted)
+    relaxation = Relaxation(mesh)
+    budget = max(int(shares.sum() * (1 / _EVEN - 1)), 4)
+    for turn in range(_TURNS + 1):
+        progress(0.1 + 0.12 * turn)
+        cells, sites = grow_cells(fine, sites, most)
+        base = _base_of(cells)
+        if turn == _TURNS or not budget:
+            break
+        grids, points, normals = base.sampled(_FIRST)
+        points, _ = relaxation.relax(grids, points, normals, _ROUNDS[1])
+        distance = distances_of_vertices(mesh, grids, points)
+        new = _worst(fine, mesh, distance, min(_SITES, budget))
+        new = np.setdiff1d(new, sites)
+        if not len(new):
+            break
+        budget -= len(new)
+        sites = np.concatenate([sites, new])
+    return base
+
+
+def _base_of(cells: Cells) -> _Base:
+    rims = trace_rims(cells)
+    maps = Maps(cells, rims)
+    count = cells.count
+    centres, _ = maps.locate(np.arange(count), np.zeros(count), np.zeros(count))
+    return _Base(cells, rims, maps, lay_out(rims, centres))
+
+
+def _worst(fine: Triangulation, mesh: Triangulation, distance: Floats, most: int) -> Integers:
+    """Triangles of the finer mesh at the vertices that are farthest away, none near another."""
+    distance = distance.copy()
+    chosen = []
+    for _ in range(most):
+        vertex = int(np.argmax(distance))
+        if distance[vertex] < _FAR * mesh.diagonal:
+            break
+        place = mesh.vertices[vertex]
+        chosen.append(place)
+        distance[np.linalg.norm(mesh.vertices - place, axis=1) < _APART * mesh.diagonal] = 0
+    _, triangles, _ = fine.closest(np.array(chosen).reshape(-1, 3))
+    return np.unique(triangles)
+
+
+def _finished(
+    mesh: Triangulation, base: _Base, grids: Grids, points: Floats
+) -> tuple[Grids, Floats, Distances, int, int]:
+    """Samples unfolded, and put on sharp edges where that brings the surfaces nearer; distances, folds, sharp edges."""
+    points, folded = _unfolded(mesh, base, grids, points)
+    distances = measure(mesh, grids, points)
+    sharpened, sharp = sharpen(mesh, grids, points)
+    if (sharpened != points).any():
+        sharpened, still = _without_new_folds(mesh, grids, points, sharpened, folded)
+        nearer = measure(mesh, grids, sharpened)
+        if nearer.rms < distances.rms:
+            points, distances, folded = sharpened, nearer, still
+    return grids, points, distances, int(np.count_nonzero(folded)), sharp
+
+
+def _unfolded(mesh: Triangulation, base: _Base, grids: Grids, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Put the samples of quads that are folded back where the maps have them, where fewer are then.
+
+    Returns
+    -------
+    points : float64 array of shape (N, 3)
+    folded : bool array of shape (Q,)
+        Quads that still are.
+    """
+    folded = folded_quads(mesh, grids, points)
+    if not folded.any():
+        return points, folded
+    raw = base.sampled(max(grids.intervals, _FIRST))[1]
+    if grids.intervals < _FIRST:
+        raw = raw[np.unique(number_samples(base.rims, base.blocks, _FIRST).numbers[:, ::2, ::2])]
+    quads = quads_of(grids.numbers)
+    for _ in range(_UNFOLDING):
+        tried = points.copy()
+        samples = np.unique(quads[folded])
+        tried[samples] = raw[samples]
+        left = folded_quads(mesh, grids, tried)
+        if left.sum() >= folded.sum():
+            break
+        points, folded = tried, left
+    return points, folded
+
+
+def _without_new_folds(
+    mesh: Triangulation, grids: Grids, points: Floats, moved: Floats, folded: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Samples as they were moved, but for those whose quads are folded only since then."""
+    quads = quads_of(grids.numbers)
+    for _ in range(_UNFOLDING):
+        still = folded_quads(mesh, grids, moved)
+        new = still & ~folded
+        if not new.any():
+            break
+        back = np.unique(quads[new])
+        moved[back] = points[back]
+    return moved, folded_quads(mesh, grids, moved)
