@@ -24,7 +24,7 @@ MEMORY, _MEMORY_BYTES = "512MiB", 512 << 20
 _LODESTREAM = [sys.executable, "-m", "lodestream_client"]
 _CHECK = """
 import sys
-from lodestream.bands.inspecting import inspect
+from lodestream.decoding.inspection import inspect
 inspect(open(sys.argv[1], "rb"), max_vertices=1 << 40, memory=int(sys.argv[2]))
 """
 

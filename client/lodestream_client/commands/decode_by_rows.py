@@ -16,7 +16,7 @@ from .inputs import named
 from .outcome import Outcome, check_grid
 
 if TYPE_CHECKING:
-    from lodestream.decoding.pieces import PiecewiseDecoder
+    from lodestream.decoding.piecewise import PiecewiseDecoder
     from lodestream.planning.byte_ranges import RangeSet
 
     from .decode import DecodeOptions
@@ -51,10 +51,9 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
     """
     if options.target.region is not None:
         return False
-    from lodestream.bands.front import default_memory
-    from lodestream.container.capacity import Capacity
+    from lodestream.container.capacity import Capacity, default_memory
     from lodestream.container.reader import read_index
-    from lodestream.decoding.pieces import PiecewiseDecoder
+    from lodestream.decoding.piecewise import PiecewiseDecoder
     from lodestream.planning.byte_ranges import RangeSet
 
     memory = default_memory() if options.memory is None else options.memory

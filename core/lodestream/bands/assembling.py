@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..container.digest import ValuesDigest
 from ..container.writer import CodedLayer, CodedSegment
 from ..decoding.values import Values
 from ..encoding.holes import given_arrays
@@ -158,7 +158,7 @@ def coded_layers(
 
 def returned_digest(surface: Surface, hole: int) -> str:
     """`values_digest` of the blocks as they come out of a container, of which some rows at a time are looked at."""
-    digest = hashlib.sha256()
+    digest = ValuesDigest()
     for block in surface.blocks:
         hidden = None
         if block.mask is not None:
@@ -171,7 +171,7 @@ def returned_digest(surface: Surface, hole: int) -> str:
                     rows = np.array(rows)
                     # Points come first, and attributes after them have 0 in place of the value of a hole.
                     Values([rows]).clear(hidden[start : start + each], 0 if number else hole)
-                digest.update(np.ascontiguousarray(rows.astype(rows.dtype.newbyteorder("<"), copy=False)).data)
+                digest.take(rows)
     return digest.hexdigest()
 
 

@@ -36,7 +36,7 @@ from .assembling import Chunks, coded_layers, returned_digest, window_section_of
 from .build import Build
 from .coding import parents_of, sizes_of_unit
 from .executing import Execution, Task
-from .measuring import ValuesOfRows, exact_errors, last_values, measured_runs
+from .measuring import exact_errors, last_values, measured_runs
 from .stored import name_of, pieces_of, read_tiles, transformed
 from .transforming import Transforming, planes_of_channel
 
@@ -195,9 +195,8 @@ class Building:
         if len(prepared.chunks) == 1:
             return prepared.chunks[0]
         start, stop = chunk_sample(prepared, header.shape)[0]
-        shown = last_values(self._build, header, range(start, stop))[0]
-        values = ValuesOfRows(shown, 0 if self._build.is_whole else start)
-        return chunk_size(prepared, header, [values], float(self._read("coefficient-bytes")))
+        values = last_values(self._build, header, range(start, stop))
+        return chunk_size(prepared, header, values, float(self._read("coefficient-bytes")))
 
     def _measured(self) -> tuple[list[MeasuredLayer], list[Errors], list[bool]]:
         """Return the layers that are kept, the errors of all levels, and of each channel whether it is exact."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 from numpy.typing import ArrayLike
 
+from ..container.capacity import default_memory
 from ..encoding import encoder
 from ..encoding.losses import at_holes
 from ..errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
@@ -24,14 +25,14 @@ from ..sources import Source, is_source, read_source
 from ..surface import Surface
 from .folders import Folder, check_out, replacing
 from .made import Made
-from .memory import WHOLE, checked_memory, default_memory, whole_memory
+from .memory import WHOLE, checked_memory, whole_memory
 from .room import CopyRoom
 from .streams import encoded
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["default_memory", "encode", "goes_by_bands"]
+__all__ = ["encode", "goes_by_bands"]
 
 #: The part of the memory that an array in memory may take.
 _PART = 16

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
 from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer, distances_of
+from ..decoding.pieces import region_of_run, runs_of
 from ..decoding.region import Region, core_level
-from ..decoding.values import Values, region_of_blocks, values_of
+from ..decoding.values import Values, chunks_of_region, values_of
 from ..encoding.prepared import Prepared
 from ..encoding.residual_encoder import ChunkCoder
 from ..entropy.part_table import Part, part_of
-from ..entropy.tiles import Tiles
-from ..kernels import PART_ROWS
+from ..entropy.tiles import Tiles, TileTable
 from ..parallel import spread
 from .build import Build
 from .stored import forget_known, known_tiles
@@ -27,7 +24,6 @@ from .stored import forget_known, known_tiles
 __all__ = [
     "RUNS_TOGETHER",
     "Residual",
-    "ValuesOfRows",
     "exact_errors",
     "last_values",
     "measure",
@@ -40,34 +36,11 @@ RUNS_TOGETHER = 2
 
 
 def measured_runs(header: Header, points: int) -> list[range]:
-    """Return what is measured together: rows of the only grid, or blocks, in runs.
+    """Return what is measured together: rows of the only grid, or blocks, in runs, see `runs_of`.
 
     ``points`` are those of a piece of the transform, which takes about as much memory.
     """
-    if header.arrangement is None:
-        rows, columns = header.shape
-        unit = max(PART_ROWS, 1 << header.chunk[0])
-        count = unit * max(1, RUNS_TOGETHER * points // (unit * columns))
-        return [range(start, min(start + count, rows)) for start in range(0, rows, count)]
-    runs, first, size = list[range](), 0, 0
-    for block, (shape, _) in enumerate(header.blocks):
-        if block > first and size + math.prod(shape) > RUNS_TOGETHER * points:
-            runs.append(range(first, block))
-            first, size = block, 0
-        size += math.prod(shape)
-    return [*runs, range(first, len(header.blocks))]
-
-
-@dataclass(frozen=True)
-class ValuesOfRows:
-    """Values of some rows of a block, from row ``top`` on."""
-
-    values: Values
-    top: int
-
-    def window(self, window: ChunkPlace) -> NDArray[Any]:
-        """Return one channel at the place of a chunk, shape (row, column), a view."""
-        return self.values.window(window, self.top)
+    return runs_of(header, header.levels, RUNS_TOGETHER * points)
 
 
 @dataclass(frozen=True)
@@ -91,7 +64,7 @@ def measure(build: Build, header: Header, run: range) -> tuple[Figures, Residual
     """Measure a run in all states, and code its residual."""
     figures, values = _measured(build, header, run)
     build.last = None
-    return figures, _residual(build.prepared, header, run, values)
+    return figures, _residual(build.prepared, header, _region(build, header, run), values)
 
 
 def _measured(build: Build, header: Header, run: range) -> tuple[Figures, Mapping[int, Values]]:
@@ -117,13 +90,11 @@ def _measured(build: Build, header: Header, run: range) -> tuple[Figures, Mappin
 def _region(build: Build, header: Header, run: range) -> Region:
     """Return what is made of a surface for a run, see `measured_runs`."""
     layout = header.layout
-    if header.arrangement is not None:
-        return region_of_blocks(header, layout.levels, run)
     if build.is_whole:
         return Region.whole(layout, layout.levels)  # all tiles are in one array, and all levels in one call
     # The scratch has neighbouring tiles of several levels only up to the core of the pieces.
     core = min(build.pieces.core, core_level(layout, layout.levels, CORE_POINTS))
-    return Region.window(layout, layout.levels, (run.start, run.stop), (0, header.shape[1]), core)
+    return region_of_run(header, layout.levels, run, core)
 
 
 def exact_errors(build: Build, header: Header, state: NDArray[np.int8]) -> Measured:
@@ -142,23 +113,22 @@ def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values
 
 def _tiles(build: Build, region: Region) -> list[Tiles]:
     """Return all that a reader knows in the end of each channel of a region."""
-    prepared = build.prepared
-    parts: dict[bool, Part] = {}
+    parts: dict[TileTable, Part] = {}
     tiles = []
     for channel in range(build.channels):
-        kind = channel < prepared.geometric or prepared.arrangement is None
-        if kind not in parts:
-            parts[kind] = part_of(build.table(channel), region.tiles)
-        tiles.append(known_tiles(build, parts[kind], channel))
+        table = build.table(channel)
+        if table not in parts:
+            parts[table] = part_of(table, region.tiles)
+        tiles.append(known_tiles(build, parts[table], channel))
     return tiles
 
 
-def _residual(prepared: Prepared, header: Header, run: range, values: Mapping[int, Values]) -> Residual:
-    by_rows = header.arrangement is None
-    coder = ChunkCoder(prepared, header, [ValuesOfRows(values[0], run.start)] if by_rows else values)
-    places = list(chunk_places(header, (run.start, run.stop)) if by_rows else chunk_places(header, blocks=run))
+def _residual(prepared: Prepared, header: Header, region: Region, values: Mapping[int, Values]) -> Residual:
+    coder = ChunkCoder(prepared, header, values)
+    places = [place for _, place in chunks_of_region(header, region, values)]
     residual = Residual([], [], [True] * header.channels)
     for place, (data, exact) in zip(places, spread(coder.code, places), strict=True):
-        (residual.kept if place.kept and by_rows else residual.chunks).append(data)
+        is_last = place.kept and region.spans is not None  # of all rows, those of other runs too
+        (residual.kept if is_last else residual.chunks).append(data)
         residual.exact[place.channel] &= exact
     return residual

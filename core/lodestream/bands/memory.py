@@ -9,7 +9,6 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..container.capacity import memory_limit
 from ..encoding.arranging import may_share
 from ..errors import OptionError
 from ..sizes import parse_size
@@ -21,7 +20,6 @@ __all__ = [
     "OF_BAND",
     "WHOLE",
     "checked_memory",
-    "default_memory",
     "largest_block",
     "least_memory",
     "masks_memory",
@@ -40,11 +38,6 @@ _MASKS = 6
 BESIDE, LEAST = 96 << 20, 1 << 20
 #: Rows of a tile.
 _ROWS = 64
-
-
-def default_memory() -> int:
-    """A quarter of the memory that this process may have, in bytes."""
-    return memory_limit() // 4
 
 
 def checked_memory(memory: int | str) -> int:

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..container.capacity import default_memory
 from ..errors import InputError
 from ..formats import read
 from ..scratch import FolderScratch, boot_id
 from ..surface import Surface
-from .front import default_memory
 from .memory import WHOLE
 from .references import file_state
 from .room import CopyRoom

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from ..errors import TooLargeError
 
-__all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "memory_limit"]
+__all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "default_memory", "memory_limit"]
 
 #: What a vertex of a capacity stands for: three coordinates in float64 take somewhat less.
 BYTES_PER_VERTEX = 128
@@ -117,6 +117,11 @@ class Capacity:
 def memory_limit() -> int:
     """Return the memory available to this process in bytes: the least limit of machine, control group and process."""
     return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
+
+
+def default_memory() -> int:
+    """A quarter of the memory that this process may have, in bytes: what encoding or a check may take."""
+    return memory_limit() // 4
 
 
 def _physical() -> int:

@@ -25,23 +25,14 @@ class ChunkPlace(NamedTuple):
     kept: bool = False
 
 
-def chunk_places(
-    header: Header, within: tuple[int, int] | None = None, blocks: range | None = None
-) -> Iterator[ChunkPlace]:
+def chunk_places(header: Header) -> Iterator[ChunkPlace]:
     """Yield all chunks in the order of the file: block by block, row by row of places, channel by channel.
 
-    A block with kept holes has as many chunks again, in the same order, for these. ``within`` restricts the result to
-    chunks that begin in these rows, half-open, whose first row begins chunks; ``blocks`` to chunks of these blocks.
+    A block with kept holes has as many chunks again, in the same order, for these.
     """
-    height, width = (1 << exponent for exponent in header.chunk)
-    for block in range(len(header.blocks)) if blocks is None else blocks:
-        rows, columns = header.blocks[block][0]
-        for kept in (False, True) if header.kept and header.kept[block] else (False,):
-            for top in range(*((0, rows) if within is None else within), height):
-                for first in range(0, columns, width):
-                    down, across = (top, min(top + height, rows)), (first, min(first + width, columns))
-                    for channel in range(header.channels):
-                        yield ChunkPlace(channel, block, down, across, kept)
+    for block, (shape, _) in enumerate(header.blocks):
+        for _, place in chunks_within(header, block, 0, ((0, shape[0]), (0, shape[1]))):
+            yield place
 
 
 def chunks_touched(header: Header, region: Region | None, channels: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -11,25 +11,35 @@ from numpy.typing import NDArray
 
 from ..surface import Block
 
-__all__ = ["DIGEST", "little_endian", "values_digest"]
+__all__ = ["DIGEST", "ValuesDigest", "values_digest"]
 
 #: Its key in a container's metadata.
 DIGEST = "values_sha256"
 
 
-def values_digest(blocks: Iterable[Block]) -> str:
-    """Compute the SHA-256 of all values, in hexadecimal digits.
+class ValuesDigest:
+    """The SHA-256 of all values, which may be taken some rows at a time.
 
     Values are hashed in C order, little-endian, in their own types: block by block the points, then each attribute.
     Holes are hashed with the values that they have in decoded `Block` objects.
     """
-    digest = hashlib.sha256()
+
+    def __init__(self) -> None:
+        self._hash = hashlib.sha256()
+
+    def take(self, rows: NDArray[Any]) -> None:
+        """Hash the next rows of an array, shape (row, column) or (row, column, component), or all of them."""
+        self._hash.update(np.ascontiguousarray(rows.astype(rows.dtype.newbyteorder("<"), copy=False)).data)
+
+    def hexdigest(self) -> str:
+        """Return the SHA-256 of what was taken, in hexadecimal digits."""
+        return self._hash.hexdigest()
+
+
+def values_digest(blocks: Iterable[Block]) -> str:
+    """Compute the SHA-256 of all values of decoded blocks, in hexadecimal digits, see `ValuesDigest`."""
+    digest = ValuesDigest()
     for block in blocks:
         for array in (block.points, *block.attributes.values()):
-            digest.update(little_endian(array))
+            digest.take(array)
     return digest.hexdigest()
-
-
-def little_endian(array: NDArray[Any]) -> memoryview:
-    """Return the bytes of an array, of any shape, that are hashed."""
-    return np.ascontiguousarray(array.astype(array.dtype.newbyteorder("<"), copy=False)).data

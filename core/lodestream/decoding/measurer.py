@@ -7,7 +7,7 @@ not matter how the surface was divided.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any, NamedTuple
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from ..container.model import Errors, Header
 from ..entropy.tiles import Tiles
 from ..grid.connectivity import Arrangement
-from ..kernels import PART_COLUMNS, PART_ROWS
 from ..parallel import spread, threads
 from ..quantization.distortion import (
     ByBlock,
@@ -31,8 +30,9 @@ from ..quantization.distortion import (
     store_values,
 )
 from ..quantization.lattice import Lattice
+from .pieces import MeasuredPart, measured_parts
 from .reconstructor import Grid, KnownState, Reconstructor, known_state
-from .region import Region, Span, core_level
+from .region import Region, Span
 
 __all__ = [
     "CORE_POINTS",
@@ -42,7 +42,6 @@ __all__ = [
     "Measurer",
     "comparisons",
     "distances_of",
-    "patches_of",
 ]
 
 State = NDArray[np.int8]
@@ -104,19 +103,13 @@ def comparisons(
     masks : for each block bool, shape (row, column), or None
         True where a point is valid.
     """
-    patches = None if arrangement is None else patches_of(region)
+    patches = None if arrangement is None else region.patches
     coordinates = originals_of(arrangement, points, masks, patches)
     others = other_originals(arrangement, arrays, masks, geometric, patches)
     return [
         Comparison(coordinates, range(geometric), 0),
         *(Comparison(own, range(k, k + 1), first) for k, (own, first) in enumerate(others, geometric)),
     ]
-
-
-def patches_of(region: Region) -> list[int]:
-    """The patches that are made, by their numbers: interfaces come before them in the layout."""
-    interfaces = sum(grid.interface for grid in region.layout.grids)
-    return [grid - interfaces for grid in region.grids if grid >= interfaces]
 
 
 @dataclass(frozen=True)
@@ -139,19 +132,6 @@ class Figures:
     counts: NDArray[np.int64]
 
 
-class _Window(NamedTuple):
-    """A part of the region that is made at once.
-
-    ``patches`` are its patches among those of the region, ``cells`` its rows and columns among the region's cells, and
-    ``within``, where the only grid is divided, its rows and columns among the region's.
-    """
-
-    region: Region
-    patches: slice
-    cells: tuple[slice, slice]
-    within: tuple[slice, slice] | None = None
-
-
 class Measurer:
     """Measures a region of the finest level in many states.
 
@@ -169,7 +149,7 @@ class Measurer:
 
     def __init__(self, header: Header, region: Region, tiles: Sequence[Tiles], compared: Sequence[Comparison]) -> None:
         self._header, self._region, self._tiles, self._compared = header, region, tiles, compared
-        self._patches = len(patches_of(region))
+        self._patches = len(region.patches)
 
     def errors(self, states: Sequence[State]) -> list[Measured]:
         """Errors of states, int8, shape (tile, channel) each, where the region is the whole surface."""
@@ -183,21 +163,21 @@ class Measurer:
         """What the region tells of the errors of states, int8, shape (tile, channel) each."""
         known = [self._known(state) for state in states]
         kinds = sum(compared.kinds for compared in self._compared)
-        squares = np.empty((len(states), *self._cells, kinds, 2))
-        windows = self._windows()
-        count = max(1, min(-(-threads() // len(windows)), len(states)))
+        squares = np.empty((len(states), *self._region.cells, kinds, 2))
+        parts = self._parts()
+        count = max(1, min(-(-threads() // len(parts)), len(states)))
         bounds = [len(states) * number // count for number in range(count + 1)]
 
-        def measure(work: tuple[_Window, Span]) -> tuple[Span, NDArray[np.bool_]]:
-            window, (start, stop) = work
+        def measure(work: tuple[MeasuredPart, Span]) -> tuple[Span, NDArray[np.bool_]]:
+            part, (start, stop) = work
             equal = np.empty((stop - start, kinds), np.bool_)
-            measuring = _WindowMeasurer(self._header, window, self._tiles, self._compared)
+            measuring = _PartMeasurer(self._header, part, self._tiles, self._compared)
             for number in range(start, stop):
-                squares[number, *window.cells], equal[number - start] = measuring.measure(known[number])
+                squares[number, *part.cells], equal[number - start] = measuring.measure(known[number])
             return (start, stop), equal
 
         equal = np.ones((len(states), kinds), np.bool_)
-        for (start, stop), same in spread(measure, product(windows, pairwise(bounds))):
+        for (start, stop), same in spread(measure, product(parts, pairwise(bounds))):
             equal[start:stop] &= same
         counts = [sum(original.count for original in compared.originals) for compared in self._compared]
         return Figures(squares, equal, np.array(counts, np.int64))
@@ -233,65 +213,24 @@ class Measurer:
             known_state(tiles.table, state[:, channel], self._region.level) for channel, tiles in enumerate(self._tiles)
         ]
 
-    @property
-    def _cells(self) -> tuple[int, int]:
-        """Rows and columns of cells."""
-        if len(self._region.layout.grids) > 1:
-            return self._patches, 1
-        ((rows, columns),) = self._region.shapes
-        return -(-rows // PART_ROWS), -(-columns // PART_COLUMNS)
-
-    def _windows(self) -> list[_Window]:
-        """The parts of the region that are made one after another: windows of the only grid, or runs of patches."""
-        region, layout = self._region, self._region.layout
-        every, points = slice(None), sum(rows * columns for rows, columns in region.shapes[-self._patches :])
-        if region.spans is None and points <= _WHOLE_POINTS:
-            return [_Window(region, every, (every, every))]
-        if len(layout.grids) > 1:
-            return list(self._runs_of_patches())
-        ((rows, columns),) = region.shapes
-        core = min(region.core, core_level(layout, region.level, CORE_POINTS))
-        top, left = (0, 0) if region.spans is None else (region.spans[0][0], region.spans[1][0])
-        across = [(0, columns)]
-        if not layout.grids[0].closed[1]:  # each would be made of all of them
-            across = list(_stretches(columns, PART_COLUMNS))
-        windows = []
-        for (a, b), (c, d) in product(_stretches(rows, PART_ROWS), across):
-            part = Region.window(layout, region.level, (top + a, top + b), (left + c, left + d), core)
-            cells = slice(a // PART_ROWS, -(-b // PART_ROWS)), slice(c // PART_COLUMNS, -(-d // PART_COLUMNS))
-            windows.append(_Window(part, every, cells, (slice(a, b), slice(c, d))))
-        return windows
-
-    def _runs_of_patches(self) -> Iterator[_Window]:
-        region, shapes = self._region, self._region.shapes[-self._patches :]
-        grids, first, points = region.grids[-self._patches :], 0, 0
-        for patch, (rows, columns) in enumerate([*shapes, (_WHOLE_POINTS, 1)]):
-            if patch > first and points + rows * columns > _WHOLE_POINTS:
-                run = slice(first, patch)
-                yield _Window(Region.of_grids(region.layout, region.level, grids[run]), run, (run, slice(None)))
-                first, points = patch, 0
-            points += rows * columns
+    def _parts(self) -> list[MeasuredPart]:
+        return measured_parts(self._region, _WHOLE_POINTS, _WINDOW_SIDE, CORE_POINTS)
 
 
-def _stretches(length: int, unit: int) -> Iterator[Span]:
-    """An axis in stretches of whole cells of so many samples, as long as windows are."""
-    cells, count = -(-length // unit), max(1, round(length / _WINDOW_SIDE))
-    for start, stop in pairwise(unit * (cells * number // count) for number in range(count + 1)):
-        yield start, min(stop, length)
+class _PartMeasurer:
+    """Measures a part of a region in one state after another: what two of them share is not measured again."""
 
-
-class _WindowMeasurer:
-    """Measures a window in one state after another: what a state shares with the one before is not measured again."""
-
-    def __init__(self, header: Header, window: _Window, tiles: Sequence[Tiles], compared: Sequence[Comparison]) -> None:
-        self._lattices, self._is_one_grid = header.lattices, len(header.layout.grids) == 1
-        self._compared = [_cut(comparison, window) for comparison in compared]
+    def __init__(
+        self, header: Header, part: MeasuredPart, tiles: Sequence[Tiles], compared: Sequence[Comparison]
+    ) -> None:
+        self._lattices, self._has_cells = header.lattices, part.region.has_cells
+        self._compared = [_cut(comparison, part) for comparison in compared]
         self._patches = len(self._compared[0].originals)
         # Channels that are compared by themselves are made anew for each state, unless levels of a window are shared.
-        room = np.empty(window.region.size, np.int32) if window.within is None and len(compared) > 1 else None
+        room = np.empty(part.region.size, np.int32) if part.within is None and len(compared) > 1 else None
         self._channels = [
             Reconstructor(
-                window.region, predictors, own, channel < header.geometric, None if channel < header.geometric else room
+                part.region, predictors, own, channel < header.geometric, None if channel < header.geometric else room
             )
             for channel, (predictors, own) in enumerate(zip(header.predictors, tiles, strict=True))
         ]
@@ -320,24 +259,24 @@ class _WindowMeasurer:
             for patch, original in enumerate(originals)
         ]
         squares, equal = zip(*figures, strict=True)
-        cells = squares[0] if self._is_one_grid else np.array([[_one_cell(own)] for own in squares])
+        cells = squares[0] if self._has_cells else np.array([[_one_cell(own)] for own in squares])
         found = cells, np.all(equal, axis=0)
         self._before[number] = found
         return found
 
 
-def _cut(comparison: Comparison, window: _Window) -> Comparison:
-    """What a window is compared with; of a window of a grid a copy of the channels that are compared, and of no others.
+def _cut(comparison: Comparison, part: MeasuredPart) -> Comparison:
+    """What a part is compared with; of a window of a grid a copy of the channels that are compared, and of no others.
 
     An array of many components is there in as many comparisons.
     """
-    originals = comparison.originals[window.patches]
-    if window.within is None:
+    originals = comparison.originals[part.patches]
+    if part.within is None:
         return comparison._replace(originals=originals)
     points, counted = originals[0].points, originals[0].counted
-    counted = None if counted is None else np.ascontiguousarray(counted[window.within])
+    counted = None if counted is None else np.ascontiguousarray(counted[part.within])
     channels = slice(comparison.first, comparison.first + len(comparison.channels))
-    compared = np.ascontiguousarray(points[window.within][..., channels])
+    compared = np.ascontiguousarray(points[part.within][..., channels])
     return comparison._replace(originals=[Original(compared, counted)], first=0)
 
 

@@ -1,34 +1,48 @@
-"""A complete container decoded piece by piece: memory for some pieces, whatever the surface is as a whole.
+"""Which regions a surface is made of: for so much memory, for threads, for whoever measures errors, or for a window.
 
-A surface of one grid is decoded by bands of rows, one of several grids by runs of blocks. Neighbouring bands share some
-tiles, which are decoded twice.
+A surface of one grid is divided into bands of rows, or into windows; one of several grids into runs of blocks or of
+patches. Which of both it is, only this module and `region` ask: all others take the regions one after another.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
-from itertools import pairwise
+import sys
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, product
+from typing import NamedTuple
 
-from ..container.digest import values_digest
-from ..container.model import Header, Index
-from ..errors import CorruptStreamError, InputError
-from ..grid.patches import level_masks, level_shapes
-from ..kernels import PART_ROWS
-from ..parallel import spread, threads
-from ..scratch import Room
-from ..surface import Surface
-from .level_grids import at_level
-from .region import Region, core_level
-from .segments import StoredSegments
-from .values import block_of, region_of_blocks
+from ..container.model import Header
+from ..grid.patches import level_shapes
+from ..kernels import PART_COLUMNS, PART_ROWS
+from ..parallel import threads
+from ..planning.selection import restored
+from ..target import Region as Window
+from .region import Region, Span, core_level
 
-__all__ = ["BYTES", "PiecewiseDecoder", "why_not_by_pieces"]
+__all__ = [
+    "BYTES",
+    "Band",
+    "MeasuredPart",
+    "bands_of",
+    "measured_parts",
+    "pieces_of",
+    "region_of_run",
+    "region_of_window",
+    "runs_of",
+    "why_not_by_pieces",
+]
 
 #: Bytes that decoding takes for each value of the pieces that are decoded together.
 BYTES = 40
 #: Levels of at most so many points are made whole for each band.
 _CORE_POINTS = 1 << 18
+
+#: Rows of a band at most; of a wide one the fewest, and its values where it has more rows than these.
+_BAND_ROWS, _FEWEST_ROWS, _BAND_VALUES = 512, 128, 1 << 20
+#: Values of a level that one thread makes as a whole: bands would only be more calls.
+_ONE_CALL_VALUES = 1 << 20
+#: Least values of a level that threads share.
+_SHARED_VALUES = 1 << 17
 
 
 def why_not_by_pieces(header: Header, memory: int, level: int | None = None) -> str | None:
@@ -40,126 +54,166 @@ def why_not_by_pieces(header: Header, memory: int, level: int | None = None) -> 
         return "x and y are made of rules"
     if header.arrangement is None:
         return None
-    shapes = [shape for shape, _ in header.blocks]
-    if level is not None:
-        shapes = level_shapes(header.patches, header.layout, level, shapes)
+    shapes = _shapes(header, header.levels if level is None else level)
     largest = max(rows * columns for rows, columns in shapes) * header.channels
     if largest * BYTES <= memory:
         return None
     return f"its largest block is decoded as a whole, in about {-(-largest * BYTES >> 20):,} MiB"
 
 
-class PiecewiseDecoder:
-    """Decodes a complete container, or a coarser level of it.
+def pieces_of(header: Header, level: int, memory: int) -> Iterator[list[Region]]:
+    """All of a level in order, in lists of pieces that are decoded together in so many bytes, about.
+
+    A list has at most as many pieces as there are threads. A band begins where chunks of residual and cells do, and has
+    some rows at least; a run of blocks has at least one. A surface whose x and y are made of rules is one piece.
+    """
+    together: list[Region] = []
+    taken = 0
+    points = sys.maxsize if header.plane is not None else memory // threads() // (BYTES * header.channels)
+    core = core_level(header.layout, level, _CORE_POINTS)
+    for run in runs_of(header, level, points):
+        piece = region_of_run(header, level, run, core)
+        size = sum(rows * columns for rows, columns in piece.shapes) * header.channels * BYTES
+        if together and (len(together) == threads() or taken + size > memory):
+            yield together
+            together, taken = [], 0
+        together.append(piece)
+        taken += size
+    yield together
+
+
+def runs_of(header: Header, level: int, points: int) -> list[range]:
+    """Rows of the only grid, or blocks, in runs of about so many points, or of the fewest rows or one block.
+
+    Rows begin where chunks of residual and cells do.
+    """
+    shapes = _shapes(header, level)
+    if header.arrangement is not None:
+        return _runs([rows * columns for rows, columns in shapes], points)
+    ((rows, columns),) = shapes
+    unit = max(PART_ROWS, 1 << header.chunk[0])
+    step = unit * max(1, points // (unit * columns))
+    return [range(start, min(start + step, rows)) for start in range(0, rows, step)]
+
+
+def region_of_run(header: Header, level: int, run: range, core: int) -> Region:
+    """What is made for a run of `runs_of`: rows above a level ``core`` that is made whole, or blocks."""
+    if header.arrangement is None:
+        columns = header.layout.shape(0, level)[1]
+        return Region.window(header.layout, level, (run.start, run.stop), (0, columns), core)
+    interfaces = len(header.layout.grids) - len(header.patches)
+    patches = sorted(number for block in run for number, _ in header.block_patches[block])
+    if len(patches) == len(header.patches):
+        return Region.whole(header.layout, level)
+    return Region.of_grids(header.layout, level, [interfaces + patch for patch in patches])
+
+
+def region_of_window(header: Header, level: int, window: Window | None) -> Region:
+    """What is made of a level for a window of the only block, rows and columns of full resolution; None: for all.
+
+    Of a block that meets itself all is made: what its sides share may lie anywhere in it.
+    """
+    if window is None or header.arrangement is not None:
+        return Region.whole(header.layout, level)
+    return Region.window(header.layout, level, *restored(header, window, level))
+
+
+class Band(NamedTuple):
+    """Rows of a region: what is made for them, and which rows of each of its grids they are."""
+
+    region: Region
+    rows: slice
+
+
+def bands_of(region: Region, workers: int) -> list[Band]:
+    """A region in bands of rows, as many for each of so many threads, or as one.
+
+    All of a large level of one grid is divided: what a band takes stays in the processor's cache, no array holds all
+    coefficients of the level, and several threads make bands at the same time. Each is made above the level below.
+    """
+    layout, level = region.layout, region.level
+    most = _ONE_CALL_VALUES if workers == 1 else _SHARED_VALUES
+    if len(region.grids) > 1 or region.spans is not None or level == 0 or layout.points(level) <= most:
+        return [Band(region, slice(None))]
+    ((rows, columns),) = region.shapes
+    count = -(-rows // min(_BAND_ROWS, max(_FEWEST_ROWS, _BAND_VALUES // columns)))
+    count = -(-count // workers) * workers
+    bounds = [rows * number // count for number in range(count + 1)]
+    return [
+        Band(Region.window(layout, level, (start, stop), (0, columns), level - 1), slice(start, stop))
+        for start, stop in pairwise(bounds)
+        if stop > start
+    ]
+
+
+class MeasuredPart(NamedTuple):
+    """A part of a region that is made at once and measured.
+
+    ``patches`` are its patches among those of the region, ``cells`` its rows and columns among the region's cells, and
+    ``within``, where the only grid is divided, its rows and columns among the region's.
+    """
+
+    region: Region
+    patches: slice
+    cells: tuple[slice, slice]
+    within: tuple[slice, slice] | None = None
+
+
+def measured_parts(region: Region, whole_points: int, side: int, core_points: int) -> list[MeasuredPart]:
+    """The parts of a region that are measured one after another: windows of the only grid, or runs of patches.
 
     Parameters
     ----------
-    read : callable (offset, length) -> bytes
-        Of the file.
-    index : Index
-        Of the container, see `read_index`.
-    level : int, optional
-        The finest if not given.
-
-    Attributes
-    ----------
-    level : int
-    shapes : list of (int, int)
-        Rows and columns of each block at the level.
-    segments : StoredSegments
+    region : Region
+    whole_points : int
+        Grids of at most so many points together are made whole, by one call for all levels.
+    side : int
+        Rows, and columns, of a window, about.
+    core_points : int
+        Levels of at most so many points are made whole for each window.
     """
-
-    def __init__(self, read: Callable[[int, int], bytes], index: Index, level: int | None = None) -> None:
-        self.index, self.header = index, index.header
-        header, layout = self.header, self.header.layout
-        self.level = layout.levels if level is None else level
-        self.segments = StoredSegments(read, index)
-        self.shapes = level_shapes(header.patches, layout, self.level, [shape for shape, _ in header.blocks])
-
-    def pieces(self, memory: int) -> Iterator[list[Region]]:
-        """All of the surface in order, in lists of pieces that are decoded together in so many bytes, about.
-
-        A list has at most as many pieces as there are threads. A band begins where chunks of residual and cells do, and
-        has some rows at least; a run of blocks has at least one.
-        """
-        together: list[Region] = []
-        taken = 0
-        for piece in self._every(memory // threads()):
-            size = sum(rows * columns for rows, columns in piece.shapes) * self.header.channels * BYTES
-            if together and (len(together) == threads() or taken + size > memory):
-                yield together
-                together, taken = [], 0
-            together.append(piece)
-            taken += size
-        yield together
-
-    def _every(self, memory: int) -> Iterator[Region]:
-        header, layout = self.header, self.header.layout
-        most = memory // (BYTES * header.channels)
-        if header.arrangement is None:
-            rows, columns = self.shapes[0]
-            unit = max(PART_ROWS, 1 << header.chunk[0])
-            step = unit * max(1, most // (unit * columns)) if header.plane is None else rows
-            core = core_level(layout, self.level, _CORE_POINTS)
-            for span in pairwise([*range(0, rows, step), rows]):
-                yield Region.window(layout, self.level, span, (0, columns), core)
-            return
-        first, points = 0, 0
-        for block, (rows, columns) in enumerate(self.shapes):
-            if block > first and points + rows * columns > most:
-                yield region_of_blocks(header, self.level, range(first, block))
-                first, points = block, 0
-            points += rows * columns
-        yield region_of_blocks(header, self.level, range(first, len(self.shapes)))
-
-    def surface(self, room: Room, memory: int, progress: Callable[[float], None]) -> Surface:
-        """Decode the surface, or its level, into arrays that go where there is room.
-
-        Parameters
-        ----------
-        room : Room
-        memory : int
-            Bytes to work in, about.
-        progress : callable
-            Is called with the fraction done, 0 to 1.
-
-        Raises
-        ------
-        CorruptStreamError
-            If a segment or a chunk is damaged, no point is finite, or the SHA-256 of the values is wrong.
-        """
-        header = self.header
-        counts = header.point_channels, *(kind.channels for kind in header.attributes)
-        firsts = [sum(counts[:number]) for number in range(len(counts))]
-        arrays = [
-            [room.empty((*shape, count), header.dtypes[first]) for count, first in zip(counts, firsts, strict=True)]
-            for shape in self.shapes
+    shapes, every = region.patch_shapes, slice(None)
+    points = [rows * columns for rows, columns in shapes]
+    if region.spans is None and sum(points) <= whole_points:
+        return [MeasuredPart(region, every, (every, every))]
+    if not region.has_cells:
+        grids = region.grids[-len(shapes) :]
+        return [
+            MeasuredPart(Region.of_grids(region.layout, region.level, grids[run]), run, (run, every))
+            for run in (slice(run.start, run.stop) for run in _runs(points, whole_points))
         ]
+    ((rows, columns),) = shapes
+    core = min(region.core, core_level(region.layout, region.level, core_points))
+    (top, _), (left, _) = region.spans_in((rows, columns))
+    across = [(0, columns)]
+    if not region.layout.grids[0].closed[1]:  # each would be made of all of them
+        across = list(_stretches(columns, PART_COLUMNS, side))
+    parts = []
+    for (a, b), (c, d) in product(_stretches(rows, PART_ROWS, side), across):
+        part = Region.window(region.layout, region.level, (top + a, top + b), (left + c, left + d), core)
+        cells = slice(a // PART_ROWS, -(-b // PART_ROWS)), slice(c // PART_COLUMNS, -(-d // PART_COLUMNS))
+        parts.append(MeasuredPart(part, every, cells, (slice(a, b), slice(c, d))))
+    return parts
 
-        def decode(piece: Region) -> int:
-            rows = slice(None) if piece.spans is None else slice(*piece.spans[0])
-            for block, values in self.segments.values(piece).items():
-                for array, part in zip(arrays[block], values.arrays, strict=True):
-                    array[rows] = part
-            return sum(math.prod(shape) for shape in piece.shapes)
 
-        points, done = header.layout.points(self.level), 0
-        for together in self.pieces(memory):
-            done += sum(spread(decode, together))
-            progress(min(done / points, 1.0))
-        finest = self.level == header.levels
-        masks = level_masks(header.patches, header.layout, self.level, header.masks)
-        blocks = []
-        for values, (_, closed), mask in zip(arrays, header.blocks, masks, strict=True):
-            # No node of so coarse a level is valid: the values under the holes are shown.
-            shown = mask if mask is None or finest or mask.any() else None
-            try:
-                blocks.append(block_of(header, values, closed, shown))
-            except InputError as error:
-                raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
-        if finest and self.index.digest is not None and header.exact:
-            digest = values_digest(blocks)
-            if digest != self.index.digest:
-                problem = f"expected values with the SHA-256 {self.index.digest}, got {digest}"
-                raise CorruptStreamError(problem, header.length)
-        return at_level(Surface(blocks=blocks, metadata=dict(self.index.metadata_values)), header, self.level)
+def _stretches(length: int, unit: int, side: int) -> Iterator[Span]:
+    """An axis in stretches of whole cells of so many samples, about as long as the side of a window."""
+    cells, count = -(-length // unit), max(1, round(length / side))
+    for start, stop in pairwise(unit * (cells * number // count) for number in range(count + 1)):
+        yield start, min(stop, length)
+
+
+def _runs(sizes: Sequence[int], most: int) -> list[range]:
+    """Neighbours in runs that have together at most so much, or one by itself that has more."""
+    runs, first, total = list[range](), 0, 0
+    for number, size in enumerate(sizes):
+        if number > first and total + size > most:
+            runs.append(range(first, number))
+            first, total = number, 0
+        total += size
+    return [*runs, range(first, len(sizes))]
+
+
+def _shapes(header: Header, level: int) -> list[tuple[int, int]]:
+    """Rows and columns of each block at a level."""
+    return level_shapes(header.patches, header.layout, level, [shape for shape, _ in header.blocks])

@@ -11,13 +11,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..entropy.part_table import consecutive, tiles_of_grids
 from ..grid.axis import AxisStep
 from ..grid.layout import Layout
+from ..grid.window import taken
+from ..kernels import PART_COLUMNS, PART_ROWS
 from ..transform.pyramid import PADDING
 from .crop import AxisCrop, SeamCrop, crop_across_seam
 
@@ -194,6 +197,41 @@ class Region:
             (top, bottom), (left, right) = self.spans
             return [(bottom - top, right - left)]
         return [self.part.shape(number, self.level) for number in range(len(self.grids))]
+
+    @cached_property
+    def patches(self) -> list[int]:
+        """The patches that are made, by their numbers: interfaces come before them in the layout."""
+        interfaces = sum(grid.interface for grid in self.layout.grids)
+        return [grid - interfaces for grid in self.grids if grid >= interfaces]
+
+    @property
+    def patch_shapes(self) -> list[tuple[int, int]]:
+        """Rows and columns of each patch that is made."""
+        return self.shapes[-len(self.patches) :]
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Rows and columns of the cells in which errors are summed up.
+
+        Of one grid a cell has `PART_ROWS` x `PART_COLUMNS` points; of several grids each patch is a row with one cell.
+        """
+        if not self.has_cells:
+            return len(self.patches), 1
+        ((rows, columns),) = self.shapes
+        return -(-rows // PART_ROWS), -(-columns // PART_COLUMNS)
+
+    @property
+    def has_cells(self) -> bool:
+        """Whether the surface is one grid, which is divided into cells."""
+        return len(self.layout.grids) == 1
+
+    def spans_in(self, shape: tuple[int, int]) -> tuple[Span, Span]:
+        """Rows and columns, half-open, of a block of this shape at the level."""
+        return self.spans or ((0, shape[0]), (0, shape[1]))
+
+    def of_block(self, array: NDArray[Any]) -> NDArray[Any]:
+        """What is made of an array of a block at the level, shape (row, column, ...); a view where it is one piece."""
+        return array if self.spans is None else taken(array, self.spans, (array.shape[0], array.shape[1]))
 
     @property
     def size(self) -> int:

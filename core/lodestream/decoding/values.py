@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from threading import local
 from typing import Any
 
@@ -15,25 +15,19 @@ from ..container.chunks import ChunkPlace, chunks_within, first_chunks
 from ..container.model import Header
 from ..entropy.tiles import Tiles
 from ..grid.patches import assemble, level_masks
-from ..grid.window import taken
 from ..parallel import spread, threads
 from ..quantization.distortion import store_values
 from ..residual import chunk_coder
 from ..surface import Block, Closed, finite_block
+from .pieces import Band, bands_of
 from .reconstructor import Grid, KnownState, Reconstructor, known_state
 from .region import Region, Span
 
-__all__ = ["Chunks", "Values", "block_of", "mark_holes", "region_of_blocks", "restore", "values_of"]
+__all__ = ["Chunks", "Values", "block_of", "chunks_of_region", "mark_holes", "restore", "values_of"]
 
 #: Gives a chunk of the residual by its number: its bytes and where they stand; None if it is empty or not there.
 Chunks = Callable[[int], tuple[bytes | memoryview, int] | None]
 
-#: Rows of a band at most; of a wide one the fewest, and its values where it has more rows than these.
-_BAND_ROWS, _FEWEST_ROWS, _BAND_VALUES = 512, 128, 1 << 20
-#: Values of a level that one thread makes as a whole: bands would only be more calls.
-_ONE_CALL_VALUES = 1 << 20
-#: Least values of a level that threads share.
-_SHARED_VALUES = 1 << 17
 #: Numbers that a thread keeps room for: a new array costs more than what a band does in it.
 _KEPT_NUMBERS = 3 << 19
 
@@ -42,9 +36,20 @@ _kept = local()
 
 @dataclass
 class Values:
-    """A block's points, shape (row, column, channel), and those of its attributes."""
+    """A block's points, shape (row, column, channel), and those of its attributes; or those of a window of it.
+
+    Attributes
+    ----------
+    arrays : list of arrays
+    first : (int, int)
+        The row and the column of the block with which the arrays begin.
+    shape : (int, int)
+        Rows and columns of the block: a window across its seam goes on with the first ones.
+    """
 
     arrays: list[NDArray[Any]]
+    first: tuple[int, int] = (0, 0)
+    shape: tuple[int, int] = (0, 0)
 
     def channel(self, number: int) -> NDArray[Any]:
         """One channel, shape (row, column), a view."""
@@ -54,15 +59,9 @@ class Values:
             number -= array.shape[2]
         raise IndexError(number)
 
-    def window(self, place: ChunkPlace, top: int = 0, left: int = 0) -> NDArray[Any]:
-        """One channel at the place of a chunk, shape (row, column), a view.
-
-        The arrays begin at row ``top`` and column ``left`` of the block.
-        """
-        rows, columns = (
-            slice(start - first, stop - first)
-            for (start, stop), first in zip((place.rows, place.columns), (top, left), strict=True)
-        )
+    def window(self, place: ChunkPlace) -> NDArray[Any]:
+        """One channel at the place of a chunk, shape (row, column), a view."""
+        rows, columns = map(_slice_from, self.first, (place.rows, place.columns), self.shape)
         return self.channel(place.channel)[rows, columns]
 
     def clear(self, holes: NDArray[np.bool_], hole: int) -> None:
@@ -74,13 +73,10 @@ class Values:
             array[holes] = np.nan if array.dtype.kind == "f" else 0 if number else array.dtype.type(hole)
 
 
-def region_of_blocks(header: Header, level: int, blocks: Sequence[int]) -> Region:
-    """All points of some blocks at a level, and the interfaces that they need."""
-    interfaces = len(header.layout.grids) - len(header.patches)
-    patches = sorted(number for block in blocks for number, _ in header.block_patches[block])
-    if len(patches) == len(header.patches):
-        return Region.whole(header.layout, level)
-    return Region.of_grids(header.layout, level, [interfaces + patch for patch in patches])
+def _slice_from(first: int, span: Span, length: int) -> slice:
+    """Where samples of an axis of this length stand in an array that begins with the sample ``first``."""
+    turn = length if span[0] < first else 0  # across the seam the first samples stand behind the last ones
+    return slice(span[0] + turn - first, span[1] + turn - first)
 
 
 def values_of(
@@ -103,9 +99,7 @@ def values_of(
     chosen : bool, shape (channel,), optional
         Channels that are not chosen are 0. All if not given.
     """
-    interfaces = len(header.layout.grids) - len(header.patches)
-    patches = [grid - interfaces for grid in region.grids if grid >= interfaces]
-    shapes = region.shapes[-len(patches) :]
+    patches, shapes = region.patches, region.patch_shapes
     counts = header.point_channels, *(kind.channels for kind in header.attributes)
     wanted = [channel for channel in range(header.channels) if chosen is None or chosen[channel]]
     new = np.empty if len(wanted) == header.channels else np.zeros
@@ -115,6 +109,8 @@ def values_of(
         for count, first in zip(counts, accumulate(counts, initial=0), strict=False)
     ]
     places = [(grids, component) for grids, count in zip(arrays, counts, strict=True) for component in range(count)]
+
+    bands = bands_of(region, threads())
 
     def store(work: _Work) -> None:
         reconstructor = Reconstructor(
@@ -128,19 +124,19 @@ def values_of(
         coordinates, fraction = reconstructor.reconstruct(work.known)
         grids, component = places[work.channel]
         for array, grid in zip(grids, coordinates[-len(patches) :], strict=True):
-            part = array if work.rows is None else array[slice(*work.rows)]
-            store_values(header.lattices[work.channel], (grid, fraction), part, component)
+            store_values(header.lattices[work.channel], (grid, fraction), array[work.rows], component)
 
     def work_of(channel: int) -> list[_Work]:
         known = known_state(channels[channel].table, state[:, channel], region.level)
-        if not _is_divided(region):
-            return [_Work(channel, region, known)]
-        below = _level_below(header.predictors[channel], channels[channel], state[:, channel], region)
-        return [_Work(channel, _band(region, rows), known, below, rows) for rows in _bands(region)]
+        below = None
+        if len(bands) > 1:
+            below = _level_below(header.predictors[channel], channels[channel], state[:, channel], region)
+        return [_Work(channel, band.region, band.rows, known, below) for band in bands]
 
     spread(store, [work for of in spread(work_of, wanted) for work in of])
     if region.spans is not None:
-        return {0: Values([array for (array,) in arrays])}
+        (top, _), (left, _) = region.spans
+        return {0: Values([array for (array,) in arrays], (top, left), region.layout.shape(0, region.level))}
     blocks = sorted({header.patches[patch].block for patch in patches})
     return {block: Values(_assembled(header, region.level, block, patches, arrays)) for block in blocks}
 
@@ -161,61 +157,35 @@ def _assembled(
 
 @dataclass(frozen=True)
 class _Work:
-    """A channel of a region, or of some rows of it above a level that is made already."""
+    """A channel of a region, or of a band of its rows above a level that is made already."""
 
     channel: int
     region: Region
+    rows: slice
     known: KnownState
-    below: tuple[Grid, int] | None = None
-    rows: Span | None = None
-
-
-def _is_divided(region: Region) -> bool:
-    """Whether all of a level of one grid is made by bands of rows.
-
-    What a band takes stays in the processor's cache, no array holds all coefficients of the level, and several threads
-    make bands at the same time.
-    """
-    if len(region.grids) > 1 or region.spans is not None or region.level == 0:
-        return False
-    return region.layout.points(region.level) > (_ONE_CALL_VALUES if threads() == 1 else _SHARED_VALUES)
-
-
-def _bands(region: Region) -> list[Span]:
-    """The rows of each band: as many bands for every thread."""
-    ((rows, columns),) = region.shapes
-    count = -(-rows // min(_BAND_ROWS, max(_FEWEST_ROWS, _BAND_VALUES // columns)))
-    workers = threads()
-    count = -(-count // workers) * workers
-    bounds = [rows * number // count for number in range(count + 1)]
-    return [(start, stop) for start, stop in pairwise(bounds) if stop > start]
-
-
-def _band(region: Region, rows: Span) -> Region:
-    ((_, columns),) = region.shapes
-    return Region.window(region.layout, region.level, rows, (0, columns), region.level - 1)
+    below: tuple[Grid, int] | None
 
 
 def _level_below(
     predictors: NDArray[np.int8], tiles: Tiles, state: NDArray[np.int8], region: Region
 ) -> tuple[Grid, int]:
-    """The only grid one level below a region, and the power of two that it stands over; by bands if it is large."""
+    """The only grid one level below a region, and the power of two that it stands over; several threads make bands."""
     whole = Region.whole(region.layout, region.level - 1)
     known = known_state(tiles.table, state, whole.level)
-    if threads() == 1 or not _is_divided(whole):
+    bands = bands_of(whole, threads())
+    if threads() == 1 or len(bands) == 1:
         (grid,), fraction = Reconstructor(whole, predictors, tiles).reconstruct(known)
         return grid, fraction
     below = _level_below(predictors, tiles, state, whole)
     array = np.empty(whole.shapes[0], np.int32)
 
-    def put(rows: Span) -> int:
-        band = _band(whole, rows)
-        reconstructor = Reconstructor(band, predictors, tiles, True, _room(band.size_above), below)
+    def put(band: Band) -> int:
+        reconstructor = Reconstructor(band.region, predictors, tiles, True, _room(band.region.size_above), below)
         (grid,), fraction = reconstructor.reconstruct(known)
-        array[slice(*rows)] = grid
+        array[band.rows] = grid
         return fraction
 
-    return array, spread(put, _bands(whole))[0]
+    return array, spread(put, bands)[0]
 
 
 def _room(size: int) -> NDArray[np.int32]:
@@ -268,6 +238,13 @@ def block_of(
     return Block(points, closed, mask=mask, attributes=attributes)
 
 
+def chunks_of_region(header: Header, region: Region, blocks: Iterable[int]) -> Iterator[tuple[int, ChunkPlace]]:
+    """The chunks of some blocks in a region of the finest level, in the order of the file, with their numbers."""
+    first = first_chunks(header)
+    for block in blocks:
+        yield from chunks_within(header, block, first[block], region.spans_in(header.blocks[block][0]))
+
+
 def restore(
     header: Header,
     region: Region,
@@ -293,23 +270,14 @@ def restore(
     CorruptStreamError
         If a chunk does not fit.
     """
-    first = first_chunks(header)
-    for block, values in blocks.items():
-        shape = header.blocks[block][0]
-        spans = region.spans or ((0, shape[0]), (0, shape[1]))
-        for number, place in chunks_within(header, block, first[block], spans):
-            if (chosen is not None and not chosen[place.channel]) or (chunk := chunks(number)) is None:
-                continue
-            # Across a seam the first rows of the block stand behind the last ones.
-            top, left = (
-                begin if start >= begin else begin - length
-                for (start, _), (begin, _), length in zip((place.rows, place.columns), spans, shape, strict=True)
-            )
-            window = values.window(place, top, left)
-            mask = (header.kept_masks if place.kept else header.masks)[block]
-            valid = slice(None) if mask is None else mask[slice(*place.rows), slice(*place.columns)]
-            known, (data, offset) = window[valid], chunk
-            window[valid] = chunk_coder.decode_chunk(known.ravel(), bytes(data), offset).reshape(known.shape)
+    for number, place in chunks_of_region(header, region, blocks):
+        if (chosen is not None and not chosen[place.channel]) or (chunk := chunks(number)) is None:
+            continue
+        window = blocks[place.block].window(place)
+        mask = (header.kept_masks if place.kept else header.masks)[place.block]
+        valid = slice(None) if mask is None else mask[slice(*place.rows), slice(*place.columns)]
+        known, (data, offset) = window[valid], chunk
+        window[valid] = chunk_coder.decode_chunk(known.ravel(), bytes(data), offset).reshape(known.shape)
 
 
 def mark_holes(header: Header, region: Region, blocks: Mapping[int, Values], corrected: bool) -> None:
@@ -322,6 +290,4 @@ def mark_holes(header: Header, region: Region, blocks: Mapping[int, Values], cor
             continue  # no node of so coarse a level is valid: the values under the holes are shown
         if corrected and finest and (kept := header.kept_masks[block]) is not None:
             mask = mask | kept
-        if region.spans is not None:
-            mask = taken(mask, region.spans, header.layout.shape(0, region.level))
-        values.clear(~mask, header.hole)
+        values.clear(~region.of_block(mask), header.hole)

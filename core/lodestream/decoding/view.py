@@ -16,12 +16,12 @@ from ..errors import CorruptStreamError, InputError, OptionError
 from ..grid.patches import level_masks
 from ..grid.window import contains, taken, within
 from ..joints import Nodes
-from ..planning.selection import Selection, region_at, restored
+from ..planning.selection import Selection, region_at
 from ..surface import Block, Closed, Surface
 from ..target import Region as Window
 from ..target import check_integer
 from .level_grids import level_nodes, level_positions, with_rules
-from .region import Region
+from .pieces import region_of_window
 from .segments import SegmentQueue
 from .values import Values, block_of
 from .window_metadata import positions, window_closed, window_metadata
@@ -317,14 +317,11 @@ class View:
         if level < header.levels:  # if no node of a level is valid, the values under the holes are shown
             masks = [mask if mask is None or mask.any() else None for mask in masks]
         closures: list[Closed] = [closed for _, closed in header.blocks]
-        region = Region.whole(header.layout, level)
-        if window is not None and header.arrangement is None:
-            region = Region.window(header.layout, level, *restored(header, window, level))
-        # Of a block that meets itself all is made: what its sides share may lie anywhere in it.
+        region = region_of_window(header, level, window)
         values = queue.values(self._length, self._state, region, corrected, chosen)
         if window is not None:
             shape, inside = header.level_shape(level) or header.shape, region_at(header, window, level)
-            around = region.spans or ((0, shape[0]), (0, shape[1]))
+            around = region.spans_in(shape)
             values = {0: Values([within(array, around, inside, shape) for array in values[0].arrays])}
             masks = [None if mask is None else taken(mask, inside, shape) for mask in masks]
             closures = [window_closed(header.closed, shape, inside)]

@@ -3,35 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..container.chunks import ChunkPlace, chunk_places
 from ..container.model import Header
+from ..decoding.values import Values
 from ..parallel import spread
 from ..residual import chunk_coder
 from .holes import given_channel
 from .prepared import Prepared
 
-__all__ = ["ChunkCoder", "Restored", "chunk_sample", "chunk_size"]
+__all__ = ["ChunkCoder", "chunk_sample", "chunk_size"]
 
 #: Bytes of tables for each chunk, and what small chunks may cost: a share of all bytes.
 _TABLES, _WORTH = 8, 0.01
 
 
-class Restored(Protocol):
-    """Values of a block, or of some of its rows."""
-
-    def window(self, window: ChunkPlace) -> NDArray[Any]:
-        """Return one channel at the place of a chunk, shape (row, column)."""
-
-
 def chunk_size(
-    prepared: Prepared, header: Header, restored: Sequence[Restored], coefficients: float
+    prepared: Prepared, header: Header, restored: Mapping[int, Values], coefficients: float
 ) -> tuple[int, int]:
     """Return the smallest chunks that do not cost much, as exponents of two of their rows and columns.
 
@@ -84,13 +76,11 @@ class ChunkCoder:
     ----------
     prepared : Prepared
     header : Header
-    restored : sequence of Restored, one for each block, or by their numbers
-        What comes back without the chunks.
+    restored : mapping of int to Values
+        By block what comes back without the chunks.
     """
 
-    def __init__(
-        self, prepared: Prepared, header: Header, restored: Sequence[Restored] | Mapping[int, Restored]
-    ) -> None:
+    def __init__(self, prepared: Prepared, header: Header, restored: Mapping[int, Values]) -> None:
         self._prepared, self._header, self._restored = prepared, header, restored
         self._rough = prepared.rough
 

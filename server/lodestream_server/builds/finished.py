@@ -1,7 +1,7 @@
 """Uploaded containers: they are not built but checked, and kept unchanged.
 
 The upload of such a surface is its container. A stranger wrote it, so all of it is checked and decoded once, in a build
-process and under the limits of a build; see `lodestream.bands.inspecting`. If the container is lost, it is checked
+process and under the limits of a build; see `lodestream.decoding.inspection`. If the container is lost, it is checked
 and copied again from the upload, and never encoded again.
 """
 
@@ -104,8 +104,8 @@ def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, 
     TooLargeError
         If it has more vertices than allowed, or cannot be checked within the memory.
     """
-    from lodestream.bands.inspecting import inspect
     from lodestream.container import describe
+    from lodestream.decoding.inspection import inspect
 
     digest = hashlib.sha256()
     with job.files[0].open("rb") as source:

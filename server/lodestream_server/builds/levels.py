@@ -169,7 +169,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     """
     from lodestream import Decoder, Target
     from lodestream.container import read_index
-    from lodestream.decoding.pieces import PiecewiseDecoder
+    from lodestream.decoding.piecewise import PiecewiseDecoder
     from lodestream.planning.planner import plan
     from lodestream.scratch import FolderScratch, Room
 

@@ -231,9 +231,9 @@ def preload() -> None:
     import numpy.ma  # noqa: F401  # numpy itself imports it when it first looks for the different values of an array
 
     import lodestream.bands.front
-    import lodestream.bands.inspecting
     import lodestream.bands.stored_surface
     import lodestream.decoding.decoder
+    import lodestream.decoding.inspection
     import lodestream.encoding.encoder
     import lodestream.formats
     import lodestream.mesh.recognise

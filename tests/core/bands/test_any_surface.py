@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.bands import made
 from lodestream.bands.front import goes_by_bands
-from lodestream.bands.inspecting import inspect
 from lodestream.container.reader import read_index
-from lodestream.decoding.pieces import PiecewiseDecoder
+from lodestream.decoding.inspection import inspect
+from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.scratch import IN_MEMORY

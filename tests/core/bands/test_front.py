@@ -18,6 +18,7 @@ import lodestream as ls
 from lodestream.bands import front, made, references, tasks
 from lodestream.bands.memory import checked_memory
 from lodestream.bands.references import root_of
+from lodestream.container.capacity import default_memory
 from lodestream.encoding.prepared import prepare
 from lodestream.scratch import FolderScratch
 
@@ -182,7 +183,7 @@ def test_more_memory_than_needed_means_one_piece(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(front, "Made", None)
     ls.encode(_heights(), out=tmp_path / "a.lode")
     assert os.listdir(tmp_path) == ["a.lode"]
-    assert front.default_memory() > 1 << 20
+    assert default_memory() > 1 << 20
 
 
 class _Plane:

@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import inspecting, made, tasks, transforming
+from lodestream.bands import made, tasks, transforming
 from lodestream.bands.front import encode
-from lodestream.bands.inspecting import inspect
 from lodestream.bands.measuring import measured_runs
 from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.bands.pieces import Pieces
 from lodestream.container.reader import read_index
-from lodestream.decoding.inspection import Inspection
-from lodestream.decoding.pieces import PiecewiseDecoder
+from lodestream.decoding import inspection
+from lodestream.decoding.inspection import Inspection, inspect
+from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.residual import chunk_coder
@@ -123,7 +123,7 @@ def _is_known_by_blocks(container: bytes, seed: int) -> None:
             assert list(own.attributes) == list(other.attributes)
             for name, values in own.attributes.items():
                 assert values.tobytes() == other.attributes[name].tobytes()
-    with mock.patch.object(inspecting, "why_not_by_pieces", return_value=None):
+    with mock.patch.object(inspection, "why_not_by_pieces", return_value=None):
         inspect(io.BytesIO(container), max_vertices=1 << 20, memory=1)
 
 

@@ -23,12 +23,12 @@ from lodestream import (
     TruncatedStreamError,
     UnsupportedVersionError,
 )
-from lodestream.bands.inspecting import inspect
 from lodestream.container import ByteRange, FrameReader, Index, describe, read_index, read_metadata, sections
 from lodestream.container import index as container_index
 from lodestream.container.fields import LARGEST, FieldReader, FieldWriter, told, told_roughly
 from lodestream.container.model import Errors, OptionalSection
 from lodestream.coordinates.coordinate_rules import evaluate
+from lodestream.decoding.inspection import inspect
 from lodestream.planning.planner import plan
 from lodestream.transfer.receiver_state import ReceiverState
 from tests import reference

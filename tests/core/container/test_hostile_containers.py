@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
 from lodestream.container import sections
+from lodestream.decoding.inspection import inspect
 from lodestream.errors import CorruptStreamError, LodestreamError, TruncatedStreamError
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of

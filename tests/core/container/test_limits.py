@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
 from lodestream.container import Header, describe, headers, limits, sections
 from lodestream.container.frames import index_sections
 from lodestream.container.index import parse_root
 from lodestream.container.model import AttributeKind, Errors
 from lodestream.container.writer import CodedLayer, CodedSegment, ContainerWriter
+from lodestream.decoding.inspection import inspect
 from lodestream.encoding import allocation
 from lodestream.errors import CorruptStreamError
 from lodestream.grid.connectivity import Arrangement, whole_patch

@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
-from lodestream.bands.inspecting import inspect as inspect_by_bands
 from lodestream.container import FrameReader, sections
 from lodestream.container.writer import CodedLayer, CodedSegment, ContainerWriter
+from lodestream.decoding.inspection import inspect
 from lodestream.errors import CorruptStreamError, LodestreamError, UnsupportedVersionError
 from lodestream_server.maintenance.fsck import check_container
 
@@ -97,13 +96,10 @@ def test_frames_let_it_pass(long: Path) -> None:
     assert frames.position == long.stat().st_size - sections.FOOTER_LENGTH
 
 
-@pytest.mark.parametrize("by_bands", [False, True])
-def test_an_inspection_lets_it_pass(long: Path, by_bands: bool) -> None:
+@pytest.mark.parametrize("memory", [None, 1 << 30])
+def test_an_inspection_lets_it_pass(long: Path, memory: int | None) -> None:
     with long.open("rb") as file, little_memory():
-        if by_bands:
-            found = inspect_by_bands(file, max_vertices=1 << 20, memory=1 << 30)
-        else:
-            found = inspect(file, max_vertices=1 << 20)
+        found = inspect(file, max_vertices=1 << 20, memory=memory)
     assert found.errors_checked
     assert len(found.index.optional) == 2
 

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
 from lodestream.container import Index
 from lodestream.container.fields import told_roughly
+from lodestream.decoding.inspection import inspect
 
 from ..container.forgery import with_index
 from ..surfaces import index_of, terrain, torus

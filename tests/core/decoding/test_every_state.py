@@ -24,10 +24,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
 from lodestream.container.fields import told_roughly
-from lodestream.decoding import values
-from lodestream.decoding.pieces import PiecewiseDecoder
+from lodestream.decoding import pieces
+from lodestream.decoding.inspection import inspect
+from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.decoding.progress import initial_state
 from lodestream.decoding.view import View
 from lodestream.encoding import prepared
@@ -316,9 +316,9 @@ def unnamed(case: Case) -> bool:
 @given(case=cases(), seed=st.integers(0, 2**32), level=st.integers(0, 9), bands=st.booleans())
 def test_every_state_shows_and_tells_what_the_page_says(case: Case, seed: int, level: int, bands: bool) -> None:
     region = window_of(case, seed)
-    small = 0 if bands else values._ONE_CALL_VALUES
-    shared = patch.object(values, "_SHARED_VALUES", min(small, values._SHARED_VALUES))
-    with patch.object(values, "_ONE_CALL_VALUES", small), shared:
+    small = 0 if bands else pieces._ONE_CALL_VALUES
+    shared = patch.object(pieces, "_SHARED_VALUES", min(small, pieces._SHARED_VALUES))
+    with patch.object(pieces, "_ONE_CALL_VALUES", small), shared:
         check_states(case, region, level)
         check_planned(case, ls.Target(order="level"))
         check_planned(case, ls.Target())

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
 from lodestream.container import Index, sections
 from lodestream.container.digest import DIGEST
-from lodestream.decoding.inspection import Inspection
+from lodestream.decoding.inspection import Inspection, inspect
 from lodestream.entropy.mask import encode_mask
 
 from ..container.forgery import (

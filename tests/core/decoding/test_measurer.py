@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.decoding import measurer
 from lodestream.decoding.measurer import Comparison, Measurer, comparisons, distances_of
-from lodestream.decoding.pieces import PiecewiseDecoder
+from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.decoding.region import Region
 from lodestream.decoding.values import Values, values_of
 from lodestream.entropy.dequantize import UNANNOUNCED
@@ -35,8 +35,7 @@ def decoder_of(container: bytes) -> PiecewiseDecoder:
 def compared(decoder: PiecewiseDecoder, region: Region, values: Mapping[int, Values]) -> list[Comparison]:
     """What comes back in the end of a region, as that which was given."""
     header, arrays = decoder.header, {block: own.arrays for block, own in values.items()}
-    rows = slice(None) if region.spans is None else slice(*region.spans[0])
-    masks = [None if mask is None else mask[rows] for mask in header.masks]
+    masks = [None if mask is None else region.of_block(mask) for mask in header.masks]
     points = {block: np.nan_to_num(own[0], posinf=0, neginf=0) for block, own in arrays.items()}
     return comparisons(region, header.arrangement, header.geometric, points, arrays, masks)
 
@@ -168,8 +167,8 @@ def test_windows_copy_the_channels_that_are_compared_alone(monkeypatch: pytest.M
     monkeypatch.setattr(measurer, "_WINDOW_SIDE", 100)
     monkeypatch.setattr(measurer, "_WHOLE_POINTS", 1)
     measuring = measurer_of(decoder, Region.whole(decoder.header.layout, decoder.header.levels))
-    windows, compared = measuring._windows(), measuring._compared
-    assert len(windows) > 1
+    parts, compared = measuring._parts(), measuring._compared
+    assert len(parts) > 1
     assert len(compared) == 1 + components
-    copied = sum(measurer._cut(own, window).originals[0].points.size for window in windows for own in compared)
+    copied = sum(measurer._cut(own, part).originals[0].points.size for part in parts for own in compared)
     assert copied == rows * columns * (1 + components), "each channel is copied once"

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import lodestream as ls
 from lodestream.container.reader import read_index
 from lodestream.decoding import pieces
-from lodestream.decoding.pieces import PiecewiseDecoder, why_not_by_pieces
+from lodestream.decoding.pieces import why_not_by_pieces
+from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.scratch import IN_MEMORY, FolderScratch, Room
 
 from ..bands.test_building import SURFACES

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.decoding import values
+from lodestream.decoding import pieces, values
 from lodestream.decoding.region import Region
 from lodestream.decoding.segments import SegmentQueue
 from lodestream.parallel import VARIABLE
@@ -59,9 +59,9 @@ def test_any_bands_of_any_state(
     region = Region.whole(header.layout, int(rng.integers(header.levels + 1)))
     with pytest.MonkeyPatch.context() as context:
         context.setenv(VARIABLE, count)
-        with patch.multiple(values, _ONE_CALL_VALUES=2**40, _SHARED_VALUES=2**40):
+        with patch.multiple(pieces, _ONE_CALL_VALUES=2**40, _SHARED_VALUES=2**40):
             expected = queue.values(queue.length, state, region)
-        bands = patch.multiple(values, _ONE_CALL_VALUES=0, _BAND_ROWS=most, _SHARED_VALUES=1 + most)
+        bands = patch.multiple(pieces, _ONE_CALL_VALUES=0, _BAND_ROWS=most, _SHARED_VALUES=1 + most)
         with bands, patch.object(values, "_KEPT_NUMBERS", 64 * most):
             found = queue.values(queue.length, state, region)
     assert list(found) == list(expected) == [0]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.decoding import segments, values
+from lodestream.decoding import pieces, segments
 from lodestream.parallel import VARIABLE
 from tests.core.surfaces import all_large
 
@@ -69,7 +69,7 @@ def test_views_in_any_order(
         else:
             container = ls.encode(surface_of(kind, shape, closed, seed))
         decoder, held = ls.Decoder(), 0
-        with patch.object(values, "_ONE_CALL_VALUES", small):
+        with patch.object(pieces, "_ONE_CALL_VALUES", small):
             while held < len(container):
                 more = int(rng.integers(1, 2 + len(container) // 4))
                 decoder.feed(container[held : held + more])

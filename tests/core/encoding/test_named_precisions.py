@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
+from lodestream.decoding.inspection import inspect
 
 from ..surfaces import terrain, torus
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.bands.inspecting import inspect
 from lodestream.container import Index, sections
+from lodestream.decoding.inspection import inspect
 from lodestream.planning.window_errors import (
     KIND,
     WindowErrors,

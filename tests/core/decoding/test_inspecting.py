@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands.inspecting import _Part, inspect
-from lodestream.decoding.inspection import Inspection
+from lodestream.decoding.inspection import Inspection, _Part, inspect
 
+from ..bands.test_building import SURFACES
 from ..container.forgery import index_of, with_layer_errors
-from .test_building import SURFACES
 
 MOST = 1 << 20
 
