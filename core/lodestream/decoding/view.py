@@ -160,6 +160,9 @@ class View:
     def window(self, region: Window, level: int | None = None) -> Surface:
         """The points of a window, at full resolution or at a coarser level; costs time and memory for the window only.
 
+        Where the complete state is verified (see `complete`), the first window at full resolution computes the whole
+        surface once.
+
         At full resolution, heights whose values lie on a lattice (integers, decimals) are exact in the window as soon
         as the data that it needs have arrived. `points` is exact only when everything has arrived. The window of a
         coarser level is always cut out of that level's grid, bit for bit as `surface` gives it.
