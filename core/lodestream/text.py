@@ -1,13 +1,17 @@
-"""Escaping of text from files and servers for printing; names in a text."""
+"""Escaping of text from files and servers for printing; names in a text; a remeshed surface in words."""
 
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from .errors import OptionError
 
-__all__ = ["names_in", "printable"]
+__all__ = ["names_in", "printable", "remesh_words"]
+
+#: What the metadata of a remeshed surface say in numbers, see `lodestream.remesh.surfaces`.
+_REMESHED = ("blocks", "quads", "folds", "rms_to_input", "rms_from_input", "largest_to_input", "largest_from_input")
 
 
 def names_in(names: object) -> list[str]:
@@ -52,3 +56,26 @@ def printable(text: str) -> str:
 def _escaped(char: str) -> str:
     """Escape a character as Python does."""
     return char.encode("unicode_escape").decode("ascii")
+
+
+def remesh_words(metadata: Mapping[str, Any]) -> str | None:
+    """Say how far a remeshed surface is from the mesh that it was made of; None if the metadata do not say so.
+
+    Examples
+    --------
+    >>> told = {"blocks": 98, "quads": 25088, "folds": 3, "rms_to_input": 1e-4, "rms_from_input": 2e-4}
+    >>> remesh_words({"remesh": told | {"largest_to_input": 0.01, "largest_from_input": 0.02}})
+    '98 blocks; RMS distance to the mesh 0.0001, from it 0.0002; largest 0.01 and 0.02; 3 of 25,088 quads folded'
+    """
+    report = metadata.get("remesh")
+    if not isinstance(report, Mapping):
+        return None
+    numbers = [report.get(name) for name in _REMESHED]
+    if not all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers):
+        return None
+    blocks, quads, folds, *distances = numbers
+    to, back, far_to, far_back = (f"{distance:.3g}" for distance in distances)
+    return (
+        f"{blocks:,} blocks; RMS distance to the mesh {to}, from it {back}; largest {far_to} and {far_back}; "
+        f"{folds:,} of {quads:,} quads folded"
+    )

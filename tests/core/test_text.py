@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lodestream.text import printable
+from lodestream.text import printable, remesh_words
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,16 @@ def test_every_character_on_its_own() -> None:
     for number in range(sys.maxunicode + 1):
         shown = printable(chr(number))
         assert shown == chr(number) or shown.isascii()
+
+
+def test_a_remeshed_surface_in_words_only_where_all_numbers_are_there() -> None:
+    report: dict[str, object] = {"blocks": 98, "quads": 25088, "folds": 3, "rms_to_input": 1e-4, "rms_from_input": 2e-4}
+    report |= {"largest_to_input": 0.01, "largest_from_input": 0.02}
+    words = remesh_words({"remesh": report})
+    assert words is not None
+    assert words.startswith("98 blocks; RMS distance to the mesh 0.0001, from it 0.0002; largest 0.01 and 0.02; 3 of")
+    for key in report:
+        assert remesh_words({"remesh": {**report, key: "many"}}) is None
+        assert remesh_words({"remesh": {name: value for name, value in report.items() if name != key}}) is None
+    for value in (None, 3, [], "yes"):
+        assert remesh_words({"remesh": value}) is None

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
+from lodestream.text import remesh_words
 
 from ..requests import addresses
 from ..terminal.output import cell, console, human_size, point_words, print_json
@@ -111,7 +112,8 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
         if details.get(kind):
             out.print()
             exact = details.get("bytes") if kind == "layers" and details.get("exact") else None
-            out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal, exact))
+            last = "exact" if remesh_words(details.get("metadata") or {}) is None else "complete"
+            out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal, exact, last))
     more = len(details.get("channel_names") or []) - _MOST_CHANNELS
     if more > 0:
         out.print()
@@ -125,6 +127,10 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
     metadata = dict(details.get("metadata") or {})
     if "recognised" in metadata:
         facts.append(("recognised", str(metadata.pop("recognised"))))
+    remeshed = remesh_words(metadata)
+    if remeshed is not None:
+        del metadata["remesh"]
+        facts.append(("remeshed", remeshed))
     if details.get("blocks"):
         facts += _grids(details["blocks"])
         facts.append(("points", point_words(details)))
@@ -137,7 +143,10 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
     if details.get("exact") is not None:
         lost = (details.get("holes") or 0) - (details.get("non_finite") or 0)
         exact = "yes, bit for bit" + (" wherever there is a value" if lost else "")
-        facts.append(("exact", exact if details["exact"] else "no, within the error that was asked for"))
+        name = "exact"
+        if remeshed is not None:
+            name, exact = "complete", "the remeshed surface bit for bit, which is not the mesh that it was made of"
+        facts.append((name, exact if details["exact"] else "no, within the error that was asked for"))
     if errors := _ERRORS.get(str(details.get("errors"))):
         facts.append(("errors", errors))
     if details.get("sha256"):
@@ -173,8 +182,10 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def _states(kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool, exact: int | None) -> Any:
-    """A table of levels or layers; `exact` are the bytes of all, which end with every value."""
+def _states(
+    kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool, exact: int | None, last: str
+) -> Any:
+    """A table of levels or layers; `exact` are the bytes of all, which end with every value, in a row named `last`."""
     from rich import box
     from rich.table import Table
 
@@ -191,7 +202,7 @@ def _states(kind: str, states: list[Mapping[str, Any]], channels: Sequence[str],
         own = [_figure(rms) for rms, _ in state.get("channels", [])][: len(shown)]
         table.add_row(*map(cell, (number, *place, *figures, *own)))
     if exact is not None:
-        table.add_row(*map(cell, ("exact", states[-1]["level"], f"{exact:,}", "0", "0", *("0" for _ in shown))))
+        table.add_row(*map(cell, (last, states[-1]["level"], f"{exact:,}", "0", "0", *("0" for _ in shown))))
     return table
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-from ..text import printable
+from ..text import printable, remesh_words
 from .pictures import SMALL, small_png
 
 if TYPE_CHECKING:
@@ -37,12 +37,12 @@ def view_html(view: View, surface: Surface, shapes: Sequence[tuple[int, int]]) -
     shapes : sequence of (int, int)
         Rows and columns of the blocks at full resolution.
     """
-    return table("View", [*errors(view), *_of_surface(surface, shapes)], small_png(surface))
+    return table("View", [*errors(view, surface.metadata), *_of_surface(surface, shapes)], small_png(surface))
 
 
-def errors(view: View) -> list[tuple[str, str]]:
-    """Bytes and errors of a view, as rows."""
-    exact = view.complete and view.rms == 0
+def errors(view: View, metadata: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Bytes and errors of a view, as rows. A remeshed surface is never called exact, which its mesh is not."""
+    exact = view.complete and view.rms == 0 and remesh_words(metadata) is None
     return [
         ("bytes", f"{view.bytes:,}"),
         ("level", f"{view.level}"),

@@ -32,6 +32,11 @@ def test_a_mesh_becomes_blocks(run: Run, file: Path) -> None:
     assert 8 <= len(surface.blocks) <= 18
     code, stdout, _ = run("info", out, "--json")
     assert (code, json.loads(stdout)["metadata"]["remesh"]) == (0, surface.metadata["remesh"])
+    code, stdout, _ = run("info", out)
+    words = " ".join(stdout.split())
+    assert (code, f"remeshed {len(surface.blocks)} blocks; RMS distance" in words) == (0, True), words
+    assert "complete the remeshed surface bit for bit, which is not the mesh" in words
+    assert not any(word in words.lower() for word in ("exact", "lossless"))
 
 
 def test_the_refusal_names_the_option(run: Run, file: Path) -> None:

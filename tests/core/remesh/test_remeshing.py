@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream.errors import FormatError, OptionError
+from lodestream.mesh import weld
 from lodestream.remesh.cells import Cells, grow_cells, place_sites
 from lodestream.remesh.cleaning import clean, refine
 from lodestream.remesh.distances import folded_quads
@@ -235,6 +236,24 @@ class TestSurfaces:
         first = np.zeros((place.max() + 1, 3))
         first[place.reshape(-1)] = after
         np.testing.assert_array_equal(first[place.reshape(-1)], after)
+
+    @pytest.mark.parametrize("scene", [scenes.torus, scenes.disc])
+    def test_any_layer_and_level_is_one_watertight_mesh(self, scene: scenes.Scene) -> None:
+        surface = ls.Surface.from_mesh(*scene(), remesh=True, blocks=24, remesh_error=1e-2)
+        container = ls.encode(surface)
+        characteristics, borders = set(), set()
+        for share in (0.3, 0.6, 1.0):
+            decoder = ls.Decoder()
+            decoder.feed(container[: int(share * len(container))])
+            for level in range(1, 4):
+                mesh = weld(decoder.surface(level))
+                assert not len(mesh.triangles)
+                edges = np.sort(np.stack([mesh.quads, np.roll(mesh.quads, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+                unique, count = np.unique(edges, axis=0, return_counts=True)
+                assert count.max() == 2
+                borders.add(bool((count == 1).any()))
+                characteristics.add(len(np.unique(mesh.quads)) - len(unique) + len(mesh.quads))
+        assert (characteristics, borders) == ({0 if scene is scenes.torus else 1}, {scene is scenes.disc})
 
     def test_the_metadata_say_what_was_measured(self) -> None:
         surface = ls.Surface.from_mesh(*scenes.sphere(), remesh=True, blocks=24, remesh_error=1e-2)
