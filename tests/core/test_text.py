@@ -51,5 +51,6 @@ def test_a_remeshed_surface_in_words_only_where_all_numbers_are_there() -> None:
     for key in report:
         assert remesh_words({"remesh": {**report, key: "many"}}) is None
         assert remesh_words({"remesh": {name: value for name, value in report.items() if name != key}}) is None
-    for value in (None, 3, [], "yes"):
+    others: list[object] = [None, 3, [], "yes"]
+    for value in others:
         assert remesh_words({"remesh": value}) is None
