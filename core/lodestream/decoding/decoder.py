@@ -514,5 +514,7 @@ def decode(container: bytes | bytearray | memoryview, *, max_vertices: int | Non
     """
     decoder = Decoder(max_vertices=max_vertices)
     decoder.feed(container)
+    if decoder.arrived:
+        decoder._queue.keep_last(decoder.layers[-1]._state)
     decoder.finish()
     return decoder.surface()

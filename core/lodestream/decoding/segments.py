@@ -76,6 +76,17 @@ class SegmentQueue:
                     self._decode(length)
                     return
 
+    def keep_last(self, state: NDArray[np.int8]) -> None:
+        """Decode all segments, and forget what only states before the last one need: nobody asks for them any more.
+
+        ``state`` is the last one, int8, shape (tile, channel). Where it has passes left, as much is needed for it.
+        """
+        with self._lock:
+            self._decode(self._added)
+            if not state.any():
+                for tiles in self._channels:
+                    tiles.forget_passes()
+
     def values(
         self,
         length: int,

@@ -270,6 +270,13 @@ class Tiles:
             begin = end
         return readings
 
+    def forget_passes(self) -> None:
+        """Forget in which passes coefficients were found, a byte a value: nothing is read any more.
+
+        Only states of which no passes remain can be shown from now on.
+        """
+        self.early = self.sign.view(np.uint8)  # kernels want as many numbers, and look at none where no passes remain
+
     def code(
         self,
         reading: bool,

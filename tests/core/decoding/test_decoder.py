@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream import Decoder, OptionError, Target, Tolerance, TruncatedStreamError, View, kernels
 from lodestream.container import Index, describe
+from lodestream.decoding.region import Region
 from lodestream.encoding import prepared
 from lodestream.planning.planner import plan
 from lodestream.target import Order
@@ -370,3 +372,39 @@ def test_long_segments_are_windows_of_what_arrived_and_those_of_a_caller_s_buffe
 def test_the_path_of_a_container_is_not_its_bytes(path: Any) -> None:
     with pytest.raises(ls.InputError, match=r"the bytes of a container, got .*hill.lode.*: pass what .*read_bytes"):
         ls.decode(path)
+
+
+def test_decode_forgets_what_states_before_the_last_one_need() -> None:
+    """It takes a byte a value less than a decoder whose earlier views may still be asked for."""
+    heights = np.rint(np.random.default_rng(2).normal(0, 9, (500, 600)).cumsum(axis=0)).astype(np.int16)
+    container = ls.encode(heights)
+
+    def by_decoder() -> ls.Surface:
+        decoder = Decoder()
+        decoder.feed(container)
+        decoder.finish()
+        return decoder.surface()
+
+    ls.decode(container)  # what is imported or computed once
+    peaks = []
+    for decode in (by_decoder, lambda: ls.decode(container)):
+        tracemalloc.start()
+        surface = decode()
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        np.testing.assert_array_equal(surface.points, heights)
+    assert peaks[1] <= peaks[0] - 0.9 * heights.size
+
+
+def test_a_last_state_with_passes_left_keeps_what_it_needs() -> None:
+    decoder = Decoder()
+    decoder.feed(ls.encode(terrain((60, 70))))
+    queue, header = decoder._queue, decoder.header
+    assert header is not None
+    region, odd = Region.whole(header.layout, header.levels), 0
+    for view in decoder.layers[:-1]:
+        expected = queue.values(queue.length, view._state, region)[0].arrays[0]
+        queue.keep_last(view._state)
+        np.testing.assert_array_equal(queue.values(queue.length, view._state, region)[0].arrays[0], expected)
+        odd += int((view._state % 2 == 1).sum())
+    assert odd, "passes are left of planes that have begun"
