@@ -243,7 +243,7 @@ class Header:
         return self.layout.levels
 
     def level_shape(self, level: int) -> tuple[int, int] | None:
-        """Rows and columns of a level of the only block; None where there are several."""
+        """Return rows and columns of a level of the only block; None where there are several."""
         if len(self.blocks) > 1:
             return None
         return level_shapes(self.patches, self.layout, level, [self.shape])[0]

@@ -191,6 +191,7 @@ class TileTable:
 
 @lru_cache(maxsize=REMEMBERED)
 def _table(layout: Layout, coordinate: bool) -> TileTable:
+    """Make the table of all tiles of a layout."""
     return TileTable(layout, coordinate)
 
 
