@@ -28,9 +28,9 @@ from lodestream.decoding.decoder import Decoder, View
 from lodestream.decoding.level_grids import level_nodes, level_positions
 from lodestream.decoding.window_metadata import window_closed, window_metadata
 from lodestream.errors import InputError, LodestreamError, OptionError, named
+from lodestream.formats.netcdf.layout import Grid, Part, values_of
 from lodestream.grid.patches import level_masks
 from lodestream.grid.window import spanning, taken
-from lodestream.interop.dataset_layout import Grid, Part, values_of
 from lodestream.interop.to_xarray import dataset
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import region_at, selection_of
@@ -236,7 +236,7 @@ class Container:
         Another value would have to be looked for among all; and those of a level or with errors may be any.
         """
         header, nodata = self.header, self._index.metadata_values.get("nodata")
-        integers = part.attribute is None and part.dtype != header.dtype
+        integers = part.stored == header.dtype != part.dtype
         if not (integers and header.exact and isinstance(nodata, int | float) and nodata == header.hole):
             return {}
         return {"dtype": header.dtype.name, "_FillValue": header.dtype.type(header.hole)}

@@ -91,3 +91,16 @@ def _integers(rows: Rows, dtype: np.dtype[Any], mask: NDArray[np.bool_], wanted:
         low = min(low, int(values.min(where=mask[part], initial=limits.max)))
         high = max(high, int(values.max(where=mask[part], initial=limits.min)))
     yield from (low - 1, high + 1)
+    yield from _gap(rows, low, high, mask)
+
+
+def _gap(rows: Rows, low: int, high: int, mask: NDArray[np.bool_]) -> Iterator[int]:
+    """The least integer above the least valid value that none of them is; nothing where there is none up to the last.
+
+    Of n values one of n + 1 successive integers is free.
+    """
+    occupied = np.zeros(min(high - low, mask.size) + 1, np.bool_)
+    for part in rows_at_once(mask.shape):
+        steps = (rows(part)[mask[part]]).astype(np.uint64) - np.uint64(low % 2**64)  # modulo 2**64, so of any integers
+        occupied[steps[steps < len(occupied)]] = True
+    yield from (low + int(place) for place in np.flatnonzero(~occupied)[:1])

@@ -79,6 +79,8 @@ class Format:
         a file holds one surface.
     by_block : bool
         Whether writing takes one block at a time: then its memory is that for the points of the largest one.
+    restored : bool
+        Whether writing takes a surface as `restore` gives it, with its repeated rows, columns and angles.
     """
 
     name: str
@@ -99,6 +101,7 @@ class Format:
     folder: Callable[[Path], bool] | None = None
     memory: int = 0
     by_block: bool = False
+    restored: bool = True
 
     @property
     def suffixes_out(self) -> tuple[str, ...]:
@@ -160,6 +163,7 @@ FORMATS = (
         options=netcdf.READ_OPTIONS,
         kinds=netcdf.KINDS,
         media_type="application/x-netcdf",
+        restored=False,
     ),
     Format(
         name="zarr",
@@ -170,6 +174,7 @@ FORMATS = (
         members=zarr_reader.members,
         options={key: text for key, text in netcdf.READ_OPTIONS.items() if key != "resolution"},
         write_beside=zarr_store.write_beside,
+        restored=False,
     ),
     _raster("png", write=png.write, memory=16, media_type="image/png"),
     _raster("esri-ascii", write=ascii_writer.write, memory=24, media_type="text/plain"),

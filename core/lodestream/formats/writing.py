@@ -139,8 +139,8 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
 
 
 def _prepared(surface: Surface, format_: Format) -> Surface:
-    """The surface as a writer takes it: with its repeated rows, columns and angles."""
+    """The surface as a writer takes it: with its repeated rows, columns and angles, unless that restores them."""
     check_blocks(format_, len(surface.blocks))
-    surface = restore(surface)
+    surface = restore(surface) if format_.restored else surface
     note_infinities(surface, format_.name)
     return surface

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,34 +9,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..coordinates.height_fields import coordinates
 from ..errors import FormatError, InputError, OptionError
-from ..formats.netcdf.attribute_texts import TYPES, text_of
-from ..formats.netcdf.choice import Choice, choose, offered, with_attributes
-from ..formats.netcdf.dataset import attributes_with_limits, not_taken, surface_of
+from ..formats.netcdf.dataset import attributes_with_limits
+from ..formats.netcdf.layout import ORDERED
+from ..formats.netcdf.mark import MARK, Mark
+from ..formats.netcdf.marked import surface_in
 from ..formats.netcdf.names import REFERENCES
-from ..formats.netcdf.single_numbers import SCALARS
 from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces
 from ..formats.nodata import checked, with_nodata
 from ..formats.notes import warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
-from ..scratch import IN_MEMORY, Room, rows_at_once
+from ..scratch import IN_MEMORY, Room
 from ..surface import Closed, Surface
 from ..text import names_in
-from .dataset_layout import MARK, ORDERED, Grid
 from .optional import require_library
-from .to_xarray import axis_attributes
 
 if TYPE_CHECKING:
     import xarray
 
 __all__ = ["from_xarray"]
-
-#: Metadata that are true of a grid of the same shape only.
-_OF_THE_SHAPE = ("seam", "dtype", "angles", *ORDERED)
-
-#: Coordinates by which `to_xarray` numbers rows and columns.
-_NUMBERS = ("row", "column")
 
 #: Options of reading a NetCDF that choose something of a Dataset.
 _OPTIONS = ("variable", "x", "y", "time", "at")
@@ -110,64 +100,23 @@ def _of_dataset(
     room: Room,
     options: Mapping[str, str],
 ) -> Surface:
-    mark = _mark(data)
     wanted = None if attributes is None else names_in(attributes)
-    left_out = _left_out(data, mark, options, wanted)
-    whole = _as_in_a_file(xr, data, left_out, room)
-    given = {**_names(whole, mark, options, wanted), **options}
-    wraps = None if mark is None else _closed(whole, mark)
-    source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, given, (), closed or wraps, room=room)
-    # Attributes of a surface are no coordinates of it, whatever they are called; nor are numbers of rows and columns.
-    own = [] if mark is None else [name for name in mark["attributes"] if name not in given.values()]
-    numbers = [] if mark is None else [name for name in _NUMBERS if name not in given.values()]
-    choice = choose(source, whole.drop_vars([*own, *numbers], errors="ignore"))
-    read = whole.drop_vars(numbers, errors="ignore")
-    if wanted is None:
-        further = [*offered(read, choice), *(name for name in own if name in read.variables)]
-        wanted = [name for name in map(str, read.variables) if name in further and name not in choice.attributes]
-        choice = with_attributes(read, choice, wanted)
-        notes = not_taken(read, choice)
-    else:
-        choice, notes = with_attributes(read, choice, wanted), []
-    surface, more = surface_of(source, read, choice, "xarray")
-    surface = _placed(surface, whole, choice.heights, room)
-    metadata = {key: value for key, value in surface.metadata.items() if key not in ("name", "format")}
-    names = {} if mark is None else mark["attributes"]
-    if mark is not None:
-        metadata = _restored(metadata, mark, surface, choice, _in_order(whole, choice))
-    beside = {str(names.get(name, name)): values for name, values in surface.attributes.items()}
-    wraps = closed or wraps or surface.closed
-    surface = Surface(surface.points, wraps, mask=surface.mask, attributes=beside, metadata=metadata)
-    for text in (*notes, *more):
+    mark = Mark.of(data.attrs)
+    given = {**_names(data, mark, options, wanted), **options}
+    left_out = set() if wanted is None or "variable" not in given else {*data.data_vars} - {*given.values(), *wanted}
+    whole = _as_in_a_file(xr, data, set(map(str, left_out)), room)
+    chosen = given if wanted is None else {**given, "attributes": wanted}
+    source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, chosen, (), closed, room=room)
+    surface, notes = surface_in(source, whole, "xarray", in_memory=True)
+    for text in notes:
         warn(text)
     return surface
 
 
-def _mark(data: Any) -> dict[str, Any] | None:
-    """What `to_xarray` has left for this; None where it made no such Dataset, or somebody has changed the text."""
-    try:
-        mark = json.loads(data.attrs[MARK])
-        shape, closed = mark["shape"], mark["closed"]
-        sound = len(shape) == len(closed) == len(set(mark["dims"])) == 2 and isinstance(mark["metadata"], dict)
-        return mark if sound and isinstance(mark["attributes"], dict) else None
-    except (KeyError, TypeError, ValueError):
-        return None
-
-
 def _places(array: Any) -> dict[str, str]:
-    """What a file would say of the coordinates of an array that are none of its dimensions."""
+    """What a file would say of the coordinates of an array or a Dataset that are none of its dimensions."""
     names = [str(name) for name in array.coords if name not in array.dims]
     return {"coordinates": " ".join(names)} if names else {}
-
-
-def _left_out(
-    data: Any, mark: Mapping[str, Any] | None, options: Mapping[str, str], attributes: list[str] | None
-) -> set[str]:
-    """Variables that are neither the surface nor an attribute of it; none where the conventions must say which is."""
-    named = {**_names(data, mark, options, attributes), **options}
-    if attributes is None or "variable" not in named:
-        return set()
-    return set(map(str, data.data_vars)) - {*named.values(), *attributes}
 
 
 def _as_in_a_file(xr: Any, data: Any, left_out: Collection[str], room: Room) -> Any:
@@ -181,7 +130,7 @@ def _as_in_a_file(xr: Any, data: Any, left_out: Collection[str], room: Room) -> 
             for name in data.data_vars
         },
         {name: _as_stored(xr, variable, room) for name, variable in data.coords.variables.items()},
-        {key: value for key, value in data.attrs.items() if key != MARK},
+        data.attrs | ({} if data.data_vars else _places(data)),
     )
 
 
@@ -259,119 +208,13 @@ def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room:
     return result if anything else None
 
 
-def _names(
-    whole: Any, mark: Mapping[str, Any] | None, options: Mapping[str, str], attributes: list[str] | None
-) -> dict[str, str]:
+def _names(data: Any, mark: Mark | None, options: Mapping[str, str], attributes: list[str] | None) -> dict[str, str]:
     """Which variable is the surface, where that is known before the conventions are asked."""
     if {"variable", "x", "y"} & set(options):
         return {}
-    if mark is not None:
-        name = mark.get("variable")
-        if name in whole.data_vars:
-            return {"variable": str(name)}
-        if name is None and {"x", "y"} <= set(whole.variables):
-            return {"x": "x", "y": "y"}  # planar points
-    left = [str(name) for name in whole.data_vars if str(name) not in (attributes or ())]
+    if mark is not None and (named := mark.options(data)):
+        return named
+    left = [str(name) for name in data.data_vars if str(name) not in (attributes or ())]
     if attributes is not None and len(left) == 1:
         return {"variable": left[0]}
-    return {"variable": "z"} if "z" in whole.data_vars and whole["z"].dtype.kind in "iuf" else {}
-
-
-def _closed(whole: Any, mark: Mapping[str, Any]) -> Closed:
-    """The closed axes that are as long as they were."""
-    variable = whole.variables.get(mark.get("variable"), whole.variables.get("x"))
-    if variable is None or variable.ndim < 2:
-        return False, False
-    known = dict(zip(mark["dims"], zip(mark["closed"], mark["shape"], strict=True), strict=True))
-    lengths = dict(zip(variable.dims, variable.shape, strict=True))
-    rows, columns = (bool(known.get(dim, (0, 0))[0]) and known[dim][1] == lengths[dim] for dim in variable.dims[:2])
-    return rows, columns
-
-
-def _in_order(whole: Any, choice: Choice) -> bool:
-    """Whether rows and columns are those that `to_xarray` numbered, each at its place."""
-    numbers = [whole.variables.get(name) for name in _NUMBERS]
-    return all(
-        own is not None and own.dims == (dim,) and np.array_equal(own.values, np.arange(length))
-        for own, dim, length in zip(numbers, choice.dims, choice.shape, strict=True)
-    )
-
-
-def _placed(surface: Surface, whole: Any, name: str | None, room: Room) -> Surface:
-    """The surface with the CRS of ``spatial_ref`` and, where it says every coordinate, its geotransform."""
-    reference = whole.variables.get("spatial_ref")
-    if reference is None:
-        return surface
-    crs = reference.attrs.get("crs_wkt", reference.attrs.get("spatial_ref"))
-    if isinstance(crs, str) and crs.strip():
-        surface.metadata["crs"] = crs
-    try:
-        transform = [float(number) for number in str(reference.attrs["GeoTransform"]).split()]
-    except (KeyError, ValueError):
-        return surface
-    if len(transform) != 6 or name is None or not _lies_at(surface, transform):
-        return surface
-    heights, metadata = surface.points, {**surface.metadata, "geotransform": transform}
-    if heights.ndim == 3:
-        heights = room.empty(surface.shape, whole.variables[name].dtype)
-        heights[...] = surface.points[..., 2]
-    metadata.pop("axes", None)
-    return Surface(heights, surface.closed, mask=surface.mask, attributes=surface.attributes, metadata=metadata)
-
-
-def _lies_at(surface: Surface, transform: list[float]) -> bool:
-    """Whether a geotransform says every coordinate; some rows at a time, of which there may be many."""
-    for rows in rows_at_once(surface.shape):
-        told = _of_rows(surface, {"geotransform": transform}, rows)
-        if surface.points.ndim == 2:
-            own, valid = _of_rows(surface, surface.metadata, rows), None
-        else:
-            own = surface.points[rows, :, 0], surface.points[rows, :, 1]
-            valid = None if surface.mask is None else surface.mask[rows]
-        if not all(((a == b) | (False if valid is None else ~valid)).all() for a, b in zip(own, told, strict=True)):
-            return False
-    return True
-
-
-def _of_rows(surface: Surface, metadata: Mapping[str, Any], rows: slice) -> tuple[NDArray[Any], NDArray[Any]]:
-    """x and y that metadata say of some rows of heights, shape (row, column)."""
-    lines = [*range(rows.start, rows.stop), rows.stop]  # a surface has two points or more
-    places = {**metadata, "nodes": [lines, list(range(surface.shape[1]))]}
-    nothing = np.broadcast_to(np.zeros((), surface.dtype), (len(lines), surface.shape[1]))
-    x, y = coordinates(Surface(nothing, metadata=places))
-    return x[:-1], y[:-1]
-
-
-def _restored(
-    metadata: dict[str, Any], mark: Mapping[str, Any], surface: Surface, choice: Choice, ordered: bool
-) -> dict[str, Any]:
-    """The metadata with those that `to_xarray` left; what is true of one shape or order only, if it is this."""
-    kept = dict(mark["metadata"])
-    gone: set[str] = set()
-    if list(surface.shape) != mark["shape"] or list(choice.dims) != mark["dims"]:
-        gone |= set(_OF_THE_SHAPE)
-    if not ordered:
-        gone |= {*ORDERED, "seam"} if "turn" in kept else set(ORDERED)
-    kept = {key: value for key, value in kept.items() if key not in gone}
-    tags = kept.pop("tags", {})
-    if isinstance(kept.get(SCALARS), dict):
-        kept[SCALARS] = {**kept[SCALARS], **metadata.get(SCALARS, {})}
-    result = {**metadata, **kept}
-    told = tags.get("", {}) if isinstance(tags, dict) else {}
-    texts = {**metadata.get("tags", {}).get("", {}), **(told if isinstance(told, dict) else {})}
-    usual = axis_attributes(Grid.of(surface.blocks[0], result | {"tags": {"": told}}))
-    for letter, attributes in usual.items():
-        for key, text in attributes.items():
-            if texts.get(f"{letter}#{key}") == text_of(text)[0] and f"{letter}#{key}" not in told:
-                del texts[f"{letter}#{key}"]  # `to_xarray` says so of every surface of this kind
-    others = {key: value for key, value in tags.items() if key} if isinstance(tags, dict) else {}
-    result.pop("tags", None)
-    types = {**metadata.get(TYPES, {}), **(kept[TYPES] if isinstance(kept.get(TYPES), dict) else {})}
-    result.pop(TYPES, None)
-    if types := {key: kind for key, kind in types.items() if key in texts}:
-        result[TYPES] = types
-    if texts or others:
-        result["tags"] = {**others, **({"": texts} if texts else {})}
-    if "variable" in metadata and "variable" not in kept:
-        del result["variable"]  # the name that `to_xarray` gave
-    return result
+    return {"variable": "z"} if "z" in data.data_vars and data["z"].dtype.kind in "iuf" else {}

@@ -15,6 +15,7 @@ from ..coordinates.seams import merge
 from ..decoding.decoder import Decoder
 from ..errors import FormatError, InputError, named
 from ..formats.attributes import NORMAL, TEXTURE
+from ..formats.netcdf.mark import MARK
 from ..formats.notes import keep_words, listing, warn
 from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
 from ..formats.vtk.grids import without_hidden
@@ -22,7 +23,6 @@ from ..mesh import Mesh
 from ..planning.planner import plan
 from ..surface import Block, Surface
 from ..target import Target
-from .dataset_layout import MARK
 from .meshes import surface_of_mesh
 from .optional import require_library
 from .pyvista_layout import GHOSTS, as_it_was, grid_of_block, marks_of

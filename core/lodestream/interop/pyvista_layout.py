@@ -16,11 +16,11 @@ from ..coordinates.height_fields import coordinates
 from ..coordinates.seams import restore, shapes_in_files
 from ..errors import InputError
 from ..formats.closing import wraps
+from ..formats.netcdf.mark import MARK, in_json
 from ..formats.notes import survives, warn
 from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
 from ..formats.vtk.writer import Grid, grid_of
 from ..surface import DTYPES, Block, Surface
-from .dataset_layout import MARK, in_json
 
 __all__ = ["GHOSTS", "as_it_was", "grid_of_block", "marks_of"]
 

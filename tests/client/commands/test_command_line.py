@@ -139,7 +139,7 @@ def test_a_store_is_written_into_an_empty_folder_and_into_no_other(
     zarr = pytest.importorskip("zarr")
     (tmp_path / "out.zarr").mkdir()
     assert fetch(out="out.zarr")[0] == 0
-    assert np.array_equal(zarr.open(tmp_path / "out.zarr", mode="r")["height"][:], terrain, equal_nan=True)
+    assert np.array_equal(zarr.open(tmp_path / "out.zarr", mode="r")["z"][:], terrain, equal_nan=True)
     code, _, stderr = fetch(out="out.zarr")
     assert code == 1
     assert "out.zarr: it is a folder with files; remove it, or choose another name" in stderr

@@ -268,7 +268,7 @@ def test_a_crs_is_written_in_attributes_of_the_conventions(tmp_path: Path, kind:
         else xr.open_zarr(tmp_path / "out.zarr", consolidated=True)
     )
     with opened as data:
-        assert_is_crs(data.crs.attrs, kind)
+        assert_is_crs(data.spatial_ref.attrs, kind)
         assert_at(surface, *np.meshgrid(data[data.t.dims[1]].values, data[data.t.dims[0]].values))
     again, _ = noted(lambda *_: ls.read(tmp_path / f"out{suffix}"), surface, tmp_path)  # type: ignore[arg-type]
     assert again.metadata["crs"] == surface.metadata["crs"]

@@ -91,20 +91,20 @@ def test_values_are_those_of_the_surface(tmp_path: Path) -> None:
     formats.write(surface, tmp_path / "a.zarr")
     group = zarr.open_group(tmp_path / "a.zarr", mode="r")
     assert group.metadata.zarr_format == 3
-    assert group["height"].chunks == (512, 512)
-    assert group["height"].fill_value == -9999
-    np.testing.assert_array_equal(group["height"][:], np.where(hole(), surface.points, -9999))
+    assert group["z"].chunks == (512, 512)
+    assert group["z"].fill_value == -9999
+    np.testing.assert_array_equal(group["z"][:], np.where(hole(), surface.points, -9999))
     np.testing.assert_array_equal(group["x"][:], 500015 + 30.0 * np.arange(700))
     np.testing.assert_array_equal(group["y"][:], 4100000 - 15 - 30.0 * np.arange(600))
 
 
-def test_lines_are_found_where_the_rule_has_two_directions(tmp_path: Path) -> None:
-    # A step so small that it is lost in the rounding leaves the same line in every row.
+def test_a_rule_of_two_directions_has_coordinates_over_both(tmp_path: Path) -> None:
+    # Even if a step is so small that it is lost in the rounding.
     surface = Surface(hills("int32"), metadata={"grid": [[0, 3, 1e-9, 0], [0, 1e-9, 2, 0]]})
     formats.write(surface, tmp_path / "a.zarr")
     store = xarray.open_zarr(tmp_path / "a.zarr", chunks=None)
-    assert (store["x"].dims, store["y"].dims) == (("x",), ("y",))
-    np.testing.assert_array_equal(store["y"], 2 * np.arange(600))
+    assert store["xc"].dims == store["yc"].dims == ("y", "x")
+    np.testing.assert_array_equal(store["yc"], np.broadcast_to(2 * np.arange(600)[:, None], (600, 700)))
 
 
 def test_a_store_is_no_stream() -> None:
@@ -125,14 +125,25 @@ def test_several_blocks_are_refused(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_holes_where_every_integer_is_a_height_are_nan(tmp_path: Path) -> None:
+    full, mask = np.arange(512).reshape(2, 256).astype("u1"), np.arange(512).reshape(2, 256) < 300
+    surface = Surface(full, (False, True), mask=mask)
+    formats.write(surface, tmp_path / "a.zarr")
+    back = formats.read(tmp_path / "a.zarr")
+    assert (back.dtype.name, back.closed) == ("float32", (False, True))
+    np.testing.assert_array_equal(back.mask, mask)
+    np.testing.assert_array_equal(back.points[mask], full[mask])
+
+
 def test_what_it_cannot_hold_is_said(tmp_path: Path) -> None:
-    full = np.arange(512).reshape(2, 256).astype("u1")
+    surface = Surface(hills(), attributes={"a b": hills()}, metadata={"foreign": {"me": b"no JSON"}})
     with pytest.warns(FormatWarning) as notes:
-        formats.write(Surface(full, (False, True), mask=np.arange(512).reshape(2, 256) < 300), tmp_path / "a.zarr")
+        formats.write(surface, tmp_path / "a.zarr")
     assert [str(note.message) for note in notes] == [
-        "Zarr is written with values in 212 holes, since the heights have every number",
-        "Zarr is written without closure, which it cannot hold",
+        "Zarr is written without foreign, which JSON cannot hold",
+        "Zarr is written with a b as a_b",
     ]
+    assert list(formats.read(tmp_path / "a.zarr").attributes) == ["a b"]
 
 
 def test_without_the_library_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,7 +156,7 @@ def test_without_the_library_it_is_said(tmp_path: Path, monkeypatch: pytest.Monk
 def test_an_empty_folder_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "a.zarr").mkdir()
     formats.write(SURFACES["bare"], tmp_path / "a.zarr")
-    assert sorted(path.name for path in (tmp_path / "a.zarr").iterdir()) == ["height", "zarr.json"]
+    assert sorted(path.name for path in (tmp_path / "a.zarr").iterdir()) == ["z", "zarr.json"]
     assert [path.name for path in tmp_path.iterdir()] == ["a.zarr"]
 
 

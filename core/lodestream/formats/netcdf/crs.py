@@ -63,7 +63,7 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
             return wkt, mapping, []
     if "grid_mapping_name" not in attributes:
         unnamed = set(attributes) - {"GeoTransform"}
-        return None, None, [f"left out {mapping}, a grid mapping without a name"] if unnamed else []
+        return None, mapping, [f"left out {mapping}, a grid mapping without a name"] if unnamed else []
     try:
         import pyproj
     except ImportError:
@@ -75,7 +75,7 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
         crs = pyproj.CRS.from_cf({key: _plain(value) for key, value in attributes.items()})
     except Exception as error:  # a file may say anything, and pyproj fails in several ways
         reason = " ".join(str(error).split())[:120] or type(error).__name__
-        return None, None, [f"left out the grid mapping {mapping}, which pyproj does not understand: {reason}"]
+        return None, mapping, [f"left out the grid mapping {mapping}, which pyproj does not understand: {reason}"]
     return str(crs.to_wkt()), mapping, []
 
 

@@ -21,6 +21,7 @@ from ..source import Source, number
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, Found, offered, others
 from .crs import crs_of
+from .geotransform import by_geotransform
 from .names import REFERENCES, associated, axis_words, is_grid_mapping
 from .single_numbers import SCALARS, names_of_single, number_of
 from .units import Conversion, conversions_of
@@ -29,7 +30,7 @@ from .values import PACKING, RANGES, Values, chosen, is_packed, no_limits, raw_v
 __all__ = ["attributes_with_limits", "not_taken", "surface_of"]
 
 #: Attributes that say how a file stores values; `Surface` has the values.
-_STORAGE = (*PACKING, *REFERENCES, "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
+_STORAGE = (*PACKING, *REFERENCES, "ancillary_variables", "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
 
 
 def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[Surface, list[str]]:
@@ -59,7 +60,7 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
         If it is no surface.
     """
     source.check_array(choice.shape, np.dtype(np.float64))
-    metadata, notes, conversions = _metadata(source, dataset, choice, format_name)
+    metadata, notes, conversions, mapping = _metadata(source, dataset, choice, format_name)
     reader = _Reader(source, dataset, choice)
     axes = [
         None if found is None else reader.coordinate(found, conversions.get(letter))
@@ -77,6 +78,7 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
     else:
         said = {"closed": source.closed, "room": source.room, **extras}
         surface = place(heights.array, x, y, mask=heights.valid, **said)
+        surface = by_geotransform(surface, heights, dataset.variables[mapping].attrs if mapping else {})
     notes += reader.notes + ([] if heights is None else _without_place(heights, x, y))
     return _closed_fields(source, dataset, choice, surface), notes
 
@@ -163,8 +165,8 @@ def _without_place(heights: Values, x: Coordinate, y: Coordinate) -> list[str]:
 
 def _metadata(
     source: Source, dataset: Any, choice: Choice, format_name: str
-) -> tuple[dict[str, Any], list[str], dict[str, Conversion]]:
-    """What the file says of itself and of the variables that are read; notes; how x and y are converted.
+) -> tuple[dict[str, Any], list[str], dict[str, Conversion], str | None]:
+    """What the file says of itself and of the variables that are read; notes; how x and y are converted; the mapping.
 
     Tags have the names that GDAL has for attributes of files. Coordinates are x and y, whatever the file calls them;
     what the CRS says of them already is left out.
@@ -213,7 +215,7 @@ def _metadata(
     taken = {main, *choice.attributes, *places, *numbers, mapping}
     if left_out := _left_out(dataset, choice, taken, single):
         notes.append(f"left out: {listing(left_out)}")
-    return metadata, notes, conversions
+    return metadata, notes, conversions, mapping
 
 
 def _same(value: Any, usual: Any) -> bool:

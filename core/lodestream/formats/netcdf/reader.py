@@ -15,8 +15,7 @@ from ..member import Member
 from ..notes import listing, warn
 from ..source import Source, check_allowed
 from . import hdf5_guard, vmec
-from .choice import choose
-from .dataset import not_taken, surface_of
+from .marked import surface_in
 from .members import members_of
 
 __all__ = [
@@ -103,15 +102,11 @@ def of_group(
     chosen = group_of(source)
     inner = [group for group in groups if group != chosen]
     try:
-        choice = choose(source, dataset)
-        if deflated:
-            source.check_expansion(choice.nbytes)
-        surface, notes = surface_of(source, dataset, choice, format_name)
+        surface, notes = surface_in(source, dataset, format_name, deflated=deflated)
     except FormatError as error:
         if not inner:
             raise
         raise FormatError(f"{error}; there are groups: {listing(inner)}, choose with group=") from None
-    notes += not_taken(dataset, choice)
     return surface, [*notes, *([f"left out groups: {listing(inner)}"] if inner else [])]
 
 

@@ -29,7 +29,9 @@ def names_of_single(dataset: Any, choice: Choice) -> list[str]:
     main = choice.heights or (choice.x.name if choice.x else "")
     along = list(choice.index)
     along += [name for dim in choice.index if is_time(dataset, dim) and (name := time_of(dataset, dim)) is not None]
-    named = [*associated(dataset, main)["coordinates"], *str(dataset.attrs.get("coordinates", "")).split()]
+    naming = (main,) if choice.heights else (main, *choice.attributes)  # x names none
+    named = [other for name in naming for other in associated(dataset, name)["coordinates"]]
+    named += str(dataset.attrs.get("coordinates", "")).split()
     return [
         name
         for name in dict.fromkeys((*along, *named))

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import warnings
-from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
@@ -18,7 +16,7 @@ from ...surface import Surface
 from ..beside import folder_beside
 from ..notes import with_nul_shown
 from .hdf5_output import Output
-from .variables import Contents, Variable, contents_of, strips
+from .stored import Contents, Variable, contents_of, strips
 
 __all__ = ["write"]
 
@@ -29,10 +27,10 @@ _CHUNK = 256
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write heights, or z over two-dimensional x and y; planar points as x and y alone.
+    """Write what `Surface.to_xarray` says of a surface.
 
-    Holes are ``_FillValue``: NaN, or a number that no height has. A CRS is a grid mapping with its WKT. The values are
-    written some rows at a time, so that the surface may be larger than memory.
+    Holes are ``_FillValue``: NaN, or a number that no height has. The values are written some rows at a time, so that
+    the surface may be larger than memory.
 
     Raises
     ------
@@ -81,23 +79,11 @@ def _write_all(path: Path, contents: Contents, stop: Event) -> None:
     with Output(path) as output:
         try:
             with h5netcdf.File(output, "w") as group:
-                group.attrs.update(_attributes(contents.attributes))
+                group.attrs.update(contents.attributes)
                 for name, variable in contents.variables.items():
                     _write(group, name, variable, output, stop)
         finally:
             output.check()
-
-
-def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes as NetCDF has them: texts, lists of texts and numbers; what else JSON can say as a text of it."""
-    plain = (str, int, float, np.ndarray, np.generic)
-    return {
-        key: value
-        if (isinstance(value, plain) and not isinstance(value, bool))
-        or (isinstance(value, list) and value and all(isinstance(word, str) for word in value))
-        else json.dumps(value)
-        for key, value in attributes.items()
-    }
 
 
 def _write(group: Any, name: str, variable: Variable, output: Output, stop: Event) -> None:
@@ -110,7 +96,7 @@ def _write(group: Any, name: str, variable: Variable, output: Output, stop: Even
         sides = (min(length, _CHUNK) for length in variable.shape[:2])
         said |= {**_DEFLATE, "chunks": (*sides, *[1] * (len(variable.shape) - 2))}
     made = group.create_variable(name, variable.dims, variable.dtype, **said)
-    made.attrs.update(_attributes(variable.attributes))
+    made.attrs.update(variable.attributes)
     if not variable.shape:
         made[...] = variable.rows(slice(None))
         return

@@ -20,7 +20,7 @@ from typing import Any
 from ...errors import FormatError, UnavailableError
 from ...surface import Surface
 from .attribute_texts import plain_of
-from .variables import Variable, contents_of, strips
+from .stored import Variable, contents_of, strips
 
 __all__ = ["SUFFIXES", "sniff", "write_beside"]
 
