@@ -144,12 +144,15 @@ def surface_options(args: argparse.Namespace) -> SurfaceOptions:
 
 
 def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOptions:
-    """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice."""
+    """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice.
+
+    Names of attributes add up.
+    """
     options: dict[str, str] = {} if args.nodata is None else {"nodata": args.nodata}
     for key, value in args.options:
-        if key in options:
+        if key in options and key != "attributes":
             args.parser.error(f"argument -o: {key} given twice")
-        options[key] = value
+        options[key] = f"{options[key]},{value}" if key in options else value
     for key, value in _remeshing(args).items():
         if options.setdefault(key, value) != value:
             args.parser.error(f"argument -o: {key} given twice")

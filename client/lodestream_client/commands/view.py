@@ -23,10 +23,11 @@ from .arguments import Subparsers, add_command, add_size_option, add_token_optio
 from .encode import read_surface
 from .inputs import input_files
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
-from .values import parse_pictures, parse_port
+from .values import parse_pictures, parse_port, parse_region
 
 if TYPE_CHECKING:
     from lodestream.surface import Surface
+    from lodestream.target import Region
 
     from ..viewer.sources import Source
 
@@ -56,6 +57,8 @@ class ViewOptions:
         Picture to draw in place of serving.
     at : tuple of (str, int or None), or None
         A picture after each of these sizes: as it was written, and in bytes (None: all).
+    region : ((int, int), (int, int)) or None
+        The window that is drawn.
     max_vertices : int or None
         Limit on the memory of what is drawn.
     token : str or None
@@ -69,6 +72,7 @@ class ViewOptions:
     static: Path | None
     png: Path | None
     at: tuple[tuple[str, int | None], ...] | None
+    region: Region | None
     max_vertices: int | None
     token: str | None
 
@@ -115,6 +119,12 @@ def register(subparsers: Subparsers) -> None:
         metavar="SIZE,...",
         help="write a picture after each of these sizes, for example 1kB,20kB,all, as OUT-1kB.png and so on",
     )
+    parser.add_argument(
+        "--roi",
+        type=parse_region,
+        metavar="R0:R1,C0:C1",
+        help="draw this window only, as in pull; the page shows the whole surface, and gets first what is looked at",
+    )
     add_surface_options(parser)
     add_size_option(parser)
     add_token_option(parser)
@@ -125,6 +135,8 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         args.parser.error("argument --png: not allowed with argument --static")
     if args.at is not None and args.png is None:
         args.parser.error("argument --at: says when --png draws")
+    if args.roi is not None and args.png is None:
+        args.parser.error("argument --roi: says what --png draws; the page gets first what is looked at")
     if args.png is not None and args.png.suffix.lower() != ".png":
         args.parser.error(f"argument --png: expected OUT.png, got {args.png}")
     if len(args.files) > 1 and any(map(is_url, args.files)):
@@ -137,6 +149,7 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         args.static,
         args.png,
         args.at,
+        args.roi,
         args.max_vertices,
         token_of(args),
     )
@@ -206,7 +219,7 @@ def _draw(options: ViewOptions, out: Path) -> None:
     require_folder(out)
     with _source(options) as source:
         sizes = options.at or (("", None),)
-        least = least_size(source, options.max_vertices)
+        least = least_size(source, options.max_vertices, options.region)
         if all(most is not None and most < least for _, most in sizes):
             words = ", ".join(label for label, _ in sizes)
             raise OptionError(f"--at {words}: expected {least} bytes or more, which the first picture takes")
@@ -215,7 +228,7 @@ def _draw(options: ViewOptions, out: Path) -> None:
                 note(f"--at {label}: no picture, since the first one takes {least} bytes")
                 continue
             path = out.with_name(f"{out.stem}-{label}{out.suffix}") if label else out
-            view, layout = view_after(source, most, options.max_vertices)
+            view, layout = view_after(source, most, options.max_vertices, options.region)
             write_png(Picture.of(view, layout, source.name).png(), path)
             note(f"{path}: {view.bytes} bytes, RMS error {view.rms:.6g}, maximum {view.max_error:.6g}")
 

@@ -15,7 +15,7 @@ from lodestream.errors import UnavailableError
 from lodestream.interop.pictures import DPI, draw_surface
 from lodestream.planning.planner import plan
 from lodestream.surface import Block, Surface
-from lodestream.target import Target
+from lodestream.target import Region, Target
 from lodestream.text import printable
 
 from ..terminal.output import human_size, replacing
@@ -31,8 +31,10 @@ _PIXELS = 1000  # along the longer side of a height field
 _LONGEST = 100  # characters of a name
 
 
-def view_after(source: Source, most: int | None, max_vertices: int | None = None) -> tuple[View, Layout]:
-    """What a stream of a container shows after at most so many bytes.
+def view_after(
+    source: Source, most: int | None, max_vertices: int | None = None, region: Region | None = None
+) -> tuple[View, Layout | None]:
+    """What a stream of a container, or of a window of it, shows after at most so many bytes.
 
     Parameters
     ----------
@@ -41,33 +43,36 @@ def view_after(source: Source, most: int | None, max_vertices: int | None = None
         Bytes; None: all.
     max_vertices : int or None
         Limit on the memory of the surface, see `lodestream.Decoder`.
+    region : ((int, int), (int, int)), optional
+        The window.
 
     Returns
     -------
-    (View, Layout)
-        What is shown, and the shapes of its levels.
+    (View, Layout or None)
+        What is shown, and the shapes of its levels; None of a window.
 
     Raises
     ------
     OptionError
-        If the first layer takes more bytes.
+        If the first layer takes more bytes, or there is no such window.
     StreamError, TooLargeError
         If the container is damaged or too large.
     """
     read = partial(read_fully, source)
-    decoder = Decoder(max_vertices=max_vertices)
+    target = Target(max_bytes=most, region=region)
+    decoder = Decoder(target, max_vertices=max_vertices)
     index = read_index(read, source.size, Capacity(decoder.capacity.max_vertices))
-    chosen = plan(index, Target(max_bytes=most))
+    chosen = plan(index, target)
     for place in (*chosen.before, index.metadata, *chosen.ranges):
         decoder.feed_at(place.offset, read(place.offset, place.length))
-    return decoder.view(), index.header.layout
+    return decoder.view(), index.header.layout if region is None else None
 
 
-def least_size(source: Source, max_vertices: int | None = None) -> int:
+def least_size(source: Source, max_vertices: int | None = None, region: Region | None = None) -> int:
     """Bytes that the first picture of a container takes; the parameters are those of `view_after`."""
-    decoder = Decoder(max_vertices=max_vertices)
-    index = read_index(partial(read_fully, source), source.size, Capacity(decoder.capacity.max_vertices))
-    return index.layers[0].end
+    capacity = Decoder(max_vertices=max_vertices).capacity
+    index = read_index(partial(read_fully, source), source.size, Capacity(capacity.max_vertices))
+    return plan(index, Target(region=region)).marks[0].bytes
 
 
 def require_matplotlib() -> None:

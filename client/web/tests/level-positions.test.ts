@@ -86,18 +86,22 @@ it("a list with the first number again says how long the step over the seam is",
   const places = [Int32Array.of(0, 1), Int32Array.of(0, 2, 4)] as const;
   const level = levelMetadata({ axes }, true, [2, 6], [false, true], places);
   expect(level.axes).toEqual({ x: [0, 20, 40, 360, "values"], y: [0, 1] });
-  const window = windowMetadata(
-    { axes },
-    {
-      shape: [2, 6],
-      inside: [
-        [0, 2],
-        [4, 8],
-      ],
-      full: [2, 6],
-      axes,
-      places: [Int32Array.of(0, 1), Int32Array.of(4, 5, 6, 7)],
-    },
-  );
-  expect(window.axes).toEqual({ x: [40, 44, 360, 364, "values"], y: [0, 1] });
+  const at = (start: number, ...columns: number[]) =>
+    windowMetadata(
+      { axes },
+      {
+        shape: [2, 6],
+        inside: [
+          [0, 2],
+          [start, start + columns.length],
+        ],
+        closed: [false, columns.length === 6],
+        full: [2, 6],
+        axes,
+        places: [Int32Array.of(0, 1), Int32Array.from(columns)],
+      },
+    ).axes;
+  expect(at(4, 4, 5, 6, 7)).toEqual({ x: [40, 44, 360, 364, "values"], y: [0, 1] });
+  // A window of the whole axis is closed too.
+  expect(at(4, 4, 5, 6, 7, 8, 9)).toEqual({ x: [40, 44, 360, 364, 380, 384, 400, "values"], y: [0, 1] });
 });

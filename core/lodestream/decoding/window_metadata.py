@@ -54,7 +54,8 @@ def window_metadata(metadata: dict[str, Any], header: Header, region: Region, le
         values["geotransform"] = [x0, x_column, x_row, y0, y_column, y_row]
     if "axes" in values:
         # Of the whole surface: a step of a level across the seam may be shorter than the others.
-        values["axes"] = axes_at(metadata["axes"], header.shape, positions(header, region, level))
+        closed = window_closed(header.closed, header.shape, region)
+        values["axes"] = axes_at(metadata["axes"], header.shape, positions(header, region, level), closed)
     return values
 
 

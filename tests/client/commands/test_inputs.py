@@ -52,6 +52,21 @@ def test_encode_says_how_the_other_variables_are_taken(run: Run, tmp_path: Path)
     assert "left out variables of the same grid: heat; take them with -o attributes=\n" in stderr
 
 
+def test_names_of_attributes_add_up(run: Run, tmp_path: Path) -> None:
+    values = np.arange(12.0).reshape(3, 4)
+    xarray = pytest.importorskip("xarray")
+    data = xarray.Dataset(dict.fromkeys(("z", "heat", "speed", "kind"), (("y", "x"), values)))
+    data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
+    words = ("variable=z", "attributes=heat,kind", "attributes=speed")
+    code, _, stderr = run(
+        "encode", tmp_path / "a.nc", tmp_path / "a.lode", *(it for word in words for it in ("-o", word))
+    )
+    assert code == 0, stderr
+    assert list(ls.decode((tmp_path / "a.lode").read_bytes()).attributes) == ["heat", "kind", "speed"]
+    code, _, stderr = run("encode", tmp_path / "a.nc", tmp_path / "b.lode", "-o", "variable=z", "-o", "variable=heat")
+    assert (code, "variable given twice" in stderr) == (2, True)
+
+
 @pytest.mark.parametrize("command", ["info", "decode"])
 def test_a_file_of_another_format_is_to_be_encoded_first(run: Run, tmp_path: Path, command: str) -> None:
     np.save(tmp_path / "a.npy", np.arange(12.0).reshape(3, 4))

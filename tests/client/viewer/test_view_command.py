@@ -136,6 +136,29 @@ def test_pictures_without_a_browser(tmp_path: Path, container: Path, capsys: pyt
     assert (tmp_path / "out-1kB.png").read_bytes() != (tmp_path / "out-all.png").read_bytes()
 
 
+def test_a_picture_of_a_window_is_that_of_its_points(
+    tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    image = pytest.importorskip("PIL.Image")
+    pytest.importorskip("matplotlib")
+    out, window = tmp_path / "out.png", HILLS[5:25, 10:50]
+    assert main(["view", str(container), "--png", str(out), "--roi", "5:25,10:50", "--at", "1B,all"]) == 0
+    first, last = capsys.readouterr().err.splitlines()
+    assert "no picture, since the first one takes" in first
+    assert "RMS error 0, maximum 0" in last
+    assert int(re.search(r"out-all\.png: (\d+) bytes", last)[1]) < container.stat().st_size  # type: ignore[index]
+    (tmp_path / "window.lode").write_bytes(ls.encode(ls.Surface(window)))
+    assert main(["view", str(tmp_path / "window.lode"), "--png", str(tmp_path / "window.png")]) == 0
+    pictures = []
+    for name in ("out-all", "window"):
+        with image.open(tmp_path / f"{name}.png") as drawn:
+            pictures.append(np.asarray(drawn.convert("RGB"), np.int64))
+    below = len(pictures[0]) // 6  # the title, which tells another size
+    assert np.array_equal(*(picture[below:] for picture in pictures))
+    assert main(["view", str(container), "--png", str(out), "--roi", "5:25,10:5000"]) == 1
+    assert "got 10:5000" in capsys.readouterr().err
+
+
 def test_a_size_that_is_too_small_does_not_lose_the_other_pictures(
     tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -190,6 +213,7 @@ def test_pictures_of_every_kind(tmp_path: Path, surface: ls.Surface) -> None:
     [
         ["--png", "a.png", "--static", "b"],
         ["--at", "1kB"],
+        ["--roi", "0:9,0:9"],
         ["--png", "a.gif"],
         ["--port", "65536"],
         ["other.npy", "http://host/a.lode"],

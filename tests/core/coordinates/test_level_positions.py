@@ -269,3 +269,27 @@ def test_nodes_over_uneven_longitudes_lie_at_places_of_the_source(
         found = decoder.surface(level).to_xarray()
         assert found.x.values.tobytes() == lon[at["lon"]].astype(found.x.dtype).tobytes()
         assert found.y.values.tobytes() == lat[at["lat"]].astype(found.y.dtype).tobytes()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("start", [0, 1, 13, 35])
+def test_a_window_of_a_whole_uneven_closed_axis_knows_the_step_across_its_seam(start: int, turned: bool) -> None:
+    xarray = pytest.importorskip("xarray")
+    lon = 10 * np.arange(36.0) + 3 * np.sin(np.arange(36) / 36 * 2 * np.pi)
+    dims = ("lon", "lat") if turned else ("lat", "lon")
+    heights = np.arange(36 * 9).reshape((36, 9) if turned else (9, 36)).astype("i4") * 7 % 101
+    east = ("lon", lon, {"units": "degrees_east"})
+    data = xarray.Dataset({"z": (dims, heights)}, {"lon": east, "lat": ("lat", np.arange(9.0) ** 2)})
+    around, across = (start, start + 36), (0, 9)
+
+    def part(decoder: ls.Decoder, columns: tuple[int, int]) -> ls.Surface:
+        return decoder.view().window((columns, across) if turned else (across, columns))
+
+    window = part(decoder_of(ls.Surface.from_xarray(data.z)), around)
+    assert window.closed == (turned, not turned)
+    assert len(window.metadata["axes"]["x"]) == 36 + 1 + 1  # a turn further, and what rule it is
+    again = decoder_of(window)
+    for columns in ((0, 36), (30, 40), (35, 71)):
+        found = coordinates(part(again, columns))[0]
+        places = start + np.arange(*columns)
+        np.testing.assert_allclose(found[:, 0] if turned else found[0], lon[places % 36] + 360 * (places // 36))

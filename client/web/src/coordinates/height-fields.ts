@@ -214,6 +214,8 @@ export interface LevelWindow {
   readonly shape: Shape;
   /** Rows and columns of the level's grid; across the seam of a closed axis they go on beyond its end. */
   readonly inside: Region;
+  /** Which axes of the window are closed. */
+  readonly closed: Closed;
   /** Shape and `axes` of the whole surface. */
   readonly full: Shape;
   readonly axes: unknown;
@@ -227,7 +229,7 @@ export interface LevelWindow {
  */
 export function windowMetadata(metadata: Metadata, window: LevelWindow): Metadata {
   const { seam: _seam, turn: _turn, poles: _poles, nodes, ...values } = metadata;
-  const { shape, inside, full, axes, places } = window;
+  const { shape, inside, closed, full, axes, places } = window;
   const [[top], [left]] = inside;
   const lines = ([0, 1] as const).map((axis) => lineOf(nodesOf(nodes)[axis], inside[axis], shape[axis]));
   if (lines.some((line) => line !== null)) values.nodes = lines;
@@ -238,7 +240,7 @@ export function windowMetadata(metadata: Metadata, window: LevelWindow): Metadat
   }
   if (values.axes !== undefined) {
     // Of the whole surface: a step of a level across the seam may be shorter than the others.
-    values.axes = axesAt(axes, full, places);
+    values.axes = axesAt(axes, full, places, closed);
   }
   return values;
 }

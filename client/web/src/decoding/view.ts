@@ -190,9 +190,7 @@ export class View implements ViewInfo {
     const grids = window
       ? [this.#window(region!, shownLevel, window, chosen)]
       : reconstruction.blocks(this.#known, shownLevel, this.#corrected && finest, chosen);
-    const closures = header.blocks.map(({ closed }) =>
-      window ? windowClosed(closed, window.shape, window.inside) : closed,
-    );
+    const closures = header.blocks.map(({ closed }) => window?.closed ?? closed);
     const masks = nodes.map((own, block) => {
       // If no node of a level is valid, what stands under the holes is shown.
       if (!finest && !this.#maskAt(block, levelNodes[block]!)?.includes(1)) return null;
@@ -254,9 +252,11 @@ export class View implements ViewInfo {
         return place < region[axis][0] ? place + header.shape[axis] : place;
       }),
     );
+    const shape: Shape = [nodes[0].length, nodes[1].length];
     return {
-      shape: [nodes[0].length, nodes[1].length],
+      shape,
       inside,
+      closed: windowClosed(header.blocks[0]!.closed, shape, inside),
       full: header.shape,
       axes: this.#shared.metadata.axes,
       places: [rows!, columns!],
