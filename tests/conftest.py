@@ -10,12 +10,14 @@ from collections.abc import Iterator
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.examples import USUAL
+
 # No deadline: no test here is about time. The same examples in every run, so that a change is judged by what it
-# changes; HYPOTHESIS_PROFILE=torture tries others, and many, for as long as it takes.
+# changes; HYPOTHESIS_PROFILE=torture tries others, and 100 times as many, see `tests.examples`.
 settings.register_profile(
     "default",
     deadline=None,
-    max_examples=30,
+    max_examples=USUAL,
     derandomize=True,
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],
@@ -34,8 +36,9 @@ LONGEST = (
     "tests/core/grid/test_watertight.py",
     "tests/client/stream/test_interrupted.py",
     "tests/core/decoding/test_decoder.py",
-    "tests/kernels/test_sanitizers.py",
     "tests/core/grid/test_topology.py",
+    "tests/core/bands/test_any_pieces.py",
+    "tests/core/bands/test_dask.py",
     "tests/server/connections/test_floods.py",
     "tests/server/builds/test_levels.py",
     "tests/faults/test_sample.py",

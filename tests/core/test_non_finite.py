@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -22,6 +22,7 @@ from lodestream.entropy.mask import encode_mask
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.surface import finite_block
+from tests.examples import examples
 
 from .surfaces import follow, index_of, terrain, torus
 
@@ -149,13 +150,13 @@ def surfaces(draw: st.DrawFn) -> ls.Surface:
     return ls.Surface(blocks=blocks)
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(surfaces())
 def test_every_surface_comes_back_bit_for_bit(surface: ls.Surface) -> None:
     assert_comes_back(surface)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(surfaces(), st.booleans())
 def test_with_a_precision_or_an_error_infinities_come_back_and_the_rest_nearly(surface: ls.Surface, rms: bool) -> None:
     attributes = {name: "0.25" for name in ("t", "flow") if name in surface.blocks[0].attributes}

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from lodestream.bands.build import Build
@@ -25,6 +25,7 @@ from lodestream.quality import Quality
 from lodestream.scratch import MemoryScratch
 from lodestream.surface import Surface
 from lodestream.transform.pyramid import forward
+from tests.examples import examples
 
 from .block_surfaces import KINDS, block_surface
 
@@ -73,7 +74,7 @@ def _check(surface: Surface, tile: tuple[int, int], points: int, core_points: in
     st.integers(1, 400),
     st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=40, deadline=None)
+@examples(20)
 @example((300, 70), (True, False), (4, 4), 1000, 9, 0)
 @example((301, 70), (True, True), (3, 4), 1, 9, 0)
 @example((300, 70), (False, False), (3, 3), 1, 9, 0)
@@ -93,7 +94,7 @@ def test_bands_of_the_only_grid(
     st.sampled_from(["", "holes"]),
     st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=15, deadline=None)
+@examples(10)
 @example("plates", (90, 80), 2, (3, 3), 1, 9, "holes", 1)
 @example("moebius", (24, 90), 3, (3, 4), 1, 9, "", 6)
 def test_grids_of_several(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -18,6 +18,7 @@ from lodestream.container.model import Header
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.decoding.level_grids import level_nodes
 from lodestream.formats import read, write
+from tests.examples import examples
 
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
 
@@ -67,7 +68,7 @@ def at_nodes(decoder: ls.Decoder, planes: tuple[NDArray[Any], ...], level: int) 
     return [plane[np.ix_(rows, columns)] for plane in planes]
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(placements())
 def test_nodes_of_heights_lie_at_their_places_in_the_finest_grid(surface: ls.Surface) -> None:
     decoder = decoder_of(surface)
@@ -83,7 +84,7 @@ def test_nodes_of_heights_lie_at_their_places_in_the_finest_grid(surface: ls.Sur
                 assert plane.tobytes() == wanted.tobytes()
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(placements())
 def test_levels_of_levels_lie_there_as_well(surface: ls.Surface) -> None:
     first = decoder_of(surface)
@@ -100,7 +101,7 @@ def test_levels_of_levels_lie_there_as_well(surface: ls.Surface) -> None:
             np.testing.assert_allclose(plane, own, rtol=0, atol=1e-14 * size)
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(
     st.tuples(st.integers(2, 60), st.integers(2, 60)),
     st.sampled_from(CLOSURES),
@@ -247,7 +248,7 @@ def longitudes(draw: st.DrawFn) -> tuple[NDArray[Any], bool]:
     return (line[::-1] if draw(st.booleans()) else line).astype(draw(st.sampled_from(["f4", "f8"]))), around
 
 
-@settings(max_examples=200, deadline=None)
+@examples(200)
 @given(longitudes(), st.integers(2, 40), st.integers(0, 2**32), st.booleans())
 def test_nodes_over_uneven_longitudes_lie_at_places_of_the_source(
     line: tuple[NDArray[Any], bool], rows: int, seed: int, turned: bool

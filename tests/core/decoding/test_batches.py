@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -22,6 +22,7 @@ from lodestream.decoding.segments import StoredSegments
 from lodestream.entropy.bitplanes import pass_count
 from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.parallel import VARIABLE, spread
+from tests.examples import examples
 
 
 def rough(shape: tuple[int, int], seed: int) -> NDArray[np.int16]:
@@ -71,7 +72,7 @@ def test_one_thread_takes_little_at_once(monkeypatch: pytest.MonkeyPatch) -> Non
     assert [len(readings) for readings in rounds_of(decoded(header, [], True), segments)] == [1]
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(seed=st.integers(0, 2**32), swaps=st.integers(1, 400), late=st.booleans())
 def test_what_comes_after_its_children_has_not_been_seen_by_them(seed: int, swaps: int, late: bool) -> None:
     """Segments in another order, but for those of one tile: no writer of ours, yet such a file has one meaning."""

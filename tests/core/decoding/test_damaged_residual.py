@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import lodestream as ls
@@ -16,6 +16,7 @@ from lodestream.errors import CorruptStreamError
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection
 from tests import reference
+from tests.examples import examples
 
 from ..container.forgery import index_of, rewritten
 from .comparison import assert_shown
@@ -79,7 +80,7 @@ def check_kept(case: Case, data: bytes, seed: int) -> None:
                     ls.decode(data)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(case=cases(), seed=st.integers(0, 2**32), rule=st.sampled_from([None, 0, 1, 2, 3, 255]))
 def test_what_came_before_a_wrong_chunk_is_kept(case: Case, seed: int, rule: int | None) -> None:
     assume(any(chunk.range.length for chunk in index_of(case.data).chunks))

@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -37,6 +37,7 @@ from lodestream.planning.selection import Selection, select
 from lodestream.scratch import FolderScratch, Room
 from lodestream.target import Region
 from tests import reference
+from tests.examples import examples
 
 from ..surfaces import follow, index_of, is_told
 from .comparison import assert_same, assert_shown
@@ -310,7 +311,7 @@ def unnamed(case: Case) -> bool:
     )
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @example(case=unnamed_tile(), seed=1, level=5, bands=False)
 @example(case=unnamed_interface(), seed=1, level=3, bands=False)
 @given(case=cases(), seed=st.integers(0, 2**32), level=st.integers(0, 9), bands=st.booleans())

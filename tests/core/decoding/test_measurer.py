@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -21,6 +21,7 @@ from lodestream.decoding.region import Region
 from lodestream.decoding.values import Values, values_of
 from lodestream.entropy.dequantize import UNANNOUNCED
 from lodestream.parallel import VARIABLE
+from tests.examples import examples
 from tests.unchanged.cases import random_case
 
 from ..surfaces import index_of
@@ -60,7 +61,7 @@ def states_of(decoder: PiecewiseDecoder, seed: int, count: int = 5) -> list[Stat
     return [*states, np.zeros_like(state)]
 
 
-@settings(deadline=None, max_examples=40)
+@examples(40)
 @given(
     seed=st.integers(0, 5000),
     memory=st.sampled_from([1, 1 << 18, 1 << 30]),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -18,6 +18,7 @@ from lodestream.entropy.tiles import Tiles, TileTable, gather
 from lodestream.grid.layout import Layout
 from lodestream.transform.lifting import FRACTION_BITS
 from lodestream.transform.pyramid import allocate, forward, grids, inverse
+from tests.examples import examples
 
 closures = st.tuples(st.booleans(), st.booleans())
 
@@ -61,7 +62,7 @@ def any_span(length: int, closed: bool, rng: np.random.Generator) -> tuple[int, 
     return start, int(rng.integers(start + 1, length + (start if closed else 0) + 1))
 
 
-@settings(max_examples=100, deadline=None)
+@examples(100)
 @given(
     shape=st.tuples(st.integers(1, 150), st.integers(1, 130)), closed=closures, part=st.booleans(), seed=st.integers(0)
 )
@@ -138,7 +139,7 @@ def test_parents_of_coded_tiles_are_coded_where_the_level_below_needs_none_of_th
     assert not parents <= {*needed, -1}
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(shape=st.tuples(st.integers(1, 90), st.integers(1, 90)), closed=closures, seed=st.integers(0))
 def test_rows_above_a_level_that_is_made_already(shape: tuple[int, int], closed: Any, seed: int) -> None:
     rng = np.random.default_rng(seed)

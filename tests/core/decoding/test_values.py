@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
@@ -15,6 +15,7 @@ from lodestream.decoding import pieces, values
 from lodestream.decoding.region import Region
 from lodestream.decoding.segments import SegmentQueue
 from lodestream.parallel import VARIABLE
+from tests.examples import examples
 
 if TYPE_CHECKING:
     from lodestream.container.model import Header
@@ -29,7 +30,7 @@ def arrived(points: Any, closed: tuple[bool, bool]) -> tuple[Header, SegmentQueu
     return decoder.header, decoder._queue
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     shape=st.tuples(st.integers(2, 150), st.integers(1, 60)),
     closed=st.sampled_from(CLOSURES),

@@ -6,7 +6,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -14,6 +14,7 @@ import lodestream as ls
 from lodestream.decoding import pieces, segments
 from lodestream.parallel import VARIABLE
 from tests.core.surfaces import all_large
+from tests.examples import examples
 
 
 def surface_of(kind: str, shape: tuple[int, int], closed: tuple[bool, bool], seed: int) -> ls.Surface:
@@ -39,7 +40,7 @@ def arrays_of(surface: ls.Surface) -> list[NDArray[np.generic]]:
     return [surface.points, *surface.attributes.values()]
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     kind=st.sampled_from(["integers", "holes", "smooth", "xyz"]),
     shape=st.tuples(st.integers(2, 120), st.integers(2, 120)),

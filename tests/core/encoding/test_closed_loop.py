@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
@@ -21,6 +21,7 @@ from lodestream.target import Tolerance
 from lodestream.transform.lifting import forward_step
 from lodestream.transform.predictors import default_predictors, predictor
 from lodestream.transform.pyramid import allocate, bare_level, inverse, third_step
+from tests.examples import examples
 
 from ..grid.test_blocks import cut, sphere, terrain
 
@@ -51,7 +52,7 @@ def check(surface: ls.Surface, base: int) -> None:
         assert distance < 8 * base + 8  # of the last patch: the two belong to each other
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(
     shape=st.tuples(st.integers(1, 70), st.integers(2, 70)),
     closed=CLOSED,
@@ -67,7 +68,7 @@ def test_the_loop_has_what_the_reader_has(
     check(ls.Surface(heights, closed), base)
 
 
-@settings(max_examples=15)
+@examples(15)
 @given(
     down=st.lists(st.integers(1, 30), min_size=1, max_size=3),
     across=st.lists(st.integers(1, 30), min_size=1, max_size=3),

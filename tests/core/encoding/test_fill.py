@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -13,6 +13,7 @@ from lodestream.encoding import fill
 from lodestream.encoding.fill import fill_holes, settle_holes
 from lodestream.grid.layout import Layout
 from lodestream.transform.pyramid import allocate, forward
+from tests.examples import examples
 
 from ..entropy.test_mask import blobs
 
@@ -107,7 +108,7 @@ def plain_fill(values: NDArray[np.float64], known: NDArray[np.bool_], closed: tu
             row[j] = (others - 0.07 * row[further_behind]) + 0.56 * row[behind]
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
     closed=st.tuples(st.booleans(), st.booleans()),

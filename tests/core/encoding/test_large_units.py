@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -16,6 +16,7 @@ from lodestream.entropy.bitplanes import pass_count, symbols_room
 from lodestream.entropy.tile_coder import Channel, TileCoder
 from lodestream.entropy.tiles import Run, Tiles, TileTable, gather
 from lodestream.grid.layout import Layout
+from tests.examples import examples
 
 from ..entropy.coding import planes_of
 from ..entropy.plain_coder import PlainLargeUnit
@@ -89,7 +90,7 @@ def check_alike(found: Tiles, expected: Tiles | PlainLargeUnit) -> None:
     budget=budgets,
     seed=st.integers(0, 2**32),
 )
-@settings(max_examples=20)
+@examples(20)
 def test_what_is_written_is_read_in_any_segments_and_calls(
     shape: tuple[int, int],
     closed: tuple[bool, bool],
@@ -135,7 +136,7 @@ def test_what_is_written_is_read_in_any_segments_and_calls(
     data=st.lists(st.one_of(st.binary(max_size=300), st.integers(0, 2**32).map(noise)), min_size=1, max_size=4),
     budget=budgets,
 )
-@settings(max_examples=20)
+@examples(20)
 def test_any_bytes_are_read_as_the_plain_decoder_reads_them(
     shape: tuple[int, int], tile: tuple[int, int], bits: int, data: list[bytes], budget: int
 ) -> None:
@@ -228,7 +229,7 @@ def test_calls_of_large_units_that_do_not_fit_are_refused(reading: bool, changes
     model=st.tuples(st.integers(0, 69), st.sampled_from([0, 1, 2**16 - 1, 2**31 - 1, -1, -(2**31)])),
     early=st.integers(0, 255),
 )
-@settings(max_examples=30)
+@examples(30)
 def test_whatever_was_kept_a_call_ends_and_stays_in_its_arrays(
     state: tuple[int, int, int], bits: int, place: int, model: tuple[int, int], early: int
 ) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -22,6 +22,7 @@ from lodestream.coordinates.height_fields import coordinates, to_xyz
 from lodestream.encoding import losses
 from lodestream.errors import FormatWarning
 from lodestream.surface import Block, Surface
+from tests.examples import examples
 
 Array = NDArray[Any]
 
@@ -147,14 +148,14 @@ def same_crs(one: str, other: str) -> bool:
 
 @pytest.mark.parametrize("suffix", ["npy", "tif", "png", "obj", "ply"])
 @given(surface=surfaces())
-@settings(max_examples=60)
+@examples(60)
 def test_what_does_not_come_back_is_named_and_nothing_else_is(suffix: str, surface: Surface) -> None:
     pytest.importorskip({"tif": "rasterio", "png": "PIL"}.get(suffix, "numpy"))
     check_losses(suffix, surface)
 
 
 @given(surface=surfaces())
-@settings(max_examples=10)  # each of which is read in a process of its own
+@examples(10)  # each of which is read in a process of its own
 def test_what_does_not_come_back_from_a_vts_is_named_and_nothing_else_is(surface: Surface) -> None:
     pytest.importorskip("vtkmodules")
     check_losses("vts", surface)

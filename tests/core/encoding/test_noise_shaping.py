@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -18,6 +18,7 @@ from lodestream.grid.layout import Layout
 from lodestream.quantization.band_steps import Quantiser
 from lodestream.transform.predictors import default_predictors
 from lodestream.transform.pyramid import allocate, inverse, inverse_level
+from tests.examples import examples
 
 
 def gram(detail: bool, count: int) -> NDArray[np.float64]:
@@ -81,7 +82,7 @@ def fed(errors: NDArray[np.float64], taps: Sequence[float], axis: int) -> NDArra
     return np.asarray(errors + taps[0] * np.roll(errors, 1, axis) + taps[1] * np.roll(errors, 2, axis))
 
 
-@settings(max_examples=8)
+@examples(8)
 @given(
     shape=st.tuples(st.integers(20, 60), st.integers(20, 60)),
     roughness=st.floats(0, 1),

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -34,6 +34,7 @@ from lodestream.grid.layout import Grid, Layout
 from lodestream.kernels import CLASSES, INDICES, RATES
 from lodestream.quantization.band_steps import MOST_BASE, ODD, TRANSITIONS, Quantiser
 from lodestream.transform.predictors import COEFFICIENT_BITS
+from tests.examples import examples
 
 WORTH = 0.05
 BITS = rate_distortion._laplace()
@@ -60,7 +61,7 @@ def coefficients_of(table: TileTable, rng: np.random.Generator) -> NDArray[np.in
     return flat
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(layout=layouts, base=st.integers(1, 5000), at_once=st.integers(1, 500), seed=st.integers(0, 2**32))
 def test_classes_are_those_of_what_is_around(layout: Layout, base: int, at_once: int, seed: int) -> None:
     table = TileTable.of(layout)
@@ -207,7 +208,7 @@ rules = st.builds(
 )
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(
     sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
     classes=st.lists(st.integers(0, CLASSES - 1), min_size=5, max_size=5),
@@ -231,7 +232,7 @@ def test_without_feedback_the_cheapest_of_all_indices_are_found(
     assert found == pytest.approx(best, rel=1e-5, abs=1e-5)
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(
     shape=st.tuples(st.integers(1, 18), st.integers(1, 19)),
     scale=st.floats(-7, 6).map(lambda power: 2.0**power),
@@ -289,7 +290,7 @@ def test_no_index_is_larger_than_a_coefficient_may_be(value: float) -> None:
     assert counts[0, 3, -1] == counts.sum() == 1
 
 
-@settings(max_examples=10)
+@examples(10)
 @given(layout=layouts, base=st.integers(1, 500), at_once=st.integers(1, 300), seed=st.integers(0, 2**32))
 def test_indices_do_not_depend_on_how_bands_are_cut_into_calls(
     layout: Layout, base: int, at_once: int, seed: int

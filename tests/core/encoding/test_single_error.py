@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -15,6 +15,7 @@ from lodestream.container import read_index
 from lodestream.container.fields import FieldWriter
 from lodestream.container.headers import parse_header, serialize_header
 from lodestream.errors import CorruptStreamError, OptionError
+from tests.examples import examples
 
 
 def waves(rows: int, columns: int) -> NDArray[np.float64]:
@@ -41,7 +42,7 @@ def _ragged(rng: np.random.Generator, shape: tuple[int, int], channels: int, dty
     return points.astype(dtype)
 
 
-@settings(max_examples=35)
+@examples(35)
 @given(
     shape=st.tuples(st.integers(1, 40), st.integers(2, 40)),
     channels=st.sampled_from([0, 0, 2, 3, 5]),

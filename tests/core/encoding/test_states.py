@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -18,6 +18,7 @@ from lodestream.entropy.tiles import Tiles, TileTable
 from lodestream.grid.layout import Grid, Layout, Source
 from lodestream.parallel import VARIABLE
 from lodestream.transform.predictors import default_predictors
+from tests.examples import examples
 
 from ..surfaces import terrain, torus
 
@@ -40,7 +41,7 @@ layouts = st.one_of(
 )
 
 
-@settings(deadline=None, max_examples=60)
+@examples(60)
 @given(layout=layouts, seed=st.integers(0, 2**32 - 1))
 def test_every_state_is_what_it_is_by_itself(layout: Layout, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -25,6 +25,7 @@ from lodestream.errors import FormatError, FormatWarning, InputError, OptionErro
 from lodestream.formats.vtk import grids, xml_files
 from lodestream.mesh.cells import unpack_cells
 from lodestream.scratch import FolderScratch, Room
+from tests.examples import examples
 
 pytest.importorskip("vtkmodules")
 
@@ -165,7 +166,7 @@ def test_images_and_rectilinear_grids_are_refused_with_what_to_do(tmp_path: Path
 
 
 @given(seed=st.integers(0, 2**32))
-@settings(max_examples=5)
+@examples(5)
 def test_what_is_blanked_is_a_hole(seed: int) -> None:
     random = np.random.default_rng(seed)
     rows, columns = 6, 7

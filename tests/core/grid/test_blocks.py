@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -15,6 +15,7 @@ import lodestream as ls
 from lodestream.container import read_index
 from lodestream.container.model import Index
 from lodestream.encoding.prepared import prepare
+from tests.examples import examples
 
 from ..surfaces import is_told
 
@@ -122,7 +123,7 @@ def test_a_moebius_strip_of_blocks_stays_together() -> None:
     assert_watertight(ls.Surface(blocks=[ls.Block(block) for block in cut(strip, [0, 12, 26, 40], [0, 7])]))
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     st.lists(st.integers(1, 9), min_size=1, max_size=3),
     st.lists(st.integers(1, 9), min_size=1, max_size=3),

@@ -5,12 +5,13 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.grid.axis import axis_step
 from lodestream.grid.connectivity import LatticeBlock, cuts
 from lodestream.transform.lifting import forward_step, inverse_step
+from tests.examples import examples
 
 from .arrangements import PREDICTORS, checked
 from .layouts import cube, layouts, overlapping, tubes
@@ -18,7 +19,7 @@ from .layouts import cube, layouts, overlapping, tubes
 DATA = Path(__file__).parents[4] / "shared" / "data"
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(layouts())
 def test_any_layout_is_watertight_at_every_level(blocks: list[LatticeBlock]) -> None:
     arrangement = checked(blocks)

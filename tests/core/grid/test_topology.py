@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from plyfile import PlyData
@@ -23,6 +23,7 @@ from lodestream import formats
 from lodestream.errors import FormatWarning
 from lodestream.grid.connectivity import LatticeBlock
 from lodestream.mesh import weld
+from tests.examples import examples
 
 from ..mesh.meshes import collapse, grid_faces
 from .layouts import layouts, overlapping, tubes
@@ -331,7 +332,7 @@ def surface_of(blocks: list[LatticeBlock], kind: str, seed: int) -> ls.Surface |
 KINDS = st.sampled_from(["none", "agree", "apart", "mixed"])
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(
     blocks=st.one_of(layouts(largest=6), overlapping(largest=6), tubes()),
     kind=KINDS,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -17,6 +17,7 @@ from lodestream.container import Header
 from lodestream.grid.connectivity import LatticeBlock
 from lodestream.grid.patches import patch_positions
 from lodestream.mesh import weld
+from tests.examples import examples
 
 from ..mesh.meshes import drawn
 from .layouts import layouts, overlapping, tubes
@@ -136,7 +137,7 @@ def surface_of(blocks: list[LatticeBlock]) -> ls.Surface | None:
     return ls.Surface(blocks=[ls.Block(b.coordinates.astype(np.int64), b.closed, mask=b.mask) for b in usable])
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(layouts(largest=8))
 def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)
@@ -144,7 +145,7 @@ def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
         assert_together(surface)
 
 
-@settings(max_examples=20, deadline=None)
+@examples(20)
 @given(st.one_of(overlapping(largest=7), tubes()))
 def test_overlaps_and_tubes_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)

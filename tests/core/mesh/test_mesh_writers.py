@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from plyfile import PlyData
@@ -18,6 +18,7 @@ from plyfile import PlyData
 from lodestream import formats
 from lodestream.errors import FormatError, FormatWarning
 from lodestream.surface import Block, Surface
+from tests.examples import examples
 
 from .meshes import drawn
 
@@ -103,7 +104,7 @@ def expected_faces(surface: Surface, split: bool) -> set[frozenset[tuple[float, 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 @pytest.mark.parametrize("closed", CLOSED)
 @given(seed=st.integers(0, 2**32))
-@settings(max_examples=2)
+@examples(2)
 def test_another_library_sees_the_same_faces_and_holes(
     tmp_path_factory: pytest.TempPathFactory, suffix: str, closed: tuple[bool, bool], seed: int
 ) -> None:

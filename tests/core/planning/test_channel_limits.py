@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -24,6 +24,7 @@ from lodestream.protocol.wire import parse, serialize
 from lodestream.target import Order
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.sender import Sender
+from tests.examples import examples
 
 from ..surfaces import index_of, terrain
 
@@ -64,7 +65,7 @@ def error(view: ls.View, name: str, which: str) -> float:
 limits = st.dictionaries(st.sampled_from(NAMES), st.floats(-4, 2).map(lambda power: 10.0**power), max_size=3)
 
 
-@settings(deadline=None, max_examples=25)
+@examples(25)
 @given(rms=limits, worst=limits, order=st.sampled_from(["quality", "level"]))
 def test_no_stream_stops_while_an_error_is_above_its_limit(
     rms: dict[str, float], worst: dict[str, float], order: Order

@@ -13,7 +13,7 @@ from types import FrameType
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -31,6 +31,7 @@ from lodestream.target import Region
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.receiver_state import MemoryStore, ReceiverState
 from lodestream.transfer.sender import Sender
+from tests.examples import examples
 
 SHAPE = (400, 530)
 NEAR: Region = ((0, 60), (0, 70))
@@ -138,7 +139,7 @@ def check_end(reception: ReceiverState, kind: str, target: ls.Target) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=6, deadline=None)
+@examples(6)
 @given(
     target=st.sampled_from(TARGETS),
     window=st.sampled_from([900, 5000, 60_000]),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -25,6 +25,7 @@ from lodestream.planning.window_errors import read_window_errors
 from lodestream.target import Region
 from lodestream.transform.lifting import CLAMP
 from lodestream.transform.pyramid import allocate, forward, inverse
+from tests.examples import examples
 
 from ..decoding.comparison import surfaces
 from ..decoding.test_every_state import small_tiles
@@ -93,7 +94,7 @@ def check_window(view: View, region: Region, level: int, inside: Places) -> None
                     np.testing.assert_allclose(found, wanted[np.ix_(*inside)], rtol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(
     surface=surfaces()
     | tubes().map(
@@ -121,7 +122,7 @@ def test_the_window_of_a_level_is_cut_out_of_it_in_every_state(surface: ls.Surfa
         check_window(view, region, level, inside)
 
 
-@settings(max_examples=40, deadline=None)
+@examples(40)
 @given(surface=surfaces(), data=st.data())
 def test_what_is_sent_for_the_window_of_a_level_is_enough(surface: ls.Surface, data: st.DataObject) -> None:
     container = encoded(surface, data.draw(st.sampled_from([None, (4, 4), (3, 5)])))
@@ -243,7 +244,7 @@ def test_no_layer_with_finer_data_is_told_as_a_state() -> None:
             assert index.layers[mark.number].level <= level
 
 
-@settings(max_examples=80, deadline=None)
+@examples(80)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.tuples(st.booleans(), st.booleans()),

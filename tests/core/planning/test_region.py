@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -20,6 +20,7 @@ from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.transform.lifting import CLAMP
 from lodestream.transform.pyramid import allocate, forward, inverse
+from tests.examples import examples
 
 CLOSURES = [(False, False), (True, False), (False, True), (True, True)]
 
@@ -137,7 +138,7 @@ def test_several_narrow_blocks_are_read(shape: tuple[int, int]) -> None:
         np.testing.assert_array_equal(found.points, block.points)
 
 
-@settings(max_examples=80, deadline=None)
+@examples(80)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.sampled_from(CLOSURES),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -23,6 +23,7 @@ from lodestream.planning.selection import selection_of
 from lodestream.planning.window_errors import read_window_errors
 from lodestream.transform.lifting import CLAMP
 from lodestream.transform.pyramid import allocate, forward, inverse
+from tests.examples import examples
 
 SHAPES = [(24, 36), (23, 37), (40, 301), (130, 260)]
 KINDS = ["integers", "floats", "holes", "points", "attributes", "rules", "level order"]
@@ -66,7 +67,7 @@ def windows(draw: st.DrawFn, shape: tuple[int, int], closed: tuple[bool, bool]) 
     return region[0], region[1]
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(st.data())
 def test_every_prefix_shows_the_window_as_numpy_takes_it(data: st.DataObject) -> None:
     kind, shape = data.draw(st.sampled_from(KINDS)), data.draw(st.sampled_from(SHAPES))
@@ -143,7 +144,7 @@ def test_windows_across_the_seam_are_sent_alone_and_their_errors_hold(kind: str)
     assert plan(index, first).bytes == plan(index, ls.Target()).bytes
 
 
-@settings(max_examples=80, deadline=None)
+@examples(80)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.sampled_from([(False, True), (True, False), (True, True)]),

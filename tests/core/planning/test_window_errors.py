@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
@@ -22,6 +22,7 @@ from lodestream.planning.window_errors import (
     read_window_errors,
     serialize_window_errors,
 )
+from tests.examples import examples
 
 from ..container.forgery import payload_of, with_index
 from ..surfaces import errors, index_of, terrain
@@ -153,7 +154,7 @@ def test_bounds_that_are_too_small_are_refused_where_the_surface_is_exact(large:
             inspect(io.BytesIO(with_index(large, replace(index, optional=optional))), max_vertices=1_000_000)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.lists(st.floats(0, 3.9), min_size=1, max_size=40), st.sampled_from([1e-110, 1.0, 1857.0, 1e110]), st.booleans()
 )

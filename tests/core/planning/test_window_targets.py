@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -18,6 +18,7 @@ from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.planning.window_errors import WindowErrors, WindowFigures, read_window_errors, window_section
 from lodestream.target import Region
+from tests.examples import examples
 
 from ..surfaces import index_of
 from .test_region import surface_of
@@ -63,7 +64,7 @@ def views_of(container: bytes, index: Index, target: ls.Target, windows: WindowE
     return views
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(
     st.tuples(st.sampled_from(KINDS), st.integers(0, 3), st.booleans()),
     st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1)),

@@ -8,7 +8,7 @@ from random import Random
 
 import msgpack
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.errors import LocalProtocolError, UnsupportedVersionError
@@ -31,6 +31,7 @@ from lodestream.protocol.messages import (
     Stop,
 )
 from lodestream.protocol.wire import serialize
+from tests.examples import examples
 
 HEADER = Opened("0" * 64, 1000, 900, 1.0, (930, 40), (900, 30), True)
 SAMPLES: dict[type[Event], Event] = {
@@ -286,7 +287,7 @@ def moves(client: Connection, server: Connection, window: int, left: int) -> lis
     return choices
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(window=st.integers(1, 300), left=st.integers(0, 1000), seed=st.integers(0, 2**32))
 def test_every_interleaving_of_honest_peers_ends(window: int, left: int, seed: int) -> None:
     """Messages cross in any order; nobody is ever accused, credit is never negative, and `stop` always ends."""

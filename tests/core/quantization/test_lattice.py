@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -17,6 +17,7 @@ from lodestream.quantization.lattice import (
     precision_lattice,
     to_dtype,
 )
+from tests.examples import examples
 
 INTEGERS = ["int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"]
 
@@ -213,7 +214,7 @@ def test_small_and_flat_surfaces_have_no_lattice_with_offsets(shape: tuple[int, 
     assert offset_lattice(np.zeros(shape, np.float32)) is None
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(
     seed=st.integers(0, 2**32 - 1),
     step=st.sampled_from([1.0, 0.025, 0.3048, 7.3, 1 / 3]),

@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream import Decoder, kernels
@@ -16,6 +16,7 @@ from lodestream.grid.layout import Layout
 from lodestream.transform import all_levels
 from lodestream.transform.predictors import INTERFACES
 from lodestream.transform.pyramid import allocate, grids, inverse
+from tests.examples import examples
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 
@@ -27,7 +28,7 @@ def _layout(path: Path) -> Layout:
     return decoder.header.layout
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(
     shape=st.tuples(st.integers(1, 150), st.integers(2, 150)),
     closed=st.tuples(st.booleans(), st.booleans()),
