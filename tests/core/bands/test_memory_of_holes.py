@@ -12,7 +12,7 @@ import pytest
 import lodestream as ls
 from lodestream.bands.memory import BESIDE, least_memory
 
-SHAPE = (4096, 2048)
+SHAPE = (4096, 1024)
 
 #: Encodes heights and holes that lie in files; prints how much memory of its own the process has at most.
 SCRIPT = """

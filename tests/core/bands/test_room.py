@@ -17,7 +17,7 @@ from ..surfaces import terrain
 
 
 def _values() -> NDArray[np.int16]:
-    return np.rint(300 * terrain((700, 640))).astype(np.int16)
+    return np.rint(300 * terrain((510, 200))).astype(np.int16)
 
 
 class _Plane:

@@ -1,18 +1,16 @@
-"""Surfaces of several blocks, and such that touch themselves, built by runs of grids: the bytes of one piece."""
+"""Surfaces of several blocks, and such that touch themselves, built and checked by runs of grids."""
 
 from __future__ import annotations
 
 import io
 import os
 from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
@@ -22,7 +20,6 @@ from lodestream.bands.measuring import measured_runs
 from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
 from lodestream.bands.pieces import Pieces
 from lodestream.container.reader import read_index
-from lodestream.decoding import inspection
 from lodestream.decoding.inspection import Inspection, inspect
 from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.encoding.prepared import prepare
@@ -33,66 +30,13 @@ from lodestream.surface import Block, Surface
 
 from ..container.forgery import with_layer_errors
 from ..surfaces import index_of
-from .block_surfaces import KINDS, block_surface
-from .test_building import built
+from .block_surfaces import block_surface
+from .test_any_pieces import built
 
 try:
     import resource
 except ImportError:  # not on Windows
     resource = None  # type: ignore[assignment]
-
-#: What a container does not keep is another matter, see test_losses.
-pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
-
-lengths = st.integers(4, 20) | st.integers(4, 90)
-
-
-@settings(max_examples=10, deadline=None)
-@given(
-    kind=st.sampled_from(KINDS),
-    shape=st.tuples(lengths, lengths),
-    count=st.integers(1, 4),
-    dtype=st.sampled_from(["float32", "float64", "int32", "int64"]),
-    more=st.sampled_from(["", "", "holes", "attributes", "holes and attributes"]),
-    precision=st.sampled_from([None, "1e-3d", 0.02]),
-    points=st.integers(1, 5_000),
-    core=st.integers(1, 600),
-    threads=st.integers(1, 3),
-    seed=st.integers(0, 2**32 - 1),
-)
-@example("plates", (90, 80), 2, "float32", "holes and attributes", None, 1, 1, 2, 1)
-@example("plates", (150, 140), 3, "float64", "", "1e-3d", 1, 1, 2, 2)
-@example("cylinders", (130, 120), 3, "float32", "", None, 1, 1, 1, 3)
-@example("sphere", (120, 130), 1, "float32", "attributes", None, 1, 1, 1, 4)
-@example("seam", (60, 63), 1, "float32", "", "1e-3d", 1, 1, 1, 5)
-@example("moebius", (24, 90), 3, "int32", "", None, 1, 1, 1, 6)
-@example("heights", (120, 90), 3, "int64", "holes", None, 1, 1, 1, 7)
-def test_any_blocks(
-    kind: str,
-    shape: tuple[int, int],
-    count: int,
-    dtype: str,
-    more: str,
-    precision: Any,
-    points: int,
-    core: int,
-    threads: int,
-    seed: int,
-) -> None:
-    surface = block_surface(kind, shape, count, dtype, more, np.random.default_rng(seed))
-    quality = Quality.of(precision)
-    try:
-        whole = ls.encode(surface, precision)
-    except ls.InputError:
-        assume(False)  # this precision is too small for the values
-    with ThreadPoolExecutor(threads) as executor, mock.patch.multiple(made, _FEWEST=1, _MOST=points):
-        own = executor if seed % 2 else None
-        assert ls.encode(surface, precision, memory=1 << 20, executor=own) == whole
-    if prepare(surface, quality).arrangement is not None:
-        container = built(surface, points, core, threads, precision=precision)
-        # Of noise the shortest of several streams is kept, and this is the first.
-        assert container == whole or (len(container) > len(whole) and precision is None)
-    _is_known_by_blocks(whole, seed)
 
 
 def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
@@ -102,29 +46,8 @@ def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
     return PiecewiseDecoder(read, read_index(read, len(container)), level)
 
 
-def _is_known_by_blocks(container: bytes, seed: int) -> None:
-    """Decoding by blocks, of a level and of the whole, and an inspection say what decoding in memory does."""
-    whole = ls.Decoder()
-    whole.feed(container)
-    assert whole.header is not None
-    for level in (seed % (whole.header.levels + 1), None):
-        decoder = _decoder(container, level)
-        if decoder.header.plane is not None:
-            return
-        found, expected = decoder.surface(IN_MEMORY, 1, lambda fraction: None), whole.surface(level)
-        assert found.metadata == expected.metadata
-        assert repr(found.joints) == repr(expected.joints)
-        for own, other in zip(found.blocks, expected.blocks, strict=True):
-            assert own.closed == other.closed
-            assert own.points.tobytes() == other.points.tobytes()
-            assert (own.mask is None) == (other.mask is None)
-            if own.mask is not None and other.mask is not None:
-                assert own.mask.tobytes() == other.mask.tobytes()
-            assert list(own.attributes) == list(other.attributes)
-            for name, values in own.attributes.items():
-                assert values.tobytes() == other.attributes[name].tobytes()
-    with mock.patch.object(inspection, "why_not_by_pieces", return_value=None):
-        inspect(io.BytesIO(container), max_vertices=1 << 20, memory=1)
+#: What a container does not keep is another matter, see test_losses.
+pytestmark = pytest.mark.filterwarnings("ignore:values of attributes at:lodestream.FormatWarning")
 
 
 def _checked(data: bytes, channels: int = 3) -> Inspection:
@@ -133,20 +56,26 @@ def _checked(data: bytes, channels: int = 3) -> Inspection:
     return inspect(io.BytesIO(data), max_vertices=1 << 20, memory=40 * largest * channels)
 
 
-def _plates(dtype: str = "float32", more: str = "") -> Surface:
-    return block_surface("plates", (260, 240), 2, dtype, more, np.random.default_rng(7))
+@cache
+def _plates(more: str = "") -> Surface:
+    return block_surface("plates", (260, 240), 2, "float32", more, np.random.default_rng(7))
+
+
+@cache
+def _container(more: str = "") -> bytes:
+    return ls.encode(_plates(more))
 
 
 @pytest.mark.parametrize("more", ["", "holes", "attributes"])
 @pytest.mark.parametrize("place", [0, 1])
 def test_wrong_errors_are_found(more: str, place: int) -> None:
-    data = ls.encode(_plates(more=more))
+    data = _container(more)
     with pytest.raises(ls.CorruptStreamError, match="RMS and maximum error of layer 0"):
         _checked(with_layer_errors(data, 0, 0.999, place), 6 if more == "attributes" else 3)
 
 
 def test_a_flipped_bit_is_found() -> None:
-    data = bytearray(ls.encode(_plates()))
+    data = bytearray(_container())
     for place in range(20, len(data), len(data) // 40):
         data[place] ^= 4
         with pytest.raises(ls.LodestreamError):
@@ -155,7 +84,7 @@ def test_a_flipped_bit_is_found() -> None:
 
 
 def test_blocks_that_are_too_large_are_refused() -> None:
-    data = ls.encode(_plates())
+    data = _container()
     assert _checked(data).errors_checked
     with pytest.raises(
         ls.TooLargeError,
@@ -228,7 +157,7 @@ def test_many_blocks_take_few_files(tmp_path: Path) -> None:
 
 
 def test_damage_is_found_where_it_is_decoded() -> None:
-    container = bytearray(ls.encode(_plates()))
+    container = bytearray(_container())
     segment = _decoder(bytes(container)).index.segments[-1]
     container[segment.range.offset] ^= 1
     with pytest.raises(ls.CorruptStreamError, match="checksum"):
@@ -238,7 +167,7 @@ def test_damage_is_found_where_it_is_decoded() -> None:
 def test_coefficients_that_are_too_large_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = _plates()
     monkeypatch.setattr(transforming, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
-    plain = built(surface, 1, 600)
+    plain = built(prepare(surface, Quality()), 1, 600)
     assert plain == encode(surface)
     assert ls.decode(plain).blocks[0].points.tobytes() == surface.blocks[0].points.tobytes()
 
@@ -258,7 +187,7 @@ def test_many_small_blocks_go_together() -> None:
     surface = _plates()
     prepared = prepare(surface, Quality())
     points = sum(block.shape[0] * block.shape[1] for block in surface.blocks)
-    header = index_of(ls.encode(surface)).header
+    header = index_of(_container()).header
     assert measured_runs(header, points) == [range(len(surface.blocks))]
     assert measured_runs(header, 1) == [range(k, k + 1) for k in range(len(surface.blocks))]
     runs, together = (Pieces(prepared.layout, size, 600) for size in (1, 2 * points))
@@ -271,7 +200,7 @@ def test_many_small_blocks_go_together() -> None:
 
 def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     surface = _plates()
-    expected, calls = ls.encode(surface), [0]
+    expected, calls = _container(), [0]
     step, measure = tasks.second_step, tasks.measure
 
     def counted(*arguments: Any) -> None:

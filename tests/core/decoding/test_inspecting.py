@@ -10,7 +10,7 @@ import pytest
 import lodestream as ls
 from lodestream.decoding.inspection import Inspection, _Part, inspect
 
-from ..bands.test_building import SURFACES
+from ..bands.grid_surfaces import SURFACES, container_of
 from ..container.forgery import index_of, with_layer_errors
 
 MOST = 1 << 20
@@ -23,8 +23,7 @@ def _inspected(data: bytes, memory: int = 1, told: list[float] | None = None) ->
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_sound_containers_pass(name: str) -> None:
-    surface, quality = SURFACES[name]
-    data, told = ls.encode(surface, **quality), list[float]()
+    data, told = container_of(name), list[float]()
     found = _inspected(data, told=told)
     wanted = _inspected(data, 1 << 30)
     assert found.errors_checked is wanted.errors_checked
@@ -37,14 +36,14 @@ def test_sound_containers_pass(name: str) -> None:
 @pytest.mark.parametrize("part", [0.0, 0.2])
 @pytest.mark.parametrize("place", [0, 1])
 def test_wrong_errors_are_found(name: str, part: float, place: int) -> None:
-    data = ls.encode(SURFACES[name][0])
+    data = container_of(name)
     number = round(part * (len(index_of(data).layers) - 1))
     with pytest.raises(ls.CorruptStreamError, match=f"RMS and maximum error of layer {number}"):
         _inspected(with_layer_errors(data, number, 0.99, place))
 
 
 def test_a_flipped_bit_is_found() -> None:
-    data = bytearray(ls.encode(SURFACES["integers"][0]))
+    data = bytearray(container_of("integers"))
     for place in range(20, len(data), len(data) // 40):
         data[place] ^= 4
         with pytest.raises(ls.LodestreamError):

@@ -17,7 +17,7 @@ from lodestream.decoding.pieces import why_not_by_pieces
 from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.scratch import IN_MEMORY, FolderScratch, Room
 
-from ..bands.test_building import SURFACES
+from ..bands.grid_surfaces import SURFACES, container_of
 
 
 def _read(container: bytes) -> Callable[[int, int], bytes]:
@@ -32,8 +32,7 @@ def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
 @pytest.mark.parametrize("name", SURFACES)
 @pytest.mark.parametrize("memory", [1, 1 << 21])
 def test_rows_make_the_surface(name: str, memory: int, tmp_path: Path) -> None:
-    surface, quality = SURFACES[name]
-    container = ls.encode(surface, **quality)
+    container = container_of(name)
     decoder, told = _decoder(container), [0.0]
     expected = ls.decode(container)
     if decoder.header.plane is not None:
@@ -77,8 +76,7 @@ def _check_levels(container: bytes) -> None:
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_rows_make_every_level(name: str) -> None:
-    surface, quality = SURFACES[name]
-    container = ls.encode(surface, **quality)
+    container = container_of(name)
     if _decoder(container).header.plane is not None:
         pytest.skip("x and y are made of rules")
     _check_levels(container)
@@ -124,7 +122,7 @@ def test_levels_of_angles_do_not_say_what_a_seam_adds() -> None:
 
 
 def test_a_flipped_bit_of_a_segment_or_a_chunk_is_found_where_it_is() -> None:
-    container = ls.encode(SURFACES["floats"][0])
+    container = container_of("floats")
     index = read_index(_read(container), len(container))
     for part, what in ((index.segments[-1], "segment"), (next(c for c in index.chunks if c.range.length), "chunk")):
         damaged = bytearray(container)
@@ -144,7 +142,7 @@ def test_kept_holes_come_back() -> None:
 
 
 def test_damage_is_found() -> None:
-    container = bytearray(ls.encode(SURFACES["integers"][0]))
+    container = bytearray(container_of("integers"))
     segment = _decoder(bytes(container)).index.segments[-1]
     container[segment.range.offset] ^= 1
     with pytest.raises(ls.CorruptStreamError, match="checksum"):
