@@ -1,5 +1,5 @@
 """``make sanitize``: the tests of kernels under AddressSanitizer and UndefinedBehaviorSanitizer, which of their lines
-the tests run, and each kernel called with anything for a while.
+the tests run, whether faults that are planted are found, and each kernel called with anything for a while.
 
 Needs gcc or clang; where neither is, it says so and that is all.
 """
@@ -22,7 +22,7 @@ from .coverage import lines_run, told
 from .declared import declarations
 from .fuzzing import FAULTS, fuzz_all
 
-__all__ = ["TESTS", "main", "run_tests"]
+__all__ = ["PLANTED_WANTED", "TESTS", "main", "run_tests"]
 
 #: Tests that decode the golden files at every layer, their prefixes, and files with a bit flipped.
 TESTS = ("tests/core/container/test_golden.py", "tests/core/entropy/test_mask.py", "tests/kernels/test_refusals.py")
@@ -41,6 +41,10 @@ MORE_TESTS = tuple(
     )
     for name in names
 )
+
+#: Tests of these tools, which `make test` skips: what they compile takes a minute.
+PLANTED = "tests/kernels/test_sanitizers.py"
+PLANTED_WANTED = "LODESTREAM_SANITIZERS"
 
 _SECONDS = 60.0
 
@@ -61,7 +65,8 @@ def main() -> int:
         print("sanitize: skipped, there is neither a gcc nor a clang with sanitizers")
         return 0
     started = time.monotonic()
-    failed = _tests(compiler, args.every_line)
+    failed = _planted_are_missed()
+    failed |= _tests(compiler, args.every_line)
     found = fuzz_all(list(declarations()), args.seconds, seed=args.seed)
     print("\n".join(map(str, found)))
     failed |= any(item.fault for item in found)
@@ -103,6 +108,12 @@ def run_tests(compiler: str, library: Path, arguments: Sequence[str], reports: P
     wrong = [f"pytest ended with {done.returncode}"] if done.returncode else []
     said = (report.read_text(errors="replace").splitlines() for report in sorted(reports.glob("report.*")))
     return [*wrong, *("\n".join(lines[:40]) for lines in said)]
+
+
+def _planted_are_missed() -> bool:
+    """Run the tests of these tools; whether one fails."""
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", PLANTED]
+    return subprocess.run(command, env={**os.environ, PLANTED_WANTED: "1"}, cwd=ROOT).returncode != 0
 
 
 def _tests(compiler: str, every_line: bool) -> bool:

@@ -1,7 +1,11 @@
-"""The tools that look for faults find those that are planted, and none where there is none."""
+"""The tools that look for faults find those that are planted, and none where there is none.
+
+``make sanitize`` runs this, with LODESTREAM_SANITIZERS: `make test` compiles nothing with sanitizers.
+"""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -12,7 +16,10 @@ from .compiling import COVERAGE, SANITIZERS, compiled, sanitizing_compiler
 from .conftest import NAMES, Sources
 from .coverage import lines_run, told
 from .fuzzing import Fuzzed, fuzz, fuzzer
-from .sanitize import run_tests
+from .sanitize import PLANTED_WANTED, run_tests
+
+if not os.environ.get(PLANTED_WANTED):
+    pytest.skip(f"make sanitize runs this ({PLANTED_WANTED} is not set)", allow_module_level=True)
 
 COMPILER = sanitizing_compiler() or ""
 
