@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 from unittest import mock
 
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
+from lodestream.bands import made, memory
 from lodestream.bands.build import Build
 from lodestream.bands.building import Building
 from lodestream.bands.executing import Execution
@@ -238,3 +241,28 @@ def test_any_pieces_of_any_blocks(
 ) -> None:
     surface = block_surface(kind, shape, count, dtype, more, np.random.default_rng(seed))
     _check(surface, precision, tile, points, core, threads, seed)
+
+
+#: A grid and blocks with everything that is in files of their own.
+_LARGER_THAN_MEMORY = {
+    "a torus": _grid("float64", (149, 33), 3, (True, True), "smooth", "holes and attributes", 3),
+    "integers of 64 bits": _grid("uint64", (150, 40), 1, (True, False), "far", "holes and attributes", 1),
+    "plates": block_surface("plates", (90, 80), 2, "float32", "holes and attributes", np.random.default_rng(1)),
+    "cylinders": block_surface("cylinders", (80, 60), 3, "float64", "attributes", np.random.default_rng(3)),
+}
+
+
+@pytest.mark.parametrize("wanted", [False, True])
+@pytest.mark.parametrize("name", _LARGER_THAN_MEMORY)
+def test_a_surface_larger_than_memory_gives_the_same_bytes(name: str, wanted: bool, tmp_path: Path) -> None:
+    surface, spied = _LARGER_THAN_MEMORY[name], made.Made.container
+    # By pieces goes what memory does not hold, or whatever an executor is given for.
+    with (
+        ThreadPoolExecutor(2) as executor,
+        mock.patch.multiple(made, _FEWEST=1, _MOST=1),
+        mock.patch.multiple(memory, WHOLE=1 << 20, _WHOLE_WITH_HOLES=1 << 20),
+        mock.patch.object(made.Made, "container", autospec=True, side_effect=spied) as container,
+    ):
+        ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, executor=executor if wanted else None)
+    container.assert_called_once()
+    assert (tmp_path / "a.lode").read_bytes() == ls.encode(surface)
