@@ -97,6 +97,13 @@ def inverse(values: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
     return np.clip(x, -LIMIT // 2, LIMIT // 2)
 
 
+def forward(samples: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
+    """Compute nodes and then details along the first axis; undoes `inverse`. int64 (samples, lines)."""
+    nodes, d = _forward(samples, axis)
+    extra = samples[-1:] if axis.extra else samples[:0]
+    return np.concatenate([nodes, extra, d - _predicted(nodes, axis, pair)])
+
+
 def details(samples: Lines, axis: Axis, pair: tuple[int, int]) -> Lines:
     """Compute the details of the forward step; int64 (samples, lines) to int64 (M, lines)."""
     nodes, d = _forward(samples, axis)

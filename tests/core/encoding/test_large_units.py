@@ -1,4 +1,4 @@
-"""Large units beside a plain decoder of docs/format.md, section 7.6, and surfaces that have such."""
+"""Large units beside the reference decoder, and surfaces that have such."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lodestream.grid.layout import Layout
 from tests.examples import examples
 
 from ..entropy.coding import planes_of
-from ..entropy.plain_coder import PlainLargeUnit
+from ..entropy.reference_units import ReferenceUnits, places_of
 from ..entropy.test_bitplanes import coefficients
 
 Ints = NDArray[np.int32]
@@ -47,18 +47,6 @@ def channel_of(table: TileTable, values: Ints) -> Channel:
     return Channel(gather(table, [values]), np.ones(len(table.bands)), top)
 
 
-def plain(table: TileTable) -> PlainLargeUnit:
-    return PlainLargeUnit(table.bands[:0], table.size, table.blocks)
-
-
-def read_plainly(unit: PlainLargeUnit, table: TileTable, tile: int, segments: Segments) -> None:
-    """Read a unit in the arrays of the one before."""
-    fresh = plain(table)
-    unit.bands, unit.contexts, unit._states = table.of_tile(tile), fresh.contexts, []
-    for segment in segments:
-        unit.read(*segment)
-
-
 def cut(rng: np.random.Generator, passes: int) -> list[tuple[int, int]]:
     """First and last passes of segments."""
     chosen = np.flatnonzero(rng.random(passes) < rng.choice([0.0, 0.1, 0.5, 1.0]))
@@ -75,8 +63,8 @@ def read(table: TileTable, units: dict[int, Segments], budget: int) -> Tiles:
     return tiles
 
 
-def check_alike(found: Tiles, expected: Tiles | PlainLargeUnit) -> None:
-    for name in ("known", "sign", "early", "flags"):
+def check_alike(found: Tiles, expected: Tiles | ReferenceUnits) -> None:
+    for name in ("known", "sign", "early", "flags") if isinstance(expected, Tiles) else ("known", "sign"):
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
 
@@ -106,7 +94,7 @@ def test_what_is_written_is_read_in_any_segments_and_calls(
     coder = TileCoder([table] * count, channels, count, None, 1)
     for number, channel in enumerate(channels):
         units: dict[int, Segments] = {}
-        expected = plain(table)
+        expected = ReferenceUnits(table)
         for unit in range(1, len(table.members)):
             passes = pass_count(int(channel.top[unit]))
             costs, units[unit] = np.zeros(passes), []
@@ -120,12 +108,13 @@ def test_what_is_written_is_read_in_any_segments_and_calls(
                 starts = [0 if first == passes - 1 else ends[first + 1] for first, *_ in units[unit]]
                 chunks = [whole[start : ends[last]] for start, (_, last, _) in zip(starts, units[unit], strict=True)]
                 assert [chunk or b"\0" for chunk in chunks] == [data for *_, data in units[unit]]
-            read_plainly(expected, table, unit, units[unit])
+            if units[unit]:
+                expected.read(unit, units[unit], large=True)
         reader = read(table, units, budget)
         check_alike(reader, expected)
         check_alike(reader, coder.tiles[number])
         for band in table.bands[table.first[1] :]:
-            places = PlainLargeUnit._places(band.tolist())
+            places = places_of(band.tolist())
             np.testing.assert_array_equal((reader.known * reader.sign)[places], channel.true[places])
 
 
@@ -137,17 +126,17 @@ def test_what_is_written_is_read_in_any_segments_and_calls(
     budget=budgets,
 )
 @examples(20)
-def test_any_bytes_are_read_as_the_plain_decoder_reads_them(
+def test_any_bytes_are_read_as_the_reference_reads_them(
     shape: tuple[int, int], tile: tuple[int, int], bits: int, data: list[bytes], budget: int
 ) -> None:
     table = a_table(shape, (False, True), tile)
     starts = np.linspace(2 * bits - 1, 0, len(data) + 1).astype(int)
     cuts = [(first - 1, last) for first, last in itertools.pairwise(starts.tolist())]
     segments = [(*cut, part) for cut, part in zip(cuts, data, strict=True) if cut[0] >= cut[1]]
-    expected = plain(table)
+    expected = ReferenceUnits(table)
     units = dict.fromkeys(range(1, len(table.members)), segments)
     for unit in units:
-        read_plainly(expected, table, unit, segments)
+        expected.read(unit, segments, large=True)
     reader = read(table, units, budget)
     check_alike(reader, expected)
     models = {tuple(model.tolist()) for model in reader.models[1:]}

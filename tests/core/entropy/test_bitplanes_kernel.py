@@ -1,8 +1,7 @@
-"""The kernel of the embedded coder beside one in plain Python, and with what it must refuse."""
+"""The kernel of the embedded coder beside the reference decoder, and with what it must refuse."""
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from lodestream.entropy.bitplanes import code_passes, new_models
 from lodestream.entropy.tiles import TileTable, gather
 from lodestream.grid.layout import Layout
 
-from .plain_coder import PlainTile
+from .reference_units import ReferenceUnits
 from .test_bitplanes import coefficients
 
 Ints = NDArray[np.int32]
@@ -62,55 +61,50 @@ shapes = st.tuples(st.integers(1, 40), st.integers(2, 40))
     trellis=st.booleans(),
     seed=st.integers(0, 2**32),
 )
-def test_bytes_and_coefficients_are_those_of_the_plain_coder(
+def test_what_is_written_is_read_as_the_reference_reads_it(
     shape: tuple[int, int], bits: int, density: float, cut: int, trellis: bool, seed: int
 ) -> None:
     table = a_table(shape)
     true = gather(table, [coefficients(shape, bits, density, seed)])
     writer, reader = Arrays(table, trellis), Arrays(table, trellis)
-    plain = PlainTile(table.bands[:0], table.size, table.blocks, trellis)
+    reference, passes = ReferenceUnits(table), 2 * bits - 1
+    last = min(cut, passes - 1)
     for tile in range(len(table.members)):
-        plain.bands, plain.contexts = table.of_tile(tile), fresh()
-        passes = 2 * bits - 1
-        last = min(cut, passes - 1)
+        segments = []
         for first, end in ((passes - 1, last), (last - 1, 0)):
             if first < end:
                 continue
-            expected = plain.code(first, end, true.tolist(), None)
             data, costs = np.zeros(64 + 64 * table.size, np.uint8), np.zeros(passes)
             runs = np.array([writer.run(tile, first, end, 0, data.size)])
             writer.code(False, runs, true, data, costs)
             written = data[: runs[0, 6]]
-            assert written.tobytes() == expected.written()
-            assert costs[end] == pytest.approx(8 * (expected.place - 4) + 32 - math.log2(expected.width), abs=1e-6)
+            # The shortest string that names a number in the interval: no more than a byte beyond what the bits take.
+            assert len(written) <= costs[end] / 8 + 1 + 1e-6
+            assert (np.diff(costs[end : first + 1]) <= 0).all()
             reader.code(True, np.array([reader.run(tile, first, end, 0, len(written))]), true[:0], written)
+            segments.append((first, end, written.tobytes()))
+        reference.read(tile, segments, large=False, indices=trellis)
+    assert np.array_equal(reference.known * reference.sign, true)
     for arrays in (writer, reader):
-        assert np.array_equal(arrays.known, plain.known)
-        assert np.array_equal(arrays.sign, plain.sign)
-        assert np.array_equal(arrays.early, plain.early)
-        assert np.array_equal(arrays.known * arrays.sign, true)
+        assert np.array_equal(arrays.known, reference.known)
+        assert np.array_equal(arrays.sign, reference.sign)
+        assert np.array_equal(arrays.early, writer.early)
         assert np.array_equal(arrays.models, writer.models)
 
 
-def fresh() -> Any:
-    """Contexts of a tile that was not coded so far."""
-    return PlainTile(np.zeros((0, 10), np.int64), 0, 0).contexts
-
-
 @given(shape=shapes, bits=st.integers(1, 28), trellis=st.booleans(), data=st.binary(max_size=200))
-def test_any_bytes_are_read_as_the_plain_coder_reads_them(
+def test_any_bytes_are_read_as_the_reference_reads_them(
     shape: tuple[int, int], bits: int, trellis: bool, data: bytes
 ) -> None:
     table = a_table(shape)
-    reader, plain = Arrays(table, trellis), PlainTile(table.bands[:0], table.size, table.blocks, trellis)
-    for tile in range(len(table.members)):
-        plain.bands, plain.contexts = table.of_tile(tile), fresh()
-        plain.code(2 * bits - 2, 0, None, data)
+    reader, reference = Arrays(table, trellis), ReferenceUnits(table)
     tiles = range(len(table.members))
+    for tile in tiles:
+        reference.read(tile, [(2 * bits - 2, 0, data)], large=False, indices=trellis)
     runs = np.array([reader.run(tile, 2 * bits - 2, 0, 0, len(data)) for tile in tiles])
     reader.code(True, runs, np.zeros(0, np.int32), np.frombuffer(data, np.uint8).copy())
-    assert np.array_equal(reader.known, plain.known)
-    assert np.array_equal(reader.sign, plain.sign)
+    assert np.array_equal(reader.known, reference.known)
+    assert np.array_equal(reader.sign, reference.sign)
 
 
 @pytest.mark.parametrize("trellis", [False, True])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lodestream.grid.axis import AxisStep, axis_lengths, axis_step, coarse_length, extension
 
-from ..transform import lifting_reference as reference
+from ..transform import reference_steps as reference
 from ..transform.refinement import refinement_matrix
 
 

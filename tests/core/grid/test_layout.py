@@ -13,7 +13,7 @@ from lodestream.grid.layout import Layout, tile_bounds
 
 from ..entropy.coding import shapes_of
 from ..surfaces import index_of
-from ..transform import lifting_reference as reference
+from ..transform import reference_steps as reference
 
 closures = st.tuples(st.booleans(), st.booleans())
 layouts = st.builds(

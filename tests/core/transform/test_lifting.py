@@ -15,8 +15,8 @@ from lodestream.grid.axis import AxisStep, axis_step
 from lodestream.transform import lifting
 from lodestream.transform.lifting import CLAMP, TAPS, forward_step, inverse_step
 
-from . import lifting_reference as reference
-from .lifting_reference import CLOSED, FREE, Ends
+from . import reference_steps as reference
+from .reference_steps import CLOSED, FREE, Ends
 from .refinement import refinement_matrix
 
 LARGEST = 2**24
@@ -348,14 +348,6 @@ def test_what_does_not_fit_is_refused() -> None:
         assert kernels.lift(0, 1, long[:rows], 4500, 4501, extension, 0, 0, start, work) == 4501
     with pytest.raises(ValueError, match="do not fit"):
         kernels.lift(0, 1, long, 4500, 4501, extension, 0, 0, 2048, work)
-
-
-def test_the_reference_in_plain_and_in_python_integers_agree() -> None:
-    lines = random_grid((21, 4), 5)
-    for ends, predictor in itertools.product(ENDS, PREDICTORS):
-        plain: NDArray[Any] = reference.forward(lines.astype(np.int64), ends, *predictor)
-        np.testing.assert_array_equal(plain, reference.forward(lines.astype(object), ends, *predictor).astype(np.int64))
-        np.testing.assert_array_equal(reference.inverse(plain, ends, *predictor), lines)
 
 
 @given(shapes=st.tuples(st.integers(1, 90), st.integers(1, 90)), closed=st.booleans(), seed=st.integers(0, 2**32 - 1))

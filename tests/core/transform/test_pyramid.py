@@ -17,7 +17,7 @@ from lodestream.transform.predictors import COEFFICIENT_BITS, default_predictors
 from lodestream.transform.pyramid import allocate, forward, inverse, synthesis_norms
 
 from ..entropy.coding import effective, shapes_of
-from . import lifting_reference as reference
+from . import reference_steps as reference
 from .refinement import dense_coarsen
 
 CLOSURES = [(False, False), (False, True), (True, False), (True, True)]
