@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import errno
+import io
 import math
 import os
 import shutil
 import tempfile
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -21,12 +24,11 @@ from numpy.typing import DTypeLike, NDArray
 
 __all__ = [
     "IN_MEMORY",
-    "DamagedError",
     "FolderScratch",
     "MemoryScratch",
     "Room",
     "Scratch",
-    "boot_id",
+    "checksum",
     "is_made",
     "rows_at_once",
 ]
@@ -36,7 +38,12 @@ _UNFINISHED = ".part"
 #: Attribute of the maps of files that a `Room` has made.
 _MADE = "_lodestream_made"
 
-_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+#: What follows the array in a file that lasts: the length of all before in 8 bytes, and the CRC-32 of that and these.
+_TRAILER = 12
+#: How the name of a folder begins that one task has for itself.
+_OF_A_TASK = "task-"
+#: Bytes that are checked together.
+_BLOCK = 1 << 20
 
 #: A part of an array in memory that has this share of its bytes is kept as it is.
 _MOST_OF = 0.9
@@ -53,19 +60,13 @@ def _parse_anew() -> None:
 os.register_at_fork(after_in_child=_parse_anew)  # another thread may have been parsing when the process forked
 
 
-def boot_id() -> str | None:
-    """What tells this start of the system from others; None where it is not told.
-
-    Files of a build are not synchronised to disk: after a power failure one may have its length and not its contents.
-    """
-    try:
-        return _BOOT_ID.read_text().strip()
-    except OSError:
-        return None
-
-
-class DamagedError(ValueError):
-    """A file of a scratch folder is not as it was written."""
+def checksum(path: Path) -> tuple[int, int]:
+    """Compute the length of a file and the CRC-32 of its bytes."""
+    length = crc = 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            length, crc = length + len(block), zlib.crc32(block, crc)
+    return length, crc
 
 
 class Scratch(ABC):
@@ -141,9 +142,7 @@ class MemoryScratch(Scratch):
 
 
 class FolderScratch(Scratch):
-    """Arrays by name, in a folder that every worker of a build sees.
-
-    A build that was cut goes on with the files that are missing. Parts of names become folders.
+    """Arrays by name, in a folder that every worker of a build sees. Parts of names become folders.
 
     Parameters
     ----------
@@ -151,30 +150,58 @@ class FolderScratch(Scratch):
         Is made if it is not there.
     make : bool
         Whether it is made. It is not made again later: a task that comes too late leaves nothing.
+    lasting : bool
+        Whether another process may go on with what is written here, perhaps after a power failure. Then a file is on
+        disk before it gets its name, and ends with its length and a checksum, by which `is_whole` knows it again.
     """
 
-    def __init__(self, folder: str | os.PathLike[str], make: bool = True) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | os.PathLike[str], make: bool = True, lasting: bool = False) -> None:
+        self.folder, self.lasting = Path(folder), lasting
         if make:
             self.folder.mkdir(parents=True, exist_ok=True)
 
     def write(self, name: str, array: NDArray[Any]) -> None:
         """Keep an array of any shape and dtype under a name; one that is there already is replaced."""
-        with self.writing(name) as path, path.open("wb") as file:
-            np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
+        array = np.asarray(array)
+        self._write(name, array.dtype, array.shape, [array if array.ndim else array[np.newaxis]])
 
     def write_joined(self, name: str, arrays: Sequence[NDArray[Any]]) -> None:
         """Keep the values of arrays of one dtype, shape (row, ...) each, one after another as a flat array."""
-        head = {
-            "descr": np.lib.format.dtype_to_descr(arrays[0].dtype),
-            "fortran_order": False,
-            "shape": (sum(array.size for array in arrays),),
-        }
+        self._write(name, arrays[0].dtype, (sum(array.size for array in arrays),), arrays)
+
+    def _write(self, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], arrays: Sequence[NDArray[Any]]) -> None:
+        head = io.BytesIO()
+        described = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(head, described)
+        parts = (np.ascontiguousarray(array[rows]) for array in arrays for rows in rows_at_once(array.shape))
+        buffers: Iterator[Any] = (part.data for part in parts if part.size)
+        length = crc = 0
         with self.writing(name) as path, path.open("wb") as file:
-            np.lib.format.write_array_header_1_0(file, head)
-            for array in arrays:
-                for rows in rows_at_once(array.shape):
-                    file.write(np.ascontiguousarray(array[rows]).data)
+            for part in chain([head.getvalue()], buffers):
+                length += file.write(part)
+                if self.lasting:
+                    crc = zlib.crc32(part, crc)
+            if self.lasting:
+                told = length.to_bytes(8, "little")
+                file.write(told + zlib.crc32(told, crc).to_bytes(4, "little"))
+                file.flush()
+                os.fsync(file.fileno())
+
+    def is_whole(self) -> bool:
+        """Check every array of a folder that lasts, and remove what tasks have not finished.
+
+        An array that is not there is not missed here, but by `read`.
+        """
+        for above, folders, names in os.walk(self.folder):
+            for name in [name for name in folders if name.startswith(_OF_A_TASK)]:
+                folders.remove(name)
+                shutil.rmtree(Path(above) / name, ignore_errors=True)
+            for name in names:
+                if name.endswith(_UNFINISHED):
+                    (Path(above) / name).unlink(missing_ok=True)
+                elif name.endswith(_SUFFIX) and not _ends_well(Path(above) / name):
+                    return False
+        return True
 
     @contextmanager
     def writing(self, name: str) -> Iterator[Path]:
@@ -196,8 +223,8 @@ class FolderScratch(Scratch):
         ------
         FileNotFoundError
             If there is none.
-        DamagedError
-            If the file is not whole, as after a failure of the machine, or holds objects of Python.
+        ValueError
+            If the file is not whole, or holds objects of Python.
         """
         path = self._path(name)
         with path.open("rb") as file:
@@ -209,15 +236,17 @@ class FolderScratch(Scratch):
             except OSError:
                 raise
             except Exception as error:  # whatever a parser of Python's literals makes of it
-                raise DamagedError(f"expected an array in {path}, got something else ({error})") from None
+                raise ValueError(f"expected an array in {path}, got something else ({error})") from None
             if not dtype.itemsize or any(length < 0 for length in shape):
-                raise DamagedError(f"expected an array with values in {path}, got {dtype}")
+                raise ValueError(f"expected an array with values in {path}, got {dtype}")
             if dtype.hasobject:  # the file would say which addresses of memory they are at
-                raise DamagedError(f"expected an array of numbers in {path}, got {dtype} with objects of Python")
+                raise ValueError(f"expected an array of numbers in {path}, got {dtype} with objects of Python")
             start, size = file.tell(), os.fstat(file.fileno()).st_size
         expected = start + math.prod(shape) * dtype.itemsize
+        if self.lasting:
+            expected += _TRAILER
         if size != expected:
-            raise DamagedError(f"expected {expected:,} bytes in {path}, got {size:,}")
+            raise ValueError(f"expected {expected:,} bytes in {path}, got {size:,}")
         if 0 in shape:
             return np.zeros(shape, dtype)
         return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
@@ -251,7 +280,8 @@ class FolderScratch(Scratch):
 
             @cache
             def files() -> FolderScratch:
-                return FolderScratch(stack.enter_context(tempfile.TemporaryDirectory(prefix="task-", dir=self.folder)))
+                folder = tempfile.TemporaryDirectory(prefix=_OF_A_TASK, dir=self.folder)
+                return FolderScratch(stack.enter_context(folder))
 
             yield Room(files, least)
 
@@ -294,6 +324,20 @@ class FolderScratch(Scratch):
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}{_SUFFIX}"
+
+
+def _ends_well(path: Path) -> bool:
+    """Whether the length and the checksum at the end of a file are those of what comes before."""
+    length = path.stat().st_size - _TRAILER
+    if length < 0:
+        return False
+    crc, left = 0, length + 8
+    with path.open("rb") as file:
+        while left and (block := file.read(min(left, _BLOCK))):
+            crc, left = zlib.crc32(block, crc), left - len(block)
+        told = file.read()
+        file.seek(length)
+        return file.read(8) == length.to_bytes(8, "little") and told == crc.to_bytes(4, "little")
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ __all__ = [
     "add_building_options",
     "add_memory_option",
     "building_options",
-    "work_folder",
+    "reading_folder",
 ]
 
 
@@ -30,7 +29,7 @@ class BuildingOptions:
     memory : int or None
         Bytes to work in; None: a quarter of the machine's.
     scratch : Path or None
-        The folder for its files; None: one beside the container.
+        The folder in which it can continue; None: a temporary one beside the container.
     dask : str or None
         Address of a Dask scheduler whose workers carry out the tasks.
     """
@@ -48,10 +47,9 @@ def add_building_options(parser: argparse.ArgumentParser) -> None:
         "--scratch",
         type=Path,
         metavar="FOLDER",
-        help="folder for the files of a build by bands, about 12 bytes a value (up to 30 of several blocks), "
-        "empty or of an interrupted build; "
-        "after an interruption it stays, and the same command continues from there (default: OUT.lode.build, which is "
-        "removed after an interruption too)",
+        help="folder in which a build by bands can continue, with about 12 bytes a value (up to 30 of several blocks): "
+        "after an interruption, even a power failure, its files stay there, and the same command continues from there "
+        "(default: a temporary folder beside OUT)",
     )
     group.add_argument(
         "--dask",
@@ -79,31 +77,40 @@ def building_options(args: argparse.Namespace) -> BuildingOptions:
 
 
 @contextmanager
-def work_folder(options: BuildingOptions, out: str) -> Iterator[Path]:
-    """A folder for the files of a build, of this process alone.
+def reading_folder(options: BuildingOptions, out: str, key: str | None) -> Iterator[Path]:
+    """A folder for what is read, of this process alone, and a note if the build is cut and can continue.
 
-    What was made there is gone afterwards, but for that of a named folder whose build was cut; what a killed process
-    has left beside the container is found again.
+    Parameters
+    ----------
+    options : BuildingOptions
+        If they name a scratch folder, it is there, else beside the container.
+    out : str
+        The container.
+    key : str or None
+        What decides about what is read, which is kept with it if the build is cut; None: it is gone in any case.
 
     Raises
     ------
     InputError
-        If the folder holds anything else, or another build is at work there.
+        If another process reads the same there.
     """
     from lodestream.bands.cluster import is_loss
-    from lodestream.bands.folders import build_folder
+    from lodestream.bands.folders import kept_folder, temporary_folder
     from lodestream.errors import UnavailableError
 
-    if options.scratch is None and out == "-":
-        with tempfile.TemporaryDirectory(prefix="lodestream-", ignore_cleanup_errors=True) as folder:
-            yield Path(folder)
-        return
-    named = options.scratch is not None
-    with build_folder(options.scratch or Path(f"{out}.build"), ("files", "build"), named) as own:
-        try:
-            yield own
-        except BaseException as error:
-            cut = isinstance(error, KeyboardInterrupt | OSError | UnavailableError) or is_loss(error)
-            if named and cut:
-                note(f"{options.scratch} is kept: the same command continues from there")
-            raise
+    above, name = (None, "") if out == "-" else (Path(out).parent, Path(out).name)
+    if options.scratch is not None:
+        options.scratch.mkdir(parents=True, exist_ok=True)
+        above = options.scratch
+    try:
+        if options.scratch is None or key is None:
+            reading = temporary_folder(above, name)
+        else:
+            reading = kept_folder(options.scratch, key)
+        with reading as folder:
+            yield folder
+    except BaseException as error:
+        cut = isinstance(error, KeyboardInterrupt | OSError | UnavailableError) or is_loss(error)
+        if options.scratch is not None and cut:
+            note(f"{options.scratch} is kept: the same command continues from there")
+        raise

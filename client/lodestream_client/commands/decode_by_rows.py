@@ -179,10 +179,10 @@ def _decode(
     progress: Callable[[float], None],
     seen: RangeSet,
 ) -> None:
-    from lodestream.bands.folders import passing_folder
+    from lodestream.bands.folders import temporary_folder
     from lodestream.scratch import FolderScratch, Room
 
-    with passing_folder(out, (_VALUES, _FILE)) as folder:
+    with temporary_folder(out.resolve().parent, out.name) as folder:
         surface = decoder.surface(Room(lambda: FolderScratch(folder / _VALUES), memory // _PART), memory, progress)
         index, last = decoder.index, decoder.index.levels[decoder.level]
         finest = decoder.level == decoder.header.levels

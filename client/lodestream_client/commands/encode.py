@@ -30,7 +30,7 @@ from .building_options import (
     BuildingOptions,
     add_building_options,
     building_options,
-    work_folder,
+    reading_folder,
 )
 from .inputs import input_files, option_hints, reason_of
 from .series import EachFolder, Part, named_files, parts
@@ -153,13 +153,14 @@ def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, 
     from lodestream.bands.cluster import executor_of
 
     started = time.monotonic()
-    with executor_of(options.building.dask) as executor, work_folder(options.building, options.out) as folder:
-        surface = read_surface(options.files, options.surface, folder / "files", options.building.memory)
+    key, building = _reading_key(options), options.building
+    with executor_of(building.dask) as executor, reading_folder(building, options.out, key) as folder:
+        surface = read_surface(options.files, options.surface, folder / "files", building.memory, key is not None)
         if part is not None:
             part.mark(surface)
         if options.surface.quality.rms is None:  # a stream for one error is refused instead
             _note_memory(surface, options.building.memory)
-        made = _made(surface, options, folder, executor)
+        made = _made(surface, options, executor)
         size = len(made) if made is not None else Path(options.out).stat().st_size
         if made is not None:
             sys.stdout.buffer.write(made)
@@ -167,7 +168,11 @@ def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, 
 
 
 def read_surface(
-    names: Sequence[str], options: SurfaceOptions, folder: Path | None = None, memory: int | None = None
+    names: Sequence[str],
+    options: SurfaceOptions,
+    folder: Path | None = None,
+    memory: int | None = None,
+    kept: bool = False,
 ) -> Surface:
     """Read the surface of one or several files; ``-`` is standard input.
 
@@ -177,6 +182,8 @@ def read_surface(
     options : SurfaceOptions
     folder : Path, optional
         Where arrays go that are large beside ``memory``, in bytes; by default all are in memory.
+    kept : bool
+        Whether what was read there before is read no more, see `lodestream.bands.reading.read_into`.
 
     Raises
     ------
@@ -198,13 +205,24 @@ def read_surface(
             from lodestream.bands.reading import read_into
 
             able = options.quality.rms is None
-            surface = read_into(folder, files.paths, memory, able, **given, **format_options)
+            surface = read_into(folder, files.paths, memory, able, kept, **given, **format_options)
     if options.name:
         surface.metadata["name"] = options.name
     return surface
 
 
-def _made(surface: Surface, options: EncodeOptions, folder: Path, executor: Executor | None) -> bytes | None:
+def _reading_key(options: EncodeOptions) -> str | None:
+    """What decides about what is read; None: it is not to be kept, or what comes over standard input."""
+    if options.building.scratch is None or "-" in options.files:
+        return None
+    from lodestream.bands.reading import reading_key
+
+    it = options.surface
+    given = {"closed": it.closed, "options": sorted(it.format_options.items())}
+    return reading_key(list(map(Path, options.files)), **given, format_name=it.format_name, nodata=it.nodata)
+
+
+def _made(surface: Surface, options: EncodeOptions, executor: Executor | None) -> bytes | None:
     """Encode into the file, or into bytes for standard output."""
     import lodestream as ls
 
@@ -218,7 +236,7 @@ def _made(surface: Surface, options: EncodeOptions, folder: Path, executor: Exec
                 progress=lambda fraction: progress.update(task, completed=fraction),
                 out=out,
                 memory=options.building.memory,
-                scratch=folder / "build",
+                scratch=options.building.scratch,
                 executor=executor,
             )
 

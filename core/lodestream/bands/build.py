@@ -37,6 +37,7 @@ class _Facts:
     lattices: Lattices
     points: int
     core_points: int
+    lasting: bool
 
 
 class Build:
@@ -112,7 +113,8 @@ class Build:
 
     def save(self, flush: bool = False) -> None:
         """Write what other processes need to open this; with ``flush``, also those of other machines."""
-        facts = _Facts(self.prepared, self.lattices, self.points, self._core_points)
+        assert isinstance(self.scratch, FolderScratch)
+        facts = _Facts(self.prepared, self.lattices, self.points, self._core_points, self.scratch.lasting)
         dump(facts, Path(self.folder) / _FILE, flush)
 
     def save_header(self, header: Header) -> None:
@@ -171,7 +173,7 @@ def _opened(folder: str, state: tuple[int, ...]) -> Build:
             while len(_OPENED) >= _MOST:
                 del _OPENED[next(iter(_OPENED))]
             facts: _Facts = load(Path(folder) / _FILE)
-            scratch = FolderScratch(folder, make=False)
+            scratch = FolderScratch(folder, make=False, lasting=facts.lasting)
             build = Build(scratch, facts.prepared, facts.lattices, facts.points, facts.core_points)
             known = _OPENED[folder] = state, build
         return known[1]

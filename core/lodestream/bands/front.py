@@ -23,7 +23,7 @@ from ..quality import Limit, Quality
 from ..scratch import Room
 from ..sources import Source, is_source, read_source
 from ..surface import Surface
-from .folders import Folder, check_out, replacing
+from .folders import BuildFolders, check_out, replacing
 from .made import Made
 from .memory import WHOLE, checked_memory, whole_memory
 from .room import CopyRoom
@@ -124,11 +124,10 @@ def encode(
         several blocks, or one that touches itself, is built block by block: the largest one is in place of such a row.
         By default a quarter of the machine's memory, and one piece where there is neither ``out`` nor an executor.
     scratch : str or path-like, optional
-        A folder for the files of a build by bands, about 12 bytes a value, up to 30 of several blocks; empty, or of a
-        build that was cut. What is made there is kept when the build is interrupted, or fails, and the same call goes
-        on from there; after success it is gone, with the folder if that was not there before. Only one build at a time
-        has a folder. By default one beside ``out`` that is gone afterwards; what a killed process left there is found
-        again.
+        A folder in which a build by bands can continue, with about 12 bytes a value, up to 30 of several blocks. The
+        build has a folder of its own there, which is kept when it is interrupted, even by a power failure, or fails;
+        the same call goes on from there, and after success it is gone. Only one process at a time makes the same
+        container there. By default a temporary folder beside ``out``, which is gone afterwards.
     executor : concurrent.futures.Executor, optional
         Carries out the tasks of a build by bands: processes, or machines that all see ``scratch`` and the files of
         memory-mapped arrays, as ``distributed.Client(...).get_executor()``. By default threads of this process.
@@ -145,8 +144,8 @@ def encode(
         If the surface cannot be encoded, or not with this precision, if its metadata are larger than
         `lodestream.container.metadata.MAX_BYTES`, or if the executor is none.
     InputError
-        Also if the scratch folder holds anything else, another build is at work there, or a file that the surface is in
-        is written to meanwhile.
+        Also if another process makes the same container in the scratch folder, or a file that the surface is in is
+        written to meanwhile.
     TooLargeError
         If a block has more rows or columns than kernels can count, if ``memory`` is given and is too little for a
         surface that cannot be built by bands, or if there is not room enough on the disk of the scratch folder.
@@ -168,13 +167,13 @@ def encode(
     if out is not None:
         check_out(Path(out))
     with ExitStack() as stack:
-        folder = Folder(stack, scratch, out)
+        folders = BuildFolders(stack, scratch, out)
         whole = out is None and memory is None and executor is None
         read = None if isinstance(surface, Surface) else _reading(surface)
         if read is not None:
             by_bands = _by_bands(limit, chosen, whole, executor is not None)
             given = None if memory is None else limit
-            surface = read(CopyRoom(folder.copies, folder.open, limit // _PART, by_bands, given))
+            surface = read(CopyRoom(folders.copies, folders.temporary, limit // _PART, by_bands, given))
         elif not isinstance(surface, Surface):
             surface = Surface(cast("ArrayLike", surface))
         encoder.check(surface, chosen)
@@ -183,7 +182,7 @@ def encode(
             warnings.warn(left_out, FormatWarning, stacklevel=2)
         told = encoder.rising(progress or (lambda fraction: None))
         if not whole and goes_by_bands(surface, chosen, limit, executor is not None, memory is not None):
-            made = Made(surface, chosen, limit, executor, told, read is not None).container(folder.open())
+            made = Made(surface, chosen, limit, executor, told, read is not None).container(folders)
             if made is not None:
                 return _given(made, out)
             if memory is not None:

@@ -1,4 +1,4 @@
-"""A container made by bands in a folder: the preparation, the streams that are tried, and what goes on after a cut."""
+"""A container made by bands in a folder: the preparation, the streams that are tried, what a build continues from."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from .. import __version__
 from ..encoding.lattice_coordinates import exact_lattices
 from ..encoding.prepared import Prepared, prepare
 from ..errors import InputError
+from ..library import fingerprint
 from ..parallel import threads
 from ..quality import Quality
-from ..scratch import DamagedError, FolderScratch, Room, boot_id, is_made
+from ..scratch import FolderScratch, Room, is_made
 from ..surface import Surface
 from .build import Build
 from .building import Building, OutOfRangeError
 from .executing import Execution
-from .folders import TASKS, remove, replacing
+from .folders import BuildFolders, is_sealed, remove, remove_leftovers, seal
 from .memory import BESIDE, OF_BAND, largest_block, masks_memory
 from .pieces import CORE_POINTS
 from .references import file_state, root_of
@@ -93,45 +94,33 @@ class Made:
         points = sum(block.points.nbytes + 4 * block.points.size for block in blocks)
         return points + sum(block.points.nbytes for block in blocks if block.mask is not None)
 
-    def container(self, folder: Path) -> Path | None:
-        """The file of the container, in the folder; None: the surface must be encoded in one piece.
+    def container(self, folders: BuildFolders) -> Path | None:
+        """The file of the container, in a folder of the call; None: the surface must be encoded in one piece.
 
         Raises
         ------
         InputError
-            If a file that the surface is in has changed meanwhile.
+            If a file that the surface is in has changed meanwhile, or another process makes the same container.
         TooLargeError
             If the disk has no room for it.
         UnavailableError
             If a worker has another version of this program.
         """
         in_memory = sum(array.nbytes for array in self._all() if root_of(array) is None)
-        check_room(folder, self._values * FOR_A_VALUE + in_memory + self._beside())
         files = [root_of(array) for array in self._all()]
         paths = sorted({str(Path(str(root.filename)).resolve()) for root in files if root is not None})
         states = [file_state(path) for path in paths]
-        # What another build has left, of another surface or another version, has another name.
-        own = folder / TASKS / hashlib.sha256(self._key().encode()).hexdigest()[:16]
-        own.parent.mkdir(exist_ok=True)
-        for path in own.parent.iterdir():
-            if path != own:
-                remove(path)
-        begun, surface = own.exists(), self._surface
-        try:
-            made = self._container(FolderScratch(own))
-        except DamagedError:
-            if not begun:
-                raise
-            remove(own)  # the machine failed, not only the build
-            self._surface = surface
-            made = self._container(FolderScratch(own))
-        for path_, state in zip(paths, states, strict=True):
-            if file_state(path_) != state:
-                raise InputError(f"expected {path_} to stay as it is until it is encoded, it was changed meanwhile")
+        scratch = folders.build(self._key())
+        check_room(scratch.folder, self._values * FOR_A_VALUE + in_memory + self._beside(), scratch.size())
+        remove_leftovers(scratch.folder)
+        made = self._container(scratch)
+        for path, state in zip(paths, states, strict=True):
+            if file_state(path) != state:
+                raise InputError(f"expected {path} to stay as it is until it is encoded, it was changed meanwhile")
         return made
 
     def _container(self, scratch: FolderScratch) -> Path | None:
-        self._surface = self._in_files(FolderScratch(scratch.folder / "surface"))
+        self._surface = self._in_files(scratch)
         # Not the files of the build that was cut: a late task of it could read them while they are written.
         remove(scratch.folder / "prepared")
         prepared_files = scratch.folder / "prepared" / uuid4().hex
@@ -152,58 +141,75 @@ class Made:
         self._progress(1.0)
         return best
 
-    def _in_files(self, files: FolderScratch) -> Surface:
+    def _in_files(self, scratch: FolderScratch) -> Surface:
         """The surface with all arrays in files, which tasks open: what is in memory would go to each of them."""
+        files = FolderScratch(scratch.folder / "surface")
+        written = scratch.lasting and is_sealed(files.folder)
+        if not written:
+            files = _emptied(files)
 
         # Copied, not made anew: that would look at all values, and put another mask into memory.
         blocks = [copy(block) for block in self._surface.blocks]
-        for block, points in zip(blocks, _kept(files, "points", [block.points for block in blocks]), strict=True):
+        for block, points in zip(
+            blocks, _kept(files, "points", [block.points for block in blocks], written), strict=True
+        ):
             block.points, block.attributes = points, dict(block.attributes)
         masked = [block for block in blocks if block.mask is not None]
-        for block, mask in zip(
-            masked, _kept(files, "masks", [b.mask for b in masked if b.mask is not None]), strict=True
-        ):
+        masks = [block.mask for block in masked if block.mask is not None]
+        for block, mask in zip(masked, _kept(files, "masks", masks, written), strict=True):
             block.mask = mask
         for number, name in enumerate(blocks[0].attributes):
             given = [block.attributes[name] for block in blocks]
-            for block, array in zip(blocks, _kept(files, f"attributes/{number}", given), strict=True):
+            for block, array in zip(blocks, _kept(files, f"attributes/{number}", given, written), strict=True):
                 block.attributes[name] = array
+        if scratch.lasting and not written:
+            seal(files.folder)
         surface = copy(self._surface)
         surface.blocks = tuple(blocks)
         surface.joints = None  # the values say again which points are one
         return surface
 
     def _stream(self, scratch: FolderScratch, prepared: Prepared, bits: int | None, room: Room) -> Path:
+        """The container of a stream; what is there of it and is not as it was written is made again."""
         name = "exact" if bits is None else f"bits-{bits}"
-        path = scratch.folder / f"{name}.lode"
-        if not path.exists():
-            own = FolderScratch(scratch.folder / name)
-            build = Build(own, prepared, exact_lattices(prepared, bits, room), self._points, self._core)
-            if self._executor is not None:
-                build.save(flush=True)
-            execution = Execution(build, self._executor, self._threads)
-            try:
-                with replacing(path) as unfinished, unfinished.open("wb") as file:
-                    Building(build, execution, self._progress).write(file)
-                    file.flush()
-                    os.fsync(file.fileno())  # it is taken for whole wherever it is, also after a power failure
-            except FileNotFoundError as error:
-                if self._executor is None:
-                    raise
-                raise InputError(
-                    f"expected workers that see the files of the build and of the surface, got none of {error.filename}"
-                ) from error
-            finally:
+        whole, path = scratch.folder / f"{name}-whole", scratch.folder / f"{name}-whole" / "container"
+        if scratch.lasting and is_sealed(whole):
+            return path
+        remove(whole)
+        tasks = FolderScratch(scratch.folder / name, lasting=scratch.lasting)
+        continued = any(tasks.folder.iterdir()) and tasks.is_whole()
+        if not continued:
+            tasks = _emptied(tasks)
+        build = Build(tasks, prepared, exact_lattices(prepared, bits, room), self._points, self._core)
+        if self._executor is not None:
+            build.save(flush=True)
+        whole.mkdir()
+        try:
+            with path.open("wb") as file:
+                Building(build, Execution(build, self._executor, self._threads), self._progress).write(file)
+        except FileNotFoundError as error:
+            missing = error.filename is None or not os.path.exists(error.filename)
+            if continued and missing:  # what was there of the stream was not all of it
                 build.close()
-            remove(own.folder)
+                remove(tasks.folder)
+                return self._stream(scratch, prepared, bits, room)
+            if self._executor is None:
+                raise
+            raise InputError(
+                f"expected workers that see the files of the build and of the surface, got none of {error.filename}"
+            ) from error
+        finally:
+            build.close()
+        if scratch.lasting:
+            seal(whole)
+        remove(tasks.folder)
         return path
 
     def _key(self) -> str:
-        """What tells this build from others: one that was cut goes on only if nothing of it has changed."""
+        """What decides about the files of this build: one that was cut goes on only if nothing of it has changed."""
         blocks = self._surface.blocks
         said = {
-            "version": __version__,
-            "boot": boot_id(),
+            "version": [__version__, fingerprint(), np.__version__],
             "quality": repr(self._quality),
             "blocks": [[block.closed, list(block.attributes), block.mask is None] for block in blocks],
             "metadata": hashlib.sha256(repr(self._surface.metadata).encode()).hexdigest(),
@@ -213,15 +219,17 @@ class Made:
         return json.dumps(said)
 
 
-def _kept(files: FolderScratch, name: str, arrays: list[NDArray[Any]]) -> list[NDArray[Any]]:
+def _emptied(scratch: FolderScratch) -> FolderScratch:
+    remove(scratch.folder)
+    return FolderScratch(scratch.folder, lasting=scratch.lasting)
+
+
+def _kept(files: FolderScratch, name: str, arrays: list[NDArray[Any]], written: bool) -> list[NDArray[Any]]:
     """Arrays of one dtype and any shapes, those in memory as parts of one file: a process may have so many open."""
     left = [number for number, array in enumerate(arrays) if root_of(array) is None]
     if not left:
         return arrays
-    # The key of a build does not tell where arrays lie: a file of other ones must not be taken for this.
-    told = json.dumps([(number, arrays[number].shape, arrays[number].dtype.str) for number in left])
-    name = f"{name}-{hashlib.sha256(told.encode()).hexdigest()[:16]}"
-    if not files.has(name):
+    if not written:
         files.write_joined(name, [arrays[number] for number in left])
     whole, found, done = files.read(name), list(arrays), 0
     for number in left:
@@ -233,12 +241,12 @@ def _kept(files: FolderScratch, name: str, arrays: list[NDArray[Any]]) -> list[N
 
 def _identity(array: NDArray[Any], copied: bool) -> list[Any]:
     """What an array is known by: its file and place there, or the digest of its values."""
-    root = None if copied else root_of(array)
-    if root is None or is_made(root):
+    root = root_of(array)
+    if copied or root is None or is_made(root):
         digest = hashlib.sha256()
         for rows in array:
             digest.update(np.ascontiguousarray(rows).data)
-        return [array.shape, array.dtype.str, digest.hexdigest()]
+        return [array.shape, array.dtype.str, root is None, digest.hexdigest()]  # those in memory go into a file
     path = str(Path(str(root.filename)).resolve())
     start = array.__array_interface__["data"][0] - root.__array_interface__["data"][0]
     return [array.shape, array.dtype.str, array.strides, path, root.offset + start, *file_state(path)]

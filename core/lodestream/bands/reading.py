@@ -1,4 +1,4 @@
-"""Files read where there is room for them, and not again when a build goes on."""
+"""Files read where there is room for them, and not again when a build continues."""
 
 from __future__ import annotations
 
@@ -11,35 +11,49 @@ from .. import __version__
 from ..container.capacity import default_memory
 from ..errors import InputError
 from ..formats import read
-from ..scratch import FolderScratch, boot_id
+from ..scratch import FolderScratch
 from ..surface import Surface
+from .folders import is_sealed, remove, seal
 from .memory import WHOLE
 from .references import file_state
 from .room import CopyRoom
 from .stored_surface import load_surface, save_surface
 
-__all__ = ["read_into"]
+__all__ = ["read_into", "reading_key"]
 
 #: The part of the memory that an array in memory may take.
 _PART = 16
-_KEY = "files.json"
+
+
+def reading_key(paths: Sequence[Path], **options: Any) -> str:
+    """What decides about the files that `read_into` leaves: the files that are read, and the options."""
+    states = [[str(path.resolve()), *file_state(path)] for path in paths]
+    return json.dumps([__version__, states, sorted((name, repr(value)) for name, value in options.items())])
 
 
 def read_into(
-    folder: Path, paths: Sequence[Path], memory: int | None = None, by_bands: bool = True, **options: Any
+    folder: Path,
+    paths: Sequence[Path],
+    memory: int | None = None,
+    by_bands: bool = True,
+    kept: bool = False,
+    **options: Any,
 ) -> Surface:
-    """Read a surface whose large arrays go into files of a folder, or find it there as it was read before.
+    """Read a surface whose large arrays go into files of a folder.
 
     Parameters
     ----------
     folder : Path
-        Is made where anything goes there. What another surface has left there is removed.
+        Is made where anything goes there.
     paths : sequence of Path
         Files of one surface.
     memory : int, optional
         Bytes to work in; by default a quarter of the machine's.
     by_bands : bool
         Whether it can be encoded by bands; then the disk needs room for that too.
+    kept : bool
+        Whether the folder is kept for another call with the same `reading_key`: what such a call has read is found
+        there, unless a failure of the machine has damaged it.
     **options
         Of `lodestream.read`.
 
@@ -52,20 +66,12 @@ def read_into(
     LodestreamError, OSError
         From `lodestream.read`.
     """
-    states = [file_state(path) for path in paths]
-    key = json.dumps(
-        [
-            __version__,
-            boot_id(),
-            [[str(path.resolve()), *state] for path, state in zip(paths, states, strict=True)],
-            sorted((name, repr(value)) for name, value in options.items()),
-        ]
-    )
-    if (folder / _KEY).exists():
-        found = _found(folder, key)
+    if kept and is_sealed(folder):
+        found = load_surface(FolderScratch(folder))
         if found is not None:
             return found
-        FolderScratch(folder).clear()
+    remove(folder)
+    states = [file_state(path) for path in paths]
     limit = default_memory() if memory is None else memory
     first, *more = paths
     room = CopyRoom(
@@ -79,18 +85,8 @@ def read_into(
     for path, state in zip(paths, states, strict=True):
         if file_state(path) != state:
             raise InputError(f"expected {path} to stay as it is until it is read, it was changed meanwhile")
-    if not folder.exists() or surface.joints is not None:
+    if not kept or not folder.exists() or surface.joints is not None:
         return surface
     save_surface(surface, FolderScratch(folder))
-    (folder / _KEY).write_text(key)
+    seal(folder)
     return load_surface(FolderScratch(folder)) or surface
-
-
-def _found(folder: Path, key: str) -> Surface | None:
-    """The surface that is in the folder; None: it is another one, or a failure of the machine has damaged it."""
-    if (folder / _KEY).read_text(errors="replace") != key:
-        return None
-    try:
-        return load_surface(FolderScratch(folder))
-    except InputError:
-        return None

@@ -22,10 +22,8 @@ from ..scratch import rows_at_once
 __all__ = ["dump", "file_state", "load", "root_of"]
 
 
-#: Attribute of a map: whether it is one of the files that had its name.
+#: Attribute of a map: whether the files that had its name had its values.
 _KNOWN = "_lodestream_files"
-#: Attribute of a map: the number of its file.
-_INODE = "_lodestream_inode"
 
 _HEAD = f"lodestream {__version__}\n".encode()
 
@@ -111,7 +109,7 @@ def file_state(path: str | os.PathLike[str]) -> list[int]:
     Of a folder, what changes when this happens to any file in it.
     """
     state = os.stat(path)
-    own = [state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns]
+    own = [state.st_size, state.st_mtime_ns, state.st_ctime_ns]
     return [*own, _state_within(path)] if stat.S_ISDIR(state.st_mode) else own
 
 
@@ -122,7 +120,7 @@ def _state_within(folder: str | os.PathLike[str]) -> int:
         for name in sorted(names):
             path = os.path.join(above, name)
             state = os.lstat(path)
-            said = path, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+            said = path, state.st_size, state.st_mtime_ns, state.st_ctime_ns
             digest.update(repr(said).encode("utf-8", "surrogateescape"))
     return int.from_bytes(digest.digest()[:8], "big")
 
@@ -149,35 +147,15 @@ def root_of(array: NDArray[Any]) -> np.memmap[Any, Any] | None:
 
 
 def _is_of(root: np.memmap[Any, Any], state: os.stat_result) -> bool:
-    """Whether a map is one of the file of this state, which has its name now.
+    """Whether the file of this state, which has the name of a map's now, has the values of the map.
 
-    Where the system does not tell, the values are compared, and the map remembers what was found: as long as it is
-    there, no other file gets the number of its own.
+    The map remembers this: not every system tells which file is mapped, and a large one should be read once.
     """
-    if _INODE not in vars(root):
-        vars(root)[_INODE] = _inode(root.__array_interface__["data"][0])  # a map is of one file as long as it is there
-    if vars(root)[_INODE] == state.st_ino:
-        return True
-    known = vars(root).setdefault(_KNOWN, {})
-    file = state.st_dev, state.st_ino
+    known: dict[tuple[int, ...], bool] = vars(root).setdefault(_KNOWN, {})
+    file = state.st_dev, state.st_size, state.st_mtime_ns, state.st_ctime_ns
     if file not in known:
         known[file] = _is_equal(root)
-    same: bool = known[file]
-    return same
-
-
-def _inode(address: int) -> int | None:
-    """The number of the file that is mapped to an address of this process; None: the system does not tell."""
-    try:
-        with open("/proc/self/maps", encoding="ascii", errors="replace") as file:
-            for line in file:
-                span, _, _, _, inode = line.split(maxsplit=5)[:5]
-                start, stop = (int(bound, 16) for bound in span.split("-"))
-                if start <= address < stop:
-                    return int(inode) or None
-    except (OSError, ValueError):  # not on macOS and Windows
-        pass
-    return None
+    return known[file]
 
 
 def _is_equal(root: np.memmap[Any, Any]) -> bool:

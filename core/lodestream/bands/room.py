@@ -15,7 +15,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..errors import TooLargeError
 from ..scratch import FolderScratch, Room
-from .folders import TASKS
 
 __all__ = ["FOR_A_VALUE", "CopyRoom", "check_room"]
 
@@ -23,15 +22,15 @@ __all__ = ["FOR_A_VALUE", "CopyRoom", "check_room"]
 FOR_A_VALUE = 12
 
 
-def check_room(folder: Path, needed: int) -> None:
-    """See that the disk has room for so many bytes more in a folder; those of a build that was cut count as free.
+def check_room(folder: Path, needed: int, there: int = 0) -> None:
+    """See that the disk has room for so many bytes in a folder, those included that a build that was cut has there.
 
     Raises
     ------
     TooLargeError
         If it has not.
     """
-    free = shutil.disk_usage(folder).free + FolderScratch(folder / TASKS, make=False).size()
+    free = shutil.disk_usage(folder).free + there
     if free < needed:
         raise TooLargeError(
             f"expected {needed >> 20:,} MiB of room in {folder} for the files of a build by bands, "

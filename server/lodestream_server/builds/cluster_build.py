@@ -5,7 +5,7 @@ to its standard output. It ends when its standard input does: with the server.
 
 What the confined process has left is not trusted. Before anything is opened or written in its folder, it is looked
 through: there may be nothing but folders and plain files of their own, and all but the parsed arrays are removed. The
-arrays are read as numbers. Tasks are files that this process writes, into a folder that did not exist before. By then
+arrays are read as numbers. Tasks are files that this process writes, into a temporary folder beside them. By then
 nobody else can write there: the confined process has ended with all that it had started, see `forkserver`.
 """
 
@@ -105,8 +105,7 @@ def _build(task: ClusterJob) -> Built | Refused:
     if vertices > job.max_vertices:
         raise TooLargeError(f"expected at most {job.max_vertices:,} vertices, got {vertices:,}")
     quality, _ = without_quality(job.options)
-    made, tasks = job.scratch / "made", job.scratch / "tasks"
-    tasks.mkdir()
+    made = job.scratch / "made"
     with ExitStack() as stack:
         try:
             executor = stack.enter_context(executor_of(task.address))
@@ -121,7 +120,6 @@ def _build(task: ClusterJob) -> Built | Refused:
                 progress=reporter(job.folder),
                 out=made,
                 memory=task.memory,
-                scratch=tasks,
                 executor=executor,
             )
         except (LodestreamError, MemoryError) as error:

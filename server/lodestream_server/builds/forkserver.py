@@ -66,6 +66,8 @@ class Allowed:
         Files and folders that it may read, in addition to Python and its libraries.
     write : Path or None
         A folder that it may write to, also used for temporary files.
+    kept : Path or None
+        Another one, which stays when this call has ended.
     processes : bool
         Whether it may start processes; each has the same limits.
     threads : int
@@ -81,6 +83,7 @@ class Allowed:
 
     read: tuple[Path, ...] = ()
     write: Path | None = None
+    kept: Path | None = None
     processes: bool = False
     threads: int = 1
     memory: int | None = None
@@ -290,7 +293,7 @@ def _limit(allowed: Allowed) -> None:
         most = math.ceil(min(time.process_time() + allowed.threads * allowed.seconds, _MOST_SECONDS))
         # Told so by SIGXCPU; who does not listen is killed.
         resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
-    write = () if allowed.write is None else (allowed.write,)
+    write = tuple(path for path in (allowed.write, allowed.kept) if path is not None)
     os.environ[parallel.VARIABLE] = str(allowed.threads)
     os.nice(_NICE)  # streams come first
     confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1))

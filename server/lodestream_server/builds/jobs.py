@@ -405,7 +405,7 @@ class Builder:
         """What becomes of a surface whose upload is not there, or not what was acknowledged; None where it is."""
         if not await asyncio.to_thread(self._storage.has_upload, record):
             await asyncio.to_thread(self._storage.lose, record.id)
-            await asyncio.to_thread(self._storage.forget_interrupted, record.id)
+            await asyncio.to_thread(self._storage.forget_work, record.id)
             return "missing"
         problem = await self._damage(record)
         return None if problem is None else await self._postpone(record, problem)
@@ -434,7 +434,7 @@ class Builder:
                 raise BlockingIOError(errno.EAGAIN, "it is not known yet how builds are confined")
             # Who builds by Dask is not confined, and a confined process may have been taken over.
             may_continue = confinement == _CONFINED and not job.shared
-            continued = self._storage.new_work(record.id, folder, may_continue)
+            continued = self._storage.begin_work(record.id, folder, may_continue)
 
         call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
         self._running[record.id] = _Running(folder, call)
@@ -448,7 +448,9 @@ class Builder:
             if result is None:
                 return "ready"
             ended = True
-            await asyncio.to_thread(discard, folder)  # whoever sees that it has failed sees nothing of it
+            await asyncio.to_thread(
+                self._storage.end_work, record.id, folder
+            )  # whoever sees that it has failed sees nothing of it
             # A build may read the files that were there when it began: not those of the same bytes that somebody has
             # uploaded after the last owner of the first had deleted them.
             if await asyncio.to_thread(_identities, job.files) != begun:
@@ -470,8 +472,7 @@ class Builder:
             self._running.pop(record.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
             keeps = held or (self._closing and not ended)
-            keep = partial(self._storage.keep_interrupted, record.id) if keeps else None
-            await _removed(folder, keep)
+            await _carried_out(partial(self._storage.end_work, record.id, folder, keeps))
 
     def _is_held_shortly(self, surface: str) -> bool:
         """Whether what holds the folder of a build may let go of it yet, as a process that is ending does."""
@@ -548,7 +549,7 @@ class Builder:
     async def _postpone(self, record: Record, reason: str) -> State:
         _log.warning("%s waits for a retry: %s", record.id, reason)
         await asyncio.to_thread(self._storage.postpone, record.id, reason)
-        await asyncio.to_thread(self._storage.forget_interrupted, record.id)  # a retry begins with the upload
+        await asyncio.to_thread(self._storage.forget_work, record.id)  # a retry begins with the upload
         return "waiting"
 
     def _out_of_memory(self) -> str:
@@ -564,23 +565,15 @@ class Builder:
             options=options,
             max_vertices=self._settings.max_vertices,
             folder=folder,
+            bands=None if self._settings.dask else self._storage.bands_folder(record.id),
             allowed=self._settings.formats,
             shared=bool(self._settings.dask),
             memory=self._memory,
         )
 
 
-async def _removed(folder: Path, keep: Callable[[Path], None] | None = None) -> None:
-    """Remove what a build has left, also where it is cancelled meanwhile: a thread that has not begun never would.
-
-    What it is to continue from is kept before that, where ``keep`` says how.
-    """
-
-    def remove() -> None:
-        if keep is not None:
-            keep(folder)
-        discard(folder)
-
+async def _carried_out(remove: Callable[[], None]) -> None:
+    """Remove what a build has left, also where it is cancelled meanwhile: a thread that has not begun never would."""
     removing = asyncio.ensure_future(asyncio.to_thread(remove))
     try:
         await asyncio.shield(removing)
@@ -602,6 +595,7 @@ def _allowed(job: worker.Job, size: int, memory: int, threads: int) -> Allowed:
     return Allowed(
         read=job.files,
         write=job.folder,
+        kept=job.bands,
         processes=process,
         threads=threads,
         memory=memory,

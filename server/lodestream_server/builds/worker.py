@@ -31,7 +31,6 @@ from lodestream.errors import (
 )
 
 from ..storage.durable import NewFile
-from ..storage.interrupted import BANDS, SCRATCH
 from . import finished
 from .stored_quality import without_quality
 
@@ -106,7 +105,7 @@ _SHORT_OF_MEMORY = re.compile(
 )
 
 _PROGRESS = "progress"
-_CONTAINER, _READ, _MADE = "container", "read", "made"
+_CONTAINER, _SCRATCH, _READ, _MADE = "container", "scratch", "read", "made"
 _BLOCK = 1 << 20
 #: The part of the memory that an array of a file may take in memory.
 _PART = 16
@@ -132,6 +131,8 @@ class Job:
     max_vertices : int
     folder : Path
         Folder to write to; empty at the start.
+    bands : Path or None
+        Folder in which a build by bands continues what another one had made; None: it does not.
     allowed : tuple of str or None
         Names of the formats that may be read; None: all.
     shared : bool
@@ -148,6 +149,7 @@ class Job:
     options: dict[str, str]
     max_vertices: int
     folder: Path
+    bands: Path | None = None
     allowed: tuple[str, ...] | None = None
     shared: bool = False
     memory: int | None = None
@@ -160,7 +162,7 @@ class Job:
     @property
     def scratch(self) -> Path:
         """Folder for what does not fit into memory."""
-        return self.folder / SCRATCH
+        return self.folder / _SCRATCH
 
     @property
     def parsed(self) -> Path:
@@ -336,7 +338,7 @@ def _build(job: Job) -> Built | Parsed:
                 save_surface(surface, FolderScratch(job.parsed))
                 return Parsed(sum(block.shape[0] * block.shape[1] for block in surface.blocks))
             made = job.folder / _MADE
-            encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.scratch / BANDS)
+            encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.bands)
             return Built(moved(made, path))
         container = encode(surface, quality=quality, progress=report)
     with NewFile(path) as file:

@@ -8,8 +8,7 @@
     DATA/uploads/{upload}/{id}.json   the record of each of these surfaces, as it was at the upload
     DATA/containers/{sha256}.lode     never changed, named by their SHA-256, shared likewise
     DATA/incoming/                    uploads in progress
-    DATA/work/                        builds in progress
-    DATA/interrupted/{id}.{start}/    what a build by bands had made when it was interrupted
+    DATA/work/{id}/                   builds in progress, and what those by bands had made when they were interrupted
     DATA/levels/                      level files made on request, removed at each start
     DATA/damaged/                     files moved away by a start or by ``lodestream fsck --repair``
     DATA/lock                         locked by the one process that uses the folder
@@ -67,13 +66,8 @@ class Folders:
 
     @property
     def work(self) -> Path:
-        """Builds in progress."""
+        """Builds in progress, see `work`."""
         return self.root / "work"
-
-    @property
-    def interrupted(self) -> Path:
-        """What builds by bands had made when they were interrupted; created when needed."""
-        return self.root / "interrupted"
 
     @property
     def levels(self) -> Path:
@@ -100,7 +94,7 @@ class Folders:
     @property
     def written(self) -> tuple[Path, ...]:
         """The folders that a server writes to."""
-        return *self.kept, self.incoming, self.work, self.interrupted
+        return *self.kept, self.incoming, self.work
 
     def record(self, surface: str) -> Path:
         """The record of a surface."""

@@ -14,8 +14,8 @@ a record without its container                the container is built again from 
 a container of another format version         it is built again from the upload, and kept until then; without the
                                               upload the surface waits
 a record without its container and upload     the surface is missing, until they are back or it is deleted
-what builds by bands of queued surfaces had   it is kept for the next attempt, unless the system was started again
-made                                          meanwhile (`interrupted`)
+what builds by bands of queued surfaces had   it is kept for the next attempt (`work`)
+made
 uploads and builds in progress, files half    removed: they were not acknowledged, or can be made again
 written, level files
 ============================================  ==========================================================================
@@ -29,7 +29,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from . import interrupted
+from . import work
 from .aside import set_aside
 from .durable import remove, sync_folder, write_file
 from .folders import Folders, is_file
@@ -66,13 +66,9 @@ def recover(at: Folders) -> list[Record]:
     found = {surface: present(at, record) for surface, record in records.items()}
     _set_strays_aside(at, found)
     queued = {surface for surface, record in found.items() if record.state == "queued"}
-    for path in at.work.iterdir():
-        if (surface := path.name.partition(".")[0]) in queued:
-            interrupted.keep(at, surface, path)
-    interrupted.clean(at, queued)
-    for folder in (at.incoming, at.work):
-        for path in folder.iterdir():
-            remove(path)
+    work.clean(at, queued)
+    for path in at.incoming.iterdir():
+        remove(path)
     remove(at.levels)
     return list(found.values())
 
@@ -242,7 +238,7 @@ def _stand_in(at: Folders, surface: str, problem: str) -> Record:
 
 
 def _count_attempts(at: Folders, records: dict[str, Record]) -> None:
-    for surface in {path.name.partition(".")[0] for path in at.work.iterdir()}:
+    for surface in work.begun(at):
         begun = records.get(surface)
         # One that has its container was built: only its folder was still to be removed.
         if begun is not None and begun.state in ("queued", "ready") and not has_container(at, begun):

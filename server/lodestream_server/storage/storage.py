@@ -19,7 +19,7 @@ from pathlib import Path
 from lodestream.errors import InputError, LodestreamError, NotFoundError
 
 from ..problems import BusyError, MissingError
-from . import interrupted, markers
+from . import markers, work
 from .catalog import Catalog, Position
 from .durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from .folders import Folders, is_file, is_folder
@@ -123,29 +123,29 @@ class Storage:
 
         A folder that still exists at the next start shows that the server ended during the build.
         """
-        return self._at.work / interrupted.work_name(surface, secrets.token_hex(8))
+        return work.new_attempt(self._at, surface)
 
-    def keep_interrupted(self, surface: str, work: Path) -> None:
-        """Keep what an interrupted build by bands has made in its folder, see `interrupted.keep`."""
-        interrupted.keep(self._at, surface, work)
+    def bands_folder(self, surface: str) -> Path:
+        """Path of the folder in which builds by bands of a surface continue."""
+        return work.bands_of(self._at, surface)
 
-    def new_work(self, surface: str, work: Path, may_continue: bool) -> bool:
-        """Create the folder of a build; returns whether what an interrupted attempt had made is in it.
+    def begin_work(self, surface: str, attempt: Path, may_continue: bool) -> bool:
+        """Create the folders of a build; returns whether what an interrupted attempt had made is there.
 
         Where the build may not continue, that is removed.
         """
-        make_folder(work)
-        if not may_continue:
-            interrupted.forget(self._at, surface)
-            return False
-        continued = interrupted.put_back(self._at, surface, work)
+        continued = work.begin(self._at, surface, attempt, may_continue)
         if continued:
             _log.info("the build of %s continues from what an interrupted attempt had made", surface)
         return continued
 
-    def forget_interrupted(self, surface: str) -> None:
+    def end_work(self, surface: str, attempt: Path, keep: bool = False) -> None:
+        """Remove what a build has left, but for what its next attempt continues from if that is to be kept."""
+        work.end(self._at, surface, attempt, keep)
+
+    def forget_work(self, surface: str) -> None:
         """Remove what an interrupted attempt had made."""
-        interrupted.forget(self._at, surface)
+        work.forget(self._at, surface)
 
     @property
     def levels(self) -> Path:
@@ -453,7 +453,7 @@ class Storage:
                     raise
             self._catalog.drop(surface)
             try:
-                interrupted.forget(self._at, surface)
+                work.forget(self._at, surface)
                 finish_delete(
                     self._at,
                     record,

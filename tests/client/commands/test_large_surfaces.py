@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.bands import cluster, tasks
-from lodestream.bands.folders import build_folder
 from lodestream_client.commands import decode_by_rows, values
-from lodestream_client.commands.building_options import BuildingOptions, work_folder
+from lodestream_client.commands.building_options import BuildingOptions, reading_folder
 from tests.clusters import local_cluster
 from tests.core.surfaces import terrain
 from tests.patience import PATIENCE
@@ -69,7 +68,7 @@ def begun(file: Path, out: Path, scratch: Path, *options: object) -> subprocess.
     command = [*COMMAND, "encode", str(file), str(out), *LITTLE, *map(str, options)]
     process = subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     end = time.monotonic() + PATIENCE
-    while not list(scratch.glob("build/tasks/*/exact/ends/**/*.npy")):
+    while not list(scratch.glob("**/exact/ends/**/*.npy")):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < end
         time.sleep(0.005)
@@ -139,27 +138,6 @@ def test_decode_with_little_memory_writes_the_same_file(
     assert names(tmp_path) == {"a.lode", out, f"whole-{out}"}
 
 
-@pytest.mark.parametrize("at", ["values", "file"])
-def test_what_a_killed_decode_left_is_removed_by_the_next(run: Run, expected: bytes, tmp_path: Path, at: str) -> None:
-    pytest.importorskip("rasterio")
-    (tmp_path / "a.lode").write_bytes(expected)
-    out = tmp_path / "a.tif"
-    out.write_text("as it was")
-    slow = {**environment(), "LODESTREAM_THREADS": "1"}
-    command = [*COMMAND, "decode", str(tmp_path / "a.lode"), str(out), *LITTLE]
-    process = subprocess.Popen(command, env=slow, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    end = time.monotonic() + PATIENCE
-    while not list(tmp_path.glob(f".a.tif.*/{at}/*")):
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < end
-        time.sleep(0.001)
-    ended(process, signal.SIGKILL)
-    assert len(names(tmp_path)) == 3
-    assert out.read_text() == "as it was"
-    assert run("decode", tmp_path / "a.lode", tmp_path / "b.npy", *LITTLE)[0] == 0
-    assert names(tmp_path) == {"a.lode", "a.tif", "b.npy"}
-
-
 def test_a_file_and_the_folder_that_it_names_are_both_written(run: Run, tmp_path: Path) -> None:
     rows, columns = np.mgrid[0:300, 0:300].astype(np.float64)
     points = np.stack([rows + np.sin(columns / 20), columns + np.cos(rows / 30), np.sin(rows / 9)], axis=-1)
@@ -210,7 +188,8 @@ def test_a_build_that_is_cut_goes_on_in_its_folder(
     assert run("encode", file, out, *LITTLE, "--scratch", scratch)[0] == 0
     assert not repeated, "the phases before coding were done"
     assert out.read_bytes() == expected
-    assert names(tmp_path) == {"a.npy", "a.lode"}
+    assert names(tmp_path) == {"a.npy", "a.lode", "scratch"}
+    assert not names(scratch)
 
 
 @pytest.mark.parametrize(
@@ -221,7 +200,7 @@ def test_the_folder_is_named_where_the_command_goes_on(
     error: Exception, kept: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = BuildingOptions(None, tmp_path / "scratch", None)
-    with pytest.raises(type(error)), work_folder(options, "a.lode"):
+    with pytest.raises(type(error)), reading_folder(options, "a.lode", "key"):
         raise error
     assert ("is kept: the same command continues from there" in capsys.readouterr().err) == kept
     assert names(tmp_path) == {"scratch"}
@@ -235,28 +214,16 @@ def test_another_command_in_the_folder_of_a_build_that_was_cut_begins_anew(
     assert run("encode", file, out, *LITTLE, "--scratch", scratch)[0] == 0
     assert repeated
     assert out.read_bytes() == expected
-    assert names(tmp_path) == {"a.npy", "a.lode"}
+    assert names(tmp_path) == {"a.npy", "a.lode", "scratch"}
 
 
 @pytest.mark.usefixtures("interrupts")
 def test_an_interrupted_build_without_a_folder_leaves_nothing(file: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.lode"
-    code, stderr = ended(begun(file, out, tmp_path / "a.lode.build"), signal.SIGINT)
+    code, stderr = ended(begun(file, out, tmp_path), signal.SIGINT)
     assert (code, stderr.splitlines()[-1]) == (130, b"lodestream: interrupted")
     assert b"kept" not in stderr
     assert names(tmp_path) == {"a.npy"}
-
-
-def test_a_killed_build_without_a_folder_is_found_again(
-    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
-) -> None:
-    out = tmp_path / "a.lode"
-    ended(begun(file, out, tmp_path / "a.lode.build"), signal.SIGKILL)
-    assert names(tmp_path) == {"a.npy", "a.lode.build"}
-    assert run("encode", file, out, *LITTLE)[0] == 0
-    assert not repeated
-    assert out.read_bytes() == expected
-    assert names(tmp_path) == {"a.npy", "a.lode"}
 
 
 @pytest.mark.parametrize("command", ["encode", "decode"])
@@ -281,39 +248,6 @@ def test_memory_that_will_be_exceeded_is_told(run: Run, file: Path, tmp_path: Pa
     assert code == 0
     assert "--memory 1.0 MB is exceeded, and encoding goes on: this surface takes about 15.8 MB at least\n" in stderr
     assert "exceeded" not in run("encode", file, tmp_path / "a.lode", "--memory", "1GiB")[2]
-
-
-def test_a_second_command_does_not_disturb_the_first(
-    run: Run, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, code, said = tmp_path / "a.lode", tasks.code, list[str]()
-
-    def second(*arguments: int) -> None:
-        if not said:
-            said.append("")
-            with pytest.raises(ls.InputError) as refused, build_folder(Path(f"{out}.build"), (), False):
-                pytest.fail("two at once")
-            said.append(str(refused.value))
-        code(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(tasks, "code", second)
-    assert run("encode", file, out, *LITTLE)[0] == 0
-    assert "another one is at work there" in said[1]
-    assert names(tmp_path) == {"a.npy", "a.lode"}
-
-
-def test_a_folder_of_something_else_is_not_touched(run: Run, file: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "diaries"
-    folder.mkdir()
-    (folder / "diary.txt").write_text("dear diary")
-    for scratch in (folder, file):
-        code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE, "--scratch", scratch)
-        assert code == 1
-        assert stderr == (
-            f"lodestream: expected {scratch} to be empty or of a build that was cut, got something else, which stays\n"
-        )
-    assert (folder / "diary.txt").read_text() == "dear diary"
-    assert names(tmp_path) == {"a.npy", "diaries"}
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import front, made, references, tasks
+from lodestream.bands import front, made, tasks
 from lodestream.bands.memory import checked_memory
 from lodestream.bands.references import root_of
 from lodestream.container.capacity import default_memory
@@ -159,7 +159,7 @@ def test_a_named_folder_is_kept_and_the_build_goes_on(
     ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
     assert not called
     assert (tmp_path / "a.lode").read_bytes() == expected
-    assert not scratch.exists()
+    assert not list(scratch.iterdir())
 
 
 def test_a_build_of_something_else_begins_anew(
@@ -233,6 +233,7 @@ def test_a_source_goes_on_if_its_values_are_the_same(
         with pytest.raises(KeyboardInterrupt):
             ls.encode(source, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
         assert {path.name for path in tmp_path.iterdir()} == {"scratch"}
+        assert [path for path in scratch.iterdir() if path.name.startswith(".")] == [], "copies"
     monkeypatch.undo()
     called = []
     coordinates = tasks.coordinates
@@ -252,43 +253,7 @@ def test_a_source_goes_on_if_its_values_are_the_same(
     monkeypatch.undo()
     ls.encode(source, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
     assert (tmp_path / "a.lode").read_bytes() == ls.encode(source.values)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.lode"}
-
-
-def test_after_a_restart_of_the_machine_a_build_begins_anew(
-    tmp_path: Path, cut: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    surface, scratch = _heights(), tmp_path / "scratch"
-    cut(2)
-    with pytest.raises(KeyboardInterrupt):
-        ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
-    monkeypatch.undo()
-    # As a power failure leaves what was not on disk yet.
-    for path in scratch.glob("tasks/*/exact/**/*.npy"):
-        content = path.read_bytes()
-        path.write_bytes(content[:128] + bytes(len(content) - 128))
-    monkeypatch.setattr(made, "boot_id", lambda: "another")
-    ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
-    assert (tmp_path / "a.lode").read_bytes() == _container()
-
-
-@pytest.mark.parametrize("name", ["surface", "exact/coefficients"])
-@pytest.mark.parametrize("length", [0, 60, 200])
-def test_files_that_a_failure_of_the_machine_cut_are_made_again(
-    tmp_path: Path, cut: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, length: int, name: str
-) -> None:
-    surface, scratch = _heights(), tmp_path / "scratch"
-    cut(2)
-    with pytest.raises(KeyboardInterrupt):
-        ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
-    monkeypatch.undo()
-    found = [*scratch.glob(f"tasks/*/{name}/**/*.npy")]
-    assert found
-    for path in found:
-        os.truncate(path, length)
-    ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=scratch)
-    assert (tmp_path / "a.lode").read_bytes() == _container()
-    assert not scratch.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"a.lode", "scratch"}
 
 
 def _mapped(path: Path, values: NDArray[Any]) -> NDArray[Any]:
@@ -339,13 +304,13 @@ def test_changes_in_a_map_that_are_not_in_its_file_are_encoded(tmp_path: Path) -
 
 
 def test_arrays_in_files_are_not_copied_for_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written, write = list[str](), FolderScratch.write
+    written, write = list[str](), FolderScratch._write
 
-    def spy(self: FolderScratch, name: str, array: NDArray[Any]) -> None:
+    def spy(self: FolderScratch, *arguments: Any) -> None:
         written.append(str(self.folder))
-        write(self, name, array)
+        write(self, *arguments)
 
-    monkeypatch.setattr(FolderScratch, "write", spy)
+    monkeypatch.setattr(FolderScratch, "_write", spy)
     mapped = _mapped(tmp_path / "heights.npy", _heights().points)
     with ThreadPoolExecutor(1) as executor:
         assert ls.encode(mapped, executor=executor, memory=LITTLE) == _container_of_values()
@@ -353,34 +318,25 @@ def test_arrays_in_files_are_not_copied_for_workers(tmp_path: Path, monkeypatch:
     assert not any(folder.endswith("surface") for folder in written)
 
 
-def test_two_builds_into_one_file_do_not_meet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_build_is_not_made_twice_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     surface, code, said = _heights(), tasks.code, list[str]()
+    other = ls.Surface(surface.points[::-1].copy())
 
     def second(*arguments: Any) -> None:
         if not said:
             said.append("")
-            with pytest.raises(ls.InputError, match="another one is at work there") as refused:
-                ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE)
+            with pytest.raises(ls.InputError, match="the same build is at work there") as refused:
+                ls.encode(surface, out=tmp_path / "b.lode", memory=LITTLE, scratch=tmp_path / "scratch")
             said.append(str(refused.value))
+            ls.encode(other, out=tmp_path / "b.lode", memory=LITTLE, scratch=tmp_path / "scratch")
+            ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE)
         code(*arguments)
 
     monkeypatch.setattr(tasks, "code", second)
-    ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE)
-    assert "a.lode.build" in said[1]
-    assert (tmp_path / "a.lode").read_bytes() == _container()
-
-
-def test_a_folder_of_that_name_is_not_ours(tmp_path: Path) -> None:
-    (tmp_path / "a.lode.build").mkdir()
-    (tmp_path / "a.lode.build" / "diary.txt").write_text("dear diary")
-    with pytest.raises(ls.InputError, match="got something else"):
-        ls.encode(_heights(), out=tmp_path / "a.lode", memory=LITTLE)
-    assert (tmp_path / "a.lode.build" / "diary.txt").read_text() == "dear diary"
-
-
-def test_the_container_stands_elsewhere_than_the_files_of_the_build(tmp_path: Path) -> None:
-    with pytest.raises(ls.InputError, match="a scratch folder of its own"):
-        ls.encode(_heights(), out=tmp_path / "tasks", memory=LITTLE, scratch=tmp_path)
+    ls.encode(surface, out=tmp_path / "a.lode", memory=LITTLE, scratch=tmp_path / "scratch")
+    assert str(tmp_path / "scratch") in said[1]
+    assert (tmp_path / "a.lode").read_bytes() == ls.encode(surface)
+    assert (tmp_path / "b.lode").read_bytes() == ls.encode(other)
 
 
 @pytest.mark.parametrize("memory", [None, LITTLE])
@@ -438,7 +394,7 @@ def test_copies_of_one_source_are_all_in_files(tmp_path: Path, monkeypatch: pyte
         assert block.mask is not None
         seen.extend([block.points, block.mask, *block.attributes.values()])
         assert all(root_of(array) is not None for array in seen)
-        assert len(list(tmp_path.glob("a.lode.build/source/*/arrays/*.npy"))) > 2
+        assert len(list(tmp_path.glob(".a.lode.*.lodestream/source/arrays/*.npy"))) > 2
         return prepare(surface, *others)
 
     monkeypatch.setattr(made, "prepare", spy)
@@ -447,16 +403,11 @@ def test_copies_of_one_source_are_all_in_files(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "a.lode").read_bytes() == ls.encode(ls.Surface.from_xarray(data))
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_map_whose_file_was_replaced_is_encoded_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: bool
-) -> None:
+def test_a_map_whose_file_was_replaced_is_encoded_itself(tmp_path: Path) -> None:
     values = _heights().points
     mapped = _mapped(tmp_path / "heights.npy", values)
     np.save(tmp_path / "new.npy", values // 2 + np.int16(7))
     os.replace(tmp_path / "new.npy", tmp_path / "heights.npy")
-    if not told:  # as where the system does not tell which file is mapped
-        monkeypatch.setattr(references, "_inode", lambda address: None)
     ls.encode(mapped, out=tmp_path / "a.lode", memory=LITTLE)
     assert (tmp_path / "a.lode").read_bytes() == ls.encode(values)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.bands import reading
-from lodestream.bands.reading import read_into
+from lodestream.bands.reading import read_into, reading_key
 
 LITTLE = 1 << 20
 
@@ -31,7 +32,9 @@ def _values() -> NDArray[np.float32]:
 
 
 def _read(folder: Path) -> ls.Surface:
-    return read_into(folder / "files", [folder / "a.tif"], LITTLE)
+    paths = [folder / "a.tif"]
+    name = hashlib.sha256(reading_key(paths).encode()).hexdigest()  # as the command line has it
+    return read_into(folder / "kept" / name, paths, LITTLE, kept=True)
 
 
 def test_a_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,30 +70,11 @@ def test_a_file_that_is_written_to_while_it_is_read_is_refused(tmp_path: Path, m
     assert np.array_equal(_read(tmp_path).points, _values())
 
 
-def test_after_a_restart_of_the_machine_a_file_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _write(tmp_path / "a.tif", _values())
-    _read(tmp_path)
-    path = tmp_path / "files" / "arrays" / "1.npy"
-    content = path.read_bytes()
-    path.write_bytes(content[:128] + bytes(len(content) - 128))
-    monkeypatch.setattr(reading, "boot_id", lambda: "another")
-    assert np.array_equal(_read(tmp_path).points, _values())
-
-
-@pytest.mark.parametrize("name", ["arrays/1.npy", "surface.msgpack", "files.json"])
-@pytest.mark.parametrize("length", [0, 30])
-def test_files_that_a_failure_of_the_machine_cut_are_read_again(tmp_path: Path, name: str, length: int) -> None:
-    _write(tmp_path / "a.tif", _values())
-    _read(tmp_path)
-    os.truncate(tmp_path / "files" / name, length)
-    assert np.array_equal(_read(tmp_path).points, _values())
-
-
 def test_room_on_the_disk_is_looked_at_before_a_file_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _write(tmp_path / "a.tif", _values())
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=16 * 250_000 - 1))
     with pytest.raises(ls.TooLargeError, match="of room"):
         _read(tmp_path)
-    assert not list((tmp_path / "files").iterdir())
+    assert not list(tmp_path.glob("kept/*/*"))
     surface = read_into(tmp_path / "files", [tmp_path / "a.tif"], LITTLE, by_bands=False)
     assert np.array_equal(surface.points, _values())

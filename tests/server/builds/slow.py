@@ -63,7 +63,7 @@ __all__ = [
 
 def allow_more(job: Job, *args: object) -> Allowed:
     """What `jobs` allows a build, and the data folder, where those below leave a mark for the next attempt."""
-    return replace(_allowed(job, *args), write=job.folder.parent.parent)
+    return replace(_allowed(job, *args), write=job.folder.parents[2])
 
 
 def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
@@ -153,7 +153,7 @@ def out_of_processor_time(job: Job) -> Built | Parsed | Refused:
 def wait(job: Job) -> Built | Parsed | Refused:
     """Report half, then go on when a file called ``go`` appears beside the surfaces' folders."""
     (job.folder / "progress").write_text("0.5")
-    go = job.folder.parent.parent / "go"
+    go = job.folder.parents[2] / "go"
     until = time.monotonic() + _PATIENCE
     while not go.exists():
         if time.monotonic() > until:
@@ -164,8 +164,8 @@ def wait(job: Job) -> Built | Parsed | Refused:
 
 def listed(job: Job) -> Built | Parsed | Refused:
     """Write down in which order surfaces are built."""
-    with (job.folder.parent.parent / "order").open("a") as file:
-        file.write(job.folder.name.partition(".")[0] + "\n")
+    with (job.folder.parents[2] / "order").open("a") as file:
+        file.write(job.folder.parent.name + "\n")
     return wait(job)
 
 
@@ -177,7 +177,7 @@ def kill(job: Job) -> Built | Parsed | Refused:
 
 def end_once(job: Job) -> Built | Parsed | Refused:
     """Be told to end the first time, as all processes of a service are that is stopped."""
-    marker = job.folder.parent.parent / "told"
+    marker = job.folder.parents[2] / "told"
     if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGTERM)
@@ -203,7 +203,7 @@ def refuse(job: Job) -> Built | Parsed | Refused:
 
 def kill_once(job: Job) -> Built | Parsed | Refused:
     """Be killed the first time."""
-    marker = job.folder.parent.parent / "killed"
+    marker = job.folder.parents[2] / "killed"
     if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -222,7 +222,7 @@ def take(count: int) -> int:
 
 def full_at_each_step(job: Job) -> Built | Parsed | Refused:
     """Find the disk full at the first step of writing the container, the next time at the second, and so on."""
-    marker = job.folder.parent.parent / "fuller"
+    marker = job.folder.parents[2] / "fuller"
     done = int(marker.read_text()) if marker.exists() else 0
     marker.write_text(str(done + 1))
     durable.disk = FullDisk(done)

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.builds import jobs, worker
+from lodestream_server.storage.durable import discard
 from lodestream_server.storage.markers import MARKER
 from lodestream_server.storage.storage import Storage
 from tests.server.builds import slow
@@ -197,7 +199,7 @@ def crash(data: Path) -> None:
     """Leave the folder as a server leaves it that dies in the middle of the one build that is queued."""
     storage = Storage(data)
     (record,) = storage.records()
-    (data / "work" / storage.work_folder(record.id).name).mkdir()
+    storage.begin_work(record.id, storage.work_folder(record.id), may_continue=True)
     storage.close()
 
 
@@ -333,7 +335,7 @@ def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -
         free = threading.Event()
         busy = asyncio.ensure_future(asyncio.to_thread(free.wait, PATIENCE))
         await asyncio.sleep(0)
-        task = asyncio.ensure_future(jobs._removed(folder))
+        task = asyncio.ensure_future(jobs._carried_out(partial(discard, folder)))
         await asyncio.sleep(0.01)
         task.cancel()
         await asyncio.sleep(0.01)

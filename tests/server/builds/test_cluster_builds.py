@@ -123,7 +123,7 @@ def test_nothing_is_written_through_what_a_parser_has_left(
     assert secret.read_text() == "as it was"
 
 
-@pytest.mark.parametrize("name", ["scratch", "scratch/read", "scratch/tasks"])
+@pytest.mark.parametrize("name", ["scratch", "scratch/read", "scratch/more"])
 @pytest.mark.usefixtures("at_once")
 def test_no_folder_of_others_is_read_or_emptied(name: str, job: worker.Job, tmp_path: Path) -> None:
     others = tmp_path / "others"

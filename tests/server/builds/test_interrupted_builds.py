@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.scratch import boot_id
-from lodestream_server.storage import interrupted
+from lodestream.bands import tasks
+from lodestream_server.builds import worker
+from lodestream_server.storage import work
 from lodestream_server.storage.folders import Folders
-from lodestream_server.storage.storage import Storage
 from tests.core.surfaces import terrain
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.helpers import eventually, settled
@@ -66,9 +66,9 @@ def _made(folder: Path) -> Inodes:
     """The finished files of builds by bands below a folder, by their name there."""
     found: Inodes = {}
     for above, _, names in os.walk(folder):  # which passes over folders that vanish meanwhile
-        for path in (Path(above) / name for name in names if "/tasks/" in f"{above}/" and name.endswith(".npy")):
+        for path in (Path(above) / name for name in names if "/exact/" in f"{above}/" and name.endswith(".npy")):
             with suppress(FileNotFoundError):
-                found[str(path).partition("/tasks/")[2]] = path.stat().st_ino
+                found["exact/" + str(path).partition("/exact/")[2]] = path.stat().st_ino
     return {name: number for name, number in found.items() if "/prepared/" not in name and "/surface/" not in name}
 
 
@@ -115,7 +115,6 @@ def test_a_build_continues_after_its_server_has_ended(
         eventually(some_more, "more files")
         assert {name: again[name] for name in measured} == measured
         assert _container(http, location) == container
-        assert not (data / "interrupted").exists() or not list((data / "interrupted").iterdir())
         assert list((data / "work").iterdir()) == []
         assert "continues from what an interrupted attempt had made" in second.log.read_text()
 
@@ -129,14 +128,13 @@ def test_what_is_kept_of_a_surface_that_waits_for_no_build_is_removed(
     first, location = _begin(data, name, content)
     first.stop()
     surface = location.rpartition("/")[2]
-    assert [path.name for path in (data / "interrupted").iterdir()] == [f"{surface}.{boot_id()}"]
+    assert [path.relative_to(data).as_posix() for path in data.glob("work/*/*")] == [f"work/{surface}/bands"]
     for kept in ("0123456789abcdef0123", "other"):
-        (data / "interrupted" / kept / "deep").mkdir(parents=True)
+        (data / "work" / kept / "bands" / "deep").mkdir(parents=True)
     with server(data, build_memory=MEMORY) as second, second.client() as http:
-        eventually(lambda: not list((data / "interrupted").iterdir()), "an empty folder")
+        assert [path.name for path in (data / "work").iterdir()] == [surface]
         http.delete(location).raise_for_status()
-        assert list((data / "work").iterdir()) == []
-        assert list((data / "interrupted").iterdir()) == []
+        eventually(lambda: not list((data / "work").iterdir()), "an empty folder")
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
@@ -155,16 +153,14 @@ def test_a_process_of_the_server_before_is_waited_for(tmp_path: Path, upload: tu
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.stop()
-    (mark,) = (data / "interrupted").glob("*/.lodestream-build")
+    (mark,) = (data / "work").glob("*/bands/*/lock")
     left = _made(data)
     with mark.open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with server(data, build_memory=MEMORY) as second, second.client() as http:
             eventually(lambda: "waits for the server's system" in second.log.read_text(), "a build that waits")
             assert http.get(location).json()["state"] in ("queued", "building")
-            eventually(
-                lambda: left in (_made(data / "interrupted"), _made(data / "work")), "what was made, still there"
-            )
+            assert _made(data / "work") == left, "what was made, still there"
             held.close()
             assert _container(http, location) == container
 
@@ -175,7 +171,7 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.kill()
-    for number, path in enumerate(sorted((data / "work").glob(f"**/{interrupted.BANDS}/tasks/**/*.npy"))):
+    for number, path in enumerate(sorted((data / "work").glob("*/bands/*/exact/**/*.npy"))):
         if number % 5 == 0:
             os.truncate(path, path.stat().st_size // 2)
     _end(data, location, container)
@@ -198,89 +194,80 @@ def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
     assert text.count("begins anew, since continued it ended so: the build failed with an internal error") == 1
 
 
-@pytest.mark.parametrize("upload", ["npy"], indirect=True)
-@pytest.mark.parametrize("end", [Server.kill, Server.stop])
-def test_after_a_restart_of_the_machine_the_build_begins_anew(
-    tmp_path: Path, upload: tuple[str, bytes, bytes], end: Callable[[Server], object]
-) -> None:
-    name, content, container = upload
-    data = tmp_path / "data"
-    first, location = _begin(data, name, content)
-    end(first)
-    (left,) = [*(data / "work").iterdir(), *(data / "interrupted").glob("*")]
-    left.rename(left.with_suffix(f".{(boot_id() or '')[::-1]}"))
-    assert "continues" not in _end(data, location, container)
-    assert not (data / "interrupted").exists() or not list((data / "interrupted").iterdir())
+def test_another_attempt_goes_on_in_the_same_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    heights = np.rint(100 * terrain((300, 310))).astype(np.int16)
+    np.save(tmp_path / "0", heights)
+    monkeypatch.setattr(worker, "memory_limit", lambda: 2 << 20)
+
+    def job(name: str) -> worker.Job:
+        for folder in (tmp_path / "bands", tmp_path / name):
+            folder.mkdir(exist_ok=True)
+        files = (tmp_path / "0.npy",)
+        return worker.Job(files, "a.npy", None, "auto", {}, 1 << 20, tmp_path / name, tmp_path / "bands")
+
+    first = job("first")
+    with monkeypatch.context() as patched:
+        patched.setattr(tasks, "measure", None)
+        with pytest.raises(TypeError):
+            worker.build(first)
+    assert list((tmp_path / "bands").glob("*/exact/coefficients"))
+    for name in ("coordinates", "first_step", "second_step", "core", "code"):
+        monkeypatch.setattr(tasks, name, None)
+    second = job("second")
+    assert isinstance(worker.build(second), worker.Built)
+    assert np.array_equal(ls.decode(second.container.read_bytes()).points, heights)
+    assert list((tmp_path / "bands").iterdir()) == []
 
 
-def test_where_a_build_may_not_continue_what_was_kept_is_removed(tmp_path: Path) -> None:
-    at = Folders(tmp_path)
-    storage = Storage(tmp_path)
-    try:
-        work = _work(at)
-        (work / interrupted.SCRATCH / interrupted.BANDS).mkdir()
-        interrupted.keep(at, "ab", work)
-        assert not storage.new_work("ab", at.work / "ab.1", may_continue=False)
-        assert list((at.work / "ab.1").iterdir()) == []
-        assert list(at.interrupted.iterdir()) == []
-    finally:
-        storage.close()
+@pytest.fixture
+def at(tmp_path: Path) -> Folders:
+    at = Folders(tmp_path / "data")
+    at.work.mkdir(parents=True)
+    return at
 
 
-def _work(at: Folders) -> Path:
-    work = at.work / interrupted.work_name("ab", "0")
-    (work / interrupted.SCRATCH).mkdir(parents=True)
-    return work
+def test_what_an_attempt_has_made_is_there_for_the_next(at: Folders) -> None:
+    first, bands = work.new_attempt(at, "ab"), work.bands_of(at, "ab")
+    assert not work.begin(at, "ab", first, may_continue=True)
+    (bands / "some").touch()
+    assert work.begun(at) == {"ab"}
+    work.end(at, "ab", first, keep=True)
+    assert work.begun(at) == set()
+    second = work.new_attempt(at, "ab")
+    assert second != first
+    assert work.begin(at, "ab", second, may_continue=True)
+    assert [path.name for path in bands.iterdir()] == ["some"]
+    assert list(second.iterdir()) == []
+    work.end(at, "ab", second, keep=False)
+    assert list(at.work.iterdir()) == []
 
 
-@pytest.mark.parametrize("hostile", ["nothing", "scratch is a link", "bands is a link", "bands is a file", "a pipe"])
-def test_no_link_is_followed_to_what_is_kept(tmp_path: Path, hostile: str) -> None:
-    at, outside = Folders(tmp_path / "data"), tmp_path / "outside"
-    work, bands = _work(at), tmp_path / "outside" / interrupted.BANDS
-    bands.mkdir(parents=True)
-    (bands / "precious").touch()
-    inside = work / interrupted.SCRATCH / interrupted.BANDS
-    if hostile == "scratch is a link":
-        shutil.rmtree(work / interrupted.SCRATCH)
-        (work / interrupted.SCRATCH).symlink_to(outside)
-    elif hostile == "bands is a link":
-        inside.symlink_to(bands)
-    elif hostile == "bands is a file":
-        inside.touch()
-    elif hostile == "a pipe":
-        os.mkfifo(inside)
-    interrupted.keep(at, "ab", work)
-    assert (bands / "precious").exists()
-    assert not at.interrupted.exists() or not list(at.interrupted.iterdir())
-    interrupted.forget(at, "ab")
-    assert not interrupted.put_back(at, "ab", at.work / "ab.1")
+def test_where_a_build_may_not_continue_what_was_kept_is_removed(at: Folders) -> None:
+    attempt = work.new_attempt(at, "ab")
+    work.begin(at, "ab", attempt, may_continue=True)
+    (work.bands_of(at, "ab") / "some").touch()
+    work.end(at, "ab", attempt, keep=True)
+    assert not work.begin(at, "ab", attempt, may_continue=False)
+    assert list(work.bands_of(at, "ab").iterdir()) == []
 
 
-def test_what_is_kept_is_put_back_once(tmp_path: Path) -> None:
-    at = Folders(tmp_path)
-    for said in ("before", "after"):
-        work = _work(at)
-        (work / interrupted.SCRATCH / interrupted.BANDS).mkdir()
-        (work / interrupted.SCRATCH / interrupted.BANDS / said).touch()
-        interrupted.keep(at, "ab", work)
-        shutil.rmtree(work)
-    work = at.work / "ab.1"
-    work.mkdir()
-    assert interrupted.put_back(at, "ab", work)
-    assert [path.name for path in (work / interrupted.SCRATCH / interrupted.BANDS).iterdir()] == ["after"]
-    shutil.rmtree(work / interrupted.SCRATCH)
-    assert not interrupted.put_back(at, "ab", work)
-    assert list(work.iterdir()) == []
-
-
-def test_where_it_cannot_be_put_back_the_build_begins_anew(tmp_path: Path) -> None:
-    at = Folders(tmp_path)
-    work = _work(at)
-    (work / interrupted.SCRATCH / interrupted.BANDS).mkdir()
-    interrupted.keep(at, "ab", work)
-    (work / interrupted.SCRATCH / interrupted.BANDS / "in the way").mkdir(parents=True)
-    assert not interrupted.put_back(at, "ab", work)
-    assert list(at.interrupted.iterdir()) == []
+def test_a_start_keeps_only_what_queued_builds_continue_from(at: Folders, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    (outside / "bands").mkdir(parents=True)
+    (outside / "bands" / "precious").touch()
+    for surface in ("queued", "ready"):
+        work.begin(at, surface, work.new_attempt(at, surface), may_continue=True)
+        (work.bands_of(at, surface) / "some").symlink_to(outside)
+    (at.work / "link").symlink_to(outside)
+    (at.work / "file").touch()
+    assert work.begun(at) == {"queued", "ready"}
+    work.clean(at, {"queued", "link", "file"})
+    assert [path.relative_to(at.work).as_posix() for path in at.work.glob("*/*")] == ["queued/bands"]
+    assert (work.bands_of(at, "queued") / "some").is_symlink()
+    assert (outside / "bands" / "precious").exists()
+    work.forget(at, "queued")
+    assert list(at.work.iterdir()) == []
+    assert (outside / "bands" / "precious").exists()
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
@@ -296,4 +283,4 @@ def test_nothing_is_kept_for_a_surface_whose_upload_is_damaged(
         damaged.write(b"\0")
     with server(data, build_memory=MEMORY) as second, second.client() as http:
         assert settled(http, location)["state"] == "waiting"
-        eventually(lambda: not list((data / "interrupted").iterdir()), "an empty folder")
+        eventually(lambda: not list((data / "work").iterdir()), "an empty folder")

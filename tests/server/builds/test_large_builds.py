@@ -77,14 +77,15 @@ def test_a_build_by_bands_has_the_same_bytes(
     (tmp_path / "whole").mkdir()
     (tmp_path / "bands").mkdir()
     data = _plot3d() if name == "blocks.p3d" else _npy(300)
-    whole, bands = (_job(tmp_path / folder, data, name, options=options) for folder in ("whole", "bands"))
+    kept = tmp_path / "kept"  # which is made when it is needed
+    whole, bands = (_job(tmp_path / folder, data, name, options=options, bands=kept) for folder in ("whole", "bands"))
     built = worker.build(whole)
     assert isinstance(built, worker.Built)
-    assert not whole.scratch.exists()
+    assert not kept.exists()
     _without_memory(monkeypatch)
     assert worker.build(bands) == built
     assert bands.container.read_bytes() == whole.container.read_bytes()
-    assert bands.scratch.exists()  # the folder of the job is removed by whoever called
+    assert list(kept.iterdir()) == []
     assert worker.read_progress(bands.folder) > 0
 
 

@@ -43,11 +43,12 @@ def take(storage: Storage, surface: str) -> None:
 
 
 def build(storage: Storage, surface: str) -> None:
-    folder = durable.make_folder(storage.work_folder(surface))
+    folder = storage.work_folder(surface)
+    storage.begin_work(surface, folder, may_continue=True)
     with durable.NewFile(folder / "container") as file:
         file.write(CONTAINER)
     storage.ready(surface, folder / "container", SHA256, {"bytes": len(CONTAINER)})
-    durable.remove(folder)
+    storage.end_work(surface, folder)
 
 
 def keeps(folder: Path, promises: Promises) -> None:
