@@ -20,7 +20,7 @@ from lodestream.container.sections import check_of
 from lodestream.errors import LodestreamError
 
 from ..builds.finished import figures_of
-from ..storage import markers
+from ..storage import markers, work
 from ..storage.folders import Folders, is_file, is_folder
 from ..storage.records import Record, read_record
 from ..storage.recovery import stray_containers
@@ -281,6 +281,10 @@ def _strays(at: Folders, report: Report) -> Iterator[Finding]:
         yield Finding("leftover", path, path.stem, "expected no surface that is still being deleted, got one")
     for path in at.unfinished():
         yield Finding("leftover", path, None, "expected a record, got a file that was being written")
+    queued = {record.id for record in report.records.values() if record.state == "queued"}
+    continuing = queued - work.begun(at) if is_folder(at.work) else set[str]()
     for folder in (at.incoming, at.work, at.levels):
         for path in sorted(folder.iterdir()) if is_folder(folder) else ():
+            if folder == at.work and path.name in continuing:
+                continue
             yield Finding("leftover", path, None, "expected no unfinished uploads, builds or levels, got one")

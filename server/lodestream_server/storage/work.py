@@ -81,6 +81,8 @@ def clean(at: Folders, queued: Collection[str]) -> None:
         for name in os.listdir(path):
             if name != _BANDS:
                 remove(path / name)
+        if _is_empty(path / _BANDS):
+            remove(path)
 
 
 def _folders(at: Folders) -> Iterator[Path]:

@@ -151,8 +151,9 @@ def test_a_damaged_file_never_reaches_a_container(case: str, tmp_path: Path) -> 
     surface = CASES[case][0]()
     left = _left(surface, CASES[case][1], tmp_path / "cut")
     assert len(left) > 3
-    kinds = {name.parts[1:3]: name for name in left}  # one of each kind, since each takes a build
-    for number, name in enumerate(kinds.values()):
+    kinds = {name.parts[1:3]: name for name in left}
+    # Some of different kinds, since each takes a build: every file is checked in the next test.
+    for number, name in enumerate(list(kinds.values())[:: 1 + len(kinds) // 8]):
         damage = DAMAGES[number % len(DAMAGES)]
         shutil.copytree(tmp_path / "cut", tmp_path / "again")
         damage(tmp_path / "again" / "scratch" / name)

@@ -130,6 +130,21 @@ def test_the_power_fails_after_any_step(
     assert len(seen) > 50
 
 
+def test_what_a_queued_build_continues_from_is_no_leftover(tmp_path: Path) -> None:
+    surface = next(iter(UPLOADS))
+    storage = Storage(tmp_path)
+    take(storage, surface)
+    attempt = storage.work_folder(surface)
+    storage.begin_work(surface, attempt, may_continue=True)
+    (storage.bands_folder(surface) / "some").touch()
+    assert "leftover" in {finding.what for finding in check(tmp_path).findings}
+    storage.end_work(surface, attempt, keep=True)
+    storage.close()
+    assert "leftover" not in {finding.what for finding in check(tmp_path).findings}
+    Storage(tmp_path).close()
+    assert (storage.bands_folder(surface) / "some").exists()
+
+
 def test_a_surface_has_not_failed_until_that_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a client was told as failed would be queued again after a restart."""
     surface = next(iter(UPLOADS))
