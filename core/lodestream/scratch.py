@@ -327,17 +327,24 @@ class FolderScratch(Scratch):
 
 
 def _ends_well(path: Path) -> bool:
-    """Whether the length and the checksum at the end of a file are those of what comes before."""
-    length = path.stat().st_size - _TRAILER
-    if length < 0:
+    """Return whether the length and the checksum at the end of a file are those of what comes before.
+
+    A file that the disk cannot read is damaged like any other.
+    """
+    try:
+        length = path.stat().st_size - _TRAILER
+        if length < 0:
+            return False
+        crc, left = 0, length + 8
+        with path.open("rb") as file:
+            while left and (block := file.read(min(left, _BLOCK))):
+                crc, left = zlib.crc32(block, crc), left - len(block)
+            checksum_at_end = file.read()
+            file.seek(length)
+            length_at_end = file.read(8)
+    except OSError:
         return False
-    crc, left = 0, length + 8
-    with path.open("rb") as file:
-        while left and (block := file.read(min(left, _BLOCK))):
-            crc, left = zlib.crc32(block, crc), left - len(block)
-        told = file.read()
-        file.seek(length)
-        return file.read(8) == length.to_bytes(8, "little") and told == crc.to_bytes(4, "little")
+    return length_at_end == length.to_bytes(8, "little") and checksum_at_end == crc.to_bytes(4, "little")
 
 
 def _files(folder: Path) -> Iterator[Path]:

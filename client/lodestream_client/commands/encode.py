@@ -218,7 +218,8 @@ def _reading_key(options: EncodeOptions) -> str | None:
     from lodestream.bands.reading import reading_key
 
     it = options.surface
-    given = {"closed": it.closed, "options": sorted(it.format_options.items())}
+    # With the quality, which what is read does not depend on: each build has its own copy, as it has its own folder.
+    given = {"closed": it.closed, "quality": repr(it.quality), "options": sorted(it.format_options.items())}
     return reading_key(list(map(Path, options.files)), **given, format_name=it.format_name, nodata=it.nodata)
 
 

@@ -31,6 +31,7 @@ __all__ = [
     "remove_leftovers",
     "replacing",
     "seal",
+    "synchronise",
     "temporary_folder",
 ]
 
@@ -128,6 +129,18 @@ def replacing(path: Path) -> Iterator[Path]:
         unfinished.unlink(missing_ok=True)
 
 
+def synchronise(folder: Path) -> None:
+    """Put the names in a folder on disk, where systems can; elsewhere they do so by themselves."""
+    if not hasattr(os, "O_DIRECTORY"):  # not on Windows
+        return
+    with suppress(OSError):  # a process that is confined, or file systems without it
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
 @contextmanager
 def temporary_folder(above: Path | None, name: str = "") -> Iterator[Path]:
     """Make a folder of this user alone in another one, and remove it afterwards, whatever happens.
@@ -185,10 +198,15 @@ def kept_folder(scratch: Path, key: str) -> Iterator[Path]:
 def _locked(folder: Path) -> int:
     """The lock of a folder, which is made if it is not there, as a file descriptor; -1 where systems have none."""
     while True:
-        with suppress(FileExistsError):
-            folder.mkdir()
         try:
-            _check(folder)
+            folder.mkdir(0o700)
+        except FileExistsError:
+            was_there = True
+        else:
+            was_there = False
+        try:
+            if was_there:
+                _check(folder)
             if fcntl is None:
                 return -1
             handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
@@ -214,6 +232,8 @@ def _check(folder: Path) -> None:
         raise InputError(f"expected a folder of a build at {folder}, got something else")
     if hasattr(os, "geteuid") and state.st_uid != os.geteuid():
         raise InputError(f"expected {folder} to be a folder of this user, got one of another; scratch= names another")
+    if hasattr(os, "geteuid") and state.st_mode & 0o022:
+        raise InputError(f"expected {folder} to be writable by this user alone, others may write there; remove it")
 
 
 def _lock(handle: int, folder: Path) -> None:
@@ -254,6 +274,8 @@ def remove(path: Path) -> None:
         path.rename(away)
     except FileNotFoundError:
         return
+    except OSError:  # a folder whose files are open, on Windows
+        away = path
     shutil.rmtree(away, ignore_errors=True)
 
 
@@ -289,7 +311,7 @@ def is_sealed(folder: Path) -> bool:
     try:
         sums = json.loads((folder / _SEAL).read_bytes())
         return bool({path.relative_to(folder).as_posix(): list(checksum(path)) for path in _files(folder)} == sums)
-    except (FileNotFoundError, NotADirectoryError, ValueError):
+    except (OSError, ValueError):  # it is not there, or damaged: so are files that a disk cannot read
         return False
 
 

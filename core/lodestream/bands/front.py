@@ -23,7 +23,7 @@ from ..quality import Limit, Quality
 from ..scratch import Room
 from ..sources import Source, is_source, read_source
 from ..surface import Surface
-from .folders import BuildFolders, check_out, replacing
+from .folders import BuildFolders, check_out, replacing, synchronise
 from .made import Made
 from .memory import WHOLE, checked_memory, whole_memory
 from .room import CopyRoom
@@ -222,8 +222,14 @@ def _given(made: Path, out: str | os.PathLike[str] | None) -> bytes | None:
     if out is None:
         return made.read_bytes()
     with replacing(Path(out)) as unfinished:
-        # Without times and rights: a process that is confined may neither move from folder to folder nor set these.
-        shutil.move(made, unfinished, copy_function=shutil.copyfile)
+        # A second name, so that a build that can continue has its container until OUT is on disk.
+        try:
+            os.link(made, unfinished)
+        except OSError:  # on another disk, or a process that is confined
+            shutil.copyfile(made, unfinished)
+        with unfinished.open("rb+") as file:
+            os.fsync(file.fileno())
+    synchronise(Path(out).resolve().parent)
     return None
 
 

@@ -116,6 +116,7 @@ class Made:
         made = self._container(scratch)
         for path, state in zip(paths, states, strict=True):
             if file_state(path) != state:
+                remove(scratch.folder)  # its key has times that do not come again
                 raise InputError(f"expected {path} to stay as it is until it is encoded, it was changed meanwhile")
         return made
 
@@ -188,8 +189,9 @@ class Made:
             with path.open("wb") as file:
                 Building(build, Execution(build, self._executor, self._threads), self._progress).write(file)
         except FileNotFoundError as error:
-            missing = error.filename is None or not os.path.exists(error.filename)
-            if continued and missing:  # what was there of the stream was not all of it
+            gone = error.filename is None or not os.path.exists(error.filename)
+            ours = error.filename is None or Path(error.filename).is_relative_to(tasks.folder)
+            if continued and gone and ours:  # what was there of the stream was not all of it
                 build.close()
                 remove(tasks.folder)
                 return self._stream(scratch, prepared, bits, room)
@@ -242,7 +244,8 @@ def _kept(files: FolderScratch, name: str, arrays: list[NDArray[Any]], written: 
 def _identity(array: NDArray[Any], copied: bool) -> list[Any]:
     """What an array is known by: its file and place there, or the digest of its values."""
     root = root_of(array)
-    if copied or root is None or is_made(root):
+    # What is stored through a map need not change its file's time.
+    if copied or root is None or root.mode != "r" or is_made(root):
         digest = hashlib.sha256()
         for rows in array:
             digest.update(np.ascontiguousarray(rows).data)

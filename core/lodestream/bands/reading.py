@@ -27,7 +27,8 @@ _PART = 16
 
 def reading_key(paths: Sequence[Path], **options: Any) -> str:
     """What decides about the files that `read_into` leaves: the files that are read, and the options."""
-    states = [[str(path.resolve()), *file_state(path)] for path in paths]
+    # The name too, since it may say what is in a file, such as the position of an SRTM tile.
+    states = [[str(path.absolute()), str(path.resolve()), *file_state(path)] for path in paths]
     return json.dumps([__version__, states, sorted((name, repr(value)) for name, value in options.items())])
 
 

@@ -17,7 +17,7 @@ import pytest
 import lodestream as ls
 from lodestream.bands import front, made, tasks
 from lodestream.bands.folders import is_sealed, seal
-from lodestream.bands.reading import read_into
+from lodestream.bands.reading import read_into, reading_key
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.scratch import FolderScratch
 
@@ -262,3 +262,66 @@ def test_a_file_is_on_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch: 
     done.clear()
     FolderScratch(tmp_path).write("a", np.ones(3))
     assert done == ["named"], "nobody continues from it"
+
+
+def test_what_is_stored_through_a_map_makes_another_build(tmp_path: Path) -> None:
+    values = np.lib.format.open_memmap(tmp_path / "a.npy", "w+", np.int16, (70, 50))
+    values[...] = np.rint(300 * terrain((70, 50)))
+    assert _left(ls.Surface(values), _at_the_end, tmp_path / "build")
+    values[10:40] += 1000  # pages that are not written yet, so that no time of the file tells it
+    assert _build(ls.Surface(values), tmp_path / "build") == ls.encode(ls.Surface(np.array(values)))
+
+
+def test_the_container_is_on_disk_before_the_build_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done, sync, rename = list[str](), os.fsync, Path.rename
+    out = tmp_path / "a.lode"
+
+    def synchronised(handle: int) -> None:
+        done.append(os.path.basename(os.readlink(f"/proc/self/fd/{handle}")))
+        sync(handle)
+
+    def renamed(path: Path, target: Path) -> Path:
+        if path.parent == tmp_path / "scratch":
+            assert out.exists()
+            done.append("removed")
+        return rename(path, target)
+
+    if not Path("/proc/self/fd").exists():
+        pytest.skip("names of open files are read in /proc")
+    monkeypatch.setattr(os, "fsync", synchronised)
+    monkeypatch.setattr(Path, "rename", renamed)
+    container = _build(_heights(), tmp_path)
+    assert done[-1] == "removed"
+    assert done[-2] == tmp_path.name, "the name of the container"
+    assert done[-3].startswith(".a.lode."), "the container, under the name that it has until it is whole"
+    assert container == _expected("heights with holes")
+
+
+def test_a_container_that_cannot_be_placed_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace = os.replace
+
+    def refused(source: Any, target: Any) -> None:
+        if Path(target).name == "a.lode":
+            raise PermissionError(errno.EPERM, "cut")
+        replace(source, target)
+
+    assert _left(_heights(), lambda patched: patched.setattr(os, "replace", refused), tmp_path)
+    monkeypatch.setattr(tasks, "measure", lambda *_: pytest.fail("it is whole already"))
+    monkeypatch.setattr(tasks, "coordinates", lambda *_: pytest.fail("it is whole already"))
+    assert _build(_heights(), tmp_path) == _expected("heights with holes")
+
+
+def test_another_name_of_a_file_is_read_anew(tmp_path: Path) -> None:
+    (tmp_path / "N45E006.hgt").write_bytes(bytes(16))
+    (tmp_path / "N10W020.hgt").symlink_to(tmp_path / "N45E006.hgt")
+    keys = {reading_key([tmp_path / name]) for name in ("N45E006.hgt", "N10W020.hgt")}
+    assert len(keys) == 2, "the name of such a file says where it lies"
+
+
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
+    _left(_heights(), _at_the_end, tmp_path)
+    (folder,) = (tmp_path / "scratch").iterdir()
+    assert folder.stat().st_mode & 0o077 == 0
+    folder.chmod(0o770)
+    with pytest.raises(ls.InputError, match="writable by this user alone"):
+        _build(_heights(), tmp_path)
