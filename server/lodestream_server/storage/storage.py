@@ -56,6 +56,8 @@ class Storage:
         self.root = root
         self._at = Folders(root)
         self._lock = threading.RLock()
+        #: Of the folders of builds, of which one thread may make one that another is about to remove.
+        self._working = threading.Lock()
         new = make_private(root)
         self._guard = claim(root)
         try:
@@ -134,18 +136,21 @@ class Storage:
 
         Where the build may not continue, that is removed.
         """
-        continued = work.begin(self._at, surface, attempt, may_continue)
+        with self._working:
+            continued = work.begin(self._at, surface, attempt, may_continue)
         if continued:
             _log.info("the build of %s continues from what an interrupted attempt had made", surface)
         return continued
 
     def end_work(self, surface: str, attempt: Path, keep: bool = False) -> None:
         """Remove what a build has left, but for what its next attempt continues from if that is to be kept."""
-        work.end(self._at, surface, attempt, keep)
+        with self._working:
+            work.end(self._at, surface, attempt, keep)
 
     def forget_work(self, surface: str) -> None:
         """Remove what an interrupted attempt had made."""
-        work.forget(self._at, surface)
+        with self._working:
+            work.forget(self._at, surface)
 
     @property
     def levels(self) -> Path:
@@ -453,7 +458,7 @@ class Storage:
                     raise
             self._catalog.drop(surface)
             try:
-                work.forget(self._at, surface)
+                self.forget_work(surface)
                 finish_delete(
                     self._at,
                     record,

@@ -9,6 +9,9 @@ The second is kept when the server ends meanwhile. The process of a build may wr
 that neither can become a link. The server itself reads nothing in them: a stranger's file may have taken over the
 process that wrote there, and some of the files are pickles. Only the next process reads them, which is confined in the
 same way and to the same surface. All is removed when the surface is ready, refused, postponed or deleted.
+
+The same upload is the same surface: one may be deleted, uploaded and begun again before the attempt for the first has
+ended. So an attempt removes its own folder, and the rest only where no other one goes on.
 """
 
 from __future__ import annotations
@@ -16,6 +19,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from .durable import discard, make_folder, remove
@@ -63,13 +67,17 @@ def end(at: Folders, surface: str, attempt: Path, keep: bool) -> None:
 
 
 def forget(at: Folders, surface: str) -> None:
-    """Remove all folders of a surface; what cannot be removed stays for the next start."""
-    discard(at.work / surface)
+    """Remove all folders of a surface, unless an attempt goes on, whose end removes them.
+
+    What cannot be removed stays for the next start.
+    """
+    if not _has_attempts(at.work / surface):
+        discard(at.work / surface)
 
 
 def begun(at: Folders) -> set[str]:
     """Surfaces during whose attempts the server ended."""
-    return {path.name for path in _folders(at) if any(name != _BANDS for name in os.listdir(path))}
+    return {path.name for path in _folders(at) if _has_attempts(path)}
 
 
 def clean(at: Folders, queued: Collection[str]) -> None:
@@ -87,6 +95,12 @@ def clean(at: Folders, queued: Collection[str]) -> None:
 
 def _folders(at: Folders) -> Iterator[Path]:
     return (path for path in at.work.iterdir() if path.is_dir() and not path.is_symlink())
+
+
+def _has_attempts(folder: Path) -> bool:
+    with suppress(FileNotFoundError):
+        return any(name != _BANDS for name in os.listdir(folder))
+    return False
 
 
 def _is_empty(folder: Path) -> bool:

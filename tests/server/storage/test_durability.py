@@ -145,6 +145,28 @@ def test_what_a_queued_build_continues_from_is_no_leftover(tmp_path: Path) -> No
     assert (storage.bands_folder(surface) / "some").exists()
 
 
+@pytest.mark.parametrize("deleted", [False, True])
+def test_an_attempt_that_ends_leaves_the_next_one_alone(tmp_path: Path, deleted: bool) -> None:
+    """The same upload may be deleted, and uploaded and begun again, before the first attempt has ended."""
+    surface = next(iter(UPLOADS))
+    storage = Storage(tmp_path)
+    take(storage, surface)
+    first, second = storage.work_folder(surface), storage.work_folder(surface)
+    storage.begin_work(surface, first, may_continue=True)
+    if deleted:
+        storage.delete(surface)
+        assert first.exists(), "its process may still be at work there"
+        take(storage, surface)
+    storage.begin_work(surface, second, may_continue=True)
+    storage.end_work(surface, first)
+    assert not first.exists()
+    assert second.exists()
+    assert storage.bands_folder(surface).exists()
+    storage.end_work(surface, second)
+    assert not second.parent.exists()
+    storage.close()
+
+
 def test_a_surface_has_not_failed_until_that_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a client was told as failed would be queued again after a restart."""
     surface = next(iter(UPLOADS))
