@@ -420,7 +420,7 @@ def test_convert_takes_a_container(run: Run, container_file: Path, terrain: Terr
     assert run("convert", container_file, tmp_path / "b.nc", "--name", "hill")[0] == 0
     found = ls.read(tmp_path / "b.nc")
     np.testing.assert_array_equal(found.points, terrain)
-    assert found.metadata["tags"][""]["NC_GLOBAL#title"] == "hill"
+    assert found.metadata["name"] == "hill"
     (tmp_path / "cut.lode").write_bytes(container_file.read_bytes()[:1000])
     code, _, stderr = run("convert", tmp_path / "cut.lode", tmp_path / "c.npz")
     assert code == 1

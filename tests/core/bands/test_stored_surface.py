@@ -126,7 +126,7 @@ def test_what_is_no_surface_is_refused(tmp_path: Path, described: bytes) -> None
     header = b"{'descr': ("
     whole = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(72)
     (scratch.folder / "unfinished.npy").write_bytes(whole)
-    scratch.write("turned", np.asfortranarray(np.ones((3, 2))))
+    np.save(scratch.folder / "turned.npy", np.asfortranarray(np.ones((3, 2))))
     (scratch.folder / "surface.msgpack").write_bytes(described)
     with pytest.raises(InputError, match="expected"):
         load_surface(scratch)

@@ -77,8 +77,8 @@ def surface_in(
     if mark is not None and marked:
         surface.metadata, called = metadata, mark.attributes
         metadata = mark.restored(surface, dataset, choice)
-        if not in_memory:
-            metadata |= source.metadata(format_name)
+        if not in_memory:  # the name of the surface, not that of the file, unless it had none
+            metadata = source.metadata(format_name) | metadata | {"format": format_name}
     attributes = {called.get(name, name): values for name, values in surface.attributes.items()}
     closed = source.closed or surface.closed
     return Surface(surface.points, closed, mask=surface.mask, attributes=attributes, metadata=metadata), notes
