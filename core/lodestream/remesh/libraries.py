@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+import os
 from typing import Any
 
 from ..errors import UnavailableError
+from ..parallel import threads
 
 __all__ = ["igl", "sparse"]
 
@@ -29,6 +31,8 @@ def igl() -> Any:
     UnavailableError
         If it is not installed.
     """
+    # Else it begins as many threads as the machine has processors, which a confined process may not.
+    os.environ["IGL_NUM_THREADS"] = str(threads())
     return _library("igl")
 
 
