@@ -47,6 +47,13 @@ describe("what is read of the end of a container", () => {
     expect(info.planeUnit).toBe(unit);
   });
 
+  it("never calls exact what a mesh was resampled into", async () => {
+    const whole = { ...(await header()), exact: true } as Header;
+    const exact = (metadata: Record<string, unknown>): boolean => infoOf(whole, { ...NO_DESCRIPTION, metadata }).exact;
+    expect(exact({})).toBe(true);
+    expect(exact({ remesh: { blocks: 98 } })).toBe(false);
+  });
+
   it("is no more than was asked for", async () => {
     let pulls = 0;
     const endless = (): BodyInit =>

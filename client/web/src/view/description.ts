@@ -229,7 +229,8 @@ export function infoOf(header: Header, { metadata, prices, size }: Omit<Descript
     joined: header.arrangement !== null,
     unit: text("unit"),
     planeUnit: planeUnitOf(header, metadata),
-    exact: header.exact,
+    // What a mesh was resampled into comes back exactly, and is not the mesh.
+    exact: header.exact && metadata.remesh === undefined,
     attributes: attributesIn(header),
     size,
     prices,

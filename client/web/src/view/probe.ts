@@ -104,7 +104,7 @@ export class Probe {
       ...of.attributes.map(([name, values]) =>
         part(name, values.map((value) => (Number.isNaN(value) ? "none" : formatStored(value))).join(", ")),
       ),
-      part("error at most", moment.complete && of.max === 0 ? "0: exact" : errorText(of.max, info.unit)),
+      part("error at most", info.exact && moment.complete && of.max === 0 ? "0: exact" : errorText(of.max, info.unit)),
       part("RMS", errorText(of.rms, info.unit)),
       html("span", { class: "dim" }, whereText(of)),
     );
