@@ -160,7 +160,7 @@ def test_coordinates_of_one_value_are_written(tmp_path: Path, suffix: str) -> No
         assert data.lead.attrs["units"] == "hours" or data.lead.dtype.kind == "m"
     back, notes = noted(lambda: ls.read(tmp_path / f"a{suffix}"))
     assert notes == []
-    assert back.metadata == {**surface.metadata, "name": "a", "format": back.metadata["format"]}
+    assert back.metadata == {**surface.metadata, "format": back.metadata["format"]}
 
 
 def test_coordinates_of_one_value_reach_xarray_and_come_back(tmp_path: Path) -> None:
