@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from .bands.front import encode
     from .decoding.decoder import Decoder, decode
     from .decoding.view import View
+    from .encoding.front import encode
     from .errors import (
         CorruptStreamError,
         FormatError,

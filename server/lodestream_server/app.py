@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
 
 import lodestream
-from lodestream.bands.cluster import require_dask
+from lodestream.encoding.cluster import require_dask
 from lodestream.library import require
 
 from . import problems

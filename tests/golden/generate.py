@@ -20,8 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import building, forward, streams, transforming
-from lodestream.encoding import large_units, prepared
+from lodestream.encoding import building, forward, large_units, prepared, streams, transforming
 from lodestream.encoding.allocation import assign_layers
 from lodestream.encoding.curves import Curves
 from lodestream.encoding.tiling import WHOLE_TILE, square

@@ -94,8 +94,8 @@ def reading_folder(options: BuildingOptions, out: str, key: str | None) -> Itera
     InputError
         If another process reads the same there.
     """
-    from lodestream.bands.cluster import is_loss
-    from lodestream.bands.folders import kept_folder, temporary_folder
+    from lodestream.encoding.cluster import is_loss
+    from lodestream.encoding.folders import kept_folder, temporary_folder
     from lodestream.errors import UnavailableError
 
     above, name = (None, "") if out == "-" else (Path(out).parent, Path(out).name)

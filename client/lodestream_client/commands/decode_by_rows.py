@@ -179,7 +179,7 @@ def _decode(
     progress: Callable[[float], None],
     seen: RangeSet,
 ) -> None:
-    from lodestream.bands.folders import temporary_folder
+    from lodestream.encoding.folders import temporary_folder
     from lodestream.scratch import FolderScratch, Room
 
     with temporary_folder(out.resolve().parent, out.name) as folder:

@@ -150,7 +150,7 @@ def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, 
     ------
     LodestreamError, OSError
     """
-    from lodestream.bands.cluster import executor_of
+    from lodestream.encoding.cluster import executor_of
 
     started = time.monotonic()
     key, building = _reading_key(options), options.building
@@ -183,7 +183,7 @@ def read_surface(
     folder : Path, optional
         Where arrays go that are large beside ``memory``, in bytes; by default all are in memory.
     kept : bool
-        Whether what was read there before is read no more, see `lodestream.bands.reading.read_into`.
+        Whether what was read there before is read no more, see `lodestream.encoding.reading.read_into`.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def read_surface(
             first, *more = files.paths
             surface = ls.read(first, *more, **given, **format_options)
         else:
-            from lodestream.bands.reading import read_into
+            from lodestream.encoding.reading import read_into
 
             able = options.quality.rms is None
             surface = read_into(folder, files.paths, memory, able, kept, **given, **format_options)
@@ -215,7 +215,7 @@ def _reading_key(options: EncodeOptions) -> str | None:
     """What decides about what is read; None: it is not to be kept, or what comes over standard input."""
     if options.building.scratch is None or "-" in options.files:
         return None
-    from lodestream.bands.reading import reading_key
+    from lodestream.encoding.reading import reading_key
 
     it = options.surface
     # With the quality, which what is read does not depend on: each build has its own copy, as it has its own folder.
@@ -246,7 +246,7 @@ def _made(surface: Surface, options: EncodeOptions, executor: Executor | None) -
 
 def _note_memory(surface: Surface, memory: int | None) -> None:
     """Say that more memory is taken than was asked for, where less is not enough."""
-    from lodestream.bands.memory import least_memory, whole_memory
+    from lodestream.encoding.memory import least_memory, whole_memory
 
     least = min(least_memory(surface), whole_memory(surface))
     if memory is not None and memory < least:

@@ -211,13 +211,13 @@ def _limit(text: str) -> tuple[str | None, Tolerance]:
 
 
 def _memory(text: str) -> int:
-    from lodestream.bands.memory import checked_memory
+    from lodestream.encoding.memory import checked_memory
 
     return checked_memory(text)
 
 
 def _scheduler(text: str) -> str:
-    from lodestream.bands.cluster import checked_address  # which most commands need not import
+    from lodestream.encoding.cluster import checked_address  # which most commands need not import
 
     return checked_address(text)
 

@@ -76,8 +76,8 @@ def encoded_here(
         From `lodestream.read` and `lodestream.encode`.
     """
     from lodestream import encode
-    from lodestream.bands.reading import read_into
     from lodestream.container.sections import is_container
+    from lodestream.encoding.reading import read_into
 
     name = asked.filename or _name_of(sources[0])
     if is_container(_head(sources[0])):

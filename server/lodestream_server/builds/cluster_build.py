@@ -90,8 +90,8 @@ def _end_with_parent() -> None:
 
 def _build(task: ClusterJob) -> Built | Refused:
     from lodestream import encode
-    from lodestream.bands.cluster import executor_of
-    from lodestream.bands.stored_surface import load_surface
+    from lodestream.encoding.cluster import executor_of
+    from lodestream.encoding.stored_surface import load_surface
     from lodestream.scratch import FolderScratch
 
     from .stored_quality import without_quality

@@ -232,11 +232,11 @@ def preload() -> None:
     """
     import numpy.ma  # noqa: F401  # numpy itself imports it when it first looks for the different values of an array
 
-    import lodestream.bands.front
-    import lodestream.bands.stored_surface
     import lodestream.decoding.decoder
     import lodestream.decoding.inspection
     import lodestream.encoding.encoder
+    import lodestream.encoding.front
+    import lodestream.encoding.stored_surface
     import lodestream.formats
     import lodestream.mesh.recognise
     import lodestream.planning.planner  # noqa: F401
@@ -315,8 +315,8 @@ def read_progress(folder: Path) -> float:
 
 def _build(job: Job) -> Built | Parsed:
     from lodestream import encode
-    from lodestream.bands.front import goes_by_bands
-    from lodestream.bands.stored_surface import save_surface
+    from lodestream.encoding.front import goes_by_bands
+    from lodestream.encoding.stored_surface import save_surface
     from lodestream.formats import check_allowed
     from lodestream.scratch import FolderScratch
 

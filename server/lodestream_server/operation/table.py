@@ -114,7 +114,7 @@ def _formats(text: str) -> tuple[str, ...]:
 
 def _scheduler(text: str) -> str:
     # Here, as nothing of the library is needed for other commands.
-    from lodestream.bands.cluster import checked_address
+    from lodestream.encoding.cluster import checked_address
 
     return checked_address(text) if text else text
 

@@ -12,7 +12,7 @@ import lodestream as ls
 from lodestream.container import capacity
 from lodestream_client.commands import decode_by_rows
 from lodestream_client.commands.outcome import Outcome
-from tests.core.bands.block_surfaces import block_surface
+from tests.core.encoding.block_surfaces import block_surface
 from tests.core.surfaces import terrain
 
 from ..conftest import Run

@@ -18,7 +18,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import cluster, tasks
+from lodestream.encoding import cluster, tasks
 from lodestream_client.commands import decode_by_rows, values
 from lodestream_client.commands.building_options import BuildingOptions, reading_folder
 from tests.clusters import local_cluster

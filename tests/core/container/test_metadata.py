@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from lodestream import formats
-from lodestream.bands.front import encode
 from lodestream.container import read_index
 from lodestream.container.metadata import MAX_BYTES, check, fitted, packed, with_notes
 from lodestream.container.sections import parse_metadata
 from lodestream.container.shape import parse_extras
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.decoding.decoder import Decoder, decode
+from lodestream.encoding.front import encode
 from lodestream.errors import FormatWarning, InputError
 from lodestream.surface import Surface
 from tests.reference.fields import unpack_map

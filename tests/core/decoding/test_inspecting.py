@@ -10,8 +10,8 @@ import pytest
 import lodestream as ls
 from lodestream.decoding.inspection import Inspection, _Part, inspect
 
-from ..bands.grid_surfaces import SURFACES, container_of
 from ..container.forgery import index_of, with_layer_errors
+from ..encoding.grid_surfaces import SURFACES, container_of
 
 MOST = 1 << 20
 

@@ -17,7 +17,7 @@ from lodestream.decoding.pieces import why_not_by_pieces
 from lodestream.decoding.piecewise import PiecewiseDecoder
 from lodestream.scratch import IN_MEMORY, FolderScratch, Room
 
-from ..bands.grid_surfaces import SURFACES, container_of
+from ..encoding.grid_surfaces import SURFACES, container_of
 
 
 def _read(container: bytes) -> Callable[[int, int], bytes]:

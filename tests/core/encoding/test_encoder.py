@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import InputError, OptionError
-from lodestream.bands import building
 from lodestream.container import describe
 from lodestream.container.model import Header
 from lodestream.decoding.measurer import Measured
+from lodestream.encoding import building
 from lodestream.encoding.layers import MeasuredLayer, State, kept_layers
 
 from ..surfaces import SAMPLES, contained, encoded, errors, index_of, is_told, terrain, torus

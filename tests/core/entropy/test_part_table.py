@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lodestream.bands.pieces import Pieces
+from lodestream.encoding.pieces import Pieces
 from lodestream.entropy.part_table import flat_span, part_of
 from lodestream.entropy.tile_coder import Channel, TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather

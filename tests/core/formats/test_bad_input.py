@@ -20,8 +20,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream import formats
-from lodestream.bands.front import encode
 from lodestream.decoding.decoder import decode
+from lodestream.encoding.front import encode
 from lodestream.errors import FormatError, InputError, OptionError, TooLargeError
 from lodestream.surface import Surface
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands.reading import read_into
+from lodestream.encoding.reading import read_into
 from lodestream.errors import FormatError, FormatWarning, InputError, OptionError
 from lodestream.formats.nodata import checked, with_nodata
 from lodestream.scratch import IN_MEMORY

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from lodestream import formats
-from lodestream.bands.front import encode
 from lodestream.decoding.decoder import decode
+from lodestream.encoding.front import encode
 from lodestream.errors import FormatWarning
 from lodestream.surface import Surface
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import scratch
-from lodestream.bands.references import root_of
+from lodestream.encoding.references import root_of
 from lodestream.formats.raster import gdal
 from lodestream.scratch import FolderScratch, Room
 

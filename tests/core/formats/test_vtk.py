@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream import formats
-from lodestream.bands.references import root_of
+from lodestream.encoding.references import root_of
 from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError, UnavailableError
 from lodestream.formats.vtk import grids, xml_files
 from lodestream.mesh.cells import unpack_cells

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import formats
-from lodestream.bands.reading import read_into, reading_key
+from lodestream.encoding.reading import read_into, reading_key
 from lodestream.errors import UnavailableError
 from tests.patience import PATIENCE
 

@@ -25,7 +25,7 @@ import pytest
 from pydantic import TypeAdapter
 
 import lodestream as ls
-from lodestream.bands import cluster as clusters
+from lodestream.encoding import cluster as clusters
 from lodestream.scratch import FolderScratch
 from lodestream_server import running_server
 from lodestream_server.builds import cluster_build, jobs, worker

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands import tasks
+from lodestream.encoding import tasks
 from lodestream_server.builds import worker
 from lodestream_server.storage import work
 from lodestream_server.storage.folders import Folders

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands import cluster as clusters
+from lodestream.encoding import cluster as clusters
 from lodestream.formats import write_stream
 from lodestream_client.__main__ import main
 from lodestream_server import create_app, running_server
 from lodestream_server.builds import cluster_build, worker
 from lodestream_server.operation.settings import Settings
 from tests.clusters import local_cluster
-from tests.core.bands.block_surfaces import block_surface
+from tests.core.encoding.block_surfaces import block_surface
 from tests.core.surfaces import terrain
 from tests.patience import PATIENCE
 from tests.server.helpers import push

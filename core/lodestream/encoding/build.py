@@ -15,12 +15,12 @@ import numpy as np
 from ..container.model import Header
 from ..decoding.measurer import Figures
 from ..decoding.values import Values
-from ..encoding.lattice_coordinates import Lattices, strips
-from ..encoding.prepared import Prepared
 from ..entropy.tiles import TileTable
 from ..quantization.band_steps import Quantiser
 from ..scratch import FolderScratch, MemoryScratch, Scratch
+from .lattice_coordinates import Lattices, strips
 from .pieces import CORE_POINTS, Pieces
+from .prepared import Prepared
 from .references import dump, load
 
 __all__ = ["Build"]

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from ..container.digest import ValuesDigest
 from ..container.writer import CodedLayer, CodedSegment
 from ..decoding.values import Values
-from ..encoding.holes import given_arrays
-from ..encoding.layers import MeasuredLayer, all_passes
 from ..planning.window_errors import serialize_window_errors
 from ..scratch import Scratch
 from ..surface import Surface
 from .build import Build
+from .holes import given_arrays
+from .layers import MeasuredLayer, all_passes
 from .stored import name_of
 
 __all__ = ["Chunks", "coded_layers", "returned_digest", "window_section_of"]

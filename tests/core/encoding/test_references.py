@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lodestream.bands.references import dump, load, root_of
+from lodestream.encoding.references import dump, load, root_of
 from lodestream.errors import UnavailableError
 from lodestream.scratch import FolderScratch
 from lodestream.surface import Surface

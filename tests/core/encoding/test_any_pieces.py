@@ -16,16 +16,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import made, memory
-from lodestream.bands.build import Build
-from lodestream.bands.building import Building
-from lodestream.bands.executing import Execution
 from lodestream.container.reader import read_index
 from lodestream.decoding import inspection
 from lodestream.decoding.inspection import inspect
 from lodestream.decoding.piecewise import PiecewiseDecoder
-from lodestream.encoding import large_units
+from lodestream.encoding import large_units, made, memory
 from lodestream.encoding import prepared as preparing
+from lodestream.encoding.build import Build
+from lodestream.encoding.building import Building
+from lodestream.encoding.executing import Execution
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.prepared import Prepared, prepare
 from lodestream.quality import Quality

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..encoding.lattice_coordinates import coordinates_of_interfaces, coordinates_of_rows
 from ..entropy.part_table import flat_span
 from ..transform import pyramid
 from ..transform.predictors import INTERFACES
@@ -18,6 +17,7 @@ from ..transform.pyramid import empty
 from . import forward, measuring
 from .build import Build
 from .coding import Units, code_segments, code_units, parents_of
+from .lattice_coordinates import coordinates_of_interfaces, coordinates_of_rows
 from .measuring import measured_runs
 from .pieces import Rows
 from .stored import (

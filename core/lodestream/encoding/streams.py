@@ -7,16 +7,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
 
-from ..encoding.encoder import rising
-from ..encoding.lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
-from ..encoding.one_error import NoQuantiserError
-from ..encoding.prepared import Prepared, prepare
 from ..quality import Quality
 from ..scratch import MemoryScratch
 from ..surface import Surface
 from .build import Build
 from .building import Building
+from .encoder import rising
 from .executing import Execution
+from .lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
+from .one_error import NoQuantiserError
+from .prepared import Prepared, prepare
 
 __all__ = ["encoded", "shortest"]
 

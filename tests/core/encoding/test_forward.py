@@ -9,14 +9,14 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from lodestream.bands.build import Build
-from lodestream.bands.executing import Task
-from lodestream.bands.pieces import Pieces
-from lodestream.bands.stored import read_tiles
-from lodestream.bands.transforming import Transforming, planes_of_channel
 from lodestream.encoding import prepared as preparing
+from lodestream.encoding.build import Build
+from lodestream.encoding.executing import Task
 from lodestream.encoding.lattice_coordinates import exact_lattices, lattice_coordinates
+from lodestream.encoding.pieces import Pieces
 from lodestream.encoding.prepared import prepare
+from lodestream.encoding.stored import read_tiles
+from lodestream.encoding.transforming import Transforming, planes_of_channel
 from lodestream.entropy.part_table import flat_span
 from lodestream.entropy.tile_coder import planes_of
 from lodestream.entropy.tiles import gather

@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from lodestream.bands.stored_surface import load_surface, save_surface
+from lodestream.encoding.stored_surface import load_surface, save_surface
 from lodestream.errors import InputError
 from lodestream.scratch import FolderScratch, Room
 from lodestream.surface import Block, Surface

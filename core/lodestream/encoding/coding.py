@@ -12,7 +12,6 @@ from itertools import groupby, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..encoding.large_units import unit_size
 from ..entropy.band_fields import COLUMNS, ROWS
 from ..entropy.bitplanes import pass_count, pass_gains
 from ..entropy.part_table import Part, part_of
@@ -20,6 +19,7 @@ from ..entropy.tile_coder import Channel, TileCoder
 from ..entropy.tiles import TileTable
 from ..parallel import spread
 from ..quantization.band_steps import Quantiser
+from .large_units import unit_size
 
 __all__ = ["CodedBand", "Units", "code_segments", "code_units", "parents_of", "sizes_of_unit"]
 

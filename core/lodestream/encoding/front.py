@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any, cast, overload
 from numpy.typing import ArrayLike
 
 from ..container.capacity import default_memory
-from ..encoding import encoder
-from ..encoding.losses import at_holes
 from ..errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
 from ..library import require
 from ..quality import Limit, Quality
 from ..scratch import Room
 from ..sources import Source, is_source, read_source
 from ..surface import Surface
+from . import encoder
 from .folders import BuildFolders, check_out, replacing, synchronise
+from .losses import at_holes
 from .made import Made
 from .memory import WHOLE, checked_memory, whole_memory
 from .room import CopyRoom

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from lodestream.bands import folders
-from lodestream.bands.folders import kept_folder, remove, replacing, temporary_folder
+from lodestream.encoding import folders
+from lodestream.encoding.folders import kept_folder, remove, replacing, temporary_folder
 from lodestream.errors import InputError
 from lodestream.scratch import FolderScratch
 

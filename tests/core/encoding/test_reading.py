@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import reading
-from lodestream.bands.reading import read_into, reading_key
+from lodestream.encoding import reading
+from lodestream.encoding.reading import read_into, reading_key
 
 LITTLE = 1 << 20
 

@@ -13,12 +13,12 @@ from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer, distan
 from ..decoding.pieces import region_of_run, runs_of
 from ..decoding.region import Region, core_level
 from ..decoding.values import Values, chunks_of_region, values_of
-from ..encoding.prepared import Prepared
-from ..encoding.residual_encoder import ChunkCoder
 from ..entropy.part_table import Part, part_of
 from ..entropy.tiles import Tiles, TileTable
 from ..parallel import spread
 from .build import Build
+from .prepared import Prepared
+from .residual_encoder import ChunkCoder
 from .stored import forget_known, known_tiles
 
 __all__ = [

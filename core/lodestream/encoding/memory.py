@@ -9,10 +9,10 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..encoding.arranging import may_share
 from ..errors import OptionError
 from ..sizes import parse_size
 from ..surface import Surface
+from .arranging import may_share
 
 __all__ = [
     "BESIDE",

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands import made, tasks
-from lodestream.bands.cluster import executor_of
+from lodestream.encoding import made, tasks
+from lodestream.encoding.cluster import executor_of
 from tests.clusters import local_cluster
 
 from ..surfaces import terrain

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands.memory import whole_memory
+from lodestream.encoding.memory import whole_memory
 from lodestream.parallel import VARIABLE
 
 from ..surfaces import terrain

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lodestream.bands import build, transforming
-from lodestream.bands.build import Build
-from lodestream.bands.building import Building
 from lodestream.decoding.decoder import decode
+from lodestream.encoding import build, transforming
+from lodestream.encoding.build import Build
+from lodestream.encoding.building import Building
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality

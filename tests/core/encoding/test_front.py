@@ -17,11 +17,11 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import front, made, tasks
-from lodestream.bands.memory import checked_memory
-from lodestream.bands.references import root_of
 from lodestream.container.capacity import default_memory
+from lodestream.encoding import front, made, tasks
+from lodestream.encoding.memory import checked_memory
 from lodestream.encoding.prepared import prepare
+from lodestream.encoding.references import root_of
 from lodestream.scratch import FolderScratch
 
 from ..surfaces import terrain

@@ -10,8 +10,8 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from lodestream.bands.front import encode
 from lodestream.encoding import large_units
+from lodestream.encoding.front import encode
 from lodestream.surface import Surface
 
 from ..surfaces import terrain

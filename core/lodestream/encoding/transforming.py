@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..encoding.one_error import quantize
 from ..entropy.part_table import flat_span
 from ..entropy.tile_coder import planes_of
 from ..transform.predictors import COEFFICIENT_BITS, INTERFACES, default_predictors, fitted_steps
@@ -15,6 +14,7 @@ from . import tasks
 from .build import Build
 from .executing import Task
 from .forward import fit_columns, fit_rows
+from .one_error import quantize
 from .stored import CORE, PLAIN, name_of, name_of_fit, pieces_of, transformed
 
 __all__ = ["Transforming", "planes_of_channel"]

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands import front, made, tasks
-from lodestream.bands.folders import is_sealed, seal
-from lodestream.bands.reading import read_into, reading_key
+from lodestream.encoding import front, made, tasks
+from lodestream.encoding.folders import is_sealed, seal
 from lodestream.encoding.lattice_coordinates import exact_lattices
+from lodestream.encoding.reading import read_into, reading_key
 from lodestream.scratch import FolderScratch
 
 from ..surfaces import terrain

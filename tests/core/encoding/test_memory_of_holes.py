@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.bands.memory import BESIDE, least_memory
+from lodestream.encoding.memory import BESIDE, least_memory
 
 SHAPE = (4096, 1024)
 

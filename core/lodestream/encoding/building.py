@@ -15,12 +15,18 @@ from ..container.digest import DIGEST
 from ..container.model import Errors, Header
 from ..container.writer import ContainerWriter
 from ..decoding.measurer import Figures, distances_of
-from ..encoding.allocation import assign_layers
-from ..encoding.band_weights import band_weights
-from ..encoding.curves import Curves
-from ..encoding.header import header_of
-from ..encoding.large_units import candidate, worth
-from ..encoding.layers import (
+from ..planning.window_errors import KIND as WINDOW_ERRORS
+from . import tasks
+from .allocation import assign_layers
+from .assembling import Chunks, coded_layers, returned_digest, window_section_of
+from .band_weights import band_weights
+from .build import Build
+from .coding import parents_of, sizes_of_unit
+from .curves import Curves
+from .executing import Execution, Task
+from .header import header_of
+from .large_units import candidate, worth
+from .layers import (
     MeasuredLayer,
     all_passes,
     kept_layers,
@@ -29,14 +35,8 @@ from ..encoding.layers import (
     shown_states,
     told_errors,
 )
-from ..encoding.residual_encoder import chunk_sample, chunk_size
-from ..planning.window_errors import KIND as WINDOW_ERRORS
-from . import tasks
-from .assembling import Chunks, coded_layers, returned_digest, window_section_of
-from .build import Build
-from .coding import parents_of, sizes_of_unit
-from .executing import Execution, Task
 from .measuring import exact_errors, last_values, measured_runs
+from .residual_encoder import chunk_sample, chunk_size
 from .stored import name_of, pieces_of, read_tiles, transformed
 from .transforming import Transforming, planes_of_channel
 

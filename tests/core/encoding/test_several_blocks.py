@@ -14,14 +14,14 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.bands import made, tasks, transforming
-from lodestream.bands.front import encode
-from lodestream.bands.measuring import measured_runs
-from lodestream.bands.memory import BESIDE, OF_BAND, least_memory
-from lodestream.bands.pieces import Pieces
 from lodestream.container.reader import read_index
 from lodestream.decoding.inspection import Inspection, inspect
 from lodestream.decoding.piecewise import PiecewiseDecoder
+from lodestream.encoding import made, tasks, transforming
+from lodestream.encoding.front import encode
+from lodestream.encoding.measuring import measured_runs
+from lodestream.encoding.memory import BESIDE, OF_BAND, least_memory
+from lodestream.encoding.pieces import Pieces
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.residual import chunk_coder

@@ -16,8 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..encoding.lattice_coordinates import exact_lattices
-from ..encoding.prepared import Prepared, prepare
 from ..errors import InputError
 from ..library import fingerprint
 from ..parallel import threads
@@ -28,8 +26,10 @@ from .build import Build
 from .building import Building, OutOfRangeError
 from .executing import Execution
 from .folders import BuildFolders, is_sealed, remove, remove_leftovers, seal
+from .lattice_coordinates import exact_lattices
 from .memory import BESIDE, OF_BAND, largest_block, masks_memory
 from .pieces import CORE_POINTS
+from .prepared import Prepared, prepare
 from .references import file_state, root_of
 from .room import FOR_A_VALUE, check_room
 from .streams import shortest

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lodestream.bands.build import Build
-from lodestream.bands.executing import Execution, Task
+from lodestream.encoding.build import Build
+from lodestream.encoding.executing import Execution, Task
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
