@@ -25,8 +25,8 @@ import psutil
 from numpy.typing import NDArray
 
 import lodestream
-from lodestream.encoding.measuring import RUNS_TOGETHER
 from lodestream.encoding.pieces import Pieces
+from lodestream.encoding.state_errors import RUNS_TOGETHER
 from lodestream.grid.layout import Layout
 from lodestream.kernels import PART_ROWS
 from lodestream.scratch import FolderScratch
@@ -41,7 +41,7 @@ PROCESSES = 2
 #: Values and workers of builds that are foreseen from it.
 FORESEEN = ((10**9, 2), (10**10, 16), (10**11, 16), (10**11, 100))
 
-#: Values of a band where there is memory enough, see `lodestream.encoding.front`, and the tiles' exponents of two.
+#: Values of a band where there is memory enough, see `lodestream.encoding.encode`, and the tiles' exponents of two.
 _POINTS, _TILE = 1 << 22, (6, 6)
 #: Phases in their order; those that run level by level, from the finest one to the core.
 _PHASES = "coordinates", "first_step", "second_step", "core", "code", "measure", "segments"

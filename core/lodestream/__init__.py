@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from .decoding.decoder import Decoder, decode
     from .decoding.view import View
-    from .encoding.front import encode
+    from .encoding.encode import encode
     from .errors import (
         CorruptStreamError,
         FormatError,

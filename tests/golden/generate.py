@@ -20,7 +20,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.encoding import building, forward, large_units, prepared, streams, transforming
+from lodestream.encoding import forward, large_units, phases, prepared, streams, transform_phases
 from lodestream.encoding.allocation import assign_layers
 from lodestream.encoding.curves import Curves
 from lodestream.encoding.tiling import WHOLE_TILE, square
@@ -108,12 +108,12 @@ class Crafted:
                 patch.setattr(streams, "_COARSER", ())  # no container of fewer bits is tried
                 patch.setattr(forward, "gather", gathered)
             if self.ones:
-                for module in (forward, transforming):
+                for module in (forward, transform_phases):
                     patch.setattr(module, "planes_of", planes)
-                patch.setattr(building, "assign_layers", assigned)
+                patch.setattr(phases, "assign_layers", assigned)
                 patch.setattr(TileCoder, "code", coded)
             if self.by_level:
-                patch.setattr(building, "assign_layers", levels)
+                patch.setattr(phases, "assign_layers", levels)
             yield
 
 

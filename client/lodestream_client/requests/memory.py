@@ -109,7 +109,7 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
     if asked.closed != "auto" and asked.closed not in _CLOSED:
         raise OptionError(f"expected closed to be one of auto, {', '.join(_CLOSED)}, got {asked.closed!r}")
 
-    from lodestream.encoding.front import encode
+    from lodestream.encoding.encode import encode
 
     surface = _surface(source, asked)
     surface.metadata = noted(surface)

@@ -17,7 +17,7 @@ from ..surface import Surface
 from .build import Build
 from .holes import given_arrays
 from .layers import MeasuredLayer, all_passes
-from .stored import name_of
+from .task_arrays import name_of
 
 __all__ = ["Chunks", "coded_layers", "returned_digest", "window_section_of"]
 

@@ -1,4 +1,4 @@
-"""What the coding passes of all units cost and gain, and for each pass the gain for each bit."""
+"""What the coding passes of all units cost and gain, the gain for each bit, and what a coefficient is worth."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import kernels
+from ..entropy.tiles import TileTable
 from ..grid.layout import Layout
 from ..parallel import spread
+from ..quantization.lattice import Lattice
+from ..transform.pyramid import synthesis_norms
+from .prepared import Prepared
 
-__all__ = ["Curves", "Worth"]
+__all__ = ["Curves", "Worth", "band_weights"]
 
 #: Two runs are one where as two they save less than this share of the tile's bits so far.
 _SHARE_OF_TILE = 0.02
@@ -115,3 +119,19 @@ class Curves:
 
     def _parts(self) -> list[tuple[int, int]]:
         return list(pairwise([*range(0, self.tile.size, _AT_ONCE), self.tile.size]))
+
+
+def band_weights(
+    prepared: Prepared, channel: int, lattice: Lattice, table: TileTable, predictors: NDArray[np.int8]
+) -> NDArray[np.float64]:
+    """Return what a coefficient of one is worth in each band: float64, shape (band,).
+
+    Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an attribute
+    shares the stream in proportion to its own range.
+    """
+    layout = prepared.layout
+    norms = [synthesis_norms(layout, predictors, grid) for grid in range(len(layout.grids))]
+    span = prepared.extent if channel < prepared.geometric else prepared.span(channel)
+    spacing = lattice.spacing / span if span else 0.0
+    classes, of_band = table.classes()
+    return np.array([norms[grid][level, *map(int, kind)] * spacing**2 for level, grid, kind in classes])[of_band]

@@ -28,8 +28,8 @@ from ..transform.fitting import fitted_to_columns, sample_stride
 from ..transform.lifting import forward_step
 from ..transform.predictors import INTERFACES, fitted_steps, is_fitted, predictor
 from ..transform.pyramid import empty
-from .crops import crop_rows
 from .pieces import Part, Piece, Rows
+from .step_rows import crop_rows
 
 __all__ = [
     "Coefficients",

@@ -14,8 +14,8 @@ from ..quantization.band_steps import Quantiser
 from ..quantization.distortion import coordinate_distances
 from ..transform.predictors import COEFFICIENT_BITS
 from ..transform.pyramid import copied, forward
-from .band_weights import band_weights
 from .closed_loop import ClosedLoop, choose_indices
+from .curves import band_weights
 from .lattice_coordinates import Lattices, lattice_coordinates
 from .prepared import Prepared
 

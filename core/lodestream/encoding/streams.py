@@ -11,12 +11,12 @@ from ..quality import Quality
 from ..scratch import MemoryScratch
 from ..surface import Surface
 from .build import Build
-from .building import Building
-from .encoder import rising
 from .executing import Execution
 from .lattice_coordinates import Lattices, exact_lattices, fine_lattices, lies_on_coarse_lattice
 from .one_error import NoQuantiserError
+from .phases import Phases
 from .prepared import Prepared, prepare
+from .request import rising
 
 __all__ = ["encoded", "shortest"]
 
@@ -95,7 +95,7 @@ def _stream(prepared: Prepared, lattices: Lattices, progress: _Progress) -> byte
     """Return one stream, in one piece: its tasks are carried out one after another, each by all threads."""
     build = Build(MemoryScratch(), prepared, lattices, _ONE_PIECE, _ONE_PIECE)
     out = io.BytesIO()
-    Building(build, Execution(build), progress).write(out)
+    Phases(build, Execution(build), progress).write(out)
     return out.getvalue()
 
 

@@ -14,13 +14,13 @@ from ..entropy.part_table import flat_span
 from ..transform import pyramid
 from ..transform.predictors import INTERFACES
 from ..transform.pyramid import empty
-from . import forward, measuring
+from . import forward, state_errors
 from .build import Build
 from .coding import Units, code_segments, code_units, parents_of
 from .lattice_coordinates import coordinates_of_interfaces, coordinates_of_rows
-from .measuring import measured_runs
 from .pieces import Rows
-from .stored import (
+from .state_errors import measured_runs
+from .task_arrays import (
     CORE,
     keep_known,
     name_of,
@@ -165,7 +165,7 @@ def segments(build: Build, channel: int, level: int, band: int) -> None:
 def measure(build: Build, number: int) -> None:
     """Measure a run of rows, or of blocks, in all states, and code its residual."""
     header = build.stored_header()
-    figures, residual = measuring.measure(build, header, measured_runs(header, build.points)[number])
+    figures, residual = state_errors.measure(build, header, measured_runs(header, build.points)[number])
     write_measured(build, number, figures, residual.chunks, residual.kept, residual.exact)
 
 

@@ -234,8 +234,8 @@ def preload() -> None:
 
     import lodestream.decoding.decoder
     import lodestream.decoding.inspection
-    import lodestream.encoding.encoder
-    import lodestream.encoding.front
+    import lodestream.encoding.encode
+    import lodestream.encoding.request
     import lodestream.encoding.stored_surface
     import lodestream.formats
     import lodestream.mesh.recognise
@@ -315,7 +315,7 @@ def read_progress(folder: Path) -> float:
 
 def _build(job: Job) -> Built | Parsed:
     from lodestream import encode
-    from lodestream.encoding.front import goes_by_bands
+    from lodestream.encoding.encode import goes_by_bands
     from lodestream.encoding.stored_surface import save_surface
     from lodestream.formats import check_allowed
     from lodestream.scratch import FolderScratch

@@ -17,7 +17,7 @@ from lodestream.container.sections import parse_metadata
 from lodestream.container.shape import parse_extras
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.decoding.decoder import Decoder, decode
-from lodestream.encoding.front import encode
+from lodestream.encoding.encode import encode
 from lodestream.errors import FormatWarning, InputError
 from lodestream.surface import Surface
 from tests.reference.fields import unpack_map

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lodestream.encoding import large_units
-from lodestream.encoding.front import encode
+from lodestream.encoding.encode import encode
 from lodestream.surface import Surface
 
 from ..surfaces import terrain

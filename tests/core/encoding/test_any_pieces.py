@@ -20,12 +20,12 @@ from lodestream.container.reader import read_index
 from lodestream.decoding import inspection
 from lodestream.decoding.inspection import inspect
 from lodestream.decoding.piecewise import PiecewiseDecoder
-from lodestream.encoding import large_units, made, memory
+from lodestream.encoding import folder_build, large_units, memory
 from lodestream.encoding import prepared as preparing
 from lodestream.encoding.build import Build
-from lodestream.encoding.building import Building
 from lodestream.encoding.executing import Execution
 from lodestream.encoding.lattice_coordinates import exact_lattices
+from lodestream.encoding.phases import Phases
 from lodestream.encoding.prepared import Prepared, prepare
 from lodestream.quality import Quality
 from lodestream.scratch import IN_MEMORY, FolderScratch, MemoryScratch, Scratch
@@ -48,7 +48,7 @@ def built(prepared: Prepared, points: int, core_points: int, threads: int = 1, f
     with tempfile.TemporaryDirectory() as path:
         scratch: Scratch = FolderScratch(path) if folder else MemoryScratch()
         build, out = Build(scratch, prepared, exact_lattices(prepared), points, core_points), io.BytesIO()
-        Building(build, Execution(build, None, threads), lambda fraction: None).write(out)
+        Phases(build, Execution(build, None, threads), lambda fraction: None).write(out)
     return out.getvalue()
 
 
@@ -254,13 +254,13 @@ _LARGER_THAN_MEMORY = {
 @pytest.mark.parametrize("wanted", [False, True])
 @pytest.mark.parametrize("name", _LARGER_THAN_MEMORY)
 def test_a_surface_larger_than_memory_gives_the_same_bytes(name: str, wanted: bool, tmp_path: Path) -> None:
-    surface, spied = _LARGER_THAN_MEMORY[name], made.Made.container
+    surface, spied = _LARGER_THAN_MEMORY[name], folder_build.FolderBuild.container
     # By pieces goes what memory does not hold, or whatever an executor is given for.
     with (
         ThreadPoolExecutor(2) as executor,
-        mock.patch.multiple(made, _FEWEST=1, _MOST=1),
+        mock.patch.multiple(folder_build, _FEWEST=1, _MOST=1),
         mock.patch.multiple(memory, WHOLE=1 << 20, _WHOLE_WITH_HOLES=1 << 20),
-        mock.patch.object(made.Made, "container", autospec=True, side_effect=spied) as container,
+        mock.patch.object(folder_build.FolderBuild, "container", autospec=True, side_effect=spied) as container,
     ):
         ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, executor=executor if wanted else None)
     container.assert_called_once()

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.encoding import front, made, tasks
+from lodestream.encoding import encode as encoding
+from lodestream.encoding import folder_build, tasks
 from lodestream.encoding.folders import is_sealed, seal
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.reading import read_into, reading_key
@@ -105,14 +106,14 @@ def _in_the_second_stream(patched: pytest.MonkeyPatch) -> None:
             raise KeyboardInterrupt("cut")
         return exact_lattices(*arguments)
 
-    patched.setattr(made, "exact_lattices", second)
+    patched.setattr(folder_build, "exact_lattices", second)
 
 
 def _at_the_end(patched: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, "cut")
 
-    patched.setattr(front, "_given", full)
+    patched.setattr(encoding, "_given", full)
 
 
 CASES: dict[str, tuple[Callable[[], ls.Surface], Callable[[pytest.MonkeyPatch], None]]] = {

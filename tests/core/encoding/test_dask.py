@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream.encoding import made, tasks
+from lodestream.encoding import folder_build, tasks
 from lodestream.encoding.cluster import executor_of
 from tests.clusters import local_cluster
 
@@ -53,7 +53,7 @@ def test_a_worker_that_dies_costs_its_task(
     cluster: Any, task: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     surface = _surface(kind)
-    monkeypatch.setattr(made, "_FEWEST", 1)  # so that pieces are small
+    monkeypatch.setattr(folder_build, "_FEWEST", 1)  # so that pieces are small
     before = cluster.run(os.getpid)
     chosen = next(iter(before))
     cluster.run(_die_in, task, workers=[chosen])

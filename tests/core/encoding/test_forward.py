@@ -15,8 +15,8 @@ from lodestream.encoding.executing import Task
 from lodestream.encoding.lattice_coordinates import exact_lattices, lattice_coordinates
 from lodestream.encoding.pieces import Pieces
 from lodestream.encoding.prepared import prepare
-from lodestream.encoding.stored import read_tiles
-from lodestream.encoding.transforming import Transforming, planes_of_channel
+from lodestream.encoding.task_arrays import read_tiles
+from lodestream.encoding.transform_phases import TransformPhases, planes_of_channel
 from lodestream.entropy.part_table import flat_span
 from lodestream.entropy.tile_coder import planes_of
 from lodestream.entropy.tiles import gather
@@ -52,7 +52,7 @@ def _check(surface: Surface, tile: tuple[int, int], points: int, core_points: in
     def report(share: float) -> Callable[[float], None]:
         return lambda fraction: None
 
-    Transforming(build, carry_out, report).carry_out(1.0)
+    TransformPhases(build, carry_out, report).carry_out(1.0)
     for channel in range(build.channels):
         whole = lattice_coordinates(prepared, channel, build.lattices.channels[channel])
         predictors, table = forward(whole, prepared.layout), build.table(channel)

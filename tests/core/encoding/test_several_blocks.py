@@ -17,12 +17,12 @@ import lodestream as ls
 from lodestream.container.reader import read_index
 from lodestream.decoding.inspection import Inspection, inspect
 from lodestream.decoding.piecewise import PiecewiseDecoder
-from lodestream.encoding import made, tasks, transforming
-from lodestream.encoding.front import encode
-from lodestream.encoding.measuring import measured_runs
+from lodestream.encoding import folder_build, tasks, transform_phases
+from lodestream.encoding.encode import encode
 from lodestream.encoding.memory import BESIDE, OF_BAND, least_memory
 from lodestream.encoding.pieces import Pieces
 from lodestream.encoding.prepared import prepare
+from lodestream.encoding.state_errors import measured_runs
 from lodestream.quality import Quality
 from lodestream.residual import chunk_coder
 from lodestream.scratch import IN_MEMORY, FolderScratch, Room
@@ -166,7 +166,7 @@ def test_damage_is_found_where_it_is_decoded() -> None:
 
 def test_coefficients_that_are_too_large_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = _plates()
-    monkeypatch.setattr(transforming, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
+    monkeypatch.setattr(transform_phases, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
     plain = built(prepare(surface, Quality()), 1, 600)
     assert plain == encode(surface)
     assert ls.decode(plain).blocks[0].points.tobytes() == surface.blocks[0].points.tobytes()
@@ -212,7 +212,7 @@ def test_a_build_of_blocks_goes_on_where_it_was_cut(tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr(tasks, "second_step", counted)
     monkeypatch.setattr(tasks, "measure", cut)
-    monkeypatch.setattr(made, "_FEWEST", 1)
+    monkeypatch.setattr(folder_build, "_FEWEST", 1)
     with pytest.raises(KeyboardInterrupt):
         ls.encode(surface, out=tmp_path / "a.lode", memory=1 << 20, scratch=tmp_path / "scratch")
     before = calls[0]

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from lodestream import formats
 from lodestream.decoding.decoder import decode
-from lodestream.encoding.front import encode
+from lodestream.encoding.encode import encode
 from lodestream.errors import FormatError, InputError, OptionError, TooLargeError
 from lodestream.surface import Surface
 

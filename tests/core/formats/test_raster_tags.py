@@ -12,7 +12,7 @@ import pytest
 
 from lodestream import formats
 from lodestream.decoding.decoder import decode
-from lodestream.encoding.front import encode
+from lodestream.encoding.encode import encode
 from lodestream.errors import FormatWarning
 from lodestream.surface import Surface
 

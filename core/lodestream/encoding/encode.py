@@ -21,10 +21,10 @@ from ..quality import Limit, Quality
 from ..scratch import Room
 from ..sources import Source, is_source, read_source
 from ..surface import Surface
-from . import encoder
+from . import request
+from .folder_build import FolderBuild
 from .folders import BuildFolders, check_out, replacing, synchronise
 from .losses import at_holes
-from .made import Made
 from .memory import WHOLE, checked_memory, whole_memory
 from .room import CopyRoom
 from .streams import encoded
@@ -162,7 +162,7 @@ def encode(
         kind = f"{type(executor).__module__}.{type(executor).__qualname__}"
         hint = ": pass what its get_executor() returns" if hasattr(executor, "get_executor") else ""
         raise InputError(f"expected a concurrent.futures.Executor as executor, got {kind}{hint}")
-    chosen = encoder.chosen_quality(quality, precision, rms, attribute_precision)
+    chosen = request.chosen_quality(quality, precision, rms, attribute_precision)
     limit = default_memory() if memory is None else checked_memory(memory)
     if out is not None:
         check_out(Path(out))
@@ -176,13 +176,13 @@ def encode(
             surface = read(CopyRoom(folders.copies, folders.temporary, limit // _PART, by_bands, given))
         elif not isinstance(surface, Surface):
             surface = Surface(cast("ArrayLike", surface))
-        encoder.check(surface, chosen)
+        request.check(surface, chosen)
         left_out = at_holes(surface)
         if left_out is not None:
             warnings.warn(left_out, FormatWarning, stacklevel=2)
-        told = encoder.rising(progress or (lambda fraction: None))
+        told = request.rising(progress or (lambda fraction: None))
         if not whole and goes_by_bands(surface, chosen, limit, executor is not None, memory is not None):
-            made = Made(surface, chosen, limit, executor, told, read is not None).container(folders)
+            made = FolderBuild(surface, chosen, limit, executor, told, read is not None).container(folders)
             if made is not None:
                 return _given(made, out)
             if memory is not None:

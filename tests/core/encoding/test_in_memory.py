@@ -15,7 +15,7 @@ from lodestream import InputError, OptionError
 from lodestream.container import describe
 from lodestream.container.model import Header
 from lodestream.decoding.measurer import Measured
-from lodestream.encoding import building
+from lodestream.encoding import phases
 from lodestream.encoding.layers import MeasuredLayer, State, kept_layers
 
 from ..surfaces import SAMPLES, contained, encoded, errors, index_of, is_told, terrain, torus
@@ -197,7 +197,7 @@ def test_a_layer_that_would_raise_the_error_is_left_out(monkeypatch: pytest.Monk
             changed = [*found[:raised], (errors._replace(rms=wrong), cells), *found[raised + 1 :]]
             return kept_layers(header, states, changed)
 
-        monkeypatch.setattr(building, "kept_layers", kept)
+        monkeypatch.setattr(phases, "kept_layers", kept)
         return [layer.rms for layer in index_of(ls.encode(points, 0.5)).layers]
 
     assert layers_when(3, told[2] * 1.5) == told[:3] + told[4:]
@@ -369,7 +369,7 @@ def test_surfaces_of_many_shapes_are_encoded_side_by_side() -> None:
 
 
 def test_axes_that_are_too_long_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lodestream.encoding.encoder.LONGEST_AXIS", 10)
+    monkeypatch.setattr("lodestream.encoding.request.LONGEST_AXIS", 10)
     ls.encode(np.zeros((10, 4)))
     with pytest.raises(ls.TooLargeError, match="at most 10 rows and columns of a block, got 11"):
         ls.encode(np.zeros((4, 11)))

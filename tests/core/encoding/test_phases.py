@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from lodestream.decoding.decoder import decode
-from lodestream.encoding import build, transforming
+from lodestream.encoding import build, transform_phases
 from lodestream.encoding.build import Build
-from lodestream.encoding.building import Building
 from lodestream.encoding.lattice_coordinates import exact_lattices
+from lodestream.encoding.phases import Phases
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.scratch import FolderScratch
@@ -25,11 +25,11 @@ from .test_any_pieces import built
 def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = SURFACES["integers"][0]
     prepared = prepare(surface, Quality())
-    monkeypatch.setattr(transforming, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
+    monkeypatch.setattr(transform_phases, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit
     expected = built(prepared, 1, 600)
-    code, late = Building._code, list[Path]()
+    code, late = Phases._code, list[Path]()
 
-    def after_late_tasks(self: Building) -> None:
+    def after_late_tasks(self: Phases) -> None:
         folder = Path(self._build.folder)
         for kind in ("coefficients", "planes", "rules", "core-rules"):
             for path in sorted((folder / f"plain-{kind}").rglob("*.npy")):
@@ -39,7 +39,7 @@ def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.Monke
                 late.append(path)
         code(self)
 
-    monkeypatch.setattr(Building, "_code", after_late_tasks)
+    monkeypatch.setattr(Phases, "_code", after_late_tasks)
     container = built(prepared, 1, 600)
     assert len(late) > 10
     assert container == expected

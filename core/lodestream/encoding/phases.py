@@ -19,10 +19,9 @@ from ..planning.window_errors import KIND as WINDOW_ERRORS
 from . import tasks
 from .allocation import assign_layers
 from .assembling import Chunks, coded_layers, returned_digest, window_section_of
-from .band_weights import band_weights
 from .build import Build
 from .coding import parents_of, sizes_of_unit
-from .curves import Curves
+from .curves import Curves, band_weights
 from .executing import Execution, Task
 from .header import header_of
 from .large_units import candidate, worth
@@ -35,12 +34,12 @@ from .layers import (
     shown_states,
     told_errors,
 )
-from .measuring import exact_errors, last_values, measured_runs
 from .residual_encoder import chunk_sample, chunk_size
-from .stored import name_of, pieces_of, read_tiles, transformed
-from .transforming import Transforming, planes_of_channel
+from .state_errors import exact_errors, last_values, measured_runs
+from .task_arrays import name_of, pieces_of, read_tiles, transformed
+from .transform_phases import TransformPhases, planes_of_channel
 
-__all__ = ["Building", "OutOfRangeError"]
+__all__ = ["OutOfRangeError", "Phases"]
 
 #: Fractions of the time that the phases take, about: transform, coding, measuring, writing.
 _SHARES = 0.3, 0.3, 0.3, 0.1
@@ -50,7 +49,7 @@ class OutOfRangeError(Exception):
     """The squares of errors are out of float64's range: the surface must be measured in one piece."""
 
 
-class Building:
+class Phases:
     """The phases of a build, each of which goes on where a build before it was cut.
 
     Parameters
@@ -94,7 +93,7 @@ class Building:
     # Transform.
 
     def _transform(self) -> None:
-        Transforming(self._build, self._carry_out, self._report).carry_out(_SHARES[0])
+        TransformPhases(self._build, self._carry_out, self._report).carry_out(_SHARES[0])
         for channel, lattice in enumerate(self._build.lattices.channels):
             if not self._scratch.has(f"weights/{channel}"):
                 predictors, table = self._read("predictors")[channel], self._build.table(channel)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.container.capacity import default_memory
-from lodestream.encoding import front, made, tasks
+from lodestream.encoding import encode as encoding
+from lodestream.encoding import folder_build, tasks
 from lodestream.encoding.memory import checked_memory
 from lodestream.encoding.prepared import prepare
 from lodestream.encoding.references import root_of
@@ -32,7 +33,7 @@ LITTLE = 1 << 20
 @pytest.fixture(autouse=True)
 def _small_pieces() -> Iterator[None]:
     """So little memory makes several pieces of two levels of `_heights`."""
-    with mock.patch.object(made, "_FEWEST", 1 << 13):
+    with mock.patch.object(folder_build, "_FEWEST", 1 << 13):
         yield
 
 
@@ -206,7 +207,7 @@ def test_numbers_whose_squares_are_no_float64_keep_to_the_memory(tmp_path: Path)
 
 
 def test_more_memory_than_needed_means_one_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(front, "Made", None)
+    monkeypatch.setattr(encoding, "FolderBuild", None)
     ls.encode(_heights(), out=tmp_path / "a.lode")
     assert os.listdir(tmp_path) == ["a.lode"]
     assert default_memory() > 1 << 20
@@ -397,7 +398,7 @@ def test_copies_of_one_source_are_all_in_files(tmp_path: Path, monkeypatch: pyte
         assert len(list(tmp_path.glob(".a.lode.*.lodestream/source/arrays/*.npy"))) > 2
         return prepare(surface, *others)
 
-    monkeypatch.setattr(made, "prepare", spy)
+    monkeypatch.setattr(folder_build, "prepare", spy)
     ls.encode(data, out=tmp_path / "a.lode", memory=LITTLE)
     assert [array.shape for array in seen] == [(510, 130, 3), (510, 130), (510, 130)]
     assert (tmp_path / "a.lode").read_bytes() == ls.encode(ls.Surface.from_xarray(data))

@@ -23,18 +23,18 @@ from ..quality import Quality
 from ..scratch import FolderScratch, Room, is_made
 from ..surface import Surface
 from .build import Build
-from .building import Building, OutOfRangeError
 from .executing import Execution
 from .folders import BuildFolders, is_sealed, remove, remove_leftovers, seal
 from .lattice_coordinates import exact_lattices
 from .memory import BESIDE, OF_BAND, largest_block, masks_memory
+from .phases import OutOfRangeError, Phases
 from .pieces import CORE_POINTS
 from .prepared import Prepared, prepare
 from .references import file_state, root_of
 from .room import FOR_A_VALUE, check_room
 from .streams import shortest
 
-__all__ = ["Made"]
+__all__ = ["FolderBuild"]
 
 #: Values of a band at least and at most.
 _FEWEST, _MOST = 1 << 17, 1 << 22
@@ -42,7 +42,7 @@ _FEWEST, _MOST = 1 << 17, 1 << 22
 _IN_A_FILE = 32 << 20
 
 
-class Made:
+class FolderBuild:
     """A container that is made by bands, or goes on being made.
 
     Parameters
@@ -187,7 +187,7 @@ class Made:
         whole.mkdir()
         try:
             with path.open("wb") as file:
-                Building(build, Execution(build, self._executor, self._threads), self._progress).write(file)
+                Phases(build, Execution(build, self._executor, self._threads), self._progress).write(file)
         except FileNotFoundError as error:
             gone = error.filename is None or not os.path.exists(error.filename)
             ours = error.filename is None or Path(error.filename).is_relative_to(tasks.folder)

@@ -19,7 +19,7 @@ from ..parallel import spread
 from .build import Build
 from .prepared import Prepared
 from .residual_encoder import ChunkCoder
-from .stored import forget_known, known_tiles
+from .task_arrays import forget_known, known_tiles
 
 __all__ = [
     "RUNS_TOGETHER",

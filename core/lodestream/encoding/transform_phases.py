@@ -15,9 +15,9 @@ from .build import Build
 from .executing import Task
 from .forward import fit_columns, fit_rows
 from .one_error import quantize
-from .stored import CORE, PLAIN, name_of, name_of_fit, pieces_of, transformed
+from .task_arrays import CORE, PLAIN, name_of, name_of_fit, pieces_of, transformed
 
-__all__ = ["Transforming", "planes_of_channel"]
+__all__ = ["TransformPhases", "planes_of_channel"]
 
 #: What the transform of a channel leaves.
 _TRANSFORMED = (
@@ -34,7 +34,7 @@ def planes_of_channel(build: Build, kind: str, channel: int) -> NDArray[np.int8]
     return np.concatenate([build.scratch.read(name_of(kind, channel, level, k)) for level, k, _ in pieces_of(build)])
 
 
-class Transforming:
+class TransformPhases:
     """Transforms the channels of a build.
 
     Parameters
