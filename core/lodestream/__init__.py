@@ -46,7 +46,7 @@ _HOMES = {
     "Decoder": "decoding.decoder",
     "View": "decoding.view",
     "decode": "decoding.decoder",
-    "encode": "bands.front",
+    "encode": "encoding.encode",
     "CorruptStreamError": "errors",
     "FormatError": "errors",
     "FormatWarning": "errors",
