@@ -110,7 +110,7 @@ class FolderBuild:
         files = [root_of(array) for array in self._all()]
         paths = sorted({str(Path(str(root.filename)).resolve()) for root in files if root is not None})
         states = [file_state(path) for path in paths]
-        scratch = folders.build(self._key())
+        scratch = folders.build(self._key)
         check_room(scratch.folder, self._values * FOR_A_VALUE + in_memory + self._beside(), scratch.size())
         remove_leftovers(scratch.folder)
         made = self._container(scratch)

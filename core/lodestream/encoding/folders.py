@@ -10,7 +10,7 @@ import secrets
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -47,6 +47,8 @@ _SHORT = 50
 _HELD: set[int] = set()
 #: What file systems without locks say.
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
+#: How often a folder may vanish, or its lock be another file than the one that was opened, while it is taken.
+_ATTEMPTS = 100
 
 
 class BuildFolders:
@@ -85,11 +87,11 @@ class BuildFolders:
         """Where copies go of what can be read only once."""
         return FolderScratch(self.temporary() / "source")
 
-    def build(self, key: str) -> FolderScratch:
-        """The folder of a build; see `kept_folder` for the key and the errors."""
+    def build(self, key: Callable[[], str]) -> FolderScratch:
+        """Return the folder of a build; the key, see `kept_folder`, is asked for only where builds continue."""
         if self._scratch is None:
             return FolderScratch(self.temporary() / "build")
-        return FolderScratch(self._stack.enter_context(kept_folder(self._scratch, key)), lasting=True)
+        return FolderScratch(self._stack.enter_context(kept_folder(self._scratch, key())), lasting=True)
 
 
 def check_out(path: Path) -> None:
@@ -197,7 +199,7 @@ def kept_folder(scratch: Path, key: str) -> Iterator[Path]:
 
 def _locked(folder: Path) -> int:
     """The lock of a folder, which is made if it is not there, as a file descriptor; -1 where systems have none."""
-    while True:
+    for _ in range(_ATTEMPTS):
         try:
             folder.mkdir(0o700)
         except FileExistsError:
@@ -223,6 +225,7 @@ def _locked(folder: Path) -> int:
             _let_go(handle)
             raise
         _let_go(handle)
+    raise InputError(f"expected {folder} to keep its lock, it is another file each time; choose another scratch folder")
 
 
 def _check(folder: Path) -> None:
@@ -231,7 +234,9 @@ def _check(folder: Path) -> None:
     if not stat.S_ISDIR(state.st_mode):
         raise InputError(f"expected a folder of a build at {folder}, got something else")
     if hasattr(os, "geteuid") and state.st_uid != os.geteuid():
-        raise InputError(f"expected {folder} to be a folder of this user, got one of another; scratch= names another")
+        raise InputError(
+            f"expected {folder} to be a folder of this user, got one of another; choose another scratch folder"
+        )
     if hasattr(os, "geteuid") and state.st_mode & 0o022:
         raise InputError(f"expected {folder} to be writable by this user alone, others may write there; remove it")
 
@@ -241,7 +246,7 @@ def _lock(handle: int, folder: Path) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise InputError(
-            f"expected {folder} to be free for this build, the same build is at work there; scratch= names another "
+            f"expected {folder} to be free for this build, the same build is at work there; choose another scratch "
             "folder"
         ) from None
     except OSError as error:

@@ -34,7 +34,7 @@ def check_room(folder: Path, needed: int, there: int = 0) -> None:
     if free < needed:
         raise TooLargeError(
             f"expected {needed >> 20:,} MiB of room in {folder} for the files of a build by bands, "
-            f"got {free >> 20:,} MiB; scratch= takes another folder"
+            f"got {free >> 20:,} MiB; choose another scratch folder"
         ) from OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 

@@ -7,9 +7,11 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -79,7 +81,8 @@ def test_what_was_being_removed_is_removed(tmp_path: Path) -> None:
 
 def test_the_same_build_is_told_that_one_is_at_work(tmp_path: Path) -> None:
     with kept_folder(tmp_path, "key") as folder:
-        with pytest.raises(InputError, match="the same build is at work there"), kept_folder(tmp_path, "key"):
+        expected = "the same build is at work there; choose another scratch folder"
+        with pytest.raises(InputError, match=expected), kept_folder(tmp_path, "key"):
             pytest.fail("two at once")
         with kept_folder(tmp_path, "another"):
             pass
@@ -206,3 +209,17 @@ def test_two_that_write_one_file_do_not_mix(tmp_path: Path) -> None:
         second.write_bytes(b"second")
     assert path.read_bytes() == b"first"
     assert names(tmp_path) == {"a.lode"}
+
+
+def test_a_lock_that_is_another_file_each_time_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os.path, "samestat", lambda one, other: False)
+    with pytest.raises(InputError, match="another file each time"), kept_folder(tmp_path, "key"):
+        raise AssertionError("entered")
+
+
+def test_the_key_is_asked_for_only_where_a_build_continues(tmp_path: Path) -> None:
+    asked = Mock(return_value="key")
+    with ExitStack() as stack:
+        for scratch in (None, tmp_path / "scratch"):
+            build = folders.BuildFolders(stack, scratch, tmp_path / "out").build(asked)
+            assert asked.called == build.lasting == (scratch is not None)
