@@ -30,6 +30,8 @@ Chunks = Callable[[int], tuple[bytes | memoryview, int] | None]
 
 #: Numbers that a thread keeps room for: a new array costs more than what a band does in it.
 _KEPT_NUMBERS = 3 << 19
+#: Chunks that a thread corrects one after another: some milliseconds.
+_CHUNKS_AT_ONCE = 8
 
 _kept = local()
 
@@ -270,14 +272,21 @@ def restore(
     CorruptStreamError
         If a chunk does not fit.
     """
-    for number, place in chunks_of_region(header, region, blocks):
-        if (chosen is not None and not chosen[place.channel]) or (chunk := chunks(number)) is None:
-            continue
-        window = blocks[place.block].window(place)
-        mask = (header.kept_masks if place.kept else header.masks)[place.block]
-        valid = slice(None) if mask is None else mask[slice(*place.rows), slice(*place.columns)]
-        known, (data, offset) = window[valid], chunk
-        window[valid] = chunk_coder.decode_chunk(known.ravel(), bytes(data), offset).reshape(known.shape)
+
+    def correct(run: Sequence[tuple[int, ChunkPlace]]) -> None:
+        for number, place in run:
+            if (chunk := chunks(number)) is None:
+                continue
+            window = blocks[place.block].window(place)
+            mask = (header.kept_masks if place.kept else header.masks)[place.block]
+            valid = slice(None) if mask is None else mask[slice(*place.rows), slice(*place.columns)]
+            known, (data, offset) = window[valid], chunk
+            window[valid] = chunk_coder.decode_chunk(known.ravel(), bytes(data), offset).reshape(known.shape)
+
+    places = chunks_of_region(header, region, blocks)
+    wanted = [item for item in places if chosen is None or chosen[item[1].channel]]
+    # No two chunks change the same value, so threads write side by side.
+    spread(correct, [wanted[start : start + _CHUNKS_AT_ONCE] for start in range(0, len(wanted), _CHUNKS_AT_ONCE)])
 
 
 def mark_holes(header: Header, region: Region, blocks: Mapping[int, Values], corrected: bool) -> None:
