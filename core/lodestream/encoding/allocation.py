@@ -1,4 +1,4 @@
-"""Which bits go into which layer: in order of what they do to the error for each byte.
+"""Allocation of coding passes to layers: in order of the error that they remove for each byte.
 
 Every tile of every channel is a list of coding passes, each with a cost in bits and a gain in squared error. Passes are
 grouped into *runs*: on the convex hull of each tile, so that a poor pass before a good one does not hide it, and so
@@ -81,7 +81,7 @@ def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = Fal
 
 
 def _worth(curves: Curves) -> Worth:
-    """Return what a run is worth, see `_SHARE_OF_STREAM`."""
+    """Return the limits of what two runs must save to be two, see `_SHARE_OF_STREAM`."""
     falling = -curves.slopes()
     order = np.argsort(falling, kind="stable")
     return Worth(falling[order], np.cumsum(curves.bits[order]), _SHARE_OF_STREAM, _SEGMENT)
@@ -90,7 +90,7 @@ def _worth(curves: Curves) -> Worth:
 def _layer_ends(
     sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: bool, most: int
 ) -> list[int]:
-    """Return how many passes are known after each of at most so many layers.
+    """Return the number of passes that are known after each of at most ``most`` layers.
 
     They follow from bytes and gains that the passes add up to.
     Where there would be more layers, neighbours are merged, evenly over the stream, so that it still begins small.
@@ -124,7 +124,7 @@ def _layer_ends(
 
 
 def _range_before(size: float, total: float, few: bool) -> tuple[float, float]:
-    """Return bytes, at least and at most, after the layer before one that ends at ``size``."""
+    """Return the fewest and the most bytes of the stream after the layer before one that ends at ``size``."""
     if few:
         second = _SECOND * _FIRST_LAYER
         count = min(max(int(total / _BYTES_FOR_A_LAYER), _FEWEST), _MOST)

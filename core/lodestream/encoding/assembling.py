@@ -1,4 +1,4 @@
-"""What tasks have left, in the order of the stream."""
+"""Results of the tasks, in the order of the stream."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Chunks(Sequence[memoryview]):
     @overload
     def __getitem__(self, number: slice) -> Sequence[memoryview]: ...
     def __getitem__(self, number: int | slice) -> memoryview | Sequence[memoryview]:
-        """One chunk, or some."""
+        """Return one chunk, or a list of those of a slice."""
         if isinstance(number, slice):
             return [self[k] for k in range(*number.indices(len(self)))]
         file, start, stop = self._places[number].tolist()
@@ -136,11 +136,11 @@ def coded_layers(
     """
     starts = np.array([tiles.start for _, _, tiles in pieces])
     stored: dict[tuple[int, int], _Piece] = {}
-    for channel, own in enumerate(tops):
+    for channel, channel_tops in enumerate(tops):
         first = build.first_large(channel, large)
         for number, (level, band, tiles) in enumerate(pieces):
             small = min(max(first - tiles.start, 0), len(tiles))
-            planes = own[tiles.start : tiles.stop]
+            planes = channel_tops[tiles.start : tiles.stop]
             stored[channel, number] = _Piece(build.scratch, (channel, level, band), tiles, planes, small)
     before = begin = all_passes(tops)
     for layer in layers:
@@ -157,26 +157,29 @@ def coded_layers(
 
 
 def returned_digest(surface: Surface, hole: int) -> str:
-    """`values_digest` of the blocks as they come out of a container, of which some rows at a time are looked at."""
+    """Return the `values_digest` of the blocks as a reader will have them.
+
+    Values are read some rows at a time, so that memory-mapped arrays are never in memory whole.
+    """
     digest = ValuesDigest()
     for block in surface.blocks:
         hidden = None
         if block.mask is not None:
             hidden = ~block.mask if block.kept is None else ~(block.mask | block.kept)
         for number, array in enumerate(given_arrays(block)):
-            each = max(1, _AT_ONCE // (array.shape[1] * array.shape[2]))
-            for start in range(0, len(array), each):
-                rows: NDArray[Any] = array[start : start + each]
+            n_rows = max(1, _AT_ONCE // (array.shape[1] * array.shape[2]))
+            for start in range(0, len(array), n_rows):
+                rows: NDArray[Any] = array[start : start + n_rows]
                 if hidden is not None:
                     rows = np.array(rows)
                     # Points come first, and attributes after them have 0 in place of the value of a hole.
-                    Values([rows]).clear(hidden[start : start + each], 0 if number else hole)
+                    Values([rows]).clear(hidden[start : start + n_rows], 0 if number else hole)
                 digest.take(rows)
     return digest.hexdigest()
 
 
 def window_section_of(codes: Sequence[NDArray[np.uint8]], total: int) -> bytes | None:
-    """Return the payload that tells errors of windows; None where it is much beside ``total`` bytes.
+    """Return the payload with the errors of windows; None where it is large beside ``total`` bytes.
 
     ``codes`` are uint8, shape (cell, 2), of each layer, see `layer_codes`.
     """

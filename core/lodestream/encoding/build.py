@@ -71,48 +71,54 @@ class Build:
 
     @cached_property
     def pieces(self) -> Pieces:
-        """What is worked on together."""
+        """The pieces that tasks work on."""
         prepared = self.prepared
         # Coordinates under holes are chosen for what is around them, and the pieces must not decide about bytes.
         with_holes = prepared.arrangement is None and prepared.surface.blocks[0].mask is not None
         return Pieces(prepared.layout, self.points, self._core_points, strips(prepared) if with_holes else None)
 
     def table(self, channel: int) -> TileTable:
-        """Of all tiles of a channel, the same object each time: points of interfaces are coordinates.
+        """Return the table of all tiles of a channel, the same object each time.
 
-        Tables of a few layouts are remembered, and a process may be at work on surfaces of many.
+        Points of interfaces are coordinates. Only tables of a few layouts are cached, and a process may work on many.
         """
         kind = channel < self.prepared.geometric
         return self._tables.get(kind) or self._tables.setdefault(kind, TileTable.of(self.prepared.layout, kind))
 
     def quantiser_of(self, channel: int) -> Quantiser | None:
-        """The quantiser of a channel, if it has one."""
+        """Return the quantiser of a channel, if it has one."""
         return self.quantiser if channel < self.prepared.geometric else None
 
     def first_large(self, channel: int, level: int) -> int:
-        """The first tile of a channel that is a large unit where those of a level are; as many as there are if none."""
+        """Return the first tile of a channel that is a large unit if those of a level are.
+
+        The number of tiles if none is.
+        """
         return self.prepared.layout.tiles_from(0 if self.quantiser_of(channel) else level)
 
     @cached_property
     def is_whole(self) -> bool:
-        """Whether everything is in one piece, in memory: no task is done twice, and what is needed no more can go."""
+        """Whether all of the surface is one piece, in memory.
+
+        Then no task runs twice, and arrays are freed after their last use.
+        """
         layout = self.prepared.layout
         in_one = self.pieces.core == layout.levels and self.points >= layout.points(layout.levels)
         return in_one and isinstance(self.scratch, MemoryScratch)
 
     @property
     def channels(self) -> int:
-        """Of the surface, attributes included."""
+        """Number of channels of the surface, attributes included."""
         return len(self.lattices.channels)
 
     @property
     def folder(self) -> str:
-        """Where other processes open this; it is in files."""
+        """The folder from which other processes open this build; the scratch is in files."""
         assert isinstance(self.scratch, FolderScratch)
         return str(self.scratch.folder)
 
     def save(self, flush: bool = False) -> None:
-        """Write what other processes need to open this; with ``flush``, also those of other machines."""
+        """Write the files from which other processes open this build; with ``flush``, also those on other machines."""
         assert isinstance(self.scratch, FolderScratch)
         facts = _Facts(self.prepared, self.lattices, self.points, self._core_points, self.scratch.lasting)
         dump(facts, Path(self.folder) / _FILE, flush)
@@ -123,7 +129,7 @@ class Build:
         self.scratch.write(_HEADER, np.frombuffer(pickle.dumps(header, pickle.HIGHEST_PROTOCOL), np.uint8))
 
     def stored_header(self) -> Header:
-        """What `save_header` wrote.
+        """Read the header that `save_header` wrote.
 
         Raises
         ------
@@ -137,7 +143,7 @@ class Build:
 
     @staticmethod
     def open(folder: str) -> Build:
-        """The build that was saved in a folder, the same object for the same folder and file.
+        """Open the build that was saved in a folder; the same object for the same folder and file.
 
         Those whose folders are gone are forgotten.
 
@@ -154,7 +160,10 @@ class Build:
         return _opened(folder, (state.st_ino, state.st_size, state.st_mtime_ns))
 
     def close(self) -> None:
-        """Let this process forget the build: maps of files that were removed take their room on the disk."""
+        """Drop the build from this process's cache.
+
+        Mapped files keep their room on the disk even after they are deleted.
+        """
         with _LOCK:
             _OPENED.pop(self.folder, None)
 

@@ -109,14 +109,17 @@ class _Details:
         self._predicted = allocate((rows, columns))
 
     def along_one(self) -> NDArray[np.int32]:
-        """Return those along one axis, from the nodes; int32, shape (row, column) of the level."""
+        """Return the predictions of details along one axis, from the nodes; int32, shape (row, column) of the level."""
         nodes = self._reconstructed[: self._top, : self._left]
         self._predicted[: self._top, self._left :] = self._third_step(nodes, 1)
         self._predicted[self._top :, : self._left] = self._third_step(nodes, 0)
         return self._predicted
 
     def along_both(self) -> NDArray[np.int32]:
-        """Return those along both, once those along one axis are known, too."""
+        """Return the predictions along both axes, from the details along one.
+
+        Int32, shape (row, column) of the level.
+        """
         details = self._predicted[: self._top, self._left :] + self._reconstructed[: self._top, self._left :]
         both = self._predicted[self._top :, self._left :]
         both[...] = self._third_step(details, 0)
@@ -146,7 +149,7 @@ class _Coder:
         self._complete = np.zeros(len(table.layout.tiles), np.int8)
 
     def code(self, of_grid: dict[int, NDArray[np.int64]], predicted: dict[int, NDArray[np.int32]]) -> None:
-        """Code some bands of each grid: what is to be reached less what is predicted, if it is."""
+        """Code some bands of each grid: the target less the prediction, if there is one."""
         for grid, numbers in of_grid.items():
             for number in numbers.tolist():
                 target, window = self._own(self._targets, number), self._window(number)

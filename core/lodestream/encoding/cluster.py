@@ -21,15 +21,17 @@ _ADDRESS = re.compile(r"(?:(?:tcp|tls|ucx|ws|wss)://)?(?:[^\s/:\[\]]+|\[[0-9a-fA
 
 
 def checked_address(address: str) -> str:
-    """The address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, as it was given; Dask refuses others late.
+    """Return the address of a Dask scheduler, such as ``tcp://10.0.0.1:8786``, unchanged if it is valid.
+
+    Dask itself refuses a wrong address only after a long wait.
 
     Raises
     ------
     OptionError
         If it is something else.
     """
-    found = _ADDRESS.fullmatch(address)
-    if found is None or not 0 < int(found[1]) < 1 << 16:
+    match = _ADDRESS.fullmatch(address)
+    if match is None or not 0 < int(match[1]) < 1 << 16:
         raise OptionError(f"expected the address of a Dask scheduler such as tcp://10.0.0.1:8786, got {address[:80]!r}")
     return address
 
@@ -48,7 +50,7 @@ def require_dask() -> None:
 
 @contextmanager
 def executor_of(address: str | None) -> Iterator[Executor | None]:
-    """What hands tasks to the workers of a Dask scheduler; None where there is no address.
+    """Connect to a Dask scheduler, and yield an executor on its workers; None where there is no address.
 
     Parameters
     ----------
@@ -73,36 +75,36 @@ def executor_of(address: str | None) -> Iterator[Executor | None]:
             yield executor
     except Exception as error:
         if is_loss(error):
-            said = str(error) or type(error).__name__
-            raise UnavailableError(f"expected a Dask cluster that lasts, lost it at {address!r}: {said}") from error
+            reason = str(error) or type(error).__name__
+            raise UnavailableError(f"expected a Dask cluster that lasts, lost it at {address!r}: {reason}") from error
         raise
 
 
 def is_loss(error: BaseException) -> bool:
-    """Whether an error says that a scheduler, or too many workers of it, were lost."""
+    """Return whether an error means that the scheduler, or too many of its workers, were lost."""
     return isinstance(error, CancelledError) or type(error).__module__.partition(".")[0] == "distributed"
 
 
 def _connected(address: str) -> Any:
-    """A client of a scheduler, a `distributed.Client`, whose classes have no types."""
+    """Return a `distributed.Client` of a scheduler; Dask's classes have no types."""
     import distributed
 
     client_of: Any = distributed.Client
-    found: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    outcomes: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
     def connect() -> None:
         try:
-            found.put(client_of(address, timeout=_PATIENCE, set_as_default=False))
+            outcomes.put(client_of(address, timeout=_PATIENCE, set_as_default=False))
         except Exception as error:  # whatever another program at that port makes of it, MemoryError among others
-            found.put(error)
+            outcomes.put(error)
 
     # Dask waits for ever for a program at that port that says nothing.
     threading.Thread(target=connect, daemon=True).start()
     try:
-        client = found.get(timeout=_PATIENCE + 2)
+        client = outcomes.get(timeout=_PATIENCE + 2)
     except queue.Empty:
         client = TimeoutError(f"no answer after {_PATIENCE + 2} s")
     if isinstance(client, Exception):
-        said = str(client) or type(client).__name__
-        raise OptionError(f"expected the address of a Dask scheduler, got {address!r}: {said}")
+        reason = str(client) or type(client).__name__
+        raise OptionError(f"expected the address of a Dask scheduler, got {address!r}: {reason}")
     return client

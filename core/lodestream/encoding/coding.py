@@ -1,4 +1,4 @@
-"""Units of a band coded: what their passes cost and gain, and their bytes.
+"""Coded units of a band: rates and gains of their passes, and their bytes.
 
 The contexts of a unit follow from itself and its parent, so a band needs its own coefficients and those of its parents.
 """
@@ -94,8 +94,8 @@ class Units:
         self.part: Part = part_of(table, [parents, tiles])
         self.first = len(parents)  # the local number of the first of the tiles
         flat = np.zeros(self.part.table.size, np.int32)
-        self.own = self.part.spans[-1][1]
-        flat[self.own] = true
+        self.span = self.part.spans[-1][1]
+        flat[self.span] = true
         if parents:
             flat[self.part.spans[0][1]] = above
         bands = [slice(table.first[run.start], table.first[run.stop]) for run in (parents, tiles) if run]
@@ -108,7 +108,7 @@ class Units:
 
 
 def code_units(units: Units) -> CodedBand:
-    """Code each tile once as a whole: what its passes cost and gain, and the bytes of large units."""
+    """Code each tile whole: bits and gains of its passes, and the bytes of large units."""
     table = units.part.table
 
     def curve(tile: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -122,7 +122,7 @@ def code_units(units: Units) -> CodedBand:
     return CodedBand(
         np.concatenate([nothing, *(bits for bits, _ in curves)]),
         np.concatenate([nothing, *(gains for _, gains in curves)]),
-        units.coder.tiles[0].early[units.own].copy(),
+        units.coder.tiles[0].early[units.span].copy(),
         np.frombuffer(b"".join(data for data, _ in strings), np.uint8),
         np.concatenate([np.zeros(0, np.int64), *(ends for _, ends in strings)]),
     )
@@ -131,7 +131,7 @@ def code_units(units: Units) -> CodedBand:
 def unit_curve(
     coder: TileCoder, tile: int, channel: Channel, table: TileTable, rounded: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Code all passes of a unit that has a bit-plane: bits and gains, float64, shape (pass,), see `Curves`.
+    """Return bits and gains of all passes of a unit that has a bit-plane, float64, shape (pass,), see `Curves`.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def unit_curve(
 
 
 def code_segments(units: Units, states: Sequence[NDArray[np.int8]]) -> list[bytes]:
-    """Return the segments of small units, by layer, then by tile.
+    """Code the small units, and return their segments by layer, then by tile.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def code_segments(units: Units, states: Sequence[NDArray[np.int8]]) -> list[byte
 def sizes_of_unit(
     table: TileTable, tile: int, true: NDArray[np.int32], above: NDArray[np.int32], top: int, large: int
 ) -> tuple[int, int]:
-    """Return bytes of one unit as a large one and as a small one.
+    """Return the bytes of one unit coded as a large one, and as a small one.
 
     Parameters are those of `Units`, of the one tile: coefficients of shape (number,), as they stand in the flat array.
     """

@@ -1,4 +1,4 @@
-"""What the coding passes of all units cost and gain, the gain for each bit, and what a coefficient is worth."""
+"""Rates and gains of the coding passes of all units, their slopes, and the weight of a coefficient in the error."""
 
 from __future__ import annotations
 
@@ -73,16 +73,16 @@ class Curves:
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:
-        """Where each curve ends among the passes: int64, shape (curve,)."""
+        """End of each curve among the passes, int64, shape (curve,)."""
         return np.cumsum(self.counts)
 
     @property
     def bytes(self) -> float:
-        """What all passes take."""
+        """Bytes of all passes."""
         return float(self.bits.sum()) / 8
 
     def slopes(self, worth: Worth = _NOTHING) -> NDArray[np.float64]:
-        """Return gain for each bit of every pass: the same for all passes of a run, falling from run to run of a curve.
+        """Return the gain for each bit of every pass: equal within a run of passes, falling from run to run of a curve.
 
         Two runs that follow each other, of a bits with a gain of s a and of b bits with t b, are one unless s > t and,
         where both as one would come, they save enough bits as two, a b (s - t) / (s a + t b): what `worth` says, and a
@@ -124,7 +124,7 @@ class Curves:
 def band_weights(
     prepared: Prepared, channel: int, lattice: Lattice, table: TileTable, predictors: NDArray[np.int8]
 ) -> NDArray[np.float64]:
-    """Return what a coefficient of one is worth in each band: float64, shape (band,).
+    """Return the weight in the squared error of a coefficient of one in each band: float64, shape (band,).
 
     Errors are weighed relative to the extent, so that their squares stay within float64 at any scale; an attribute
     shares the stream in proportion to its own range.

@@ -1,4 +1,4 @@
-"""Encoding any surface: in one piece where it fits into memory, by bands where it does not or others shall help."""
+"""Encode a surface: in memory if it fits, otherwise piece by piece, optionally on other machines."""
 
 from __future__ import annotations
 
@@ -180,18 +180,18 @@ def encode(
         left_out = at_holes(surface)
         if left_out is not None:
             warnings.warn(left_out, FormatWarning, stacklevel=2)
-        told = request.rising(progress or (lambda fraction: None))
+        report = request.rising(progress or (lambda fraction: None))
         if not whole and goes_by_bands(surface, chosen, limit, executor is not None, memory is not None):
-            made = FolderBuild(surface, chosen, limit, executor, told, read is not None).container(folders)
-            if made is not None:
-                return _given(made, out)
+            container = FolderBuild(surface, chosen, limit, executor, report, read is not None).container(folders)
+            if container is not None:
+                return _given(container, out)
             if memory is not None:
                 _check_whole(surface, chosen, limit, "float64 does not hold the squares of its errors")
-        return _in_memory(surface, chosen, told, out)
+        return _in_memory(surface, chosen, report, out)
 
 
 def _reading(source: Any) -> Callable[[Room], Surface] | None:
-    """How the surface is read of what is read by windows; None: it is an array in memory."""
+    """Return the function that reads a source by windows; None if the source is an array in memory."""
     if isinstance(source, str | os.PathLike):
         from ..formats import read as read_file
 
@@ -213,20 +213,20 @@ def _reading(source: Any) -> Callable[[Room], Surface] | None:
 
 
 def _by_bands(limit: int, quality: Quality, whole: bool, wanted: bool) -> Callable[[int], bool]:
-    """Whether an array of so many values goes by bands, as far as its number of values tells."""
+    """Return a function that tells, by its number of values, whether an array must be encoded by bands."""
     able = not whole and quality.rms is None
     return lambda values: able and (wanted or values * WHOLE > limit)
 
 
-def _given(made: Path, out: str | os.PathLike[str] | None) -> bytes | None:
+def _given(container: Path, out: str | os.PathLike[str] | None) -> bytes | None:
     if out is None:
-        return made.read_bytes()
+        return container.read_bytes()
     with replacing(Path(out)) as unfinished:
         # A second name, so that a build that can continue has its container until OUT is on disk.
         try:
-            os.link(made, unfinished)
+            os.link(container, unfinished)
         except OSError:  # on another disk, or a process that is confined
-            shutil.copyfile(made, unfinished)
+            shutil.copyfile(container, unfinished)
         with unfinished.open("rb+") as file:
             os.fsync(file.fileno())
     synchronise(Path(out).resolve().parent)
@@ -245,7 +245,7 @@ def _in_memory(
 
 
 def goes_by_bands(surface: Surface, quality: Quality, memory: int, wanted: bool = False, strict: bool = False) -> bool:
-    """Whether a surface is built by bands: it can be, and takes more memory in one piece or somebody wants it.
+    """Return whether a surface is built by bands: that is possible, and is wanted or saves memory that there is not.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def _check_whole(surface: Surface, quality: Quality, memory: int, reason: str) -
 
 
 def _in_one_piece(surface: Surface, quality: Quality) -> str | None:
-    """Why a surface cannot be built by bands; None: it can."""
+    """Return the reason why a surface cannot be built by bands; None if it can."""
     if quality.rms is not None:
         return "a stream for one error (rms) is made of all values together"
     return None

@@ -1,4 +1,4 @@
-"""Tasks carried out by threads of this process, or by any executor: what is done already is not done again."""
+"""Run tasks in threads of this process or in any executor; tasks that are done are skipped."""
 
 from __future__ import annotations
 

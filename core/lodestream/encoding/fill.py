@@ -1,4 +1,4 @@
-"""Values under the holes of a surface, such that they cost few bytes.
+"""Fill the holes of a surface with values that cost few bytes.
 
 `fill_holes` lays a thin plate through what is around them. Averages of 2 x 2 points are taken until there are no
 holes left; on the way back each hole takes what the coarser grid has there, in a straight line between its points, and
@@ -98,7 +98,7 @@ def fill_channel(values: NDArray[Any], mask: NDArray[np.bool_], closed: Closed, 
 def settle_holes(
     coordinates: NDArray[np.int32], mask: NDArray[np.bool_], layout: Layout, room: Room = IN_MEMORY
 ) -> None:
-    """Move what is under holes so that the transform has fewer coefficients to code.
+    """Move the values under holes so that the transform has fewer coefficients to code.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def settle_holes(
 
 
 def _forward_again(values: NDArray[np.int32], layout: Layout, predictors: NDArray[np.int8]) -> None:
-    """The forward transform with predictors that are known."""
+    """Run the forward transform with given predictors, in place."""
     for level in range(layout.levels, 0, -1):
         rows, columns = layout.shape(0, level)
         for axis, step in enumerate(layout.steps(0, level)):
@@ -150,7 +150,7 @@ def _forward_again(values: NDArray[np.int32], layout: Layout, predictors: NDArra
 def _fill(
     values: NDArray[np.float64], known: NDArray[np.bool_], closed: Closed, sweeps: int, room: Room = IN_MEMORY
 ) -> None:
-    """Fill one grid by way of coarser ones, in place."""
+    """Fill the holes of one grid in place, from coarser grids."""
     shape = ((values.shape[0] + 1) // 2, (values.shape[1] + 1) // 2)
     coarser, filled = room.empty(shape, np.float64), room.empty(shape, np.bool_)
     for first, last in _runs(coarser.size):
@@ -164,5 +164,5 @@ def _fill(
 
 
 def _runs(count: int) -> Iterator[tuple[int, int]]:
-    """Divide so many points into what one call of a kernel does."""
+    """Divide ``count`` points into runs, one for each call of a kernel; yield (first, last + 1)."""
     return ((first, min(first + _AT_ONCE, count)) for first in range(0, count, _AT_ONCE))

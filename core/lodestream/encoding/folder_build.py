@@ -1,4 +1,4 @@
-"""A container made by bands in a folder: the preparation, the streams that are tried, what a build continues from."""
+"""A container that is built by bands in a folder, and that a later call can continue."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ class FolderBuild:
         copied: bool = False,
     ) -> None:
         self._surface, self._quality, self._progress, self._executor = surface, quality, progress, executor
-        own = threads()
+        n_threads = threads()
         points = sum(block.shape[0] * block.shape[1] for block in surface.blocks)
         channels = max(1, sum(a.size for a in self._arrays()) // points)
         room = max(memory - BESIDE - masks_memory(surface), 0) // (OF_BAND * channels)
-        self._threads = 1 if executor is not None else max(1, min(own, room // _FEWEST))
+        self._threads = 1 if executor is not None else max(1, min(n_threads, room // _FEWEST))
         self._points = min(max(room // self._threads, _FEWEST), _MOST)
         self._core = min(CORE_POINTS, max(self._points // 2, 1 << 12))
         self._room, self._channels, self._values = room, channels, points * channels
@@ -87,7 +87,7 @@ class FolderBuild:
         return [*self._arrays(), *(block.mask for block in self._surface.blocks if block.mask is not None)]
 
     def _beside(self) -> int:
-        """About the bytes of what is prepared of several blocks, and of such with holes: copies, and lattice points."""
+        """Estimate the bytes of copies and lattice points, which a surface of several blocks takes in addition."""
         blocks = self._surface.blocks
         if len(blocks) == 1:
             return 0
@@ -95,7 +95,7 @@ class FolderBuild:
         return points + sum(block.points.nbytes for block in blocks if block.mask is not None)
 
     def container(self, folders: BuildFolders) -> Path | None:
-        """The file of the container, in a folder of the call; None: the surface must be encoded in one piece.
+        """Build the container, and return its file in a folder of the call; None: it must be encoded in one piece.
 
         Raises
         ------
@@ -113,12 +113,12 @@ class FolderBuild:
         scratch = folders.build(self._key)
         check_room(scratch.folder, self._values * FOR_A_VALUE + in_memory + self._beside(), scratch.size())
         remove_leftovers(scratch.folder)
-        made = self._container(scratch)
+        container = self._container(scratch)
         for path, state in zip(paths, states, strict=True):
             if file_state(path) != state:
                 remove(scratch.folder)  # its key has times that do not come again
                 raise InputError(f"expected {path} to stay as it is until it is encoded, it was changed meanwhile")
-        return made
+        return container
 
     def _container(self, scratch: FolderScratch) -> Path | None:
         self._surface = self._in_files(scratch)
@@ -143,7 +143,10 @@ class FolderBuild:
         return best
 
     def _in_files(self, scratch: FolderScratch) -> Surface:
-        """The surface with all arrays in files, which tasks open: what is in memory would go to each of them."""
+        """Return the surface with all arrays in files, which tasks open.
+
+        Arrays in memory would be sent to each of them.
+        """
         files = FolderScratch(scratch.folder / "surface")
         written = scratch.lasting and is_sealed(files.folder)
         if not written:
@@ -171,7 +174,10 @@ class FolderBuild:
         return surface
 
     def _stream(self, scratch: FolderScratch, prepared: Prepared, bits: int | None, room: Room) -> Path:
-        """The container of a stream; what is there of it and is not as it was written is made again."""
+        """Build the container of one stream, and return its file.
+
+        Parts of an earlier build are used where they are intact.
+        """
         name = "exact" if bits is None else f"bits-{bits}"
         whole, path = scratch.folder / f"{name}-whole", scratch.folder / f"{name}-whole" / "container"
         if scratch.lasting and is_sealed(whole):
@@ -208,9 +214,12 @@ class FolderBuild:
         return path
 
     def _key(self) -> str:
-        """What decides about the files of this build: one that was cut goes on only if nothing of it has changed."""
+        """Return the key of the files of this build.
+
+        An interrupted build continues only if nothing in its key has changed.
+        """
         blocks = self._surface.blocks
-        said = {
+        key = {
             "version": [__version__, fingerprint(), np.__version__],
             "quality": repr(self._quality),
             "blocks": [[block.closed, list(block.attributes), block.mask is None] for block in blocks],
@@ -218,7 +227,7 @@ class FolderBuild:
             "arrays": [_identity(array, self._copied) for array in self._all()],
             "points": [self._points, self._core],
         }
-        return json.dumps(said)
+        return json.dumps(key)
 
 
 def _emptied(scratch: FolderScratch) -> FolderScratch:
@@ -227,22 +236,25 @@ def _emptied(scratch: FolderScratch) -> FolderScratch:
 
 
 def _kept(files: FolderScratch, name: str, arrays: list[NDArray[Any]], written: bool) -> list[NDArray[Any]]:
-    """Arrays of one dtype and any shapes, those in memory as parts of one file: a process may have so many open."""
-    left = [number for number, array in enumerate(arrays) if root_of(array) is None]
-    if not left:
+    """Return arrays of one dtype, any shapes, all in files; those in memory go into one file.
+
+    One file for all, because a process may have only so many open.
+    """
+    in_memory = [number for number, array in enumerate(arrays) if root_of(array) is None]
+    if not in_memory:
         return arrays
     if not written:
-        files.write_joined(name, [arrays[number] for number in left])
-    whole, found, done = files.read(name), list(arrays), 0
-    for number in left:
+        files.write_joined(name, [arrays[number] for number in in_memory])
+    whole, stored, start = files.read(name), list(arrays), 0
+    for number in in_memory:
         array = arrays[number]
-        found[number] = whole[done : done + array.size].reshape(array.shape)
-        done += array.size
-    return found
+        stored[number] = whole[start : start + array.size].reshape(array.shape)
+        start += array.size
+    return stored
 
 
 def _identity(array: NDArray[Any], copied: bool) -> list[Any]:
-    """What an array is known by: its file and place there, or the digest of its values."""
+    """Return the identity of an array: its file and offset there, or the digest of its values."""
     root = root_of(array)
     # What is stored through a map need not change its file's time.
     if copied or root is None or root.mode != "r" or is_made(root):

@@ -73,7 +73,7 @@ class BuildFolders:
         self._temporary: Path | None = None
 
     def temporary(self) -> Path:
-        """A folder that is gone afterwards, whatever happens."""
+        """Make a temporary folder, which is removed at the end, whatever happens."""
         if self._temporary is None:
             name = "" if self._out is None else self._out.name
             above = None if self._out is None else self._out.parent
@@ -84,18 +84,18 @@ class BuildFolders:
         return self._temporary
 
     def copies(self) -> FolderScratch:
-        """Where copies go of what can be read only once."""
+        """Make a temporary folder for copies of sources that can be read only once."""
         return FolderScratch(self.temporary() / "source")
 
     def build(self, key: Callable[[], str]) -> FolderScratch:
-        """Return the folder of a build; the key, see `kept_folder`, is asked for only where builds continue."""
+        """Make or reopen the folder of a build; the key, see `kept_folder`, is asked for only where builds continue."""
         if self._scratch is None:
             return FolderScratch(self.temporary() / "build")
         return FolderScratch(self._stack.enter_context(kept_folder(self._scratch, key())), lasting=True)
 
 
 def check_out(path: Path) -> None:
-    """Say before any work that a file cannot be written.
+    """Check before any work that a file can be written.
 
     Raises
     ------
@@ -112,14 +112,14 @@ def check_out(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path for a new file, which takes the place of ``path`` when it is whole; no other process writes to it.
+    """Yield a path for a new file that replaces ``path`` when the block ends; no other process writes to it.
 
     A link stays a link. A pipe or a device is not replaced: the file is copied into it.
     """
     if path.exists() and not path.is_file():  # before links are followed: that of a pipe leads to no path
         with tempfile.TemporaryDirectory(prefix="lodestream-") as folder:
-            yield (made := Path(folder) / "container")
-            with made.open("rb") as whole, path.open("wb") as out:
+            yield (copy := Path(folder) / "container")
+            with copy.open("rb") as whole, path.open("wb") as out:
                 shutil.copyfileobj(whole, out)
         return
     path = path.resolve()
@@ -132,7 +132,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def synchronise(folder: Path) -> None:
-    """Put the names in a folder on disk, where systems can; elsewhere they do so by themselves."""
+    """Put the names in a folder on disk, on systems that can; others do so by themselves."""
     if not hasattr(os, "O_DIRECTORY"):  # not on Windows
         return
     with suppress(OSError):  # a process that is confined, or file systems without it
@@ -145,7 +145,7 @@ def synchronise(folder: Path) -> None:
 
 @contextmanager
 def temporary_folder(above: Path | None, name: str = "") -> Iterator[Path]:
-    """Make a folder of this user alone in another one, and remove it afterwards, whatever happens.
+    """Make a folder in another one that only this user can read, and remove it afterwards, whatever happens.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def temporary_folder(above: Path | None, name: str = "") -> Iterator[Path]:
 
 @contextmanager
 def kept_folder(scratch: Path, key: str) -> Iterator[Path]:
-    """Have the folder for files of one kind for oneself; it is removed if the block ends well, else it is kept.
+    """Lock the folder of a key, and yield it; it is removed if the block ends well, else it is kept.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def kept_folder(scratch: Path, key: str) -> Iterator[Path]:
 
 
 def _locked(folder: Path) -> int:
-    """The lock of a folder, which is made if it is not there, as a file descriptor; -1 where systems have none."""
+    """Lock a folder, which is made if it is missing; return a file descriptor, -1 on systems without locks."""
     for _ in range(_ATTEMPTS):
         try:
             folder.mkdir(0o700)
@@ -229,7 +229,7 @@ def _locked(folder: Path) -> int:
 
 
 def _check(folder: Path) -> None:
-    """Refuse what others could have put in the place of a folder: tasks are read from it."""
+    """Refuse a folder of another user: tasks are unpickled from it."""
     state = folder.lstat()
     if not stat.S_ISDIR(state.st_mode):
         raise InputError(f"expected a folder of a build at {folder}, got something else")
@@ -263,7 +263,7 @@ def _let_go(handle: int) -> None:
 
 
 def _forked() -> None:
-    """Close what a process has inherited, so that a lock ends with the process that took it."""
+    """Close inherited descriptors in a forked process, so that a lock ends with the process that took it."""
     while _HELD:
         os.close(_HELD.pop())
 
@@ -273,7 +273,10 @@ if hasattr(os, "register_at_fork"):  # not on Windows
 
 
 def remove(path: Path) -> None:
-    """Remove a folder, if it is there, with all that is in it; a late task finds none under its name to write into."""
+    """Remove a folder with its contents, if it exists.
+
+    It is renamed first, so that a late task cannot write into it.
+    """
     away = path.with_name(f"{_REMOVED}{secrets.token_hex(6)}")
     try:
         path.rename(away)
@@ -285,13 +288,13 @@ def remove(path: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a process that was killed was removing in a folder of its own."""
+    """Remove folders that a killed process had begun to remove."""
     for path in folder.glob(f"{_REMOVED}*"):
         shutil.rmtree(path, ignore_errors=True)
 
 
 def seal(folder: Path) -> None:
-    """Put the files of a folder, to which nobody writes any more, on disk, with their lengths and checksums.
+    """Put the files of a finished folder on disk, with a list of their lengths and checksums.
 
     Raises
     ------
@@ -312,7 +315,7 @@ def seal(folder: Path) -> None:
 
 
 def is_sealed(folder: Path) -> bool:
-    """Whether a folder is there and has the files, byte for byte, that it had when it was sealed."""
+    """Return whether a folder exists and its files are byte for byte those that were sealed."""
     try:
         sums = json.loads((folder / _SEAL).read_bytes())
         return bool({path.relative_to(folder).as_posix(): list(checksum(path)) for path in _files(folder)} == sums)

@@ -1,4 +1,4 @@
-"""The forward transform of one channel by pieces, level by level: what `pyramid.forward` makes of the whole.
+"""The forward transform of one channel by pieces, level by level; equal to `pyramid.forward` of the whole.
 
 For each level above the core, a first round of tasks steps the rows of each piece along the rows' axis; the predictor
 of the columns' axis is then fitted to some of the rows; a second round steps along it, and leaves the coefficients of
@@ -50,14 +50,14 @@ _Arrays = list[NDArray[np.int32]]
 
 
 def joined(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return int32 arrays, shape (row, column), one after another in a flat one; the only one as it is."""
+    """Return int32 arrays, shape (row, column), one after another in a flat array; a single array is not copied."""
     if len(arrays) == 1:
         return arrays[0]
     return np.concatenate([np.zeros(0, np.int32), *(array.ravel() for array in arrays)])
 
 
 def _separated(stored: NDArray[Any], shapes: Sequence[tuple[int, int]]) -> list[NDArray[Any]]:
-    """Undo `joined`: views of these shapes, (row, column)."""
+    """Return the arrays that `joined` put into a flat one: views of these shapes, (row, column)."""
     if len(shapes) == 1:
         return [stored.reshape(shapes[0])]
     arrays, place = [], 0
@@ -101,14 +101,14 @@ class Samples:
                 out[low - wanted.start : high - wanted.start] = array[low - rows.start : high - rows.start]
 
     def grid(self, grid: int) -> NDArray[np.int32]:
-        """Return all of a grid, shape (row, column), an array from `pyramid.empty`."""
+        """Return all samples of a grid, shape (row, column), an array from `pyramid.empty`."""
         shape = self._layout.shape(grid, self._level)
         array = empty(shape)
         self.read(Rows(grid, 0, shape[0]), array)
         return array
 
     def _piece(self, number: int) -> list[NDArray[np.int32]]:
-        """Return the arrays of a piece; the last one that was asked for stays open, as neighbours are in it."""
+        """Return the arrays of a piece. The last piece stays open, since neighbours need it too."""
         if self._opened[0] != number:
             self._opened = number, _separated(self._scratch.read(f"{self._name}/{number}"), self._shapes[number])
         return self._opened[1]
@@ -127,7 +127,7 @@ def _lines(layout: Layout, level: int, axis: int) -> tuple[int, int]:
 
 
 def _stride(layout: Layout, level: int, grid: int, axis: int) -> int:
-    """Return every how manieth line along an axis a grid's predictor is fitted to; 0: it is not fitted."""
+    """Return the stride between lines along an axis that a grid's predictor is fitted to; 0: it is not fitted."""
     if not is_fitted(layout.steps(grid, level)[axis]):
         return 0
     lines = _lines(layout, level, axis)[layout.grids[grid].interface]
@@ -145,7 +145,7 @@ def _line_counts(layout: Layout, level: int, part: Part, stride: int) -> tuple[i
 
 
 def sampled_columns(arrays: Sequence[NDArray[np.int32]], layout: Layout, level: int, rows: Sequence[Rows]) -> _Arrays:
-    """Return the columns of samples that a predictor of the rows' axis is fitted to, shape (row, column) each.
+    """Return the columns of samples to which the predictor of the rows' axis is fitted, shape (row, column) each.
 
     ``arrays`` have ``rows`` of the level. Grids whose axis is too short have none.
     """
@@ -156,7 +156,7 @@ def sampled_columns(arrays: Sequence[NDArray[np.int32]], layout: Layout, level: 
 
 
 def sampled_rows(stepped: Sequence[NDArray[np.int32]], layout: Layout, piece: Piece) -> _Arrays:
-    """Return those rows of `first_step` that a predictor of the columns' axis is fitted to, shape (row, column) each.
+    """Return the rows of `first_step` to which the predictor of the columns' axis is fitted, shape (row, column) each.
 
     Of each part the nodes, then the details; none of grids whose axis is too short.
     """
@@ -174,7 +174,7 @@ def sampled_rows(stepped: Sequence[NDArray[np.int32]], layout: Layout, piece: Pi
 def fit_rows(
     stored: Sequence[NDArray[np.int32]], pieces: Sequence[Sequence[Rows]], layout: Layout, level: int, rule: int
 ) -> tuple[int, int] | None:
-    """Fit the (a, b) of the rows' axis of all patches, or of all interfaces; None: they have none of their own.
+    """Fit the (a, b) of the rows' axis of all patches, or of all interfaces; None where the level has none.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def fit_rows(
 def fit_columns(
     stored: Sequence[NDArray[np.int32]], pieces: Sequence[Piece], layout: Layout, level: int
 ) -> tuple[int, int] | None:
-    """Fit the (a, b) of the columns' axis of all patches; None: they have none of their own.
+    """Fit the (a, b) of the columns' axis of all patches; None where the level has none.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def fit_columns(
 def first_step(
     read: Callable[[Rows, NDArray[np.int32]], None], layout: Layout, piece: Piece, predictors: NDArray[np.int8]
 ) -> _Arrays:
-    """Step a piece along the rows' axis.
+    """Transform a piece along the rows' axis.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def first_step(
 def second_step(
     stored: NDArray[np.int32], layout: Layout, piece: Piece, predictors: NDArray[np.int8]
 ) -> tuple[_Arrays, _Arrays]:
-    """Step a piece along the columns' axis.
+    """Transform a piece along the columns' axis.
 
     Parameters
     ----------
@@ -334,17 +334,17 @@ def coefficients_of(
     if parts is not None:
         origins, grids = local.origins.copy(), range(parts[0].grid, parts[-1].grid + 1)
         level = table.layout.level_of(tiles.start)
-        for own, bands in zip(parts, local.of_grids(grids), strict=True):
-            height = own.nodes[1] - own.nodes[0]
-            below = height - table.layout.shape(own.grid, level - 1)[0] - own.details[0]
-            origins[bands, 1] += np.where(local.bands[bands, KIND] > 1, below, -own.nodes[0])
+        for piece_part, bands in zip(parts, local.of_grids(grids), strict=True):
+            height = piece_part.nodes[1] - piece_part.nodes[0]
+            below = height - table.layout.shape(piece_part.grid, level - 1)[0] - piece_part.details[0]
+            origins[bands, 1] += np.where(local.bands[bands, KIND] > 1, below, -piece_part.nodes[0])
     flat = gather(local, arrays, origins, grids)
     planes = np.array([planes_of(local, flat, tile) for tile in range(len(tiles))], np.int8)
     return Coefficients(flat[part.spans[0][1]], planes)
 
 
 def details_of(array: NDArray[np.int32], nodes: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return what the steps of both axes leave beside the nodes: views, shape (row, column).
+    """Return the three bands of details beside the nodes as two views, shape (row, column).
 
     ``array``, shape (row, column), has the nodes in its first rows and columns.
     """
@@ -353,5 +353,5 @@ def details_of(array: NDArray[np.int32], nodes: NDArray[np.int32]) -> tuple[NDAr
 
 
 def largest_of(arrays: Sequence[NDArray[np.int32]]) -> int:
-    """Return the largest magnitude in arrays, shape (row, column); 0 of none."""
+    """Return the largest magnitude in arrays, shape (row, column); 0 if there are none."""
     return max((max(int(array.max()), -int(array.min())) for array in arrays if array.size), default=0)

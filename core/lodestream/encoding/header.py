@@ -1,4 +1,4 @@
-"""The header of a stream: what a reader must know before the first layer."""
+"""The header of a stream, which a reader needs before the first layer."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def header_of(
     quantiser: Quantiser | None,
     large: int,
 ) -> Header:
-    """Return the header, with the largest chunks, and without what is known when all layers are coded.
+    """Return the header, with chunks of the largest size, and without the fields that follow from the coded layers.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def header_of(
 
 
 def _empty_levels(layout: Layout, top: NDArray[np.int8]) -> int:
-    """Return the levels without a coefficient other than 0, as bits; ``top``: bit-planes of each tile."""
+    """Return the levels that have no coefficient other than 0, as bits. ``top``: bit-planes of each tile."""
     return sum(1 << level for level in range(layout.levels + 1) if not top[layout.tiles_of(level)].any())
 
 
@@ -81,7 +81,7 @@ def _encode_mask(mask: NDArray[np.bool_]) -> bytes:
 
 
 def _kept(prepared: Prepared) -> dict[str, Any]:
-    """Return the fields of a header that tell which holes have values that come back."""
+    """Return the fields of a header that tell which holes keep their values."""
     if all(kept is None for kept in prepared.kept):
         return {}
     counts, coded = [], []
@@ -92,7 +92,7 @@ def _kept(prepared: Prepared) -> dict[str, Any]:
 
 
 def _hole(surface: Surface) -> int:
-    """Return what integer points are under holes: the surface's nodata value where it is one of them."""
+    """Return the integer under holes of the points: the surface's nodata value where it is one of them."""
     nodata = surface.metadata.get("nodata")
     if surface.dtype.kind == "f" or not isinstance(nodata, int | float) or nodata != int(nodata):
         return 0

@@ -1,4 +1,4 @@
-"""Which values of a surface are worth coding, and what stands in place of the others."""
+"""Choose the values of a surface that are worth coding, and values in place of the others."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ Arrays = list[NDArray[Any]]
 
 
 def given_arrays(block: Block) -> Arrays:
-    """Return points and attributes of a block as they were given, shape (row, column, channel); views."""
+    """Return points and attributes of a block as the user gave them, shape (row, column, channel); views."""
     arrays = (block.points, *block.attributes.values())
     return [array if array.ndim == 3 else array[..., np.newaxis] for array in arrays]
 
 
 def given_channel(block: Block, channel: int) -> NDArray[Any]:
-    """Return one channel of a block as it was given, shape (row, column), a view.
+    """Return one channel of a block as the user gave it, shape (row, column), a view.
 
     Raises
     ------
@@ -39,7 +39,9 @@ def given_channel(block: Block, channel: int) -> NDArray[Any]:
 
 
 def filled(block: Block, room: Room = IN_MEMORY) -> Arrays:
-    """Return points and attributes of a block, finite everywhere; C-contiguous, shape (row, column, channel).
+    """Return points and attributes of a block with filled holes, finite everywhere.
+
+    C-contiguous, shape (row, column, channel).
 
     What has no holes is not copied; large copies go where there is room.
     """
@@ -61,7 +63,7 @@ def filled(block: Block, room: Room = IN_MEMORY) -> Arrays:
 
 
 def known_values(values: NDArray[Any], block: Block, coordinate: bool) -> NDArray[np.bool_] | None:
-    """Return where one channel has numbers that are worth coding, bool, shape (row, column); None: everywhere.
+    """Return a mask of the values of a channel that are worth coding, bool, shape (row, column); None: all are.
 
     A valid point may lack an attribute, and a hole that is kept may have some of its coordinates; the residual gives
     both back. Numbers that lie further out than all valid ones are left to it as well.

@@ -1,4 +1,4 @@
-"""Which units are coded as large ones: many times as fast, for about a per cent more bytes (docs/format.md, 7.6).
+"""Choose the units that are coded as large ones: many times as fast, for about 1 % more bytes (docs/format.md, 7.6).
 
 Contexts of large units follow from the planes above alone. On coarse levels, whose units have few bits, that costs too
 much; and on a few surfaces the neighbours in the same plane tell more than those above.
@@ -22,14 +22,14 @@ _MOST, _TRIED = 1.05, 2
 
 
 def candidate(layout: Layout) -> tuple[int, list[int]]:
-    """Return the coarsest level whose units may be large, 0 if there is none, and the tiles on which that is tried."""
+    """Return the coarsest level whose units may be large, 0 if there is none, and the tiles on which to try it."""
     level = next((level for level in range(1, layout.levels + 1) if layout.points(level) >= _LARGE), 0)
     tiles = layout.tiles_of(layout.levels)
     return level, sorted({tiles[len(tiles) * (2 * i + 1) // (2 * _TRIED)] for i in range(_TRIED)})
 
 
 def worth(large: Sequence[int], small: Sequence[int]) -> bool:
-    """Return whether units should be large that take so many bytes as large ones and as small ones."""
+    """Return whether large units are worth their bytes, given the bytes as large ones and as small ones."""
     return sum(large) <= _MOST * sum(small)
 
 

@@ -1,4 +1,4 @@
-"""The lattices that a stream starts from, and a channel's coordinates on its lattice, grid by grid."""
+"""Choose the lattices of a stream, and find a channel's coordinates on its lattice, grid by grid."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Lattices:
 
 
 def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_MEMORY) -> Lattices:
-    """Return a lattice for each channel: its own, or one as fine as its precision asks for, or as costs least.
+    """Return a lattice for each channel: that of its values, one as fine as its precision asks for, or the cheapest.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_
 
 
 def _joined(arrays: list[NDArray[Any]], room: Room) -> NDArray[Any]:
-    """Return arrays of shape (point, component) one below the other."""
+    """Concatenate arrays of shape (point, component)."""
     if len(arrays) == 1:
         return arrays[0]
     joined, done = room.empty((sum(map(len, arrays)), arrays[0].shape[1]), arrays[0].dtype), 0
@@ -99,9 +99,9 @@ def _joined(arrays: list[NDArray[Any]], room: Room) -> NDArray[Any]:
 
 
 def fine_lattices(prepared: Prepared) -> Lattices | None:
-    """Return lattices whose steps are small beside the error that the stream is made for.
+    """Return lattices whose steps are small beside the error that the stream is made for; None where there are none.
 
-    None where it is made for none, and where all steps would be too many, however few make the error.
+    There are none for a stream that is not made for an error, and where the steps would be too many for any error.
 
     Raises
     ------
@@ -123,13 +123,13 @@ def fine_lattices(prepared: Prepared) -> Lattices | None:
 
 
 def lies_on_coarse_lattice(prepared: Prepared) -> bool:
-    """Return whether the coordinates lie on a lattice as coarse as the error: an exact stream may then be shorter."""
+    """Return whether the coordinates lie on a lattice as coarse as the error; an exact stream may then be shorter."""
     lattice = find_lattice(prepared.valid)
     return lattice is not None and prepared.rms is not None and lattice.spacing >= prepared.rms
 
 
 def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
-    """Return coordinates of a channel on its lattice; what patches share agrees.
+    """Return the coordinates of a channel on its lattice, the same on both sides of every interface.
 
     Returns
     -------
@@ -145,7 +145,7 @@ def lattice_coordinates(prepared: Prepared, channel: int, lattice: Lattice) -> l
 
 
 def strips(prepared: Prepared) -> list[tuple[int, int]]:
-    """Return the rows of a surface of one grid, half-open, whose lattice coordinates are found together.
+    """Return the strips of rows, half-open, of a surface of one grid whose lattice coordinates are found together.
 
     Without holes each row is for itself. Those under holes are chosen for what is around them: a surface that is not
     very large is one strip, and what they are then follows from its shape alone, not from the memory that there is.
@@ -216,7 +216,7 @@ def _of_strip(
 
 
 def coordinates_of_interfaces(prepared: Prepared, channel: int, lattice: Lattice) -> list[NDArray[np.int32]]:
-    """Return coordinates of a channel on all interfaces, int32, shape (point,): those of the first patch that has each.
+    """Return the coordinates of a channel on all interfaces, int32, shape (point,), taken from the first patch of each.
 
     All 0 for attributes, which are not shared: blocks may disagree about them.
     """

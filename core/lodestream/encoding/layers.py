@@ -1,4 +1,4 @@
-"""The states that a receiver shows after each layer and level, and which layers are kept once these are measured."""
+"""The states after each layer and level, and the choice of the layers that are kept once their errors are measured."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ class MeasuredLayer:
 
 
 def told_errors(errors: Errors) -> Errors:
-    """Return errors as a container tells them."""
+    """Return errors rounded as a container stores them."""
     channels = tuple((told_roughly(rms), told_roughly(worst)) for rms, worst in errors.channels)
     return Errors(told(errors.rms), told(errors.maximum), channels)
 
 
 def all_passes(tops: Sequence[NDArray[np.int8]]) -> State:
-    """Return passes of every tile and channel, int8, shape (tile, channel), from their bit-planes, shape (tile,)."""
+    """Return the passes of every tile and channel, int8, shape (tile, channel), from bit-planes, shape (tile,)."""
     return np.stack([np.maximum(2 * top - 1, 0) for top in tops], axis=1).astype(np.int8)
 
 
 def shown_states(header: Header, states: Sequence[State], passes: State) -> list[State]:
-    """Return what a receiver knows after each layer.
+    """Return the state that a receiver has after each layer.
 
     Tiles of which it has heard nothing are `UNANNOUNCED` until the last.
 
@@ -78,7 +78,7 @@ def shown_states(header: Header, states: Sequence[State], passes: State) -> list
 
 
 def level_states(header: Header) -> list[State]:
-    """Return the states that hold all levels up to one, but for the last: int8, shape (tile, channel)."""
+    """Return the states that hold all levels up to each one but the last: int8, shape (tile, channel)."""
     start, states = initial_state(header), []
     for level in range(header.layout.levels):
         state = start.copy()
@@ -112,7 +112,7 @@ def kept_layers(header: Header, states: Sequence[State], measured: Sequence[Meas
 
 
 def _window_codes(header: Header, layers: Sequence[Measured]) -> list[NDArray[np.uint8] | None]:
-    """Return errors of the cells of each layer, where there are several and they can be told; None otherwise."""
+    """Return the coded errors of the cells of each layer; None where there is one cell, or errors have no code."""
     if header.arrangement is not None or not is_divided(header):
         return [None] * len(layers)
     measured = [cells[0] for errors, cells in layers if errors.maximum and cells]
@@ -125,6 +125,6 @@ def _window_codes(header: Header, layers: Sequence[Measured]) -> list[NDArray[np
 
 
 def remaining_errors(errors: Errors, exact: Sequence[bool], geometric: int) -> Errors:
-    """Return the errors of the complete surface, of which some channels are exact."""
+    """Return the errors of the complete surface, some of whose channels are exact."""
     channels = tuple((0.0, 0.0) if known else pair for known, pair in zip(exact, errors.channels, strict=False))
     return Errors(0.0, 0.0, channels) if all(exact[:geometric]) else errors._replace(channels=channels)

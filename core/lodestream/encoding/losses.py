@@ -1,4 +1,4 @@
-"""What a container does not keep of a surface."""
+"""Values of a surface that a container does not keep."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MORE_CHANNELS = "channels beyond the third"
 
 
 def at_holes(surface: Surface) -> str | None:
-    """Describe in one line which attributes have values at holes of the points; no container keeps these.
+    """Describe in one line which attributes have values at holes of the points, which no container keeps.
 
     NaN, 0 and the metadata's ``nodata`` do not count as values. Returns None if nothing is lost.
     """
@@ -42,14 +42,14 @@ def at_holes(surface: Surface) -> str | None:
 
 
 def _holes(block: Block) -> NDArray[np.bool_] | None:
-    """Return the holes whose values do not come back, shape (H, W); None where there are none."""
+    """Return the holes whose values are lost, shape (H, W); None where there are none."""
     if block.mask is None:
         return None
     return ~block.mask if block.kept is None else ~(block.mask | block.kept)
 
 
 def _count_values(values: NDArray[np.generic], nodata: object) -> int:
-    """Count the holes, axis 0, that have anything but NaN, zero, and the file's word for nothing."""
+    """Count the holes, axis 0, whose value is not NaN, zero or the file's nodata value."""
     valued = (values != 0) & (values == values)
     if isinstance(nodata, int | float):
         valued &= values != nodata

@@ -1,4 +1,4 @@
-"""How much memory encoding takes, in one piece and by bands."""
+"""Estimates of the memory of encoding, in one piece and by bands."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _ROWS = 64
 
 
 def checked_memory(memory: int | str) -> int:
-    """A number of bytes to work in, from a number or text such as ``"512MiB"``.
+    """Return the bytes of a memory limit, given as a number or text such as ``"512MiB"``.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def checked_memory(memory: int | str) -> int:
 
 
 def whole_memory(surface: Surface, rms: bool = False) -> int:
-    """Return about what encoding a surface in one piece takes, in bytes; with ``rms``, into a stream for one error."""
+    """Estimate the bytes that encoding a surface in one piece takes; with ``rms``, into a stream for one error."""
     holes = any(block.mask is not None for block in surface.blocks)
     if holes:
         needed = _WHOLE_WITH_HOLES * sum(array.size for array in _arrays(surface))
@@ -79,9 +79,9 @@ def _arrays(surface: Surface) -> Iterator[NDArray[Any]]:
 
 
 def least_memory(surface: Surface) -> int:
-    """About the least that encoding a surface by bands takes, in bytes: the program, and a row of tiles.
+    """Estimate the fewest bytes in which a surface can be encoded by bands: the program, and a row of tiles.
 
-    Of several blocks, and of one that touches itself, the largest one in place of a row.
+    A surface of several blocks, and one that touches itself, takes its largest block in place of a row.
     """
     values, first = largest_block(surface), surface.blocks[0]
     in_space = first.points.ndim == 3 and first.points.shape[2] > 1
@@ -91,11 +91,11 @@ def least_memory(surface: Surface) -> int:
 
 
 def largest_block(surface: Surface) -> int:
-    """Values of the largest block, attributes included."""
+    """Count the values of the largest block, attributes included."""
     blocks = surface.blocks
     return max(sum(array.size for array in (block.points, *block.attributes.values())) for block in blocks)
 
 
 def masks_memory(surface: Surface) -> int:
-    """About what masks take where a surface is encoded by bands, in bytes: which points are holes is known of all."""
+    """Estimate the bytes of masks where a surface is encoded by bands: the holes of all bands are known at once."""
     return _MASKS * sum(block.mask.size for block in surface.blocks if block.mask is not None)

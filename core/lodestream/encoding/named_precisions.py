@@ -13,7 +13,7 @@ __all__ = ["check_names", "named_errors"]
 
 
 def check_names(surface: Surface, quality: Quality) -> None:
-    """Refuse a precision for what the surface does not have.
+    """Refuse a precision for a channel that the surface does not have.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def check_names(surface: Surface, quality: Quality) -> None:
 
 
 def named_errors(surface: Surface, arrays: Sequence[Arrays], quality: Quality) -> dict[int, float]:
-    """Return the largest error allowed of each channel that is named, in its unit.
+    """Return the largest allowed error of each channel that has a precision of its own, in the channel's unit.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def _width(block: Block) -> int:
 
 
 def _channels(block: Block) -> dict[str, int]:
-    """Return the number of each channel that has a name of its own; whole attributes have theirs beside these."""
+    """Return the number of each channel by its name; whole attributes are not among them."""
     width = _width(block)
     names = ["z"] if width == 1 else list("xyz")[:width]
     names += [f"attribute_{number}" for number in range(width - len(names))]
@@ -73,7 +73,7 @@ def _channels(block: Block) -> dict[str, int]:
 
 
 def _span(arrays: Arrays, channel: int) -> tuple[float, float]:
-    """Return lowest and highest value of a channel of a block."""
+    """Return the lowest and the highest value of a channel of a block."""
     for array in arrays:
         if channel < array.shape[2]:
             values = array[..., channel]

@@ -1,4 +1,4 @@
-"""How the errors of quantized coefficients add up in the surface: what the encoder minimises in place of their squares.
+"""How errors of quantized coefficients add up in the surface, which the encoder minimises in place of their squares.
 
 Synthesis functions of neighbours in a band overlap, so the sum of squares over the surface is a quadratic form of a
 band's errors: e G e, where G holds the inner products of its synthesis functions before the third step. Far from the
@@ -34,7 +34,7 @@ FILTERS = np.array(
 
 
 def feedback_rules(table: TileTable, quantiser: Quantiser) -> NDArray[np.float32]:
-    """Return what `kernels.choose` is told of each band.
+    """Return the rules of each band for `kernels.choose`.
 
     Returns
     -------

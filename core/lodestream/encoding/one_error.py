@@ -1,4 +1,4 @@
-"""Indices of quantization steps in place of coefficients, of a stream that is made for one root mean square error."""
+"""Indices of quantization steps in place of coefficients, for a stream that is made for one root mean square error."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def quantize(prepared: Prepared, lattices: Lattices, table: TileTable, progress:
 def closed_loop(
     prepared: Prepared, lattices: Lattices, table: TileTable, channel: int
 ) -> tuple[ClosedLoop, NDArray[np.int8]]:
-    """Return what quantizes a coordinate, and its predictors, int8, shape (level, axis, 2).
+    """Return the closed loop that quantizes a coordinate, and its predictors, int8, shape (level, axis, 2).
 
     It keeps the lattice coordinates, int32, shape (row, column) of each grid.
     """

@@ -85,7 +85,7 @@ class Phases:
         self._execution.carry_out(phase, self._report(share))
 
     def _report(self, share: float) -> Callable[[float], None]:
-        """Return what is told the fraction done of work that takes a share of the time."""
+        """Return a callback for the progress of work that takes a share of the time."""
         start = self._done
         self._done = start + share
         return lambda fraction: self._progress(start + share * fraction)
@@ -114,7 +114,7 @@ class Phases:
         self._carry_out(_SHARES[1], [Task(name_of("ends", *unit), tasks.code, unit) for unit in units])
 
     def _large_level(self) -> int:
-        """Return the coarsest level whose units should be large; 0: none should."""
+        """Return the coarsest level whose units should be large; 0 if none should be."""
         level, tried = candidate(self._layout)
         if not level or all(self._build.quantiser_of(channel) for channel in range(self._build.channels)):
             return 0
@@ -136,12 +136,12 @@ class Phases:
         return int(self._read("large"))
 
     def _curves(self) -> Curves:
-        """Return the curves of all units in the order in which one piece codes them: by level, tile and channel."""
+        """Return the curves of all units, sorted by level, tile and channel, as a build in one piece has them."""
         arrays = [self._curves_of(*piece) for piece in self._pieces]
         return Curves(*(np.concatenate(parts) for parts in zip(*arrays, strict=True)))
 
     def _curves_of(self, level: int, number: int, tiles: range) -> tuple[NDArray[Any], ...]:
-        """Return the arrays of `Curves` for a piece."""
+        """Return the arrays of `Curves` of a piece."""
         channels = self._build.channels
         planes = np.array([tops[tiles.start : tiles.stop] for tops in self._tops], np.int64)
         counts = np.maximum(2 * planes - 1, 0)
@@ -158,7 +158,7 @@ class Phases:
 
     @cached_property
     def _header(self) -> Header:
-        """With the largest chunks."""
+        """The header with chunks of the largest size."""
         build = self._build
         predictors = np.array(self._read("predictors"))
         return header_of(build.prepared, build.lattices, predictors, self._tops, build.quantiser, self._large)
@@ -185,7 +185,7 @@ class Phases:
 
     @property
     def _runs(self) -> int:
-        """How many runs of rows, or of blocks, are measured."""
+        """Number of runs of rows, or of blocks, that are measured."""
         return len(measured_runs(self._build.stored_header(), self._build.points))
 
     def _chunk(self) -> tuple[int, int]:
@@ -198,7 +198,7 @@ class Phases:
         return chunk_size(prepared, header, values, float(self._read("coefficient-bytes")))
 
     def _measured(self) -> tuple[list[MeasuredLayer], list[Errors], list[bool]]:
-        """Return the layers that are kept, the errors of all levels, and of each channel whether it is exact."""
+        """Return the layers that are kept, the errors of all levels, and for each channel whether it is exact."""
         prepared, count = self._build.prepared, self._runs
         figures = [
             Figures(self._read(f"squares/{k}"), self._read(f"equal/{k}"), self._read(f"counts/{k}"))

@@ -1,4 +1,4 @@
-"""Which rows, grids and tiles are worked on together, level by level: pure geometry of a layout."""
+"""The rows, grids and tiles of each task, level by level: pure geometry of a layout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Rows(NamedTuple):
 
     @property
     def height(self) -> int:
-        """How many rows."""
+        """Number of rows."""
         return self.stop - self.start
 
 
@@ -100,7 +100,7 @@ class Pieces:
 
     @property
     def levels(self) -> range:
-        """The levels that have pieces of their own, coarsest first."""
+        """The levels with pieces of their own, coarsest first."""
         return range(self.core + 1, self.layout.levels + 1)
 
     def of(self, level: int) -> tuple[Piece, ...]:
@@ -113,7 +113,7 @@ class Pieces:
         return range(self.layout.tiles_of(self.core).stop)
 
     def samples(self, level: int) -> list[tuple[Rows, ...]]:
-        """Return what each piece of a level's samples holds.
+        """Return the rows that each piece of a level's samples holds.
 
         Samples of the finest level are in strips, or as its pieces need them; those of the others are the nodes of the
         pieces of the next finer level.
@@ -128,7 +128,7 @@ class Pieces:
         return [tuple(self._sampled(part, level) for part in piece.parts) for piece in self.of(level)]
 
     def _sampled(self, part: Part, level: int) -> Rows:
-        """Return the samples that lie beside nodes of a part, so that each is in one of them."""
+        """Return the samples beside the nodes of a part; each sample is in one part."""
         rows, coarse = self.layout.shape(part.grid, level)[0], self.layout.shape(part.grid, level - 1)[0]
         spacing = 2 if self.layout.steps(part.grid, level)[0].midpoints else 1
         start, stop = (rows if end == coarse else min(spacing * end, rows) for end in part.nodes)

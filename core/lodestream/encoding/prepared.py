@@ -1,4 +1,4 @@
-"""The first stage: holes filled, blocks cut into patches, vertices counted once."""
+"""First stage of encoding: holes filled, blocks cut into patches, shared vertices counted once."""
 
 from __future__ import annotations
 
@@ -105,12 +105,15 @@ class Prepared:
 
     @cached_property
     def originals(self) -> tuple[Original, ...]:
-        """What the coordinates of each patch are compared with."""
+        """The values with which the coordinates of each patch are compared."""
         masks = [block.mask for block in self.surface.blocks]
         return tuple(originals_of(self.arrangement, [arrays[0] for arrays in self.arrays], masks))
 
     def comparisons(self, region: Region) -> list[Comparison]:
-        """Return what the channels of a region are compared with: of all blocks or some, or of rows of the only one."""
+        """Return the values with which the channels of a region are compared.
+
+        All or some blocks, or rows of the only block.
+        """
         rows = slice(None) if region.spans is None else slice(*region.spans[0])
         blocks = self.surface.blocks
         return comparisons(
@@ -124,12 +127,12 @@ class Prepared:
 
     @property
     def kept(self) -> list[NDArray[np.bool_] | None]:
-        """Of each block the holes whose values come back, bool, shape (row, column)."""
+        """The holes of each block that keep their values, bool, shape (row, column)."""
         return [block.kept for block in self.given.blocks]
 
     @property
     def rough(self) -> list[bool]:
-        """Of each channel whether it need not come back bit for bit."""
+        """For each channel, whether it may come back with an error."""
         flags = [self.precision is not None or self.rms is not None] * self.geometric
         flags += [False] * (self.point_channels - self.geometric)
         for kind in self.kinds:
@@ -138,7 +141,7 @@ class Prepared:
 
     @property
     def interfaces(self) -> int:
-        """How many of the layout's grids are interfaces; they come before the patches."""
+        """Number of the layout's grids that are interfaces; they come before the patches."""
         return len(self.layout.grids) - len(self.patches)
 
     def channel(self, block: int, channel: int) -> NDArray[Any]:
@@ -156,14 +159,14 @@ class Prepared:
         raise IndexError(channel)
 
     def span(self, channel: int) -> float:
-        """Return largest value of a channel less the smallest one, in its unit."""
+        """Return the largest value of a channel less the smallest one, in its unit."""
         values = [self.channel(block, channel) for block in range(len(self.arrays))]
         return max(float(v.max()) for v in values) - min(float(v.min()) for v in values)
 
     def canvases(self) -> list[NDArray[np.int32]]:
-        """Return room for reconstructing all coordinates of each grid: int32, shape (coordinate, row, column or more).
+        """Return arrays for the reconstructed coordinates of each grid: int32, shape (coordinate, row, column or more).
 
-        What is in it does not matter to whoever reconstructs; rows end in `pyramid.PADDING` columns that kernels use.
+        They are not initialised. Rows end in `pyramid.PADDING` columns that kernels use.
         """
         shapes = [grid.shape for grid in self.layout.grids]
         return [np.empty((self.geometric, rows, columns + PADDING), np.int32) for rows, columns in shapes]
@@ -231,7 +234,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
 
 
 def _check_counts(prepared: Prepared) -> None:
-    """Refuse what a container may not have, see `limits`.
+    """Refuse more channels, patches, interfaces or extra fields than a container may have, see `limits`.
 
     Raises
     ------
@@ -247,7 +250,10 @@ def _check_counts(prepared: Prepared) -> None:
 
 
 def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
-    """Return heights in place of x, y and z where a short rule makes x and y again, and that rule."""
+    """Return heights in place of x, y and z, and the rule that gives x and y.
+
+    The surface itself and None without a rule.
+    """
     block = surface.blocks[0]
     lost = block.mask is not None and surface.dtype.kind != "f"  # integers have no coordinates under holes
     if len(surface.blocks) > 1 or "angles" in surface.metadata or lost:
@@ -262,7 +268,7 @@ def _heights(surface: Surface) -> tuple[Surface, Mapping[str, Any] | None]:
 
 
 def _extent_given(block: Block) -> float:
-    """Return the diagonal of the box of what came as x, y and z and is coded as heights, for relative tolerances."""
+    """Return the diagonal of the bounding box of x, y and z, for relative tolerances of a block coded as heights."""
     points = block.points if block.mask is None else block.points[block.mask][:, np.newaxis]
     return extent_of(points, 3)
 
@@ -275,19 +281,19 @@ def _kinds(block: Block) -> tuple[AttributeKind, ...]:
 
 
 def _divisions(points: Sequence[NDArray[Any]], geometric: int) -> float:
-    """Choose into how many lattice steps the widest extent is divided where all values come back bit for bit."""
+    """Choose the number of lattice steps of the widest extent where all values come back bit for bit."""
     largest = max(points, key=lambda array: array.size)
     return default_divisions([largest[..., channel] for channel in range(geometric)])
 
 
 def _takes_small_tiles(surface: Surface, valid: NDArray[Any]) -> bool:
-    """Return whether a surface that is kept exactly has few points, of many bytes each: floats on no lattice."""
+    """Return whether small tiles suit a surface that is kept exactly: few points, of many bytes each, on no lattice."""
     few = math.prod(surface.blocks[0].shape) <= SMALL
     return few and surface.dtype.kind == "f" and find_lattice(valid) is None
 
 
 def _of_one_grid(block: Block, geometric: int, small: bool) -> tuple[Layout, Sequence[tuple[int, int]]]:
-    """Return the layout of a surface of one block that shares no side, and what its chunks may be."""
+    """Return the layout of a surface of one block that shares no side, and the sizes that its chunks may have."""
     bits = SMALL_TILE if small else TILE_BITS if geometric == 1 else WHOLE_TILE
     layout = Layout.single(block.shape, block.closed, tile_exponents(block.shape, bits))
     return layout, chunk_exponents(block.shape, small)

@@ -1,4 +1,4 @@
-"""Which index each coefficient gets: the one that costs least, in squared error and in bits.
+"""Choose the index of each coefficient that costs least, in squared error and in bits.
 
 What an index costs in bits is not known before everything is coded, so it is estimated: coefficients are put into
 classes by the size of what is around them, and the share of each index in its class gives its bits; a few turns
@@ -58,7 +58,7 @@ class IndexChooser:
         self._room = np.empty(8 * len(TRANSITIONS) * widest, np.int16), np.empty(2 * widest, np.float32)
 
     def begin(self, steps: NDArray[np.int64], rules: NDArray[np.float32]) -> None:
-        """Choose all indices anew; what was learned of the last ones serves, with other quantization steps, too.
+        """Begin to choose all indices; statistics of the last choice are kept, whatever its quantization steps were.
 
         For the shapes of ``steps`` and ``rules`` see `TileTable.steps` and `noise_shaping.feedback_rules`.
         """
@@ -89,7 +89,7 @@ class IndexChooser:
             )
 
     def end(self) -> NDArray[np.int32]:
-        """Return all indices, shape (`TileTable.size`,), from which is estimated what others cost."""
+        """Return all indices, shape (`TileTable.size`,), and estimate from them the costs for the next choice."""
         self._bits = -np.log2(self._counts / self._counts.sum(axis=2, keepdims=True))
         chosen = self.chosen
         del self.chosen, self._relative, self._classes
@@ -97,7 +97,7 @@ class IndexChooser:
 
 
 def _rates(bits: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return what each index costs with its sign: float32, shape (quantiser, class, `kernels.RATES`)."""
+    """Return the cost of each index and its sign: float32, shape (quantiser, class, `kernels.RATES`)."""
     index = np.arange(RATES)
     rates = bits[:, :, np.minimum(index, INDICES - 1)] + (index > 0)
     rates += 2.0 * np.log2(np.maximum(index - INDICES + 3, 1)) * (index >= INDICES - 1)
@@ -106,22 +106,22 @@ def _rates(bits: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def _runs(sizes: NDArray[np.int64]) -> list[tuple[int, int]]:
-    """Divide bands into those of one call of a kernel: the first of each, and the one behind its last.
+    """Divide bands into runs, one for each call of a kernel; return (first, last + 1) of each.
 
     ``sizes``: coefficients of each band.
     """
     runs, first, size = [], 0, 0
-    for number, own in enumerate(sizes.tolist()):
-        if number > first and size + own > _AT_ONCE:
+    for number, band_size in enumerate(sizes.tolist()):
+        if number > first and size + band_size > _AT_ONCE:
             runs.append((first, number))
             first, size = number, 0
-        size += own
+        size += band_size
     return [*runs, (first, len(sizes))]
 
 
 @cache
 def _laplace() -> NDArray[np.float64]:
-    """Return bits of each index (without its sign) by class, of coefficients with a Laplace distribution.
+    """Return the bits of each index, without its sign, for coefficients of a Laplace distribution, by class.
 
     float64, shape (quantiser, class, index).
     """
@@ -138,7 +138,9 @@ def _laplace() -> NDArray[np.float64]:
 
 
 def longest_base(error_of: Callable[[int], float], wanted: float, guess: int) -> int | None:
-    """Find the largest base of a quantiser whose error is at most the one wanted, and close to it; None: there is none.
+    """Find the largest base of a quantiser whose error is at most the wanted one, and close to it.
+
+    None if there is none.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Files read where there is room for them, and not again when a build continues."""
+"""Read files into a folder, and reuse them when a build continues."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PART = 16
 
 
 def reading_key(paths: Sequence[Path], **options: Any) -> str:
-    """What decides about the files that `read_into` leaves: the files that are read, and the options."""
+    """Return the key of the files that `read_into` leaves: the state of the source files, and the options."""
     # The name too, since it may say what is in a file, such as the position of an SRTM tile.
     states = [[str(path.absolute()), str(path.resolve()), *file_state(path)] for path in paths]
     return json.dumps([__version__, states, sorted((name, repr(value)) for name, value in options.items())])
@@ -68,9 +68,9 @@ def read_into(
         From `lodestream.read`.
     """
     if kept and is_sealed(folder):
-        found = load_surface(FolderScratch(folder))
-        if found is not None:
-            return found
+        stored = load_surface(FolderScratch(folder))
+        if stored is not None:
+            return stored
     remove(folder)
     states = [file_state(path) for path in paths]
     limit = default_memory() if memory is None else memory

@@ -1,4 +1,4 @@
-"""Objects written to a file with their memory-mapped arrays as references, for other processes to open again.
+"""Pickle objects whose memory-mapped arrays stay in their files, for other processes to open.
 
 Only files that a build has written itself are read: unpickling runs whatever a file says.
 """
@@ -29,7 +29,7 @@ _HEAD = f"lodestream {__version__}\n".encode()
 
 
 def dump(value: object, path: Path, flush: bool = False) -> None:
-    """Write an object; what it holds of memory-mapped arrays stays in their files, which must stay where they are.
+    """Write an object; its memory-mapped arrays are written as references to their files, which must stay in place.
 
     With ``flush``, what was written to maps is in these files when it returns, for other machines to read.
     """
@@ -41,7 +41,7 @@ def dump(value: object, path: Path, flush: bool = False) -> None:
 
 
 def load(path: Path) -> Any:
-    """Read an object that `dump` wrote; its memory-mapped arrays are maps that cannot be changed.
+    """Read an object that `dump` wrote; its memory-mapped arrays are read-only maps.
 
     Raises
     ------
@@ -52,8 +52,8 @@ def load(path: Path) -> Any:
     """
     with path.open("rb") as file:
         if (head := file.readline()) != _HEAD:
-            found, own = (line.decode("ascii", "replace").strip()[:80] for line in (head, _HEAD))
-            raise UnavailableError(f"expected workers of the same version: {found} builds, a worker has {own}")
+            version, expected = (line.decode("ascii", "replace").strip()[:80] for line in (head, _HEAD))
+            raise UnavailableError(f"expected workers of the same version: {version} builds, a worker has {expected}")
         return pickle.load(file)
 
 
@@ -66,7 +66,7 @@ class _Pickler(pickle.Pickler):
         self._flush = flush
 
     def reducer_override(self, value: object) -> Any:
-        """As `pickle` wants it: how an object is made again."""
+        """Return the reduction of a value for `pickle`: memory-mapped arrays become references to files."""
         if isinstance(value, np.ndarray) and value.size:
             root = root_of(value)
             if root is not None and root.filename is not None:
@@ -91,7 +91,7 @@ class _File:
 
     @property
     def raw(self) -> np.memmap[Any, Any]:
-        """Its bytes, uint8, shape (byte,)."""
+        """Bytes of the file, uint8, shape (byte,)."""
         if self._raw is None:
             self._raw = np.memmap(self._path, np.uint8, "r")
         return self._raw
@@ -104,13 +104,13 @@ def _part(
 
 
 def file_state(path: str | os.PathLike[str]) -> list[int]:
-    """What changes when a file is written to, or another one gets its name, whatever times that one pretends.
+    """Return numbers that change when a file is written to or replaced, even if its modification time is set back.
 
-    Of a folder, what changes when this happens to any file in it.
+    Of a folder, numbers that change when this happens to any file in it.
     """
     state = os.stat(path)
-    own = [state.st_size, state.st_mtime_ns, state.st_ctime_ns]
-    return [*own, _state_within(path)] if stat.S_ISDIR(state.st_mode) else own
+    figures = [state.st_size, state.st_mtime_ns, state.st_ctime_ns]
+    return [*figures, _state_within(path)] if stat.S_ISDIR(state.st_mode) else figures
 
 
 def _state_within(folder: str | os.PathLike[str]) -> int:
@@ -120,36 +120,36 @@ def _state_within(folder: str | os.PathLike[str]) -> int:
         for name in sorted(names):
             path = os.path.join(above, name)
             state = os.lstat(path)
-            said = path, state.st_size, state.st_mtime_ns, state.st_ctime_ns
-            digest.update(repr(said).encode("utf-8", "surrogateescape"))
+            figures = path, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+            digest.update(repr(figures).encode("utf-8", "surrogateescape"))
     return int.from_bytes(digest.digest()[:8], "big")
 
 
 def root_of(array: NDArray[Any]) -> np.memmap[Any, Any] | None:
-    """The memory-mapped array that an array, of any shape (row, ...), is a view of, or is itself.
+    """Return the memory-mapped array that an array, of any shape (row, ...), is a view of, or is itself; else None.
 
-    None also where the values may differ from those of the file: the map is a copy on write, or the file is gone, or
-    another one has its name.
+    None also where the values may differ from those of the file: the map is copy-on-write, or the file is gone or was
+    replaced.
     """
-    found: np.memmap[Any, Any] | None = None
+    root: np.memmap[Any, Any] | None = None
     base: NDArray[Any] | None = array
     while isinstance(base, np.ndarray):
         if isinstance(base, np.memmap):
-            found = base
+            root = base
         base = base.base
-    if found is None or found.filename is None or found.mode == "c":
+    if root is None or root.filename is None or root.mode == "c":
         return None
     try:
-        state = os.stat(found.filename)
+        state = os.stat(root.filename)
     except FileNotFoundError:
         return None
-    return found if _is_of(found, state) else None
+    return root if _is_of(root, state) else None
 
 
 def _is_of(root: np.memmap[Any, Any], state: os.stat_result) -> bool:
-    """Whether the file of this state, which has the name of a map's now, has the values of the map.
+    """Return whether the file that now has the name of a map's file, and this state, holds the values of the map.
 
-    The map remembers this: not every system tells which file is mapped, and a large one should be read once.
+    The answer is cached in the map: not every system tells which file is mapped, and a large one is compared once.
     """
     known: dict[tuple[int, ...], bool] = vars(root).setdefault(_KNOWN, {})
     file = state.st_dev, state.st_size, state.st_mtime_ns, state.st_ctime_ns
@@ -159,13 +159,13 @@ def _is_of(root: np.memmap[Any, Any], state: os.stat_result) -> bool:
 
 
 def _is_equal(root: np.memmap[Any, Any]) -> bool:
-    """Whether the file that has the name of a map's has its values."""
+    """Compare a map with the file that now has its name, byte for byte."""
     try:
         again = _mapped(str(root.filename), root.offset, root.dtype, root.shape, root.strides)
     except (OSError, ValueError):  # it is shorter, or gone
         return False
-    own, found = (np.asarray(array).ravel(order="K") for array in (root, again))
-    return all(own[part].tobytes() == found[part].tobytes() for part in rows_at_once(own.shape))
+    values, current = (np.asarray(array).ravel(order="K") for array in (root, again))
+    return all(values[part].tobytes() == current[part].tobytes() for part in rows_at_once(values.shape))
 
 
 def _mapped(

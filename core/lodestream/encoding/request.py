@@ -1,4 +1,4 @@
-"""What is asked of an encoding: checked before anything takes time."""
+"""Checks of the arguments of an encoding, before anything takes time."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _Progress = Callable[[float], None]
 def chosen_quality(
     quality: Quality | None, precision: Limit | None, rms: Limit | None, attributes: Mapping[str, Limit] | None
 ) -> Quality:
-    """Return the quality that was given, or that the shorthand says; `OptionError` is raised if there are both."""
+    """Return the quality, given or from the shorthand; `OptionError` is raised if there are both."""
     if quality is None:
         return Quality.of(precision, rms, attributes)
     if precision is not None or rms is not None or attributes:
@@ -29,7 +29,7 @@ def chosen_quality(
 
 
 def check(surface: Surface, quality: Quality) -> None:
-    """Refuse what cannot be encoded before anything takes time.
+    """Refuse a surface that cannot be encoded, before anything takes time.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def _check_counts(surface: Surface) -> None:
 
 
 def rising(progress: _Progress) -> _Progress:
-    """Tell fractions that never fall, whatever is tried one after another."""
+    """Return a callback that passes on only fractions that rise, whatever is tried one after another."""
     highest = 0.0
 
     def told(fraction: float) -> None:

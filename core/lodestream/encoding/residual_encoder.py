@@ -1,4 +1,4 @@
-"""The writing end of the residual section: what each window needs for its values to come back as they were given."""
+"""Encode the residual: corrections that restore the values of each window exactly, or within their precision."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TABLES, _WORTH = 8, 0.01
 def chunk_size(
     prepared: Prepared, header: Header, restored: Mapping[int, Values], coefficients: float
 ) -> tuple[int, int]:
-    """Return the smallest chunks that do not cost much, as exponents of two of their rows and columns.
+    """Return the smallest chunks that cost few bytes, as exponents of two of their rows and columns.
 
     Small ones serve windows. But each begins without a memory, which some surfaces need. So bytes are counted in the
     middle of the surface.
@@ -57,7 +57,7 @@ def chunk_size(
 
 
 def chunk_sample(prepared: Prepared, shape: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return rows and columns, half-open, on which `chunk_size` tries sizes: the largest chunk in the middle."""
+    """Return the rows and columns, half-open, on which `chunk_size` tries sizes: the largest chunk in the middle."""
     starts = [length // 2 >> exponent << exponent for length, exponent in zip(shape, prepared.chunks[-1], strict=True)]
     rows, columns = (
         (start, min(start + (1 << exponent), length))
@@ -85,7 +85,7 @@ class ChunkCoder:
         self._rough = prepared.rough
 
     def code(self, window: ChunkPlace) -> tuple[bytes, bool]:
-        """Return one chunk, and whether its values are exact then."""
+        """Return the coded chunk of a window, and whether its values are then exact."""
         prepared, channel = self._prepared, window.channel
         block = prepared.surface.blocks[window.block]
         mask = prepared.kept[window.block] if window.kept else block.mask

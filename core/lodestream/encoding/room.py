@@ -1,4 +1,4 @@
-"""Room on the disk for the files of a build, looked at before they are written."""
+"""Check that the disk has room for the files of a build before they are written."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FOR_A_VALUE = 12
 
 
 def check_room(folder: Path, needed: int, there: int = 0) -> None:
-    """See that the disk has room for so many bytes in a folder, those included that a build that was cut has there.
+    """Check that a folder's disk has room for ``needed`` bytes, of which ``there`` are in the folder already.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class CopyRoom(Room):
         self._folder, self._by_bands = folder, by_bands
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array of this shape, (row, ...), whatever it holds.
+        """Return a new array of this shape, (row, ...), not initialised.
 
         Raises
         ------

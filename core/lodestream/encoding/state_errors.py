@@ -1,4 +1,4 @@
-"""Errors of states, and the residual, of some rows of a surface or of some of its blocks."""
+"""Measure errors of states, and code the residual, of some rows of a surface or of some of its blocks."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RUNS_TOGETHER = 2
 
 
 def measured_runs(header: Header, points: int) -> list[range]:
-    """Return what is measured together: rows of the only grid, or blocks, in runs, see `runs_of`.
+    """Return the runs of rows of the only grid, or of blocks, that are measured together, see `runs_of`.
 
     ``points`` are those of a piece of the transform, which takes about as much memory.
     """
@@ -68,7 +68,7 @@ def measure(build: Build, header: Header, run: range) -> tuple[Figures, Residual
 
 
 def _measured(build: Build, header: Header, run: range) -> tuple[Figures, Mapping[int, Values]]:
-    """Measure a run in all states, and then make its values after the last layer: they would stand beside the states.
+    """Measure a run in all states, and only then make its values after the last layer, to hold fewer arrays at once.
 
     Of a build in one piece both are kept, since the size of chunks is chosen by the values before they are coded. What
     a reader knows is then needed no more.
@@ -88,7 +88,7 @@ def _measured(build: Build, header: Header, run: range) -> tuple[Figures, Mappin
 
 
 def _region(build: Build, header: Header, run: range) -> Region:
-    """Return what is made of a surface for a run, see `measured_runs`."""
+    """Return the region of a surface that a run covers, see `measured_runs`."""
     layout = header.layout
     if build.is_whole:
         return Region.whole(layout, layout.levels)  # all tiles are in one array, and all levels in one call
@@ -98,13 +98,13 @@ def _region(build: Build, header: Header, run: range) -> Region:
 
 
 def exact_errors(build: Build, header: Header, state: NDArray[np.int8]) -> Measured:
-    """Measure the surface in a state, int8, shape (tile, channel), also where float64 does not hold the squares."""
+    """Measure the surface in a state, int8, shape (tile, channel), also where float64 cannot hold the squares."""
     region = Region.whole(header.layout, header.levels)
     return Measurer(header, region, _tiles(build, region), build.prepared.comparisons(region)).exact_errors(state)
 
 
 def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values]:
-    """Return rows of the only block, or some blocks, as they are after the last layer; all of a build in one piece."""
+    """Return rows of the only block, or some blocks, after the last layer; all of them in a build in one piece."""
     if build.is_whole:
         return _measured(build, header, run)[1]
     region = _region(build, header, run)
@@ -112,7 +112,7 @@ def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values
 
 
 def _tiles(build: Build, region: Region) -> list[Tiles]:
-    """Return all that a reader knows in the end of each channel of a region."""
+    """Return the final coefficients of each channel of a region."""
     parts: dict[TileTable, Part] = {}
     tiles = []
     for channel in range(build.channels):

@@ -1,4 +1,4 @@
-"""Rows that a forward step along the rows' axis needs for some of its nodes and details."""
+"""Rows that a forward step along the rows' axis reads for some of its nodes and details."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RowsCrop(NamedTuple):
 
 
 def crop_rows(step: AxisStep, nodes: tuple[int, int], details: tuple[int, int]) -> RowsCrop:
-    """Return what gives nodes and details of a step, from the first to before the last of each; nodes at least.
+    """Return the rows that a step reads to make some of its nodes (at least one) and details, half-open ranges.
 
     Details are counted from the first one. Those that are asked for lie beside the nodes: detail k after node k.
     """

@@ -36,29 +36,29 @@ def save_surface(surface: Surface, scratch: FolderScratch) -> None:
     The others share a file for each dtype, since a process may have only so many files open. Which points of the
     surface are one (`Surface.joints`) is not kept.
     """
-    every: list[dict[str, NDArray[Any]]] = []
+    block_arrays: list[dict[str, NDArray[Any]]] = []
     for block in surface.blocks:
-        own = {"points": block.points}
+        arrays = {"points": block.points}
         if block.mask is not None:
-            own["mask"] = block.mask
-        every.append(own | {f"attribute {k}": array for k, array in enumerate(block.attributes.values())})
+            arrays["mask"] = block.mask
+        block_arrays.append(arrays | {f"attribute {k}": array for k, array in enumerate(block.attributes.values())})
     places: list[dict[str, _Place | None]] = [
-        {key: _place_of(array, scratch) for key, array in own.items()} for own in every
+        {key: _place_of(array, scratch) for key, array in arrays.items()} for arrays in block_arrays
     ]
     left: dict[str, list[tuple[int, str]]] = {}
-    for number, own in enumerate(every):
-        for key, array in own.items():
+    for number, arrays in enumerate(block_arrays):
+        for key, array in arrays.items():
             if places[number][key] is None:
                 left.setdefault(array.dtype.name, []).append((number, key))
     for dtype, several in left.items():
         name, done = f"surface/{dtype}-{uuid4().hex}", 0  # arrays that stay may lie in a file of before
-        scratch.write_joined(name, [every[number][key] for number, key in several])
+        scratch.write_joined(name, [block_arrays[number][key] for number, key in several])
         for number, key in several:
-            places[number][key] = name, done, dtype, every[number][key].shape
-            done += every[number][key].nbytes
+            places[number][key] = name, done, dtype, block_arrays[number][key].shape
+            done += block_arrays[number][key].nbytes
     blocks = [
-        {"arrays": own, "closed": list(block.closed), "attributes": list(block.attributes)}
-        for own, block in zip(places, surface.blocks, strict=True)
+        {"arrays": arrays, "closed": list(block.closed), "attributes": list(block.attributes)}
+        for arrays, block in zip(places, surface.blocks, strict=True)
     ]
     described = msgpack.packb({"blocks": blocks, "metadata": surface.metadata})
     temporary = scratch.folder / f"{_FILE}.part"
@@ -67,7 +67,7 @@ def save_surface(surface: Surface, scratch: FolderScratch) -> None:
 
 
 def load_surface(scratch: FolderScratch) -> Surface | None:
-    """The surface that `save_surface` wrote into a folder, its arrays memory-mapped; None: it has written none.
+    """Open the surface that `save_surface` wrote into a folder, its arrays memory-mapped; None if there is none.
 
     Raises
     ------
@@ -83,10 +83,10 @@ def load_surface(scratch: FolderScratch) -> Surface | None:
     try:
         if len(described) > _MOST:
             raise ValueError("too long")
-        found = msgpack.unpackb(described, strict_map_key=False)
+        fields = msgpack.unpackb(described, strict_map_key=False)
         files = _Files(scratch)
-        blocks = [_block(entry, files) for entry in found["blocks"]]
-        metadata = found["metadata"]
+        blocks = [_block(entry, files) for entry in fields["blocks"]]
+        metadata = fields["metadata"]
         if not isinstance(metadata, dict):
             raise TypeError("no map")
     except InputError:
@@ -104,7 +104,7 @@ class _Files:
         self._known: dict[str, NDArray[np.uint8]] = {}
 
     def bytes_of(self, name: object) -> NDArray[np.uint8]:
-        """The values of a file as bytes, shape (byte,)."""
+        """Return the values of a file as bytes, shape (byte,)."""
         if not isinstance(name, str):
             raise TypeError(f"a name was expected, not {type(name).__name__}")
         if ".." in Path(name).parts or Path(name).is_absolute():
@@ -146,7 +146,7 @@ def _read(place: Any, files: _Files) -> NDArray[Any]:
 
 
 def _place_of(array: NDArray[Any], scratch: FolderScratch) -> _Place | None:
-    """Where an array lies in a file of this folder; None: in none, or in another order."""
+    """Return the place of an array in a file of this folder; None if it is elsewhere, or in another order."""
     root = root_of(array)
     if root is None or not array.flags.c_contiguous:
         return None

@@ -1,4 +1,4 @@
-"""The streams that are tried for a surface, of which the shortest one is its container."""
+"""Encode a surface as several streams, and keep the shortest one as its container."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def shortest(
 
 
 def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> bytes | None:
-    """Return the stream for one root mean square error; None where exact values are the way to meet it."""
+    """Return the stream for one root mean square error; None if it takes exact values to meet it."""
     prepared = prepare(surface, quality)
     lattices = fine_lattices(prepared)
     if lattices is None:
@@ -92,7 +92,7 @@ def _for_one_error(surface: Surface, quality: Quality, progress: _Progress) -> b
 
 
 def _stream(prepared: Prepared, lattices: Lattices, progress: _Progress) -> bytes:
-    """Return one stream, in one piece: its tasks are carried out one after another, each by all threads."""
+    """Return one stream, in one piece: its tasks run one after another, each on all threads."""
     build = Build(MemoryScratch(), prepared, lattices, _ONE_PIECE, _ONE_PIECE)
     out = io.BytesIO()
     Phases(build, Execution(build), progress).write(out)
@@ -100,7 +100,7 @@ def _stream(prepared: Prepared, lattices: Lattices, progress: _Progress) -> byte
 
 
 def _longest(raw: int) -> int:
-    """Return most bytes that a container takes which restores so many bytes of values, unless nothing else is shorter.
+    """Return the most bytes that a container of ``raw`` bytes of values takes, unless no other stream is shorter.
 
     >>> _longest(100_000)
     102024

@@ -1,4 +1,4 @@
-"""What tasks leave for each other: names of files, and pieces of a channel's flat arrays by the tiles they hold."""
+"""Arrays that tasks pass to each other: file names, and pieces of a channel's flat arrays by their tiles."""
 
 from __future__ import annotations
 
@@ -43,17 +43,17 @@ CORE = 0
 
 
 def name_of(kind: str, channel: int, level: int, band: int) -> str:
-    """The name of a file."""
+    """Return the name of the file of a kind for a channel, level and band."""
     return f"{kind}/{channel}/{level}/{band}"
 
 
 def name_of_fit(kind: str, channel: int, fit: int, *place: int) -> str:
-    """The name of a file of a channel's transform, see `kind_of`, or of a folder: level, piece and so on follow."""
+    """Return the beginning of the names of a channel's transform, see `kind_of`; level, piece and so on follow."""
     return "/".join([kind_of(kind, bool(fit)), *map(str, (channel, *place))])
 
 
 def kind_of(kind: str, fit: bool) -> str:
-    """What the transform of a channel leaves, with fitted predictors or else with the default ones.
+    """Return the kind of arrays that the transform of a channel leaves, with fitted or with default predictors.
 
     The names differ, so that a late task of the one leaves nothing for the other.
     """
@@ -61,47 +61,50 @@ def kind_of(kind: str, fit: bool) -> str:
 
 
 def transformed(build: Build, kind: str, channel: int) -> str:
-    """The kind under which a channel has this when all channels are transformed."""
+    """Return the kind of arrays that a channel has when all channels are transformed."""
     return kind_of(kind, not build.scratch.read(PLAIN)[channel])
 
 
 def pieces_of(build: Build) -> list[tuple[int, int, range]]:
-    """All pieces: level, band and tiles of each, parents before children. The core stands under its finest level."""
+    """Return level, band and tiles of all pieces, parents before children.
+
+    The core has the number of its finest level.
+    """
     pieces = build.pieces
     core = (pieces.core, CORE, pieces.core_tiles)
     return [core, *((level, piece.number, piece.tiles) for level in pieces.levels for piece in pieces.of(level))]
 
 
 def stored_tiles(build: Build, kind: str, channel: int, tiles: range) -> Iterator[tuple[slice, NDArray[Any]]]:
-    """What neighbouring tiles of a level, or of levels of the core, have in the flat array of a kind, piece by piece.
+    """Yield the parts of the flat array of a kind that belong to neighbouring tiles of a level, or of the core.
 
-    Yields where a piece goes among that of these tiles, and what it has, shape (number,), not to be changed.
+    Yields the place of a part among these tiles, and its values, shape (number,), which must not be changed.
     """
     table, core = build.table(channel), build.pieces.core
     level = build.prepared.layout.level_of(tiles.start)
     wanted = flat_span(table, tiles)
-    for at, number, own in pieces_of(build):
-        if at != max(level, core) or own.stop <= tiles.start or own.start >= tiles.stop:
+    for at, number, piece_tiles in pieces_of(build):
+        if at != max(level, core) or piece_tiles.stop <= tiles.start or piece_tiles.start >= tiles.stop:
             continue
-        piece, place = build.scratch.read(name_of(kind, channel, at, number)), flat_span(table, own)
+        piece, place = build.scratch.read(name_of(kind, channel, at, number)), flat_span(table, piece_tiles)
         low, high = max(place.start, wanted.start), min(place.stop, wanted.stop)
         yield slice(low - wanted.start, high - wanted.start), piece[low - place.start : high - place.start]
 
 
 def read_tiles(build: Build, kind: str, channel: int, tiles: range) -> NDArray[Any]:
-    """The same in one array, shape (number,). There is at least one tile."""
+    """Return the parts that `stored_tiles` yields in one array, shape (number,). There is at least one tile."""
     span = flat_span(build.table(channel), tiles)
-    found: NDArray[Any] | None = None
+    flat: NDArray[Any] | None = None
     for place, piece in stored_tiles(build, kind, channel, tiles):
-        if found is None:
-            found = np.empty(span.stop - span.start, piece.dtype)
-        found[place] = piece
-    assert found is not None  # every tile is in a piece
-    return found
+        if flat is None:
+            flat = np.empty(span.stop - span.start, piece.dtype)
+        flat[place] = piece
+    assert flat is not None  # every tile is in a piece
+    return flat
 
 
 def keep_known(build: Build, channel: int, units: Units) -> None:
-    """Keep, of a channel in one piece that is coded, what a reader knows in the end, and coefficients of small units.
+    """Keep the final coefficients of a coded channel in one piece, and the coefficients of its small units.
 
     These are the coder's arrays: measuring then takes nothing more for them.
     """
@@ -115,13 +118,13 @@ def keep_known(build: Build, channel: int, units: Units) -> None:
 
 
 def forget_known(build: Build) -> None:
-    """Forget what a reader knows in the end: a build in one piece is measured."""
+    """Drop the final coefficients of all channels, once a build in one piece is measured."""
     for kind in _KNOWN:
         build.scratch.remove(kind)
 
 
 def known_tiles(build: Build, part: Part, channel: int) -> Tiles:
-    """All that a reader knows in the end of a channel in some tiles, which have been coded; not to be changed."""
+    """Return the final coefficients of a channel in some tiles, which have been coded; they must not be changed."""
     tiles = Tiles(part.table, build.quantiser_of(channel))
     if build.is_whole:
         assert part.table is build.table(channel)
@@ -140,7 +143,7 @@ def known_tiles(build: Build, part: Part, channel: int) -> Tiles:
 
 
 def rules_of(build: Build, channel: int, fit: int, level: int, rules: Sequence[int]) -> NDArray[np.int8]:
-    """Predictors that tell some rules of a level alone, axes or `INTERFACES`; int8, shape (level, rule, 2)."""
+    """Return the predictors of a level for some rules alone, axes or `INTERFACES`; int8, shape (level, rule, 2)."""
     predictors = default_predictors(build.prepared.layout)
     for rule in rules:
         predictors[level - 1, rule] = build.scratch.read(name_of_fit("rules", channel, fit, level, rule))
@@ -150,12 +153,12 @@ def rules_of(build: Build, channel: int, fit: int, level: int, rules: Sequence[i
 def write_measured(
     build: Build, number: int, figures: Figures, chunks: Sequence[bytes], kept: Sequence[bytes], exact: Sequence[bool]
 ) -> None:
-    """Write what the run of this number tells of errors; its chunks, and those of holes that are kept."""
+    """Write the errors of a run, its chunks of residual, and those of holes that are kept."""
     scratch = build.scratch
     scratch.write(f"squares/{number}", figures.squares)
     scratch.write(f"equal/{number}", figures.equal)
     scratch.write(f"counts/{number}", figures.counts)
-    for kind, own in (("chunks", chunks), ("kept-chunks", kept)):
-        scratch.write(f"{kind}/{number}", np.frombuffer(b"".join(own), np.uint8))
-        scratch.write(f"{kind}-lengths/{number}", np.array([len(chunk) for chunk in own], np.int64))
+    for kind, coded in (("chunks", chunks), ("kept-chunks", kept)):
+        scratch.write(f"{kind}/{number}", np.frombuffer(b"".join(coded), np.uint8))
+        scratch.write(f"{kind}-lengths/{number}", np.array([len(chunk) for chunk in coded], np.int64))
     scratch.write(f"exact/{number}", np.array(exact))

@@ -1,4 +1,4 @@
-"""The tasks of a build: each reads arrays of its scratch, or the surface, and leaves arrays there.
+"""The tasks of a build: each reads arrays of its scratch, or the surface, and writes arrays there.
 
 A task is called with the build, then with numbers. The array that it writes last tells that it is done.
 """
@@ -73,7 +73,7 @@ def coordinates(build: Build, channel: int, fit: int, number: int) -> None:
 
 
 def first_step(build: Build, channel: int, fit: int, level: int, number: int) -> None:
-    """Step a piece along the rows' axis; ``fit`` as in `core`."""
+    """Transform a piece along the rows' axis; ``fit`` as in `core`."""
     layout, piece = build.prepared.layout, build.pieces.of(level)[number]
     predictors = rules_of(build, channel, fit, level, [0, INTERFACES])
     stepped = forward.first_step(_samples(build, channel, fit, level).read, layout, piece, predictors)
@@ -83,7 +83,10 @@ def first_step(build: Build, channel: int, fit: int, level: int, number: int) ->
 
 
 def second_step(build: Build, channel: int, fit: int, level: int, number: int) -> None:
-    """Step a piece along the columns' axis: its coefficients, and samples of the level below; ``fit`` as in `core`."""
+    """Transform a piece along the columns' axis into coefficients and samples of the level below.
+
+    ``fit`` as in `core`.
+    """
     layout, piece = build.prepared.layout, build.pieces.of(level)[number]
     stored = build.scratch.read(name_of_fit("halves", channel, fit, level, number))
     arrays, nodes = forward.second_step(stored, layout, piece, rules_of(build, channel, fit, level, [1]))
@@ -97,7 +100,7 @@ def second_step(build: Build, channel: int, fit: int, level: int, number: int) -
 
 
 def core(build: Build, channel: int, fit: int) -> None:
-    """Transform the levels of the core; ``fit`` says, as 0 or 1, whether the predictors of the channel are fitted."""
+    """Transform the levels of the core. ``fit``: 1 if the channel's predictors are fitted, else 0."""
     layout, level = build.prepared.layout, build.pieces.core
     samples = _samples(build, channel, fit, level)
     arrays = [samples.grid(grid) for grid in range(len(layout.grids))]
@@ -130,7 +133,7 @@ def _write_samples(
 
 
 def _write_coefficients(build: Build, place: tuple[int, int, int, int], coefficients: forward.Coefficients) -> None:
-    """Write what the tiles of a piece hold; ``place`` is channel, fit, level and number."""
+    """Write the coefficients of the tiles of a piece; ``place`` is channel, fit, level and number."""
     channel, fit, level, number = place
     build.scratch.write(name_of_fit("coefficients", channel, fit, level, number), coefficients.flat)
     build.scratch.write(name_of_fit("planes", channel, fit, level, number), coefficients.planes)
@@ -170,7 +173,7 @@ def measure(build: Build, number: int) -> None:
 
 
 def _units(build: Build, channel: int, level: int, band: int, stop: int | None = None) -> Units:
-    """Return the units of a piece, or those of them before the tile ``stop``, ready to be coded."""
+    """Return the units of a piece, or those before the tile ``stop``, ready to be coded."""
     pieces, table = build.pieces, build.table(channel)
     tiles = pieces.core_tiles if level == pieces.core else pieces.of(level)[band].tiles
     tiles = tiles[: None if stop is None else max(stop - tiles.start, 0)]

@@ -1,4 +1,4 @@
-"""How large the tiles of coefficients and the chunks of residual of a surface are, as exponents of two."""
+"""Sizes of the tiles of coefficients and of the chunks of residual of a surface, as exponents of two."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, 
 
 
 def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
-    """Return rows and columns that chunks of residual of a surface of one grid may have, as exponents of two.
+    """Return the sizes, rows and columns as exponents of two, that chunks of a surface of one grid may have.
 
     The smallest first; ``small``: of a surface that takes small ones, since a window needs a larger share of it.
 
@@ -57,7 +57,7 @@ def square(bits: int) -> tuple[int, int]:
 
 
 def _fitting(rows: int, columns: int, bits: int) -> tuple[int, int]:
-    """Return a square, or something longer where that holds more of what is narrow."""
+    """Return a square size, or a longer one for a grid that is narrower than the square."""
     short, long = square(bits)
     while short > 1 and 2 * min(rows, columns) <= 1 << short:
         short, long = short - 1, long + 1

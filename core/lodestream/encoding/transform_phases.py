@@ -1,4 +1,4 @@
-"""The first phases of a build: every channel transformed, level by level from the finest one down."""
+"""The first phases of a build: every channel transformed, level by level, from the finest to the coarsest."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _CarryOut = Callable[[float, Sequence[Task]], None]
 
 
 def planes_of_channel(build: Build, kind: str, channel: int) -> NDArray[np.int8]:
-    """Return bit-planes of all tiles of a channel, int8, shape (tile,); ``kind`` as of `transformed`."""
+    """Return the bit-planes of all tiles of a channel, int8, shape (tile,); ``kind`` as of `transformed`."""
     return np.concatenate([build.scratch.read(name_of(kind, channel, level, k)) for level, k, _ in pieces_of(build)])
 
 
@@ -85,7 +85,7 @@ class TransformPhases:
             self._scratch.write(f"weights/{channel}", result.weights[channel])
 
     def _is_plain(self, channel: int, share: float) -> bool:
-        """Transform a channel; whether it has the default predictors."""
+        """Transform a channel, and return whether it has the default predictors."""
         overflow = f"overflow/{channel}"
         if not self._scratch.has(overflow):
             self._transform(channel, share, fit=True)
@@ -133,7 +133,7 @@ class TransformPhases:
         self._carry_out(0.0, [Task(done, tasks.core, (channel, int(fit)))])
 
     def _fit(self, channel: int, level: int, rule: int, fit: bool, names: list[str]) -> None:
-        """Fit a predictor to what the pieces of a level have sampled, or let it be the default one."""
+        """Fit a predictor to the samples of the pieces of a level, or take the default one."""
         name = name_of_fit("rules", channel, fit, level, rule)
         if self._scratch.has(name):
             return
