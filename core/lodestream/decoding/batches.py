@@ -1,4 +1,4 @@
-"""Segments in the order in which they are decoded: the tiles of a level side by side, coarse levels first.
+"""Segments in decoding order: the tiles of a level side by side, coarse levels first.
 
 What a segment decodes to depends on the segments of its tile before it, and on what its parent tile knows of the same
 bit-planes and of higher ones. So a tile takes all its segments in turn, while what they work on stays in the cache, and
@@ -38,10 +38,10 @@ class Coded(NamedTuple):
 
 
 def batch_length(layout: Layout, segments: Sequence[Coded]) -> int:
-    """How many of the segments may be decoded coarse levels first, at least 1.
+    """Return the number of segments, at least 1, that may be decoded coarse levels first.
 
-    A segment that comes after a child has looked for its planes in vain, as no writer of ours puts it, begins the next
-    batch: what it tells must not be known before.
+    A segment that follows a child whose planes depend on it begins the next batch: its bits must not be known before.
+    None of our encoders writes one.
     """
     parents, channels = layout.parents.data, 1 + max((segment.channel for segment in segments), default=0)
     lowest: dict[int, int] = {}  # the lowest plane that was looked at, by the number of a unit
@@ -58,16 +58,18 @@ def batch_length(layout: Layout, segments: Sequence[Coded]) -> int:
 
 
 def rounds_of(channels: Sequence[Tiles], segments: Sequence[Coded]) -> list[list[Reading]]:
-    """What decodes a batch: rounds one after another, in each of them readings that may run at the same time."""
+    """Return the rounds that decode a batch, one after another; the readings of a round may run at the same time."""
     runs: list[list[Run]] = [[] for _ in channels]
     for tile, channel, first, passes, data, _ in segments:
         runs[channel].append(Run(tile, first, first - passes + 1, data))
-    every = [list(_rounds(tiles, own)) for tiles, own in zip(channels, runs, strict=True) if own]
-    return [[reading for some in of for reading in some] for of in zip_longest(*every, fillvalue=())]
+    channel_rounds = [
+        list(_rounds(tiles, channel_runs)) for tiles, channel_runs in zip(channels, runs, strict=True) if channel_runs
+    ]
+    return [[reading for some in of for reading in some] for of in zip_longest(*channel_rounds, fillvalue=())]
 
 
 def _rounds(tiles: Tiles, runs: list[Run]) -> Iterator[list[Reading]]:
-    """The rounds of one channel: one reading for all levels that have little, several for a level that has more."""
+    """Yield the rounds of a channel: one reading for all levels with few bytes, several for a level with more."""
     runs.sort(key=_tile)
     if sum([len(run.data) for run in runs]) <= (_LITTLE if threads() == 1 else _WORTH):
         yield tiles.readings(runs, [len(runs)])
@@ -77,20 +79,20 @@ def _rounds(tiles: Tiles, runs: list[Run]) -> Iterator[list[Reading]]:
     begin = 0
     while begin < len(runs):
         level, end = level_of(runs[begin].tile), begin
-        size, own = 0, []
+        size, round_ends = 0, []
         while end < len(runs) and level_of(runs[end].tile) == level:
             if size >= _WORTH and runs[end].tile != runs[end - 1].tile:
-                own.append(end)
+                round_ends.append(end)
                 size = 0
             size += len(runs[end].data)
             end += 1
-        own.append(end)
-        if len(own) == 1 and len(ends[-1]) < 2:
-            ends[-1] = own  # goes on with the reading of the levels below
+        round_ends.append(end)
+        if len(round_ends) == 1 and len(ends[-1]) < 2:
+            ends[-1] = round_ends  # goes on with the reading of the levels below
         else:
-            ends.append(own)
+            ends.append(round_ends)
         begin = end
-    made = iter(tiles.readings(runs, [end for own in ends for end in own]))
-    for own in ends:
-        if own:
-            yield [next(made) for _ in own]
+    readings = iter(tiles.readings(runs, [end for round_ends in ends for end in round_ends]))
+    for round_ends in ends:
+        if round_ends:
+            yield [next(readings) for _ in round_ends]

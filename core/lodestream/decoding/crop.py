@@ -1,4 +1,4 @@
-"""The reconstruction of a window: of every level only what the window is made of, so that it costs what a window costs.
+"""Reconstruct a window from the parts of every level that it depends on, so that its cost follows its size.
 
 From the finest level down, an axis is followed by the samples that are wanted. The nodes and details that give them
 back, and a few more beside them, are one stretch of the axis. It is stepped like an axis of its own: where it ends
@@ -61,7 +61,7 @@ class SeamCrop(NamedTuple):
 
 
 def crop_across_seam(step: AxisStep, start: int, stop: int) -> SeamCrop:
-    """What gives the samples from ``start`` to before ``stop`` back.
+    """Return the crop of a step that restores the samples from ``start`` to before ``stop``.
 
     Of a closed axis ``stop`` may be up to ``start`` plus the length: the samples then go on with the first ones.
     """
@@ -69,14 +69,14 @@ def crop_across_seam(step: AxisStep, start: int, stop: int) -> SeamCrop:
         first = (start >> 1) - _SUPPORT
         count = ((stop - 1) >> 1) + 2 + _SUPPORT - first
         if count < step.run:
-            made = AxisStep(2 * count - 1, count, count - 1, count, False, False, False)
+            cropped = AxisStep(2 * count - 1, count, count - 1, count, False, False, False)
             place, begin = start - 2 * first, first % step.run
-            crop = AxisCrop(begin, made, place)
+            crop = AxisCrop(begin, cropped, place)
             return SeamCrop((crop,), ((place, place + stop - start),), (begin, begin + count))
     elif stop <= step.length:
         crop = crop_axis(step, start, stop)
-        own = crop.start, crop.start + stop - start
-        return SeamCrop((crop,), (own,), (crop.first, crop.first + crop.step.coarse))
+        kept = crop.start, crop.start + stop - start
+        return SeamCrop((crop,), (kept,), (crop.first, crop.first + crop.step.coarse))
     else:
         # Both sides of the gap are free ends: neither looks at what is on the other one.
         last, first_ones = crop_axis(step, start, step.length), crop_axis(step, 0, stop - step.length)
@@ -89,7 +89,7 @@ def crop_across_seam(step: AxisStep, start: int, stop: int) -> SeamCrop:
 
 
 def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:
-    """What gives the samples from ``start`` to before ``stop`` back.
+    """Return the crop of a step that restores the samples from ``start`` to before ``stop``.
 
     An axis that wraps is taken whole.
     """
@@ -106,7 +106,7 @@ def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:
     # The sample of its own at the end of an axis of even length goes with the last node of the run.
     tail = int(step.tail and last == step.run - 1)
     run = last - first + 1
-    made = AxisStep(
+    cropped = AxisStep(
         2 * run - 1 + tail,
         run + tail,
         run - 1,
@@ -115,4 +115,4 @@ def crop_axis(step: AxisStep, start: int, stop: int) -> AxisCrop:
         step.left and first == 0,
         step.right and last == step.run - 1,
     )
-    return AxisCrop(first, made, start - 2 * first)
+    return AxisCrop(first, cropped, start - 2 * first)

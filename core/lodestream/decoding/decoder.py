@@ -112,7 +112,7 @@ class Decoder:
         self._footer = bytearray()
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[View]:
-        """Decode the next bytes of the file; returns the views that they complete.
+        """Decode the next bytes of the file, and return the views that they complete.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class Decoder:
         return self.layers[before:]
 
     def feed_at(self, offset: int, data: bytes | bytearray | memoryview) -> list[View]:
-        """Decode a slice of the container that starts at ``offset``; returns the views that it completes.
+        """Decode a slice of the container that starts at ``offset``, and return the views that it completes.
 
         Slices must come in the order of a `plan`. They may be cut anywhere.
         """
@@ -229,7 +229,7 @@ class Decoder:
         return self.arrived
 
     def view(self) -> View:
-        """The current state.
+        """Return the current state.
 
         Raises
         ------
@@ -244,11 +244,14 @@ class Decoder:
         return self.layers[-1]
 
     def surface(self, level: int | None = None) -> Surface:
-        """The current state as a surface, see `View.surface`."""
+        """Return the current state as a surface, see `View.surface`."""
         return self.view().surface(level)
 
     def points_at(self, level: int) -> NDArray[Any]:
-        """The current grid of a level: shape (row, column), or (row, column, component); see `View.points_at`."""
+        """Return the current grid of a level, shape (row, column), or (row, column, component).
+
+        See `View.points_at`.
+        """
         return self.view().points_at(level)
 
     @property
@@ -375,27 +378,27 @@ class Decoder:
             self.layers.pop()
             raise
 
-    def _show(self, made: State) -> None:
-        corrected = made.complete and self.header is not None and self.header.corrected
+    def _show(self, shown: State) -> None:
+        corrected = shown.complete and self.header is not None and self.header.corrected
         window = self._window
-        length, state = self._queue.length, self._progress.snapshot(made.all_layers)
+        length, state = self._queue.length, self._progress.snapshot(shown.all_layers)
         self.capacity.take(state.nbytes)
-        if self.header is not None and made.whole_level >= 0:
+        if self.header is not None and shown.whole_level >= 0:
             # The index says that there is nothing more of these levels.
-            levels = state[: self.header.layout.tiles_of(made.whole_level).stop]
+            levels = state[: self.header.layout.tiles_of(shown.whole_level).stop]
             levels[levels == UNANNOUNCED] = 0
-        if made.whole_near and self._near is not None:
+        if shown.whole_near and self._near is not None:
             state[self._near[:, None] & (state == UNANNOUNCED)] = 0
-        figures = made.rms, made.max_error, False
+        figures = shown.rms, shown.max_error, False
         if window is not None:
-            window.put_outside(made, state)
-            figures = window.figures(made)
+            window.put_outside(shown, state)
+            figures = window.figures(shown)
         view = View(
-            made.number,
-            made.level,
-            made.bytes,
+            shown.number,
+            shown.level,
+            shown.bytes,
             *figures,
-            made.complete,
+            shown.complete,
             self._queue,
             length,
             state,
@@ -403,19 +406,19 @@ class Decoder:
             self._values,
             self._ending,
             self._selection,
-            channels=made.channels if window is None else (),
+            channels=shown.channels if window is None else (),
         )
         self.layers.append(view)
 
     def _take_part(self, offset: int, data: Bytes) -> None:
-        """Bytes of a plan, once the header is known."""
+        """Decode bytes of a plan, once the header is known."""
         if self._slices is None:
             self._take_loose(offset, data)
         elif self._window is None or not self._window.take(offset, data):
             self._take_slice(offset, data)
 
     def _take_loose(self, offset: int, data: Bytes) -> None:
-        """Bytes that do not continue the file and belong to a service section: the index or the metadata."""
+        """Store bytes that do not continue the file, but belong to the index or the metadata."""
         start, run = self._loose.pop(offset, (offset, bytearray()))
         run += data
         kind, place = run[0], ByteRange(start, len(run))

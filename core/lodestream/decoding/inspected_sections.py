@@ -1,4 +1,4 @@
-"""A container from an untrusted source, section by section: each is sound, and the index says what stands there."""
+"""Check a container from an untrusted source section by section, and its index against the sections."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def walk(file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None]
     """
     size = file.seek(0, os.SEEK_END)
     # Its header is held to the number of vertices below; how much memory it may take is for the caller to limit.
-    decoder, found = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()
+    decoder, contents = Decoder(max_vertices=max_vertices * _MOST_CHANNELS), _Found()
     decoder.feed(_start(file, size))
     for kind, place in _sections(file, size):
         if _passes(kind, place, size):
@@ -91,7 +91,7 @@ def walk(file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None]
             for start in range(place.offset, place.end, _AT_ONCE):
                 decoder.feed(_read(file, start, min(_AT_ONCE, place.end - start)))
                 progress(start / size)
-            found.optional.append(OptionalSection(kind, place))
+            contents.optional.append(OptionalSection(kind, place))
             continue
         data = _read(file, place.offset, place.length)
         frame = whole_section(data, place.offset, kind)
@@ -100,15 +100,15 @@ def walk(file: BinaryIO, *, max_vertices: int, progress: Callable[[float], None]
             _check_size(header, max_vertices)
         decoder.feed(data)
         assert decoder.header is not None  # the decoder takes nothing else first
-        _note(found, frame, decoder.header)
+        _note(contents, frame, decoder.header)
         if decoder.layers:
             decoder.layers[-1]._queue.drop()
         progress(place.end / size)
     decoder.finish()
     assert decoder.index is not None  # the last section
     _take_footer(file, size, decoder)
-    _compare(decoder.index, found)
-    return Walked(decoder, decoder.index, found.windows)
+    _compare(decoder.index, contents)
+    return Walked(decoder, decoder.index, contents.windows)
 
 
 def _read(file: BinaryIO, offset: int, length: int) -> bytes:
@@ -117,7 +117,7 @@ def _read(file: BinaryIO, offset: int, length: int) -> bytes:
 
 
 def _start(file: BinaryIO, size: int) -> bytes:
-    """The signature."""
+    """Read and check the signature."""
     start = _read(file, 0, len(sections.SIGNATURE))
     if len(start) < len(sections.SIGNATURE) and sections.SIGNATURE.startswith(start):
         raise TruncatedStreamError(f"expected a container, got the first {size} bytes of one (at byte {size})")
@@ -125,7 +125,7 @@ def _start(file: BinaryIO, size: int) -> bytes:
 
 
 def _sections(file: BinaryIO, size: int) -> Iterator[tuple[int, ByteRange]]:
-    """Kind and place of each section, up to the index."""
+    """Yield kind and place of each section, up to the index."""
     offset, kind = len(sections.SIGNATURE), -1
     while kind != sections.INDEX:
         head = _read(file, offset, _FRAME_HEAD)
@@ -141,7 +141,7 @@ def _sections(file: BinaryIO, size: int) -> Iterator[tuple[int, ByteRange]]:
 
 
 def _passes(kind: int, place: ByteRange, size: int) -> bool:
-    """Whether a section of a file of so many bytes is one that no reader of this library uses."""
+    """Return whether a section is of a kind that no reader of this library uses."""
     if kind == WINDOW_ERRORS:
         return place.length > max(size // MOST_SHARE, _AT_ONCE)
     return kind >= sections.OPTIONAL
@@ -158,45 +158,47 @@ def _check_size(header: Header, most: int) -> None:
         )
 
 
-def _note(found: _Found, frame: Frame, header: Header) -> None:
-    """Add what a section is to what the index should say."""
+def _note(contents: _Found, frame: Frame, header: Header) -> None:
+    """Record a section for the comparison with the index."""
     place = ByteRange(frame.offset, frame.end - frame.offset)
     if frame.kind == sections.LAYER:
-        _note_layer(found, frame, header)
+        _note_layer(contents, frame, header)
     elif frame.kind == sections.RESIDUAL:
-        found.remaining, chunks = sections.parse_chunks(frame.payload, frame.payload_offset, header)
-        found.residual = place
-        found.chunks = [Chunk(ByteRange(at, len(data)), sections.check_of(data) if data else 0) for data, at in chunks]
+        contents.remaining, chunks = sections.parse_chunks(frame.payload, frame.payload_offset, header)
+        contents.residual = place
+        contents.chunks = [
+            Chunk(ByteRange(at, len(data)), sections.check_of(data) if data else 0) for data, at in chunks
+        ]
     elif frame.kind == sections.METADATA:
-        found.metadata = place
+        contents.metadata = place
     elif frame.kind >= sections.OPTIONAL:
-        found.optional.append(OptionalSection(frame.kind, place))
+        contents.optional.append(OptionalSection(frame.kind, place))
         if frame.kind == WINDOW_ERRORS:
-            found.windows = parse_window_errors(frame.payload, frame.payload_offset, header)
+            contents.windows = parse_window_errors(frame.payload, frame.payload_offset, header)
 
 
-def _note_layer(found: _Found, frame: Frame, header: Header) -> None:
+def _note_layer(contents: _Found, frame: Frame, header: Header) -> None:
     errors, entries, start = sections.parse_layer(frame.payload, frame.payload_offset, header)
-    number = len(found.layers)
-    level = found.layers[-1].level if found.layers else 0
+    number = len(contents.layers)
+    level = contents.layers[-1].level if contents.layers else 0
     for entry in entries:
         # The decoder has made sure that it is told at the first segment of each.
-        top = found.tops.setdefault((entry.tile, entry.channel), entry.top)
+        top = contents.tops.setdefault((entry.tile, entry.channel), entry.top)
         place = ByteRange(frame.payload_offset + start, entry.length)
         check = sections.check_of(frame.payload[start : start + entry.length])
-        found.segments.append(Segment(number, entry.tile, entry.channel, top, entry.passes, place, check))
+        contents.segments.append(Segment(number, entry.tile, entry.channel, top, entry.passes, place, check))
         start += entry.length
         level = max(level, header.layout.level_of(entry.tile))
-    if found.layers and errors.rms > found.layers[-1].rms:
+    if contents.layers and errors.rms > contents.layers[-1].rms:
         raise CorruptStreamError(
-            f"expected an RMS error of at most {found.layers[-1].rms}, that of the layer before, got {errors.rms}",
+            f"expected an RMS error of at most {contents.layers[-1].rms}, that of the layer before, got {errors.rms}",
             frame.offset,
         )
-    found.layers.append(LayerRecord(number, frame.offset, frame.end, level, *errors))
+    contents.layers.append(LayerRecord(number, frame.offset, frame.end, level, *errors))
 
 
 def _take_footer(file: BinaryIO, size: int, decoder: Decoder) -> None:
-    """Feed the footer, after which nothing may stand."""
+    """Feed the footer, and check that it ends the file."""
     assert decoder.index is not None  # it has just come
     end = decoder.index.index.end
     footer = _read(file, end, sections.FOOTER_LENGTH)
@@ -214,21 +216,21 @@ def _take_footer(file: BinaryIO, size: int, decoder: Decoder) -> None:
         )
 
 
-def _compare(index: Index, found: _Found) -> None:
-    """Refuse an index that says anything else than the sections."""
+def _compare(index: Index, contents: _Found) -> None:
+    """Refuse an index that differs from the sections."""
     offset = index.index.offset
     pairs: tuple[tuple[str, Sequence[object], Sequence[object]], ...] = (
-        ("layer", index.layers, found.layers),
-        ("segment", index.segments, found.segments),
-        ("chunk", index.chunks, found.chunks),
-        ("section", (index.residual, index.metadata), (found.residual, found.metadata)),
-        ("optional section", index.optional, found.optional),
+        ("layer", index.layers, contents.layers),
+        ("segment", index.segments, contents.segments),
+        ("chunk", index.chunks, contents.chunks),
+        ("section", (index.residual, index.metadata), (contents.residual, contents.metadata)),
+        ("optional section", index.optional, contents.optional),
     )
     for word, named, real in pairs:
         wrong = [k for k, (a, b) in enumerate(zip(named, real, strict=False)) if a != b]
         if wrong or len(named) != len(real):
             number = wrong[0] if wrong else min(len(named), len(real))
             raise CorruptStreamError(f"expected an index that matches the file, got another {word} {number}", offset)
-    last = found.remaining or found.layers[-1].errors
+    last = contents.remaining or contents.layers[-1].errors
     if index.levels[-1].errors != last:
         raise CorruptStreamError(f"expected errors {last} of the complete surface in the index, got others", offset)

@@ -1,4 +1,4 @@
-"""Checking a container from an untrusted source: every section, the index, every value, and the recorded errors."""
+"""Check a container from an untrusted source: every section, the index, every value, and the recorded errors."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ def _decoded(
     memory: int,
     progress: Callable[[float], None],
 ) -> _Decoded:
-    """Decode all pieces, and measure them in these states."""
+    """Decode all pieces, and measure them in the given states."""
     header = decoder.header
     digest, corners, figures = ValuesDigest(), list[NDArray[Any]](), list[Figures]()
     holes, lists = [0] * len(header.blocks), list(decoder.pieces(memory))
@@ -184,8 +184,8 @@ def _decoded(
         progress(_READ + (_MEASURED - _READ) * number / len(lists) / passes)
     for attribute in range(1, passes):
         for together in lists:
-            for found in spread(decoder.segments.values, together):
-                digest.take(found[0].arrays[attribute])
+            for block_values in spread(decoder.segments.values, together):
+                digest.take(block_values[0].arrays[attribute])
         progress(_READ + (_MEASURED - _READ) * (attribute + 1) / passes)
     return _Decoded(digest.hexdigest(), tuple(holes), corners, figures)
 
@@ -193,12 +193,14 @@ def _decoded(
 def _piece(
     decoder: PiecewiseDecoder, region: Region, states: Sequence[NDArray[np.int8]]
 ) -> tuple[dict[int, _Part], list[Figures]]:
-    """Decode a piece, by block, and measure it in these states, if there are any."""
+    """Decode a piece, by block, and measure it in the given states, if there are any."""
     header, tiles = decoder.header, decoder.segments.channels(region)
     values = decoder.segments.values_from(region, tiles)
     figures = [_measurer(header, region, tiles, values).figures(states)] if states else []
     parts = {}
-    for block, (arrays, mask) in ((block, (own.arrays, header.masks[block])) for block, own in values.items()):
+    for block, (arrays, mask) in (
+        (block, (restored.arrays, header.masks[block])) for block, restored in values.items()
+    ):
         mask = None if mask is None else region.of_block(mask)
         if header.plane is not None:  # never divided
             heights = Surface(blocks=[block_of(header, arrays, header.closed, mask)])
@@ -208,16 +210,16 @@ def _piece(
 
 
 def _measurer(header: Header, region: Region, tiles: Sequence[Tiles], values: Mapping[int, Values]) -> Measurer:
-    """What measures a region, whose values in the end are these."""
-    arrays = {block: own.arrays for block, own in values.items()}
-    points = {block: own[0] for block, own in arrays.items()}
+    """Return a measurer of a region whose final values are ``values``."""
+    arrays = {block: restored.arrays for block, restored in values.items()}
+    points = {block: restored[0] for block, restored in arrays.items()}
     masks = [None if mask is None else region.of_block(mask) for mask in header.masks]
     compared = comparisons(region, header.arrangement, header.geometric, points, arrays, masks)
     return Measurer(header, region, tiles, compared)
 
 
 def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
-    """A surface of a level's shape whose values are 0: as much as its metadata are about."""
+    """Return a surface of zeros with a level's shape, to which its metadata can be attached."""
     shapes = level_shapes(header.patches, header.layout, level, [shape for shape, _ in header.blocks])
     counts = (header.point_channels, *(kind.channels for kind in header.attributes))
     first = [sum(counts[:number]) for number in range(len(counts))]
@@ -245,7 +247,7 @@ def _level(header: Header, metadata: Mapping[str, Any], level: int) -> Surface:
 def _errors(
     decoder: PiecewiseDecoder, figures: list[Figures], states: Sequence[NDArray[np.int8]], fits: bool
 ) -> list[Measured]:
-    """The errors of all states of the whole surface; ``fits``: it may be decoded in one piece.
+    """Return the errors of all states of the whole surface; ``fits``: it fits into memory in one piece.
 
     Raises
     ------
@@ -265,7 +267,9 @@ def _errors(
 
 
 def _check_values(index: Index, holes: tuple[int, ...], corners: Sequence[NDArray[Any]]) -> None:
-    """Refuse holes or an extent that are not the complete surface's. The digest was checked when it was decoded.
+    """Refuse a container whose holes or extent differ from its complete surface.
+
+    The digest is checked while decoding.
 
     Parameters
     ----------
@@ -287,17 +291,19 @@ def _check_values(index: Index, holes: tuple[int, ...], corners: Sequence[NDArra
         )
     if holes != (header.holes or (0,) * len(holes)):
         raise CorruptStreamError(f"expected {header.holes} holes in the blocks, got {holes}", 0)
-    if any(own == rows * columns for own, ((rows, columns), _) in zip(holes, header.blocks, strict=True)):
+    if any(count == rows * columns for count, ((rows, columns), _) in zip(holes, header.blocks, strict=True)):
         raise CorruptStreamError("expected a valid point in each block, got none", 0)
     if header.exact:
         box = np.stack(corners)[:, np.newaxis]
-        found = extent_of(box[..., 0] if box.shape[2] == 1 else box, min(box.shape[2], 3))
-        if not math.isclose(found, header.extent, rel_tol=_TOLERANCE):
-            raise CorruptStreamError(f"expected the extent of the surface, {found}, got {header.extent}", 0)
+        extent = extent_of(box[..., 0] if box.shape[2] == 1 else box, min(box.shape[2], 3))
+        if not math.isclose(extent, header.extent, rel_tol=_TOLERANCE):
+            raise CorruptStreamError(f"expected the extent of the surface, {extent}, got {header.extent}", 0)
 
 
 def _corners_of(points: NDArray[Any], mask: NDArray[np.bool_] | None) -> list[NDArray[Any]]:
-    """The least and the largest values of valid points, shape (channel,); none where none are valid.
+    """Return the smallest and the largest values of valid points, shape (channel,).
+
+    An empty list without valid points.
 
     Parameters
     ----------
@@ -310,7 +316,7 @@ def _corners_of(points: NDArray[Any], mask: NDArray[np.bool_] | None) -> list[ND
 
 
 def _check_levels(index: Index, surface_at: Callable[[int], Surface], most: int | None = None) -> None:
-    """Refuse metadata that would upset whoever writes a level of the surface into a file.
+    """Reject metadata with which a level could not be written to a file.
 
     Parameters
     ----------
@@ -342,7 +348,10 @@ def _check_levels(index: Index, surface_at: Callable[[int], Surface], most: int 
 
 
 def _states_of(walked: Walked) -> Iterator[NDArray[np.int8]]:
-    """The states whose errors are told, int8, shape (tile, channel): of the layers, then of the levels but the last."""
+    """Yield the states with recorded errors, int8, shape (tile, channel).
+
+    Of the layers, then of all levels but the last.
+    """
     header = walked.index.header
     for _, view in zip(walked.index.layers, walked.decoder.layers, strict=False):
         yield view._state
@@ -352,8 +361,8 @@ def _states_of(walked: Walked) -> Iterator[NDArray[np.int8]]:
         yield state
 
 
-def _check_errors(walked: Walked, found: Iterable[Measured], progress: Callable[[float], None]) -> None:
-    """Refuse errors of layers, levels and windows that are not theirs.
+def _check_errors(walked: Walked, measurements: Iterable[Measured], progress: Callable[[float], None]) -> None:
+    """Refuse a container whose recorded errors of layers, levels or windows differ from the measured ones.
 
     Parameters
     ----------
@@ -374,7 +383,9 @@ def _check_errors(walked: Walked, found: Iterable[Measured], progress: Callable[
         (f"layer {record.number}", record, record.errors, record.offset) for record in index.layers
     ]
     names += [(f"level {known.level}", None, known.errors, index.index.offset) for known in index.levels[:-1]]
-    for number, ((name, record, errors, offset), (measured, cells)) in enumerate(zip(names, found, strict=True), 1):
+    for number, ((name, record, errors, offset), (measured, cells)) in enumerate(
+        zip(names, measurements, strict=True), 1
+    ):
         _agree(errors, measured, name, offset)
         if record is not None and windows is not None and index.header.arrangement is None and cells:
             _bound(windows, cells[0], record)
@@ -383,18 +394,18 @@ def _check_errors(walked: Walked, found: Iterable[Measured], progress: Callable[
     _agree(index.levels[-1].errors, nothing, "the exact surface", index.index.offset)
 
 
-def _agree(said: Errors, found: Errors, what: str, offset: int) -> None:
-    pairs = [(told, said[:2], found[:2])]
-    pairs += [(told_roughly, *channel) for channel in zip(said.channels, found.channels, strict=True)]
-    for rounded, one, other in pairs:
-        for a, b in zip(one, other, strict=True):
+def _agree(stored: Errors, measured: Errors, what: str, offset: int) -> None:
+    pairs = [(told, stored[:2], measured[:2])]
+    pairs += [(told_roughly, *channel) for channel in zip(stored.channels, measured.channels, strict=True)]
+    for rounded, recorded, other in pairs:
+        for a, b in zip(recorded, other, strict=True):
             if not rounded(b * (1 - _TOLERANCE)) <= a <= rounded(b * (1 + _TOLERANCE)):
-                wanted, got = (f"{pair[0]} and {pair[1]}" for pair in (other, one))
+                wanted, got = (f"{pair[0]} and {pair[1]}" for pair in (other, recorded))
                 raise CorruptStreamError(f"expected the RMS and maximum error of {what}, {wanted}, got {got}", offset)
 
 
 def _bound(windows: WindowErrors, cells: NDArray[np.float64], layer: LayerRecord) -> None:
-    """Refuse errors of windows that are smaller than what was measured, as far as cells are the same."""
+    """Refuse errors of windows below the measured ones, where the cells are the same."""
     known = layer_codes(cells, windows.header)
     if windows.cell != CELL or known is None:
         return

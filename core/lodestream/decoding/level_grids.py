@@ -1,4 +1,4 @@
-"""The grid of a coarser level: which rows and columns of the surface it shows, and what its metadata say."""
+"""The grid of a coarser level: the rows and columns of the surface at its nodes, and its metadata."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ __all__ = ["at_level", "level_nodes", "level_positions", "with_rules"]
 
 
 def level_nodes(header: Header, level: int) -> list[Nodes]:
-    """Which rows and columns of each block stand at a level's nodes, int64, shape (row,) and (column,) each."""
+    """Return the rows and columns of each block that stand at a level's nodes, int64, shape (row,) and (column,)."""
     owned = zip(header.block_patches, header.blocks, strict=True)
-    return [patches.level_positions(own, len(header.patches), header.layout, level, shape) for own, (shape, _) in owned]
+    return [
+        patches.level_positions(patch_grid, len(header.patches), header.layout, level, shape)
+        for patch_grid, (shape, _) in owned
+    ]
 
 
 def level_positions(metadata: dict[str, Any], header: Header, level: int) -> dict[str, Any]:
-    """Metadata of a level's grid from those of heights of one block: where its nodes lie, see `level_metadata`."""
+    """Return the metadata of a level of heights of one block, with the places of its nodes, see `level_metadata`."""
     if header.plane is not None and not metadata.keys() & {"axes", "geotransform"}:
         return metadata  # these points have an x and a y of their own
     values = level_metadata(metadata, *header.blocks[0], level_nodes(header, level)[0])

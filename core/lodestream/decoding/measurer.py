@@ -1,4 +1,4 @@
-"""Errors of states over a region of the surface: what a receiver shows in each of them, beside what was given.
+"""Errors of states over a region of the surface: the values that a receiver shows against the original ones.
 
 What regions tell is put together for the whole surface: sums are those of cells, which are added up exactly, so it does
 not matter how the surface was divided.
@@ -77,7 +77,7 @@ class Comparison(NamedTuple):
 
     @property
     def kinds(self) -> int:
-        """Kinds of distances: of all channels together, and where there are several, of each by itself."""
+        """Number of distances: of all channels together, and of each of several channels."""
         return 1 + len(self.channels) if len(self.channels) > 1 else 1
 
 
@@ -89,7 +89,7 @@ def comparisons(
     arrays: ByBlock[Sequence[NDArray[Any]]],
     masks: ByBlock[NDArray[np.bool_] | None],
 ) -> list[Comparison]:
-    """What the channels of a region are compared with: the coordinates, then each other channel.
+    """Return the original values of the channels of a region: the coordinates together, then each other channel.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def comparisons(
     others = other_originals(arrangement, arrays, masks, geometric, patches)
     return [
         Comparison(coordinates, range(geometric), 0),
-        *(Comparison(own, range(k, k + 1), first) for k, (own, first) in enumerate(others, geometric)),
+        *(Comparison(originals, range(k, k + 1), first) for k, (originals, first) in enumerate(others, geometric)),
     ]
 
 
@@ -152,7 +152,7 @@ class Measurer:
         self._patches = len(region.patches)
 
     def errors(self, states: Sequence[State]) -> list[Measured]:
-        """Errors of states, int8, shape (tile, channel) each, where the region is the whole surface."""
+        """Measure the errors of states, int8, shape (tile, channel) each, where the region is the whole surface."""
         figures = [self.figures(states)]
         return [
             distances_of(self._header, figures, number) or self.exact_errors(state)
@@ -160,7 +160,7 @@ class Measurer:
         ]
 
     def figures(self, states: Sequence[State]) -> Figures:
-        """What the region tells of the errors of states, int8, shape (tile, channel) each."""
+        """Measure the region's part of the errors of states, int8, shape (tile, channel) each."""
         known = [self._known(state) for state in states]
         kinds = sum(compared.kinds for compared in self._compared)
         squares = np.empty((len(states), *self._region.cells, kinds, 2))
@@ -183,24 +183,24 @@ class Measurer:
         return Figures(squares, equal, np.array(counts, np.int64))
 
     def exact_errors(self, state: State) -> Measured:
-        """Errors of a state, int8, shape (tile, channel), of the whole surface.
+        """Measure the errors of a state, int8, shape (tile, channel), of the whole surface.
 
         They are found also where float64 does not hold the squares of its values.
         """
-        cells, found = list[NDArray[np.float64]](), list[tuple[float, float]]()
+        cells, distances = list[NDArray[np.float64]](), list[tuple[float, float]]()
         known = self._known(state)
         for number, (originals, channels, first) in enumerate(self._compared):
-            made = [self._reconstructor(channel).reconstruct(known[channel]) for channel in channels]
-            grids = zip(*(arrays[-self._patches :] for arrays, _ in made), strict=True)
-            found += coordinate_distances(
+            reconstructed = [self._reconstructor(channel).reconstruct(known[channel]) for channel in channels]
+            grids = zip(*(arrays[-self._patches :] for arrays, _ in reconstructed), strict=True)
+            distances += coordinate_distances(
                 originals,
                 [self._header.lattices[channel] for channel in channels],
                 [np.stack(coordinates) for coordinates in grids],
-                [fraction for _, fraction in made],
+                [fraction for _, fraction in reconstructed],
                 first,
                 None if number else cells,
             )
-        return _errors(found, self._header.geometric), cells
+        return _errors(distances, self._header.geometric), cells
 
     def _reconstructor(self, channel: int) -> Reconstructor:
         return Reconstructor(
@@ -208,7 +208,7 @@ class Measurer:
         )
 
     def _known(self, state: State) -> list[KnownState]:
-        """A state, int8, shape (tile, channel), as far as each channel's tiles are concerned."""
+        """Return the part of a state, int8, shape (tile, channel), that each channel's tiles need."""
         return [
             known_state(tiles.table, state[:, channel], self._region.level) for channel, tiles in enumerate(self._tiles)
         ]
@@ -230,15 +230,19 @@ class _PartMeasurer:
         room = np.empty(part.region.size, np.int32) if part.within is None and len(compared) > 1 else None
         self._channels = [
             Reconstructor(
-                part.region, predictors, own, channel < header.geometric, None if channel < header.geometric else room
+                part.region,
+                predictors,
+                channel_tiles,
+                channel < header.geometric,
+                None if channel < header.geometric else room,
             )
-            for channel, (predictors, own) in enumerate(zip(header.predictors, tiles, strict=True))
+            for channel, (predictors, channel_tiles) in enumerate(zip(header.predictors, tiles, strict=True))
         ]
         #: Of each comparison its figures in the state before, and whether all is equal.
         self._before: list[tuple[NDArray[np.float64], NDArray[np.bool_]] | None] = [None] * len(compared)
 
     def measure(self, state: Sequence[KnownState]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Sums and largest of the squared distances in a state of each channel; see `Figures`, of one state.
+        """Measure the sums and maxima of the squared distances of each channel in a state; see `Figures`.
 
         Returns
         -------
@@ -255,18 +259,18 @@ class _PartMeasurer:
         frames = [self._channels[channel].frames[-self._patches :] for channel in channels]
         lattices = [self._lattices[channel] for channel in channels]
         figures = [
-            _compared(original, lattices, _stacked([own[patch] for own in frames]), fractions, first)
+            _compared(original, lattices, _stacked([grids[patch] for grids in frames]), fractions, first)
             for patch, original in enumerate(originals)
         ]
         squares, equal = zip(*figures, strict=True)
-        cells = squares[0] if self._has_cells else np.array([[_one_cell(own)] for own in squares])
-        found = cells, np.all(equal, axis=0)
-        self._before[number] = found
-        return found
+        cells = squares[0] if self._has_cells else np.array([[_one_cell(patch_squares)] for patch_squares in squares])
+        result = cells, np.all(equal, axis=0)
+        self._before[number] = result
+        return result
 
 
 def _cut(comparison: Comparison, part: MeasuredPart) -> Comparison:
-    """What a part is compared with; of a window of a grid a copy of the channels that are compared, and of no others.
+    """Return the original values of a part; of a window of a grid a copy of the compared channels alone.
 
     An array of many components is there in as many comparisons.
     """
@@ -285,14 +289,17 @@ def _stacked(frames: Sequence[Grid]) -> NDArray[np.int32]:
 
 
 def _one_cell(squares: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """The sum and the largest of each kind over all cells of a patch."""
-    return [(math.fsum(own[..., 0].flat), float(own[..., 1].max())) for own in np.moveaxis(squares, 2, 0)]
+    """Return the sum and the largest of each kind over all cells of a patch."""
+    return [
+        (math.fsum(kind_squares[..., 0].flat), float(kind_squares[..., 1].max()))
+        for kind_squares in np.moveaxis(squares, 2, 0)
+    ]
 
 
 def _compared(
     original: Original, lattices: Sequence[Lattice], canvas: NDArray[np.int32], fractions: Sequence[int], channel: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """`distance_figures`, and of each kind whether all values are equal: known where the squares are all 0.
+    """Return `distance_figures`, and for each kind whether all values are equal, that is, all squares are 0.
 
     Parameters are those of `distance_figures`; ``canvas`` are its coordinates, int32, shape (channel, row, column).
 
@@ -315,7 +322,7 @@ def _compared(
 
 
 def distances_of(header: Header, figures: Sequence[Figures], state: int) -> Measured | None:
-    """Errors of the whole surface in a state, and the distances in cells.
+    """Return the errors of the whole surface in a state, and the distances in its cells.
 
     Parameters
     ----------
@@ -330,7 +337,7 @@ def distances_of(header: Header, figures: Sequence[Figures], state: int) -> Meas
     (Errors, list of float64 arrays, shape (row of cells, column of cells, 2)) or None
         None: float64 does not hold the squares.
     """
-    geometric, found, cells = header.geometric, list[tuple[float, float]](), list[NDArray[np.float64]]()
+    geometric, distances, cells = header.geometric, list[tuple[float, float]](), list[NDArray[np.float64]]()
     first = 0
     for comparison, count in enumerate(np.sum([part.counts for part in figures], axis=0).tolist()):
         kinds = 1 + geometric if comparison == 0 and geometric > 1 else 1
@@ -345,11 +352,11 @@ def distances_of(header: Header, figures: Sequence[Figures], state: int) -> Meas
             errors = [(0.0, 0.0)] * kinds
         elif comparison == 0 and errors[0][1]:
             cells = [squares[..., 0, :]]
-        found += errors
-    return _errors(found, geometric), cells
+        distances += errors
+    return _errors(distances, geometric), cells
 
 
-def _errors(found: Sequence[tuple[float, float]], geometric: int) -> Errors:
-    """Errors from those of each kind: of all coordinates together, then of each of several channels."""
-    distances, *channels = found
-    return Errors(*distances, tuple(channels if geometric > 1 else found if len(found) > 1 else ()))
+def _errors(kind_errors: Sequence[tuple[float, float]], geometric: int) -> Errors:
+    """Return errors from those of each kind: all coordinates together, then each of several channels."""
+    distances, *channels = kind_errors
+    return Errors(*distances, tuple(channels if geometric > 1 else kind_errors if len(kind_errors) > 1 else ()))

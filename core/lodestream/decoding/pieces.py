@@ -1,4 +1,4 @@
-"""Which regions a surface is made of: for so much memory, for threads, for whoever measures errors, or for a window.
+"""Divide a surface into regions: for a limit of memory, for threads, for measuring errors, or for a window.
 
 A surface of one grid is divided into bands of rows, or into windows; one of several grids into runs of blocks or of
 patches. Which of both it is, only this module and `region` ask: all others take the regions one after another.
@@ -46,7 +46,7 @@ _SHARED_VALUES = 1 << 17
 
 
 def why_not_by_pieces(header: Header, memory: int, level: int | None = None) -> str | None:
-    """Why a container cannot be decoded by pieces in so many bytes; None: it can.
+    """Return the reason why a container cannot be decoded by pieces in ``memory`` bytes; None if it can.
 
     No block is divided where there are several, or where one touches itself. ``level`` is the finest if not given.
     """
@@ -62,7 +62,7 @@ def why_not_by_pieces(header: Header, memory: int, level: int | None = None) -> 
 
 
 def pieces_of(header: Header, level: int, memory: int) -> Iterator[list[Region]]:
-    """All of a level in order, in lists of pieces that are decoded together in so many bytes, about.
+    """Yield all of a level in order, in lists of pieces that are decoded together in about ``memory`` bytes.
 
     A list has at most as many pieces as there are threads. A band begins where chunks of residual and cells do, and has
     some rows at least; a run of blocks has at least one. A surface whose x and y are made of rules is one piece.
@@ -83,7 +83,7 @@ def pieces_of(header: Header, level: int, memory: int) -> Iterator[list[Region]]
 
 
 def runs_of(header: Header, level: int, points: int) -> list[range]:
-    """Rows of the only grid, or blocks, in runs of about so many points, or of the fewest rows or one block.
+    """Return runs of rows of the only grid, or of blocks, of about so many points, but at least one band or block.
 
     Rows begin where chunks of residual and cells do.
     """
@@ -97,7 +97,7 @@ def runs_of(header: Header, level: int, points: int) -> list[range]:
 
 
 def region_of_run(header: Header, level: int, run: range, core: int) -> Region:
-    """What is made for a run of `runs_of`: rows above a level ``core`` that is made whole, or blocks."""
+    """Return the region of a run of `runs_of`: blocks, or rows above a level ``core`` that is made whole."""
     if header.arrangement is None:
         columns = header.layout.shape(0, level)[1]
         return Region.window(header.layout, level, (run.start, run.stop), (0, columns), core)
@@ -109,7 +109,7 @@ def region_of_run(header: Header, level: int, run: range, core: int) -> Region:
 
 
 def region_of_window(header: Header, level: int, window: Window | None) -> Region:
-    """What is made of a level for a window of the only block, rows and columns of full resolution; None: for all.
+    """Return the region of a level for a window of the only block, rows and columns of full resolution; None: all.
 
     Of a block that meets itself all is made: what its sides share may lie anywhere in it.
     """
@@ -126,7 +126,7 @@ class Band(NamedTuple):
 
 
 def bands_of(region: Region, workers: int) -> list[Band]:
-    """A region in bands of rows, as many for each of so many threads, or as one.
+    """Divide a region into bands of rows, as many for each thread, or return it as one band.
 
     All of a large level of one grid is divided: what a band takes stays in the processor's cache, no array holds all
     coefficients of the level, and several threads make bands at the same time. Each is made above the level below.
@@ -160,7 +160,9 @@ class MeasuredPart(NamedTuple):
 
 
 def measured_parts(region: Region, whole_points: int, side: int, core_points: int) -> list[MeasuredPart]:
-    """The parts of a region that are measured one after another: windows of the only grid, or runs of patches.
+    """Return the parts of a region that are measured one after another.
+
+    Windows of the only grid, or runs of patches.
 
     Parameters
     ----------
@@ -172,14 +174,14 @@ def measured_parts(region: Region, whole_points: int, side: int, core_points: in
     core_points : int
         Levels of at most so many points are made whole for each window.
     """
-    shapes, every = region.patch_shapes, slice(None)
+    shapes, everything = region.patch_shapes, slice(None)
     points = [rows * columns for rows, columns in shapes]
     if region.spans is None and sum(points) <= whole_points:
-        return [MeasuredPart(region, every, (every, every))]
+        return [MeasuredPart(region, everything, (everything, everything))]
     if not region.has_cells:
         grids = region.grids[-len(shapes) :]
         return [
-            MeasuredPart(Region.of_grids(region.layout, region.level, grids[run]), run, (run, every))
+            MeasuredPart(Region.of_grids(region.layout, region.level, grids[run]), run, (run, everything))
             for run in (slice(run.start, run.stop) for run in _runs(points, whole_points))
         ]
     ((rows, columns),) = shapes
@@ -192,19 +194,19 @@ def measured_parts(region: Region, whole_points: int, side: int, core_points: in
     for (a, b), (c, d) in product(_stretches(rows, PART_ROWS, side), across):
         part = Region.window(region.layout, region.level, (top + a, top + b), (left + c, left + d), core)
         cells = slice(a // PART_ROWS, -(-b // PART_ROWS)), slice(c // PART_COLUMNS, -(-d // PART_COLUMNS))
-        parts.append(MeasuredPart(part, every, cells, (slice(a, b), slice(c, d))))
+        parts.append(MeasuredPart(part, everything, cells, (slice(a, b), slice(c, d))))
     return parts
 
 
 def _stretches(length: int, unit: int, side: int) -> Iterator[Span]:
-    """An axis in stretches of whole cells of so many samples, about as long as the side of a window."""
+    """Yield stretches of an axis that are whole cells of ``unit`` samples, about as long as the side of a window."""
     cells, count = -(-length // unit), max(1, round(length / side))
     for start, stop in pairwise(unit * (cells * number // count) for number in range(count + 1)):
         yield start, min(stop, length)
 
 
 def _runs(sizes: Sequence[int], most: int) -> list[range]:
-    """Neighbours in runs that have together at most so much, or one by itself that has more."""
+    """Return runs of neighbours whose sizes add up to at most ``most``; a larger one is a run of its own."""
     runs, first, total = list[range](), 0, 0
     for number, size in enumerate(sizes):
         if number > first and total + size > most:
@@ -215,5 +217,5 @@ def _runs(sizes: Sequence[int], most: int) -> list[range]:
 
 
 def _shapes(header: Header, level: int) -> list[tuple[int, int]]:
-    """Rows and columns of each block at a level."""
+    """Return rows and columns of each block at a level."""
     return level_shapes(header.patches, header.layout, level, [shape for shape, _ in header.blocks])

@@ -1,4 +1,4 @@
-"""A complete container decoded piece by piece: memory for some pieces, whatever the surface is as a whole.
+"""Decode a complete container piece by piece, in memory for a few pieces, however large the surface is.
 
 `pieces` says which they are. Neighbouring bands of rows share some tiles, which are decoded twice.
 """
@@ -52,7 +52,7 @@ class PiecewiseDecoder:
         self.shapes = level_shapes(header.patches, layout, self.level, [shape for shape, _ in header.blocks])
 
     def pieces(self, memory: int) -> Iterator[list[Region]]:
-        """All of the level in order, in lists of pieces that are decoded together, see `pieces_of`."""
+        """Yield all of the level in order, in lists of pieces that are decoded together, see `pieces_of`."""
         return pieces_of(self.header, self.level, memory)
 
     def surface(self, room: Room, memory: int, progress: Callable[[float], None]) -> Surface:

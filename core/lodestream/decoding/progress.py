@@ -1,4 +1,4 @@
-"""The coding passes that have been announced of each tile: what a state knows."""
+"""The coding passes of each tile that have been announced, and the state that follows from them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Progress:
         self.top, self.state = np.zeros(shape, np.int8).data, self._state.data
 
     def advance(self, tile: int, channel: int, top: int, passes: int, offset: int) -> int:
-        """Note a segment; returns the first of its passes.
+        """Record a segment, and return the first of its passes.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class Progress:
         return below - 1
 
     def advance_all(self, entries: Sequence[Entry], payload: memoryview, start: int, offset: int) -> list[Coded]:
-        """Note the segments of a layer, whose bytes stand in its payload one after another from ``start`` on.
+        """Record the segments of a layer, whose bytes stand in its payload one after another from ``start`` on.
 
         The payload, of bytes that never change, stands at ``offset``. See `advance`.
         """
@@ -85,7 +85,7 @@ class Progress:
         return segments
 
     def snapshot(self, whole: bool) -> NDArray[np.int8]:
-        """The present state, int8, shape (tile, channel).
+        """Return the present state, int8, shape (tile, channel).
 
         Once ``whole``, a tile that no layer has announced is known to have nothing but zeros.
         """
@@ -93,9 +93,9 @@ class Progress:
 
 
 def initial_state(header: Header) -> NDArray[np.int8]:
-    """The state before the first layer, int8, shape (tile, channel).
+    """Return the state before the first layer, int8, shape (tile, channel).
 
-    What has no coefficient, or none other than 0 in its whole level, is known.
+    Tiles without coefficients, and tiles of a level whose coefficients are all 0, are known.
     """
     layout = header.layout
     state = np.full((len(layout.tiles), header.channels), UNANNOUNCED, np.int8)
@@ -111,19 +111,19 @@ def initial_state(header: Header) -> NDArray[np.int8]:
 
 
 def known_levels(layout: Layout, state: NDArray[np.int8], level: int) -> tuple[int, list[int]]:
-    """The finest level up to which all details are known, and the levels without details, both at most ``level``.
+    """Return the finest level whose details are known to the end, and the levels without details, up to ``level``.
 
     ``state`` is int8, shape (tile,). No level is without details where sides come from interfaces, which tell those
     along them.
     """
     starts = layout.starts[: level + 1]
-    own = state[: layout.tiles_of(level).stop]
-    if not own.any():
+    level_state = state[: layout.tiles_of(level).stop]
+    if not level_state.any():
         return level, []
-    unknown = np.flatnonzero(np.maximum.reduceat(own, starts)[1:])
+    unknown = np.flatnonzero(np.maximum.reduceat(level_state, starts)[1:])
     whole = int(unknown[0]) if unknown.size else level
     if layout.shared:
         return whole, []
-    nothing = np.minimum.reduceat(own, starts)[1:] >= UNANNOUNCED
+    nothing = np.minimum.reduceat(level_state, starts)[1:] >= UNANNOUNCED
     bare: list[int] = (np.flatnonzero(nothing) + 1).tolist()
     return whole, bare

@@ -1,4 +1,4 @@
-"""The lattice coordinates of a region of one channel, in one state after another.
+"""Reconstruct the lattice coordinates of a region of one channel, in one state after another.
 
 Whole grids are made up to the core in one call of a kernel, each finer level of a window in another one. What a state
 shares with the one before it is not made again.
@@ -44,7 +44,7 @@ class KnownState(NamedTuple):
 
 
 def known_state(table: TileTable, state: NDArray[np.int8], level: int) -> KnownState:
-    """A state of all tiles of the surface, int8, shape (tile,), as far as a table and the levels up to one need it."""
+    """Return the part of a state, int8, shape (tile,), that a table needs for all levels up to ``level``."""
     passes = state if table.chosen is None else state[table.chosen]
     return KnownState(np.ascontiguousarray(passes), *known_levels(table.layout, state, level))
 
@@ -112,7 +112,7 @@ class Reconstructor:
         self._before: KnownState | None = None
 
     def reconstruct(self, state: KnownState) -> tuple[list[Grid], int]:
-        """Make the region in a state.
+        """Reconstruct the region in a state.
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class Reconstructor:
 
     @property
     def frames(self) -> list[Grid]:
-        """What was made last of each grid, in one piece: more columns, which mean nothing, follow.
+        """The grids of the last call in one piece; further columns, whose values mean nothing, follow.
 
         int32, shape (row, column and `PADDING` or more); of a window only where it crosses no seam.
         """
@@ -151,11 +151,11 @@ class Reconstructor:
         ]
 
     def is_shown(self, state: KnownState) -> bool:
-        """Whether the state before shows the same."""
+        """Return whether the state before looks the same."""
         return self._shared_with(state) == len(self._used)
 
     def _shared_with(self, state: KnownState) -> int:
-        """How many levels, the core and those above it, are the same as in the state before."""
+        """Return how many levels, the core counting as one, are the same as in the state before."""
         before = self._before
         if before is None:
             return 0
@@ -199,7 +199,7 @@ class _Level:
             self._inverses.append((corner, LevelInverse((rows.step, columns.step), (down, across))))
 
     def make(self, tiles: Tiles, state: KnownState) -> None:
-        """Make it from the level below."""
+        """Reconstruct the level from the level below."""
         bare = self._number in state.bare
         for place, nodes in self._copies:
             place[...] = nodes
@@ -211,7 +211,7 @@ class _Level:
 
 
 def _quarters(step: LevelPart, array: Grid, table: TileTable) -> list[_Quarter]:
-    """The parts of a level's array that hold its coefficients."""
+    """Return the parts of a level's array that hold its coefficients."""
     tiles = table.layout.tiles_of(step.level)
     span = np.searchsorted(np.asarray(table.members), [tiles.start, tiles.stop])
     numbers = np.arange(table.first[span[0]], table.first[span[1]])
@@ -229,7 +229,7 @@ def _quarters(step: LevelPart, array: Grid, table: TileTable) -> list[_Quarter]:
 
 
 def _arrays(shapes: Sequence[tuple[int, int]], memory: NDArray[np.int32] | None) -> list[Grid]:
-    """Arrays of these shapes, (row, column), in one piece of memory; behind each is room for one row more."""
+    """Return arrays of these shapes, (row, column), in one piece of memory, each followed by room for another row."""
     ends = list(accumulate(((rows + 1) * (columns + PADDING) for rows, columns in shapes), initial=0))
     flat = np.empty(ends[-1], np.int32) if memory is None else memory
     arrays = []
@@ -240,7 +240,10 @@ def _arrays(shapes: Sequence[tuple[int, int]], memory: NDArray[np.int32] | None)
 
 
 def _copies(step: LevelPart, array: Grid, nodes: Grid, wanted: Sequence[Sequence[Span]]) -> list[tuple[Grid, Grid]]:
-    """Pairs of a place in a level's array, shape (row, column), and the nodes of the level below that go there."""
+    """Return pairs of views.
+
+    A place in a level's array, shape (row, column), and the nodes of the level below for it.
+    """
     pairs = [
         list(_paired(part.node_places, spans)) for part, spans in zip((step.rows, step.columns), wanted, strict=True)
     ]
@@ -251,14 +254,14 @@ def _copies(step: LevelPart, array: Grid, nodes: Grid, wanted: Sequence[Sequence
 
 
 def _paired(places: Sequence[Span], sources: Sequence[Span]) -> Iterator[tuple[Span, Span]]:
-    """Pairs of equally long spans: those of ``sources``, one after another, and where they go among ``places``."""
+    """Yield pairs of equally long spans: those of ``sources``, one after another, and their places among ``places``."""
     cuts = sorted({0, *(accumulate(b - a for a, b in places)), *(accumulate(b - a for a, b in sources))})
     for start, stop in pairwise(cuts):
         yield _within(places, start, stop), _within(sources, start, stop)
 
 
 def _within(spans: Sequence[Span], start: int, stop: int) -> Span:
-    """The numbers from ``start`` to before ``stop`` of spans that stand one after another: all within one of them."""
+    """Return the samples from ``start`` to before ``stop`` of concatenated spans; all must lie within one span."""
     for first, last in spans:
         if start < last - first:
             return first + start, first + stop

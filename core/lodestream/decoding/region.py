@@ -1,4 +1,4 @@
-"""A part of a surface at a level, and the part of every coarser level that it is made of.
+"""A part of a surface at a level, and the parts of all coarser levels that it depends on.
 
 A region is the whole surface, rows or a window of its only grid, or some of its grids. Whole grids are made up to a
 level, the *core*. Each finer level of a window is made from the nodes and details around it alone: `crop_across_seam`
@@ -59,31 +59,31 @@ class AxisPart:
 
     @cached_property
     def starts(self) -> list[int]:
-        """Where the samples of each crop begin among those that are made, and how many are made."""
+        """Start of the samples of each crop among all that are made, then their number."""
         return [0, *accumulate(crop.step.length for crop in self.crop.crops)]
 
     @property
     def length(self) -> int:
-        """Samples that are made, those beside the wanted ones included."""
+        """Number of samples that are made, including those beside the wanted ones."""
         return self.starts[-1]
 
     @property
     def places(self) -> list[tuple[int, AxisCrop]]:
-        """Each crop, and where its samples begin among those that are made."""
+        """Each crop, and the start of its samples among all that are made."""
         return list(zip(self.starts, self.crop.crops, strict=False))
 
     @property
     def node_places(self) -> list[Span]:
-        """Where the nodes of each crop go among the samples that are made."""
+        """Places of the nodes of each crop among the samples that are made."""
         return [(at, at + crop.step.coarse) for at, crop in self.places]
 
     @property
     def runs(self) -> list[Run]:
-        """The nodes and details that are taken, in runs of neighbours."""
+        """The nodes and details that the crops take, in runs of neighbours."""
         return [run for at, crop in self.places for run in self._runs(crop, at)]
 
     def _runs(self, crop: AxisCrop, before: int) -> list[Run]:
-        """Nodes and details of a crop, each in two runs where they go on with the first ones of the axis."""
+        """Return nodes and details of a crop, each in two runs where they continue at the start of the axis."""
         full, runs = self.step, []
         nodes, details = crop.step.coarse, crop.step.length - crop.step.coarse
         for count, total, start, place in (
@@ -157,12 +157,12 @@ class Region:
 
     @staticmethod
     def whole(layout: Layout, level: int) -> Region:
-        """All grids of a level."""
+        """Return all grids of a level."""
         return Region(layout, level, level)
 
     @staticmethod
     def window(layout: Layout, level: int, rows: Span, columns: Span, core: int | None = None) -> Region:
-        """Rows and columns of a level of the only grid.
+        """Return rows and columns of a level of the only grid.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class Region:
 
     @staticmethod
     def of_grids(layout: Layout, level: int, grids: Sequence[int]) -> Region:
-        """Some grids of a level, patches by their numbers in the layout, and the interfaces that they need."""
+        """Return some grids of a level, patches by their numbers in the layout, and the interfaces that they need."""
         return Region(layout, level, level, part=layout.part(grids))
 
     @property
@@ -226,27 +226,30 @@ class Region:
         return len(self.layout.grids) == 1
 
     def spans_in(self, shape: tuple[int, int]) -> tuple[Span, Span]:
-        """Rows and columns, half-open, of a block of this shape at the level."""
+        """Return the rows and columns, half-open, of the region in a block of this shape at the level."""
         return self.spans or ((0, shape[0]), (0, shape[1]))
 
     def of_block(self, array: NDArray[Any]) -> NDArray[Any]:
-        """What is made of an array of a block at the level, shape (row, column, ...); a view where it is one piece."""
+        """Return the region's part of an array of a block at the level, shape (row, column, ...).
+
+        A view if it is one piece.
+        """
         return array if self.spans is None else taken(array, self.spans, (array.shape[0], array.shape[1]))
 
     @property
     def size(self) -> int:
-        """Numbers that a reconstruction takes: the grids of the core, and what is made of each finer level."""
+        """Integers that a reconstruction takes: the grids of the core, and the parts of all finer levels."""
         core = [self.part.shape(number, self.core) for number in range(len(self.grids))]
         return _size(core) + self.size_above
 
     @property
     def size_above(self) -> int:
-        """The same where the core is made already."""
+        """Integers that a reconstruction takes where the core is made already."""
         return _size([step.shape for step in self.steps])
 
     @cached_property
     def tiles(self) -> list[range]:
-        """The tiles that have coefficients of the region: runs of numbers, of one level each."""
+        """The tiles with coefficients of the region: runs of numbers, of one level each."""
         if self.spans is None:
             return tiles_of_grids(self.layout, self.grids, self.level)
         return [run for runs in self._level_tiles for run in runs]
@@ -269,7 +272,7 @@ class Region:
         return [[range(self.layout.tiles_of(self.core).stop)], *map(self._tiles_of, self.steps)]
 
     def _tiles_of(self, step: LevelPart) -> list[range]:
-        """The tiles of a level that have nodes or details of what is made of it."""
+        """Return the tiles of a level that have nodes or details of what is made of it."""
         tiles = self.layout.tiles_of(step.level)
         bands = self.layout.tile_arrays.bands(np.arange(tiles.start, tiles.stop), True)
         first, last = bands.start, bands.start + bands.shape
@@ -281,16 +284,16 @@ class Region:
 
 
 def _size(shapes: Sequence[tuple[int, int]]) -> int:
-    """Numbers that arrays of these shapes take, each with room for one row more."""
+    """Return numbers that arrays of these shapes take, each with room for one row more."""
     return sum((rows + 1) * (columns + PADDING) for rows, columns in shapes)
 
 
 def core_level(layout: Layout, level: int, points: int) -> int:
-    """The finest level, up to ``level``, of at most so many points; 0 if there is none."""
+    """Return the finest level, up to ``level``, of at most so many points; 0 if there is none."""
     return max((coarser for coarser in range(level + 1) if layout.points(coarser) <= points), default=0)
 
 
 def span_pieces(span: Span, length: int) -> list[Span]:
-    """A span of an axis of so many samples, in two where it goes on with the first ones."""
+    """Return a span of an axis, in two spans where it continues at the start of the axis."""
     start, stop = span
     return [(start, min(stop, length)), *([(0, stop - length)] if stop > length else [])]

@@ -1,4 +1,4 @@
-"""Segments and chunks into values: of a container that arrives, or of a complete one that is read from its file."""
+"""Decode segments and chunks to values, from a container that arrives or from a complete file."""
 
 from __future__ import annotations
 
@@ -47,27 +47,27 @@ class SegmentQueue:
 
     @property
     def length(self) -> int:
-        """Segments added so far."""
+        """Number of segments added so far."""
         return self._added
 
     def add(self, segments: Sequence[Coded]) -> None:
-        """Take segments; nothing is decoded yet."""
+        """Add segments; they are decoded later."""
         self._waiting.update(enumerate(segments, self._added))
         self._added += len(segments)
 
     def add_chunk(self, number: int, data: bytes | memoryview, offset: int) -> None:
-        """Take a chunk of the residual section, which stands at ``offset``."""
+        """Add a chunk of the residual section, which stands at ``offset``."""
         if data:
             self._chunks[number] = data, offset
 
     def drop(self) -> None:
-        """Forget all that was added and is not decoded: nobody will ask for values."""
+        """Drop all that was added and is not decoded, because no values will be asked for."""
         self._waiting.clear()
         self._chunks.clear()
         self.dropped = True
 
     def prepare(self, length: int) -> None:
-        """Decode the first ``length`` segments, if those that wait are worth the calls that this takes."""
+        """Decode the first ``length`` segments, if there are enough of them to be worth the calls."""
         with self._lock:
             size = 0
             for number in range(self._decoded, length):
@@ -77,7 +77,7 @@ class SegmentQueue:
                     return
 
     def keep_last(self, state: NDArray[np.int8]) -> None:
-        """Decode all segments, and forget what only states before the last one need: nobody asks for them any more.
+        """Decode all segments, and drop the data that only states before the last one need.
 
         ``state`` is the last one, int8, shape (tile, channel). Where it has passes left, as much is needed for it.
         """
@@ -121,13 +121,13 @@ class SegmentQueue:
         return blocks
 
     def channels(self, length: int) -> list[Tiles]:
-        """Return what the first ``length`` segments tell, or more of them, of each channel."""
+        """Return the decoded tiles of each channel after the first ``length`` segments, or more."""
         with self._lock:
             self._decode(length)
             return self._channels
 
     def _decode(self, length: int) -> None:
-        """Decode the first ``length`` segments. After an interruption at any place the next call goes on from there."""
+        """Decode the first ``length`` segments. After an interruption at any place the next call continues."""
         if not self._channels:
             self._channels = _channels(self.header, None)
         while self._decoded < length:
@@ -164,7 +164,7 @@ class StoredSegments:
         self._complete = np.zeros((len(self.header.layout.tiles), self.header.channels), np.int8)
 
     def values(self, region: Region) -> dict[int, Values]:
-        """Return the values of a region by block, exact as far as the container is.
+        """Return the values of a region by block, exact where the container is.
 
         Raises
         ------
@@ -189,7 +189,7 @@ class StoredSegments:
         return blocks
 
     def channels(self, region: Region) -> list[Tiles]:
-        """Decode all segments of the tiles that a region is made of, and return what they tell of each channel.
+        """Decode all segments of the tiles of a region, and return the tiles of each channel.
 
         Raises
         ------
@@ -221,7 +221,7 @@ class StoredSegments:
         return (self._checked(chunk, "chunk"), chunk.range.offset) if chunk.range.length else None
 
     def _checked(self, part: Segment | Chunk, what: str) -> bytes:
-        """The bytes of a segment or a chunk."""
+        """Read the bytes of a segment or a chunk, and check them."""
         with self._reading:
             data = self._read(part.range.offset, part.range.length)
         if len(data) != part.range.length or check_of(data) != part.check:
@@ -230,7 +230,7 @@ class StoredSegments:
 
 
 def _channels(header: Header, runs: Sequence[range] | None) -> list[Tiles]:
-    """Room for what segments tell of each channel, of all tiles or of some runs of them."""
+    """Return empty tiles of each channel, for all tiles or for some runs of them."""
     tables = [TileTable.of(header.layout, coordinate) for coordinate in (True, False)]
     if runs is not None:
         tables = [part_of(table, runs).table for table in tables]

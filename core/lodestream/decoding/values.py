@@ -1,4 +1,4 @@
-"""The values of a region: channels stored as values, restored by the residual, with holes marked."""
+"""The values of a region: channels as values, corrected by the residual, with holes marked."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Values:
     shape: tuple[int, int] = (0, 0)
 
     def channel(self, number: int) -> NDArray[Any]:
-        """One channel, shape (row, column), a view."""
+        """Return one channel, shape (row, column), a view."""
         for array in self.arrays:
             if number < array.shape[2]:
                 return array[..., number]
@@ -62,12 +62,12 @@ class Values:
         raise IndexError(number)
 
     def window(self, place: ChunkPlace) -> NDArray[Any]:
-        """One channel at the place of a chunk, shape (row, column), a view."""
+        """Return one channel at the place of a chunk, shape (row, column), a view."""
         rows, columns = map(_slice_from, self.first, (place.rows, place.columns), self.shape)
         return self.channel(place.channel)[rows, columns]
 
     def clear(self, holes: NDArray[np.bool_], hole: int) -> None:
-        """Give holes (bool, shape (row, column)) the value that says so.
+        """Write the hole value into holes (bool, shape (row, column)).
 
         NaN in floats, ``hole`` in integer points, 0 in integer attributes.
         """
@@ -76,7 +76,7 @@ class Values:
 
 
 def _slice_from(first: int, span: Span, length: int) -> slice:
-    """Where samples of an axis of this length stand in an array that begins with the sample ``first``."""
+    """Return the slice of samples of an axis of this length in an array that begins with sample ``first``."""
     turn = length if span[0] < first else 0  # across the seam the first samples stand behind the last ones
     return slice(span[0] + turn - first, span[1] + turn - first)
 
@@ -88,7 +88,7 @@ def values_of(
     state: NDArray[np.int8],
     chosen: NDArray[np.bool_] | None = None,
 ) -> dict[int, Values]:
-    """Return the values of a region by block, as the segments alone tell them: `restore` and `mark_holes` come after.
+    """Return the values of a region by block from the segments alone; `restore` and `mark_holes` come after.
 
     Parameters
     ----------
@@ -146,15 +146,15 @@ def values_of(
 def _assembled(
     header: Header, level: int, block: int, patches: Sequence[int], arrays: Sequence[Sequence[NDArray[Any]]]
 ) -> list[NDArray[Any]]:
-    """The arrays of a block from those of patches, which stand by array and patch."""
-    shape, every = header.blocks[block][0], []
+    """Return the arrays of a block, assembled from those of its patches, ordered by array and patch."""
+    shape, assembled = header.blocks[block][0], []
     for grids in arrays:
         of_patch: list[NDArray[Any]] = [grids[0]] * len(header.patches)
         for patch, grid in zip(patches, grids, strict=True):
             of_patch[patch] = grid
         whole = assemble(header.block_patches[block], header.layout, level, shape, of_patch)
-        every.append(np.ascontiguousarray(whole))
-    return every
+        assembled.append(np.ascontiguousarray(whole))
+    return assembled
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class _Work:
 def _level_below(
     predictors: NDArray[np.int8], tiles: Tiles, state: NDArray[np.int8], region: Region
 ) -> tuple[Grid, int]:
-    """The only grid one level below a region, and the power of two that it stands over; several threads make bands."""
+    """Return the only grid one level below a region, and its number of fractional bits; threads share it by bands."""
     whole = Region.whole(region.layout, region.level - 1)
     known = known_state(tiles.table, state, whole.level)
     bands = bands_of(whole, threads())
@@ -191,7 +191,7 @@ def _level_below(
 
 
 def _room(size: int) -> NDArray[np.int32]:
-    """Room for so many numbers, whatever it holds: this thread's, until the thread asks again."""
+    """Return an uninitialised buffer of this thread, int32, shape (size,); the next call returns it again."""
     kept: NDArray[np.int32] | None = getattr(_kept, "room", None)
     if kept is None or kept.size < size:
         kept = np.empty(size, np.int32)
@@ -208,7 +208,7 @@ def block_of(
     names: Sequence[str] | None = None,
     finite: bool = False,
 ) -> Block:
-    """Make a block of its arrays.
+    """Make a block from its arrays.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def block_of(
 
 
 def chunks_of_region(header: Header, region: Region, blocks: Iterable[int]) -> Iterator[tuple[int, ChunkPlace]]:
-    """The chunks of some blocks in a region of the finest level, in the order of the file, with their numbers."""
+    """Yield the chunks of some blocks in a region of the finest level, in the order of the file, with their numbers."""
     first = first_chunks(header)
     for block in blocks:
         yield from chunks_within(header, block, first[block], region.spans_in(header.blocks[block][0]))
@@ -254,7 +254,7 @@ def restore(
     chunks: Chunks,
     chosen: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Add what the residual has of a region of the finest level, in place.
+    """Add the residual of a region of the finest level, in place.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def restore(
 
 
 def mark_holes(header: Header, region: Region, blocks: Mapping[int, Values], corrected: bool) -> None:
-    """Give holes the value that says so, in place; ``corrected``: but for those that keep a value of their own."""
+    """Write the hole value into holes, in place; ``corrected``: except where a hole keeps its own value."""
     finest = region.level == header.levels
     masks = level_masks(header.patches, header.layout, region.level, header.masks)
     for block, values in blocks.items():

@@ -121,12 +121,12 @@ class View:
 
     @property
     def _finest(self) -> int:
-        """The finest level that can be shown: of a window the one that was asked for."""
+        """Finest level that can be shown; of a window the level that was asked for."""
         header, selection = self._queue.header, self._selection
         return header.levels if selection.region is None else selection.finest(header)
 
     def prepare(self) -> None:
-        """Decode what has come until here, so that the points of this view or a later one are made sooner.
+        """Decode the bytes received so far in advance, so that the points of this view or a later one come sooner.
 
         It changes no result, and does nothing where little waits. A program that shows the last view only, and receives
         more slowly than it decodes, calls it for each view that it does not show: at the end the last layers alone are
@@ -135,7 +135,7 @@ class View:
         self._queue.prepare(self._length)
 
     def points_at(self, level: int, block: int | None = None) -> NDArray[Any]:
-        """The grid of a coarser level, an array with that level's shape.
+        """Return the grid of a coarser level, an array with that level's shape.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class View:
         return surface.blocks[block].points
 
     def window(self, region: Window, level: int | None = None) -> Surface:
-        """The points of a window, at full resolution or at a coarser level; costs time and memory for the window only.
+        """Return the points of a window, at full resolution or at a coarser level. Time and memory follow its size.
 
         Where the complete state is verified (see `complete`), the first window at full resolution computes the whole
         surface once.
@@ -201,7 +201,7 @@ class View:
         return replace(self, _selection=selection, _state=state).surface()
 
     def surface(self, level: int | None = None, metadata: Mapping[str, Any] | None = None) -> Surface:
-        """The state as a `Surface`, at full resolution or at a coarser level.
+        """Return the state as a `Surface`, at full resolution or at a coarser level.
 
         Parameters
         ----------
@@ -227,7 +227,7 @@ class View:
         return surface
 
     def _shown(self, level: int, metadata: Mapping[str, Any] | None = None) -> Surface:
-        """`surface`, but for which of its points are one: who asks for points alone need not wait for that."""
+        """Return `surface` without its joints: points alone can be shown sooner."""
         header = self._queue.header
         if not 0 <= level <= self._finest:
             raise OptionError(f"expected a level of 0 to {self._finest}, got {level}")
@@ -239,7 +239,10 @@ class View:
         return self._made(level, values, self._taken() if level == header.levels else None)
 
     def _made(self, level: int, values: dict[str, Any], kept: Surface | None = None) -> Surface:
-        """`_shown` with these metadata of the whole surface; ``kept``: it is computed already."""
+        """Return `_shown` with these metadata of the whole surface.
+
+        ``kept``: holes with values, if they are known already.
+        """
         if kept is None:
             surface, values = self._positioned(Surface(blocks=self._blocks(level)), values, level)
         else:
@@ -249,7 +252,7 @@ class View:
         return surface
 
     def verify(self) -> None:
-        """Make sure, once, that a complete state that takes a residual is not damaged: its chunks may hold anything.
+        """Verify, once, a complete state that has a residual: its chunks may be damaged.
 
         The surface is computed and held to its SHA-256, now or as soon as that has come; the next `surface` returns it.
         Of other states nothing is done.
@@ -289,7 +292,7 @@ class View:
         ending.verified.append((replace(self._selection, level=None), surface))
 
     def _taken(self) -> Surface | None:
-        """The complete surface, if `verify` has computed it and nobody has taken it."""
+        """Return the complete surface that `verify` has computed, once; else None."""
         if self._corrected:
             with suppress(IndexError):
                 selection, surface = self._ending.verified.pop()
@@ -299,7 +302,7 @@ class View:
         return None
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: a small picture, sizes and errors."""
+        """Return the HTML for a notebook: a small picture, sizes and errors."""
         from ..interop.html import SMALL, view_html
 
         header, region = self._queue.header, self._selection.region
@@ -312,7 +315,7 @@ class View:
         return view_html(self, self.surface(level), [shape for shape, _ in header.blocks])
 
     def _blocks(self, level: int) -> list[Block]:
-        """All blocks at a level, or the window of the only one; of heights that came with x and y, heights alone."""
+        """Return all blocks at a level, or the window of the only one; without the x and y of height fields."""
         queue, window = self._queue, self._selection.region
         header, chosen = queue.header, self._selection.channels(queue.header)
         corrected = self._corrected and level == header.levels
@@ -331,7 +334,7 @@ class View:
         return [self._block(values[number].arrays, *of) for number, of in enumerate(zip(closures, masks, strict=True))]
 
     def _block(self, arrays: Sequence[NDArray[Any]], closed: Closed, mask: NDArray[np.bool_] | None) -> Block:
-        """One block of its points and attributes, shape (row, column, component) each; ``mask``, (row, column)."""
+        """Make a block from its points and attributes, shape (row, column, component) each; ``mask``, (row, column)."""
         header, selection = self._queue.header, self._selection
         finite = selection.region is None and not self._corrected  # the values of a lattice are
         try:
@@ -342,7 +345,7 @@ class View:
             raise CorruptStreamError(f"expected the points of a surface: {error}", header.length) from None
 
     def _positioned(self, surface: Surface, values: dict[str, Any], level: int) -> tuple[Surface, dict[str, Any]]:
-        """The surface with the x and y that its heights came with, and the metadata of its level or window."""
+        """Return the surface with the x and y of its height field, and the metadata of its level or window."""
         header, region = self._queue.header, self._selection.region
         finest = level == header.levels
         whole = finest and region is None
@@ -350,7 +353,7 @@ class View:
         return surface, self._placed_metadata(values, level)
 
     def _placed_metadata(self, values: dict[str, Any], level: int) -> dict[str, Any]:
-        """The metadata of the grid of a level, or of the window of it, from those of the whole surface."""
+        """Return the metadata of the grid of a level, or of its window, from those of the whole surface."""
         header, region = self._queue.header, self._selection.region
         if region is not None:
             return window_metadata(values, header, region, level)
@@ -359,7 +362,7 @@ class View:
         return values
 
     def _hold_to_digest(self) -> None:
-        """Hold the SHA-256 of the values to the one that came with them, if both are known.
+        """Compare the SHA-256 of the values with the recorded one, if both are known.
 
         Raises
         ------
@@ -372,7 +375,7 @@ class View:
             raise CorruptStreamError(problem, self._queue.header.length)
 
     def _check_digest(self, surface: Surface, level: int) -> None:
-        """Hold the values to the SHA-256 that came with them, where this is the complete surface and it is exact."""
+        """Compare the values with the recorded SHA-256 if this is the complete surface and it is exact."""
         header, selection = self._queue.header, self._selection
         if self._ending.promised is None or not self.complete or not header.exact or level != header.levels:
             return
@@ -381,7 +384,7 @@ class View:
             self._hold_to_digest()
 
     def _nodes(self, level: int) -> list[Nodes]:
-        """Which rows and columns of each block are shown at a level, or in the window."""
+        """Return the rows and columns of each block that are shown at a level, or in the window."""
         header, region = self._queue.header, self._selection.region
         if region is not None:
             lines = zip(positions(header, region, level), header.shape, strict=True)
@@ -390,7 +393,7 @@ class View:
         return level_nodes(header, level)
 
     def _kept(self, finest: bool) -> NDArray[np.bool_] | None:
-        """Which holes of the only block have values."""
+        """Return the holes of the only block that keep their values."""
         if not (finest and self._corrected):
             return None
         header, region = self._queue.header, self._selection.region

@@ -18,7 +18,7 @@ __all__ = ["positions", "window_closed", "window_metadata"]
 
 
 def window_closed(closed: Closed, shape: tuple[int, int], region: Region) -> Closed:
-    """Which axes of a window wrap: those that do in the surface, where the window holds all of them."""
+    """Return which axes of a window wrap: those of the surface that the window holds whole."""
     rows, columns = (
         wraps and stop - start == length for wraps, (start, stop), length in zip(closed, region, shape, strict=True)
     )
@@ -26,7 +26,7 @@ def window_closed(closed: Closed, shape: tuple[int, int], region: Region) -> Clo
 
 
 def window_metadata(metadata: dict[str, Any], header: Header, region: Region, level: int) -> dict[str, Any]:
-    """Metadata of a window of a level: a geotransform with its nodes, or axes, move with it.
+    """Return the metadata of a window of a level, whose geotransform, nodes and axes are moved with it.
 
     Across the seam of a closed axis all go on, beyond the end of the surface.
 
@@ -60,21 +60,21 @@ def window_metadata(metadata: dict[str, Any], header: Header, region: Region, le
 
 
 def positions(header: Header, region: Region, level: int) -> list[NDArray[np.int64]]:
-    """The rows and columns of the surface at which those of a window of a level stand.
+    """Return the rows and columns of the surface at which the nodes of a window of a level stand.
 
     int64, shape (row,) and (column,). Across the seam of a closed axis they go on beyond its end.
     """
-    found = []
+    lines = []
     for line, (start, _), span, length in zip(
         level_nodes(header, level)[0], region, region_at(header, region, level), header.shape, strict=True
     ):
         places = line[np.arange(*span) % len(line)]
-        found.append(np.where(places < start, places + length, places))
-    return found
+        lines.append(np.where(places < start, places + length, places))
+    return lines
 
 
 def _line(nodes: list[float] | None, span: tuple[int, int], length: int) -> list[float] | None:
-    """Where the rows or columns of a window stand, in steps of the even grid from its first; None where evenly."""
+    """Return the rows or columns of a window, in steps of the even grid from its first one; None if they are even."""
     if nodes is None:
         return None
     places = np.arange(*span)

@@ -1,4 +1,4 @@
-"""A window on its way: what its errors do not exceed, and what is taken for known outside of it.
+"""A window while it is received: bounds of its errors, and the state that is assumed outside of it.
 
 Errors are those of the whole surface's layers, in cells or altogether. So a window must be reconstructed as it would be
 within the whole: a level counts as known only from the layer on with which all of it is, wherever its tiles lie.
@@ -45,11 +45,11 @@ class WindowState:
         self._known_from: NDArray[np.int64] | None = None
 
     def follow(self, index: Index) -> None:
-        """Learn from the index with which layer each level is known."""
+        """Read from the index with which layer each level is complete."""
         self._index, self._known_from = index, _known_from(index)
 
     def take(self, offset: int, data: bytes) -> bool:
-        """Take bytes of the section with the errors of windows; returns whether they belong to it.
+        """Take bytes of the section with the errors of windows, and return whether they belong to it.
 
         Raises
         ------
@@ -67,32 +67,32 @@ class WindowState:
                 self._figures = WindowFigures(self._header, self._region, windows)
         return True
 
-    def figures(self, made: State) -> tuple[float, float, bool]:
-        """RMS and maximum error of a state in the window, and whether they are bounds."""
+    def figures(self, shown: State) -> tuple[float, float, bool]:
+        """Return RMS and maximum error of a state in the window, and whether they are bounds."""
         last = self._header.layer_count - 1
-        layer = made.number if made.whole_level < 0 and made.number <= last else None
-        rms, max_error = self._figures.within(made.rms, made.max_error, layer)
+        layer = shown.number if shown.whole_level < 0 and shown.number <= last else None
+        rms, max_error = self._figures.within(shown.rms, shown.max_error, layer)
         return rms, max_error, not self._figures.whole and max_error != 0 and not math.isnan(rms)
 
-    def put_outside(self, made: State, state: NDArray[np.int8]) -> None:
-        """Set what tiles outside the window tell of their levels; int8, shape (tile, channel); changed."""
+    def put_outside(self, shown: State, state: NDArray[np.int8]) -> None:
+        """Set the state of the tiles outside the window, int8, shape (tile, channel), in place."""
         outside = self._outside
-        if made.complete or math.isnan(made.rms):
+        if shown.complete or math.isnan(shown.rms):
             state[outside] = 0
-        elif made.whole_level >= 0:
-            told = initial_state(self._header)
-            told[: self._header.layout.tiles_of(made.whole_level).stop] = 0
-            state[outside] = told[outside]
+        elif shown.whole_level >= 0:
+            assumed = initial_state(self._header)
+            assumed[: self._header.layout.tiles_of(shown.whole_level).stop] = 0
+            state[outside] = assumed[outside]
         elif self._known_from is not None:
             levels = self._header.layout.tile_levels
-            told = initial_state(self._header)
-            told[self._known_from[levels] <= made.number] = 0
-            state[outside] = told[outside]
+            assumed = initial_state(self._header)
+            assumed[self._known_from[levels] <= shown.number] = 0
+            state[outside] = assumed[outside]
         # Else the file comes in its own order, and all of the state is known as it is.
 
 
 def _known_from(index: Index) -> NDArray[np.int64]:
-    """The first layer with which every tile of a level is known, int64, shape (level, channel)."""
+    """Return the first layer after which every tile of a level is known, int64, shape (level, channel)."""
     header = index.header
     levels = header.layout.tile_levels.data
     unknown = initial_state(header) == UNANNOUNCED
@@ -107,8 +107,8 @@ def _known_from(index: Index) -> NDArray[np.int64]:
         known[levels[segment.tile], segment.channel] = segment.layer
     for level in range(header.levels + 1):
         tiles = header.layout.tiles_of(level)
-        own = slice(tiles.start, tiles.stop)
+        level_tiles = slice(tiles.start, tiles.stop)
         # What no layer has named is known with the last one; what has passes left is never known.
-        first[level, unknown[own].any(axis=0)] = header.layer_count - 1
-        first[level, left[own].any(axis=0)] = header.layer_count
+        first[level, unknown[level_tiles].any(axis=0)] = header.layer_count - 1
+        first[level, left[level_tiles].any(axis=0)] = header.layer_count
     return first
