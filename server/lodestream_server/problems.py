@@ -196,7 +196,7 @@ def install(app: FastAPI) -> None:
 
 
 def problem(error: Exception) -> tuple[int, str, str, str]:
-    """Status, code, title and detail for an exception; an unexpected one reveals nothing about the server."""
+    """Return status, code, title and detail for an exception; an unexpected one reveals nothing about the server."""
     for kind, answer in _ANSWERS:
         if isinstance(error, kind):
             return answer.status, answer.code, answer.title, str(error)
@@ -206,7 +206,7 @@ def problem(error: Exception) -> tuple[int, str, str, str]:
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI responses of routes that answer with these problems."""
+    """Return OpenAPI responses of routes that answer with these problems."""
     return {
         status: {
             "description": http.HTTPStatus(status).phrase,
@@ -226,7 +226,7 @@ async def _raised(request: HTTPConnection, error: Exception) -> Response:
 
 
 def answer(request: HTTPConnection, error: Exception) -> Response:
-    """The problem document for an error."""
+    """Return the problem document for an error."""
     status, code, title, detail = problem(error)
     if status >= 500 and not isinstance(error, StreamError):  # whoever found the damage has told of it
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
@@ -255,12 +255,12 @@ async def _refused(request: Request, error: Exception) -> Response:
 
 
 def _methods(request: Request) -> list[str]:
-    found = set[str]()
+    methods = set[str]()
     for routes in request.app.state.routes:
         for route in routes:
             if isinstance(route, Route) and route.path_regex.match(request.url.path):
-                found |= route.methods or set()
-    return sorted(found)
+                methods |= route.methods or set()
+    return sorted(methods)
 
 
 async def _invalid(request: Request, error: Exception) -> Response:

@@ -88,21 +88,21 @@ class Server(uvicorn.Server):
 
 
 async def _listen(host: str, port: int, backlog: int) -> list[socket.socket]:
-    """Sockets that listen: a name may have several addresses."""
-    found = list[socket.socket]()
+    """Return listening sockets, one for each address of a name."""
+    listening = list[socket.socket]()
     try:
         # Nothing is accepted yet: the protocol is never used.
         bound = await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port, start_serving=False)
-        found += [ours.dup() for ours in bound.sockets]
+        listening += [ours.dup() for ours in bound.sockets]
         bound.close()
-        for ours in found:
+        for ours in listening:
             ours.listen(backlog)
     except OSError as error:
-        for ours in found:
+        for ours in listening:
             ours.close()
         reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
         raise LodestreamError(f"cannot listen on {host} port {port}: {reason}") from None
-    return found
+    return listening
 
 
 def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
@@ -145,7 +145,7 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
 
 
 def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:
-    """Run a server as the only task of its process, until it is told to end; returns the server.
+    """Run a server as the only task of its process, until it is told to end, and return it.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:
 
 @contextmanager
 def running_server(data: Path, **settings: Any) -> Iterator[str]:
-    """A server on a free port of this machine, in a thread, for the length of the ``with`` block.
+    """Run a server on a free port of this machine, in a thread, for the length of the ``with`` block.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Who may do what, and how much of it at once."""
+"""Access control and limits on concurrent use."""

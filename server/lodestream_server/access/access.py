@@ -60,7 +60,7 @@ class Caller:
     token: str | None = None
 
     def may_change(self, owner: str | None) -> bool:
-        """Whether this caller may delete or retry a surface of this owner: its owner and an admin may."""
+        """Return whether this caller may delete or retry a surface of this owner: its owner and an admin may."""
         return self.admin or (owner is not None and owner == self.owner)
 
 
@@ -115,7 +115,7 @@ class Access:
                 )
 
     def authorize(self, connection: HTTPConnection, scope: str) -> Caller:
-        """The caller, if it may do what the scope allows.
+        """Return the caller, if it may do what the scope allows.
 
         Raises
         ------
@@ -134,7 +134,7 @@ class Access:
         return replace(anybody(connection), admin=self._hindrance(connection, "admin") is None)
 
     def reader(self, connection: HTTPConnection) -> Caller | None:
-        """The caller that opens a stream; None if its ``open`` message must contain a token.
+        """Return the caller that opens a stream; None if its ``open`` message must contain a token.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class Access:
             return None
 
     def reader_with(self, text: str | None) -> Caller:
-        """The caller with the token of an ``open`` message, if reading needs one.
+        """Return the caller with the token of an ``open`` message, if reading needs one.
 
         Raises
         ------
@@ -203,12 +203,12 @@ def _signs_of_others(connection: HTTPConnection, settings: Settings) -> Iterator
 
 
 def key_of(owner: str | None) -> str:
-    """The key of callers with a token of this name, or of all callers without a token."""
+    """Return the key of callers with a token of this name, or of all callers without a token."""
     return "nobody" if owner is None else f"token {owner}"
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address can only be this machine."""
+    """Return whether a name or address can only be this machine."""
     if host.lower() == "localhost":
         return True
     try:
@@ -240,6 +240,6 @@ def _bearer(connection: HTTPConnection) -> str | None:
 
 
 def anybody(connection: HTTPConnection) -> Caller:
-    """A caller without a token, known by its address."""
+    """Return a caller without a token, known by its address."""
     host = connection.client.host if connection.client is not None else "unknown"
     return Caller(f"{_ADDRESS}{network_of(host)}", host[:80])

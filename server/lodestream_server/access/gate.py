@@ -59,11 +59,12 @@ class Gate:
 
 
 def caller_of(connection: HTTPConnection) -> Caller | None:
-    """The caller of a request; None on a route that is open to everybody, and for a stream whose ``open`` must have a
-    token.
+    """Return the caller of a request.
+
+    None on an open route, and for a stream whose ``open`` message must have a token.
     """
-    found: Caller | None = connection.scope[_CALLER]
-    return found
+    caller: Caller | None = connection.scope[_CALLER]
+    return caller
 
 
 def _check_path(scope: Scope) -> None:

@@ -1,4 +1,4 @@
-"""Limits on what happens at the same time and on disk space; requests beyond them are told to come back.
+"""Limits on concurrent work and disk space; requests beyond them are asked to come back.
 
 A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds, surfaces, bytes
 on disk and streams as it leaves free for the others (`fair_share`). The rule does not apply if nobody else can write.
@@ -84,7 +84,7 @@ class Limits:
 
     @contextmanager
     def stream(self, caller: Caller) -> Iterator[int]:
-        """Count an open stream for the length of the block; yields the most credit that is kept for it.
+        """Count an open stream for the length of the block, and yield the most credit that is kept for it.
 
         What goes beyond `BASE_CREDIT` is an eighth of what the memory for streams has left, so that all streams
         together never have more than that; and no more than the caller's share of that memory.
@@ -137,7 +137,7 @@ class Limits:
 
     @asynccontextmanager
     async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:
-        """Count an upload in progress; yields a request that checks the limits while its body arrives.
+        """Count an upload in progress, and yield a request that checks the limits while its body arrives.
 
         An upload that is not stored needs no disk space and makes no surface, so only the number of uploads limits it.
 
@@ -181,7 +181,7 @@ class Limits:
             _subtract(self._taken, caller.owner, room.taken)
 
     def end(self) -> None:
-        """The server ends: uploads that are not complete soon are ended too."""
+        """End: uploads that do not complete soon are ended too."""
         for clock in self._uploads:
             clock.reschedule(asyncio.get_running_loop().time() + _LAST_SECONDS)
 
@@ -222,16 +222,16 @@ class Limits:
             self._check_bytes(caller.owner, free, promised)
 
     async def check_owner(self, owner: str | None) -> None:
-        """Check that an owner uses no more disk space than allowed; raises FullError otherwise."""
+        """Check that an owner uses no more disk space than allowed; FullError is raised otherwise."""
         free, _ = await self._free()
         self._check_bytes(owner, free, 0)
 
     async def room(self) -> int:
-        """Bytes of free disk space, without the space to keep free; announced sizes are not subtracted."""
+        """Return bytes of free disk space, without the space to keep free; announced sizes are not subtracted."""
         return max((await self._free())[0], 0)
 
     async def _free(self) -> tuple[int, int]:
-        """Bytes that may be taken, and bytes that stay free."""
+        """Return the bytes that may be taken, and the bytes that stay free."""
         disk = await asyncio.to_thread(shutil.disk_usage, self._folder)
         kept = self._settings.keep_free
         if kept is None:
@@ -260,7 +260,7 @@ class Limits:
         _subtract(self._promised, room.caller.key, size)
 
     def check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
-        """Check that a caller may have one more of what callers share.
+        """Check that a caller may have one more of a shared resource.
 
         Parameters
         ----------
@@ -277,13 +277,13 @@ class Limits:
         BusyError, TooManyError
             If the server, or the caller, has as many as allowed.
         """
-        everybody, own = there
+        everybody, count = there
         if everybody >= most:
             raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
-        if exceeds_share(most, everybody, own) and not self._alone():
+        if exceeds_share(most, everybody, count) and not self._alone():
             raise TooManyError(
-                f"expected no more {what} of {caller.name} than are left for others, got {own}, and {most - everybody} "
-                f"of {most} are left; try again when some are done"
+                f"expected no more {what} of {caller.name} than are left for others, got {count}, and "
+                f"{most - everybody} of {most} are left; try again when some are done"
             )
 
     def check_indexes(self, caller: Caller, most: int, there: tuple[int, int]) -> None:
@@ -294,27 +294,27 @@ class Limits:
         TooManyError
             If less would be left for others than it has.
         """
-        everybody, own = there
-        if own and exceeds_share(most, everybody, own - 1) and not self._alone():
+        everybody, size = there
+        if size and exceeds_share(most, everybody, size - 1) and not self._alone():
             raise TooManyError(
                 f"expected no more memory for indexes of surfaces that {caller.name} streams than is left for others, "
-                f"got {own >> 10} KiB, and {(most - everybody) >> 10} KiB would be left; try again when some are done"
+                f"got {size >> 10} KiB, and {(most - everybody) >> 10} KiB would be left; try again when some are done"
             )
 
     def _check_surfaces(self, caller: Caller) -> None:
-        """Check that one more surface is allowed, beside those that uploads in progress will be."""
+        """Check that one more surface is allowed; uploads in progress count as surfaces."""
         most = self._settings.max_surfaces
         uploads = list(self._uploads.values())
         kept, kept_of_owner = self._surfaces(caller.owner)
         everybody = kept + len(uploads)
-        own = kept_of_owner + sum(other.owner == caller.owner for other in uploads)
+        count = kept_of_owner + sum(other.owner == caller.owner for other in uploads)
         if everybody >= most:
             raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
-        if exceeds_share(most, everybody, own) and not self._alone():
+        if exceeds_share(most, everybody, count) and not self._alone():
             whose = _called(caller.owner)
             raise FullError(
-                f"expected no more surfaces of {whose} than are left for others, got {own}, and {most - everybody} of "
-                f"{most} are left; delete some of them"
+                f"expected no more surfaces of {whose} than are left for others, got {count}, and "
+                f"{most - everybody} of {most} are left; delete some of them"
             )
 
 

@@ -34,20 +34,20 @@ def needs(scope: str | None) -> Callable[[_Endpoint], _Endpoint]:
 
 
 def scope_of(route: BaseRoute) -> str | None:
-    """The scope declared at a route; without a declaration ``admin``, so that a forgotten one opens nothing."""
+    """Return the scope declared at a route; without a declaration ``admin``, so that a forgotten one opens nothing."""
     declared: str | None = getattr(getattr(route, "endpoint", None), _DECLARED, "admin")
     return declared
 
 
 def routes_of(app: FastAPI) -> list[BaseRoute]:
-    """The routes of an application of `create_app`, in the order in which they are matched."""
+    """Return the routes of an application of `create_app`, in the order in which they are matched."""
     ours = [route for routes in app.state.routes for route in routes]
     # What was added to the application itself; an included router is none that has a path.
     return ours + [route for route in app.routes if hasattr(route, "path_regex")]
 
 
 def needed_scope(scope: Scope) -> str | None:
-    """The scope that a request needs; None if it is open to everybody.
+    """Return the scope that a request needs; None if it is open to everybody.
 
     The routes themselves decide which of them answers. If none does, a scope for reading or writing is needed all the
     same, depending on the method, before the answer 404.

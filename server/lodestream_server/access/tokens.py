@@ -1,4 +1,4 @@
-"""Tokens: a file with their hashes, and what each of them allows.
+"""Tokens: a file with their hashes and scopes.
 
 A token is 256 random bits, so a plain SHA-256 reveals nothing about it, and it cannot be guessed. The file::
 
@@ -63,7 +63,7 @@ class Token:
     expires: str | None = None
 
     def allows(self, scope: str) -> bool:
-        """Whether one of its scopes is this one or includes it."""
+        """Return whether one of the token's scopes is this one or includes it."""
         return any(SCOPES.index(given) >= SCOPES.index(scope) for given in self.scopes)
 
     @property
@@ -73,7 +73,7 @@ class Token:
 
     @classmethod
     def from_json(cls, values: Any) -> Token:
-        """A token from the values in a file; raises ValueError, TypeError or KeyError if they are invalid."""
+        """Return a token from the values in a file; raises ValueError, TypeError or KeyError if they are invalid."""
         token = cls(
             str(values["name"]),
             bytes.fromhex(values["sha256"]).hex(),
@@ -101,7 +101,7 @@ class TokenFile:
         self.path = path
 
     def load(self) -> tuple[Token, ...]:
-        """All tokens; none if there is no file.
+        """Return all tokens; none if there is no file.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class TokenFile:
             raise LodestreamError(f"expected a token file, got {self.path}: {why}") from None
 
     def create(self, name: str, scopes: tuple[str, ...], days: float | None = None) -> tuple[str, Token]:
-        """Add a token; returns the token itself, which is stored nowhere, and its stored data.
+        """Add a token, and return the token itself, which is stored nowhere, and its stored data.
 
         Raises
         ------
@@ -225,20 +225,20 @@ class Tokens:
         return self._met
 
     def find(self, text: str) -> Token | None:
-        """The token with this text, unless it has expired.
+        """Return the token with this text, unless it has expired.
 
         The text is compared with all tokens in constant time, so that timing reveals nothing.
         """
         self._follow()
         digest = _digest(text)
-        found = None
+        match = None
         for token in self._tokens:
             if hmac.compare_digest(token.sha256, digest):
-                found = token
-        return None if found is None or found.expired else found
+                match = token
+        return None if match is None or match.expired else match
 
     def known(self, sha256: str) -> Token | None:
-        """The token with this hash, unless it was revoked or has expired."""
+        """Return the token with this hash, unless it was revoked or has expired."""
         self._follow()
         return next((token for token in self._tokens if token.sha256 == sha256 and not token.expired), None)
 

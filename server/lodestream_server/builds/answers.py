@@ -78,12 +78,12 @@ class UnforeseenError(LodestreamError):
 
 
 def name_of(function: Callable[..., Any]) -> str:
-    """The module and the name by which another process finds a function."""
+    """Return the module and the name by which another process finds a function."""
     return f"{function.__module__}:{function.__qualname__}"
 
 
 def answer_of(call: Callable[[], Any]) -> bytes:
-    """Make a call; what it returns or raises as JSON, for `result_of`."""
+    """Make a call, and return its result or exception as JSON, for `result_of`."""
     # Not every exception survives the way between processes: its name and its text do.
     try:
         return to_json({"returned": call()})
@@ -100,7 +100,7 @@ def answer_of(call: Callable[[], Any]) -> bytes:
 
 
 def result_of(function: Callable[..., Any], answer: bytes) -> Any:
-    """What a function returned, or raised, by the word of its process.
+    """Return the result of a function, or raise its exception, as its process reports it.
 
     Parameters
     ----------
@@ -119,10 +119,10 @@ def result_of(function: Callable[..., Any], answer: bytes) -> Any:
         If the function raised anything else.
     """
     try:
-        told = json.loads(answer)
+        message = json.loads(answer)
     except (ValueError, RecursionError):
         raise WrongAnswerError("expected JSON") from None
-    match told:
+    match message:
         case {"returned": value}:
             kind = get_type_hints(function).get("return", Any)
             try:
@@ -143,6 +143,6 @@ def _printable(text: str) -> str:
 
 
 def reason_of(text: str) -> str:
-    """A reason given by a process, as one printable line of limited length."""
+    """Return a reason given by a process, as one printable line of limited length."""
     words = " ".join("".join(character if character.isprintable() else " " for character in text).split(" "))
     return words if len(words) <= _LONGEST_REASON else words[: _LONGEST_REASON - 3] + "..."

@@ -1,4 +1,4 @@
-"""A build by the workers of a Dask cluster, in a process of its own: of a surface that a confined process has parsed.
+"""A process that builds a surface with the workers of a Dask cluster, after a confined process has parsed it.
 
 The process gets a `ClusterJob` as a line of JSON on its standard input and writes its answer, see `answers.answer_of`,
 to its standard output. It ends when its standard input does: with the server.
@@ -55,7 +55,7 @@ class ClusterJob:
 
 
 def main() -> None:
-    """Carry out the job that comes over the standard input."""
+    """Carry out the job that arrives on the standard input."""
     task = TypeAdapter(ClusterJob).validate_json(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # What does not go by bands after all must not take the memory of everybody else.
@@ -105,7 +105,7 @@ def _build(task: ClusterJob) -> Built | Refused:
     if vertices > job.max_vertices:
         raise TooLargeError(f"expected at most {job.max_vertices:,} vertices, got {vertices:,}")
     quality, _ = without_quality(job.options)
-    made = job.scratch / "made"
+    container = job.scratch / "made"
     with ExitStack() as stack:
         try:
             executor = stack.enter_context(executor_of(task.address))
@@ -118,7 +118,7 @@ def _build(task: ClusterJob) -> Built | Refused:
                 surface,
                 quality=quality,
                 progress=reporter(job.folder),
-                out=made,
+                out=container,
                 memory=task.memory,
                 executor=executor,
             )
@@ -132,11 +132,11 @@ def _build(task: ClusterJob) -> Built | Refused:
             # Of Dask: workers died, the scheduler has gone, a worker lacks this package or has another version.
             words = str(error) or "its scheduler has gone, or has dropped the tasks"
             return Refused(f"LODESTREAM_DASK: the cluster gave up: {type(error).__name__}: {words}", final=False)
-    return Built(moved(made, job.container))
+    return Built(moved(container, job.container))
 
 
 def keep_parsed(job: Job) -> None:
-    """Remove all that a parser has left but its arrays, so that nothing of it is written to or followed.
+    """Remove all files of a parser but its arrays, so that nothing of it is written to or followed.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def keep_parsed(job: Job) -> None:
 
 
 def check_plain(folder: Path) -> None:
-    """Refuse a folder in which anything is but folders and files that have no other name.
+    """Refuse a folder with anything but folders and files that have no other name.
 
     A link could lead to what belongs to somebody else.
 
@@ -168,9 +168,9 @@ def check_plain(folder: Path) -> None:
         raise InputError(f"expected a folder of arrays, got something else at {folder.name}")
     for parent, folders, files in os.walk(folder, onerror=_unreadable):
         for name in (*folders, *files):
-            found = (Path(parent) / name).lstat()
-            plain = stat.S_ISREG(found.st_mode) and found.st_nlink == 1
-            if not plain and not stat.S_ISDIR(found.st_mode):
+            status = (Path(parent) / name).lstat()
+            plain = stat.S_ISREG(status.st_mode) and status.st_nlink == 1
+            if not plain and not stat.S_ISDIR(status.st_mode):
                 raise InputError(f"expected files and folders of arrays, got something else at {name[:80]!a}")
 
 

@@ -1,4 +1,4 @@
-"""Builds that the workers of a Dask cluster carry out: the process that hands them out, for as long as one takes."""
+"""Builds by the workers of a Dask cluster: starts and ends the process that hands out the tasks of each build."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LAST_WORDS = 2000
 
 
 async def build_by_cluster(task: ClusterJob, seconds: float, threads: int) -> Built | Refused:
-    """Build a surface that was parsed.
+    """Build a parsed surface with a Dask cluster.
 
     Cancelling it kills the process that hands out tasks; those that workers are at work on find their folder gone.
 
@@ -81,7 +81,7 @@ async def build_by_cluster(task: ClusterJob, seconds: float, threads: int) -> Bu
 
 
 async def _last_words(stream: asyncio.StreamReader) -> bytes:
-    """The end of what comes: Dask tells much in hours."""
+    """Return the end of a stream: Dask logs much in hours."""
     words = b""
     while piece := await stream.read(1 << 12):
         words = (words + piece)[-_LAST_WORDS:]

@@ -38,7 +38,7 @@ _BLOCK = 1 << 20
 
 
 def is_container(path: Path) -> bool:
-    """Whether a file begins like a container, of any version."""
+    """Return whether a file begins like a container, of any version."""
     from lodestream.container.sections import SIGNATURE, is_container
 
     with path.open("rb") as file:
@@ -79,7 +79,7 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
 
 
 def _check_sections(path: Path) -> None:
-    """Refuse what sections announce; what else may be wrong is found when all is looked through."""
+    """Refuse sections that announce too much; all other damage is found when the container is decoded."""
     from lodestream.container import section_lengths
     from lodestream.container.limits import MOST_SECTIONS
     from lodestream.container.metadata import MAX_BYTES
@@ -94,7 +94,7 @@ def _check_sections(path: Path) -> None:
 
 
 def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, str]:
-    """Check an uploaded container, and copy it to a path; returns its SHA-256 and who vouches for its errors.
+    """Check an uploaded container, and copy it to a path; return its SHA-256 and who vouches for its errors.
 
     Raises
     ------
@@ -109,23 +109,23 @@ def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, 
 
     digest = hashlib.sha256()
     with job.files[0].open("rb") as source:
-        found = inspect(
+        inspection = inspect(
             source,
             max_vertices=job.max_vertices,
             memory=job.room,
             progress=progress,
         )
-        checked(found.index, describe(found.index, channels=True))
+        checked(inspection.index, describe(inspection.index, channels=True))
         source.seek(0)
         with NewFile(path) as target:
             while block := source.read(_BLOCK):
                 digest.update(block)
                 target.write(block)
-    return digest.hexdigest(), CHECKED if found.errors_checked else TOLD
+    return digest.hexdigest(), CHECKED if inspection.errors_checked else TOLD
 
 
 def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Path]) -> dict[str, Any]:
-    """The description of a surface whose container has this index.
+    """Return the description of a surface whose container has this index.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Pa
 
 
 def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:
-    """The description of a container as plain JSON values.
+    """Return the description of a container as plain JSON values.
 
     Raises
     ------
@@ -162,8 +162,8 @@ def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:
             f"expected a name of at most {_LONGEST_NAME} characters, got {str(name)[:80]!a}", place.offset
         )
     try:
-        told: dict[str, Any] = plain(info)
-        json.dumps(told, allow_nan=False).encode()
+        description: dict[str, Any] = plain(info)
+        json.dumps(description, allow_nan=False).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise CorruptStreamError(f"expected metadata that JSON can express: {error}"[:300], place.offset) from None
-    return told
+    return description

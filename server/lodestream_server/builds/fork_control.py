@@ -1,4 +1,4 @@
-"""This side of the fork server: it is started when the first call needs it, and forks a process for each call."""
+"""Control of the fork server: starts it for the first call, and asks it to fork a process for each call."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Started:
         return message
 
     def end(self) -> None:
-        """Kill it, and wait until it is gone."""
+        """Kill the fork server, and wait for its end."""
         self.process.kill()
         self.process.wait()
         self.settled.wait()
@@ -88,7 +88,7 @@ class ForkServer:
 
     @property
     def pid(self) -> int | None:
-        """Number of its process, once it is started."""
+        """Number of the fork server's process, once it is started."""
         return None if self._started is None else self._started.process.pid
 
     @property
@@ -98,7 +98,7 @@ class ForkServer:
         return None if started is None else started.confinement
 
     def wait(self, given_up: Callable[[], bool] = lambda: False) -> str | None:
-        """Start it, and wait until it is ready, or until `given_up` returns True.
+        """Start the fork server, and wait until it is ready, or until `given_up` returns True.
 
         Returns
         -------
@@ -146,7 +146,7 @@ class ForkServer:
         return Process(ours, answer, request)
 
     def close(self) -> None:
-        """End it, with all processes that were forked from it."""
+        """End the fork server, with all processes that were forked from it."""
         with self._lock:
             self._closed = True
             started = self._started
@@ -203,7 +203,7 @@ class Process:
         self._over = False
 
     def begin(self) -> bool:
-        """Hand over the call; False when there is nobody to take it.
+        """Hand over the call; return False when the fork server has ended.
 
         Raises
         ------
@@ -220,7 +220,7 @@ class Process:
         return "begun" in message
 
     def finish(self, seconds: float | None) -> bytes:
-        """The answer, once the process has ended.
+        """Wait for the end of the process, and return its answer.
 
         Raises
         ------
@@ -245,12 +245,12 @@ class Process:
         return answer
 
     def kill(self) -> None:
-        """Have it killed; from any thread."""
+        """Have the process killed; may be called from any thread."""
         with suppress(OSError):
             self._connection.shutdown(socket.SHUT_WR)
 
     def end(self) -> None:
-        """Kill it, and wait for its end; nothing of it is left then."""
+        """Kill the process and all that it has started, and wait for their end."""
         if self._over:
             return
         self._over = True
@@ -264,7 +264,7 @@ class Process:
         os.close(self._answer)
 
     def _read(self, until: float | None) -> bytes | None:
-        """All that it says; None when it takes too long."""
+        """Return the whole answer of the process; None when it takes too long."""
         data = bytearray()
         while len(data) <= LONGEST_ANSWER:
             if not self._wait(self._answer, until):
@@ -285,7 +285,7 @@ class Process:
         return bool(poll.poll(None if until is None else max(0.0, 1000 * (until - time.monotonic()))))
 
     def _message(self) -> dict[str, int]:
-        """The next word of whoever forked it; nothing when they have gone."""
+        """Return the next message of the fork server; an empty one when it has ended."""
         try:
             line = self._lines.readline()
         except OSError:

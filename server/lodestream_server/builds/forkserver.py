@@ -99,7 +99,7 @@ class _Request:
 
 
 def main() -> None:
-    """Fork for each call that arrives over a socket until it is closed; its number is the first argument."""
+    """Fork for each call that arrives over a socket, whose number is the first argument, until it is closed."""
     control = socket.socket(fileno=int(sys.argv[1]))
     # Ctrl-C, and the end of a service, reach every process: this one is its parent's to end.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -130,7 +130,7 @@ class _Server:
         self._ended, self._wake = os.pipe()
 
     def run(self) -> None:
-        """Serve until the other side is gone; then nothing that was started is left."""
+        """Serve until the other side has closed, then end all calls."""
         for end in (self._ended, self._wake):
             os.set_blocking(end, False)
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
@@ -216,14 +216,14 @@ class _Server:
 
 
 def _kill(process: int) -> None:
-    """Kill a process with all that it has started: none of them can leave its group."""
+    """Kill a process with all that it has started: they cannot leave its process group."""
     for kill in (os.killpg, os.kill):  # before it is in a group of its own there is nobody else
         with suppress(ProcessLookupError):
             kill(process, signal.SIGKILL)
 
 
 def _wait_for_group(group: int) -> None:
-    """Wait for the end of all that is left of a group that was killed: until then one might still be writing."""
+    """Wait for the end of a killed process group: until then one of its processes might still write."""
     with suppress(ChildProcessError):
         while True:
             os.waitpid(-group, 0)
@@ -268,7 +268,7 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def _arguments(function: Callable[..., Any], values: list[Any]) -> list[Any]:
-    """What a function takes, of JSON's values."""
+    """Return the arguments of a function, converted from JSON values."""
     hints = get_type_hints(function)
     kinds = [hints.get(name, Any) for name in signature(function).parameters]
     return [_adapter(kind).validate_python(value) for kind, value in zip(kinds, values, strict=False)]
@@ -300,17 +300,17 @@ def _limit(allowed: Allowed) -> None:
 
 
 def _private_memory() -> int:
-    """Bytes of this process that count under RLIMIT_DATA; 0 where the system does not say."""
+    """Return the bytes of this process that count under RLIMIT_DATA; 0 on systems that do not tell."""
     try:
         text = Path("/proc/self/status").read_text()
     except OSError:
         return 0
-    found = re.search(r"^VmData:\s+(\d+) kB$", text, re.MULTILINE)
-    return int(found[1]) << 10 if found else 0
+    match = re.search(r"^VmData:\s+(\d+) kB$", text, re.MULTILINE)
+    return int(match[1]) << 10 if match else 0
 
 
 def resolve(name: str) -> Callable[..., Any]:
-    """The function with this name, ``module:qualified.name``."""
+    """Return the function with this name, ``module:qualified.name``."""
     module, _, qualified = name.partition(":")
     function: Callable[..., Any] = attrgetter(qualified)(importlib.import_module(module))
     return function
@@ -345,12 +345,12 @@ def _tell(connection: socket.socket, message: dict[str, int]) -> None:
 
 
 def _try_confinement() -> list[str]:
-    """What the kernel holds a process to, found out by one that confines itself."""
+    """Return the confinements that the kernel enforces, found out by a process that confines itself."""
     return _in_a_fork(lambda: list(confine(Rights()))) or []
 
 
 def _preload(name: str) -> str | None:
-    """Call the function of this name; what went wrong, if anything did."""
+    """Call the function of this name; return the reason if it failed."""
     try:
         resolve(name)()
     except Exception:
@@ -359,7 +359,7 @@ def _preload(name: str) -> str | None:
 
 
 def _in_a_fork(function: Callable[[], Any]) -> Any:
-    """What a function returns, called in a process of its own, as JSON has it; None when it died."""
+    """Call a function in a process of its own, and return its result through JSON; None when the process died."""
     ours, theirs = os.pipe()
     parent = os.getpid()
     process = os.fork()
@@ -380,7 +380,7 @@ def _in_a_fork(function: Callable[[], Any]) -> Any:
 
 @contextmanager
 def _ending_with(process: int) -> Iterator[None]:
-    """While the ``with`` block lasts, end when this process has another parent than that one."""
+    """Within the ``with`` block, end this process as soon as its parent is another than the given one."""
 
     def look(*_: object) -> None:
         if os.getppid() != process:

@@ -112,7 +112,7 @@ class _LaterError(Exception):
 
     @classmethod
     def of(cls, number: int | None) -> _LaterError:
-        """What stands behind an error of the system."""
+        """Return the error for a system error with this number."""
         return cls(
             "space on the server's disk"
             if number in worker.NO_ROOM
@@ -177,7 +177,7 @@ class Builder:
         return len(self._tasks)
 
     def pending_of(self, caller: str) -> tuple[int, int]:
-        """Number of builds that wait or run: all of them, and those of the caller with this key."""
+        """Return the number of builds that wait or run: all of them, and those of the caller with this key."""
         return len(self._tasks), self._pending.get(caller, 0)
 
     def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
@@ -244,8 +244,9 @@ class Builder:
             self.submit(record, caller)
 
     async def retry(self, surface: str, caller: str | None = None) -> Record:
-        """Build a surface again that failed, waits or is missing, if there is something to build it from; returns its
-        record.
+        """Build a surface again that failed, waits or is missing, if there is something to build it from.
+
+        Return its record.
 
         Parameters
         ----------
@@ -265,7 +266,7 @@ class Builder:
         return record
 
     def state(self, record: Record) -> tuple[State, float]:
-        """The current state of a surface, and the fraction of its build that is done."""
+        """Return the current state of a surface, and the fraction of its build that is done."""
         if record.state != "queued":
             return record.state, float(record.state == "ready")
         running = self._running.get(record.id)
@@ -317,13 +318,13 @@ class Builder:
 
     @property
     def confinement(self) -> str | None:
-        """How builds are confined, as ``/readyz`` says it; None before it is known."""
+        """Confinement of builds, as ``/readyz`` reports it; None before it is known."""
         held = self.fork_server.confinement
         return None if held is None else "+".join(held) or "none"
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """What the kernel does not keep builds from, a sentence for each mechanism; empty before it is known."""
+        """What builds may do for lack of a mechanism of the kernel, a sentence for each; empty before it is known."""
         held = self.fork_server.confinement
         return () if held is None else missing(held)
 
@@ -351,17 +352,17 @@ class Builder:
             _log.error("what builds need could not be loaded: %s", problem)
 
     async def _build(self, record: Record) -> None:
-        delay, said, attempts = _FIRST_DELAY, "", 0
+        delay, reason, attempts = _FIRST_DELAY, "", 0
         while True:
             attempts += 1
             started = time.monotonic()
             try:
                 state = await self._insist(record)
             except _LaterError as error:
-                if str(error) != said:
-                    said = str(error)
-                    _log.error("the build of %s %s", record.id, said)
-                    self._storage.note(record.id, said)
+                if str(error) != reason:
+                    reason = str(error)
+                    _log.error("the build of %s %s", record.id, reason)
+                    self._storage.note(record.id, reason)
                 if not self._patient and attempts == _ATTEMPTS:
                     return
                 with suppress(TimeoutError):
@@ -377,7 +378,7 @@ class Builder:
             return
 
     async def _insist(self, record: Record) -> State:
-        """Try until it is ready or refused."""
+        """Retry a build until the surface is ready or refused."""
         if record.attempts >= _CRASHES:
             return await self._postpone(record, f"the server ended {record.attempts} times while this was being built")
         deaths = endings = 0
@@ -402,7 +403,10 @@ class Builder:
                 return await self._postpone(record, f"{reason}, {deaths + endings} times")
 
     async def _check_upload(self, record: Record) -> State | None:
-        """What becomes of a surface whose upload is not there, or not what was acknowledged; None where it is."""
+        """Return the new state of a surface whose upload is gone or differs from the acknowledged one.
+
+        None if it is intact.
+        """
         if not await asyncio.to_thread(self._storage.has_upload, record):
             await asyncio.to_thread(self._storage.lose, record.id)
             await asyncio.to_thread(self._storage.forget_work, record.id)
@@ -419,7 +423,7 @@ class Builder:
                 raise _LaterError(f"disk space of its owner: {error}") from None
 
     async def _attempt(self, record: Record) -> State | None:
-        """What a build makes of a surface; None where it is to be tried again from nothing."""
+        """Build a surface once, and return its new state; None if the build must start again from nothing."""
         folder = self._storage.work_folder(record.id)
         job = self._job(record, folder)
         begun = await asyncio.to_thread(_identities, job.files)
@@ -475,7 +479,7 @@ class Builder:
             await _carried_out(partial(self._storage.end_work, record.id, folder, keeps))
 
     def _is_held_shortly(self, surface: str) -> bool:
-        """Whether what holds the folder of a build may let go of it yet, as a process that is ending does."""
+        """Return whether the folder of a build is locked by a process that is about to end."""
         return time.monotonic() - self._held.setdefault(surface, time.monotonic()) < _HELD_SECONDS
 
     async def _run(self, work: Awaitable[_T]) -> _T | worker.Refused:
@@ -539,7 +543,7 @@ class Builder:
         return "failed"
 
     async def _damage(self, record: Record) -> str | None:
-        """Why the upload is not what was acknowledged; None where it is."""
+        """Return how the upload differs from the acknowledged one; None if it does not."""
         try:
             problem = await asyncio.to_thread(check_upload, self._storage.upload_files(record), record)
         except OSError as error:
@@ -573,7 +577,7 @@ class Builder:
 
 
 async def _carried_out(remove: Callable[[], None]) -> None:
-    """Remove what a build has left, also where it is cancelled meanwhile: a thread that has not begun never would."""
+    """Remove the files of a build, even if the task is cancelled: a thread that has not begun would never run."""
     removing = asyncio.ensure_future(asyncio.to_thread(remove))
     try:
         await asyncio.shield(removing)
@@ -583,7 +587,7 @@ async def _carried_out(remove: Callable[[], None]) -> None:
 
 
 def _allowed(job: worker.Job, size: int, memory: int, threads: int) -> Allowed:
-    """What the process of a build may touch and take."""
+    """Return the rights and limits of the process of a build."""
     from lodestream.formats import sniff
 
     try:
@@ -606,12 +610,12 @@ def _allowed(job: worker.Job, size: int, memory: int, threads: int) -> Allowed:
 
 
 def _identities(files: Sequence[Path]) -> list[tuple[int, int, int]] | None:
-    """What tells files from others in their places; None where one is not there."""
+    """Return the identities of files, which tell them from others under the same names; None where one is missing."""
     try:
-        found = [os.stat(path) for path in files]
+        statuses = [os.stat(path) for path in files]
     except OSError:
         return None
-    return [(status.st_dev, status.st_ino, status.st_ctime_ns) for status in found]
+    return [(status.st_dev, status.st_ino, status.st_ctime_ns) for status in statuses]
 
 
 def _not_now(error: OSError) -> worker.Refused:

@@ -49,7 +49,7 @@ class Lease:
         file.readers += 1
 
     def again(self) -> Lease:
-        """Another lease of the same file."""
+        """Return another lease of the same file."""
         assert self._files is not None, "it was not given back"
         return Lease(self._files, self._file)
 
@@ -100,7 +100,7 @@ class LevelFiles:
         return self._lent + sum(file.size for file in self._files.values() if not file.readers)
 
     def lend(self, key: Key) -> Lease | None:
-        """A lease of a file, if it exists."""
+        """Return a lease of a file, if it exists."""
         file = self._files.get(key)
         if file is None:
             return None
@@ -113,14 +113,14 @@ class LevelFiles:
         return Lease(self, file)
 
     def released(self, file: _File) -> None:
-        """Called by `Lease` when a reader has released a file."""
+        """Count a reader less of a file; `Lease` calls this."""
         if not file.readers:
             self._lent -= file.size
             if file.forgotten:
                 discard(file.path)
 
     async def make_room(self) -> int:
-        """Remove files to make room for another one; returns the bytes that it may have, 0 if there is no room."""
+        """Remove files to make room for another one; return the bytes that it may have, 0 if there is no room."""
         await self._shrink(self.most // 2)
         free = await self._free()
         if free < 2 * self.longest:
@@ -138,13 +138,11 @@ class LevelFiles:
                 await asyncio.to_thread(discard, file.path)
 
     def new_folder(self, key: Key) -> Path:
-        """Path of a folder in which to make a file."""
+        """Return the path of a folder in which to make a file."""
         return self.folder / f"{key.container}-{key.level}-{key.format_name}.{next(self._numbers)}"
 
     def add(self, key: Key, path: Path, size: int, *, kept: bool) -> Lease:
-        """Take over a file that was made in a folder of `new_folder`; without `kept` it is removed when its reader
-        releases it.
-        """
+        """Take over a file from a folder of `new_folder`, and lend it; without `kept` it is removed at its release."""
         place = path.parent.with_name(f"{path.parent.name}.level")
         path.rename(place)
         file = _File(place, size, forgotten=not kept)

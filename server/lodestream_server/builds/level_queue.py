@@ -1,4 +1,4 @@
-"""Levels as files: made one at a time, each in its own process, under limits, while somebody waits for them.
+"""Levels as files: made one at a time, each in its own process, under limits, while a client waits for them.
 
 What happens to a request:
 
@@ -147,7 +147,7 @@ class LevelQueue:
         self._closing = False
 
     async def borrow(self, request: Request, key: Key, caller: Caller) -> Loan:
-        """A level file, made if it does not exist; given up if the client disconnects meanwhile.
+        """Return a level file, which is made if it does not exist; the work is given up if the client disconnects.
 
         Parameters
         ----------
@@ -175,7 +175,7 @@ class LevelQueue:
         return await _while_there(request, self.take(key, caller))
 
     async def take(self, key: Key, caller: Caller) -> Loan:
-        """Like `borrow`, for a caller that does not disconnect."""
+        """Return a level file like `borrow`, for a caller that does not disconnect."""
         self._check_caller(caller.key)
         self._callers[caller.key] += 1
         try:
@@ -281,7 +281,7 @@ class LevelQueue:
         job.callers.clear()
 
     def _abandon(self, job: _Job) -> None:
-        """Nobody waits for it any more."""
+        """Give up a job for which no client waits any more."""
         if job.lease is not None:
             job.lease.release()
         if job.done.done():
@@ -361,7 +361,7 @@ class LevelQueue:
         seconds = self._settings.level_seconds
         try:
             call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings))
-            made: MadeLevel | RefusedLevel = await self._pool.run(call)
+            result: MadeLevel | RefusedLevel = await self._pool.run(call)
         except TimeoutError:
             raise LargeLevelError(
                 f"expected a level that is made within {seconds:g} s (level_seconds); {advice}"
@@ -383,9 +383,9 @@ class LevelQueue:
         except OSError as error:
             # No process could be started.
             raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
-        if isinstance(made, MadeLevel):
-            return await asyncio.to_thread(_checked_size, wanted, made)
-        refused = made.error()
+        if isinstance(result, MadeLevel):
+            return await asyncio.to_thread(_checked_size, wanted, result)
+        refused = result.error()
         if isinstance(refused, FileTooLongError):
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
@@ -394,8 +394,8 @@ class LevelQueue:
                 f"levels (level_disk); {advice}"
             )
         if isinstance(refused, TooLargeError):  # what the decoder advises is for those who call it
-            told, _, _ = str(refused).partition("; max_vertices=")
-            raise LargeLevelError(f"expected a level that needs at most {self._memory}: {told}; {advice}")
+            limit, _, _ = str(refused).partition("; max_vertices=")
+            raise LargeLevelError(f"expected a level that needs at most {self._memory}: {limit}; {advice}")
         if isinstance(refused, InputError) and not isinstance(refused, OptionError):
             raise UnfitLevelError(str(refused))
         if isinstance(refused, StreamError):
@@ -405,8 +405,8 @@ class LevelQueue:
     @property
     def _memory(self) -> str:
         """The memory that a level may take, and the setting that says so."""
-        own = self._settings.level_memory is not None
-        setting = "level_memory" if own else "half of LODESTREAM_MEMORY, but at least 1024 MiB"
+        is_chosen = self._settings.level_memory is not None
+        setting = "level_memory" if is_chosen else "half of LODESTREAM_MEMORY, but at least 1024 MiB"
         return f"{self._settings.memory_of_levels >> 20} MiB of memory ({setting})"
 
     def _no_room(self, most: int) -> LodestreamError:
@@ -420,7 +420,7 @@ class LevelQueue:
 
 
 def _allowed(wanted: LevelJob, settings: Settings) -> Allowed:
-    """What the process that makes a level may touch and take: a stranger may have written the container."""
+    """Return the rights and limits of the process that makes a level: a stranger may have written the container."""
     return Allowed(
         (wanted.container,),
         wanted.folder,
@@ -430,14 +430,14 @@ def _allowed(wanted: LevelJob, settings: Settings) -> Allowed:
     )
 
 
-def _checked_size(wanted: LevelJob, made: MadeLevel) -> int:
-    """Bytes of the file that was made, if there is one and it is no link to another."""
+def _checked_size(wanted: LevelJob, level: MadeLevel) -> int:
+    """Return the bytes of a new level file, which must exist and not be a link to another file."""
     if not is_file(wanted.path):
         raise WrongAnswerError("expected a level in a file of its own")
-    found = wanted.path.lstat()
-    if found.st_nlink != 1 or found.st_size != made.size or made.size > wanted.most_bytes:
-        raise WrongAnswerError(f"expected a level of {made.size} bytes in a file of its own, got {found.st_size}")
-    return made.size
+    status = wanted.path.lstat()
+    if status.st_nlink != 1 or status.st_size != level.size or level.size > wanted.most_bytes:
+        raise WrongAnswerError(f"expected a level of {level.size} bytes in a file of its own, got {status.st_size}")
+    return level.size
 
 
 def _make_folders(folder: Path) -> None:
@@ -451,7 +451,7 @@ def _empty(folder: Path) -> None:
 
 
 async def _while_there(request: Request, work: Coroutine[Any, Any, Loan]) -> Loan:
-    """What is lent once it is; the work is cancelled when the client goes."""
+    """Wait for a loan; the work is cancelled when the client disconnects."""
     working, watching = asyncio.ensure_future(work), asyncio.ensure_future(_gone(request))
     try:
         await asyncio.wait((working, watching), return_when=asyncio.FIRST_COMPLETED)

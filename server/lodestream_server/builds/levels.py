@@ -124,14 +124,14 @@ class RefusedLevel:
     reason: str
 
     def error(self) -> LodestreamError:
-        """The exception, limited to known classes: the process is not trusted."""
+        """Return the exception, limited to known classes: the process is not trusted."""
         kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
         return kind(reason_of(self.reason))
 
 
 @cache
 def written_by() -> str:
-    """What decides about the bytes of a level file beside the container, as some hexadecimal digits."""
+    """Return hexadecimal digits that change with the programs that write level files."""
     versions = [str(_REVISION)]
     for name in _LIBRARIES:
         try:
@@ -160,7 +160,7 @@ def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
 
 
 def _decode(job: LevelJob) -> tuple[Surface, int]:
-    """The level, and how many bytes of it are in files.
+    """Return the level, and how many of its bytes are in files.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
 
 
 def _goes_by_pieces(header: Header, job: LevelJob) -> bool:
-    """Whether a level is decoded by bands, and written so: it takes much memory in one piece, and can be."""
+    """Return whether a level is decoded and written by bands: it can be, and takes much memory in one piece."""
     from lodestream.decoding.pieces import why_not_by_pieces
     from lodestream.formats import written
 
@@ -228,7 +228,7 @@ class _Plain:
 
 @contextmanager
 def _short_files(job: LevelJob, aside: int) -> Iterator[None]:
-    """Let files become so long and no longer, those included that a library writes on the way to the format.
+    """Limit the length of files that are written, including temporary files of libraries.
 
     With the bytes that are in files already they have as many as the level's may have.
 

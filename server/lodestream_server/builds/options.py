@@ -88,7 +88,7 @@ def check(
     options: SurfaceOptions,
     allowed: Collection[str] | None = None,
 ) -> Format:
-    """Check an upload as far as its first bytes allow; returns the first file's format.
+    """Check an upload as far as its first bytes allow, and return the format of its first file.
 
     Parameters
     ----------
@@ -113,19 +113,19 @@ def check(
     if any(map(finished.is_container, files)):
         _check_allowed(("lode",), names[0], allowed)
         return finished.check_upload(files, options.chosen)
-    found = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
-    for format_ in found:
+    sniffed = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
+    for format_ in sniffed:
         if format_.read is None:
             readable = ", ".join(item.name for item in formats() if item.read and not item.folder)
             raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
-    _check_allowed(found[0].names, names[0], allowed)
+    _check_allowed(sniffed[0].names, names[0], allowed)
     for key in options.chosen:
-        if key not in ("precision", "rms", "closed", "nodata", *found[0].options) and not key.startswith(ATTRIBUTE):
-            known = ", ".join(("precision", "rms", "closed", "nodata", "name", "filename", *found[0].options))
-            raise OptionError(f"expected one of {known} for format {found[0].name}, got {key[:80]!a}")
+        if key not in ("precision", "rms", "closed", "nodata", *sniffed[0].options) and not key.startswith(ATTRIBUTE):
+            known = ", ".join(("precision", "rms", "closed", "nodata", "name", "filename", *sniffed[0].options))
+            raise OptionError(f"expected one of {known} for format {sniffed[0].name}, got {key[:80]!a}")
     if options.chosen.get("remesh") is not None:
         _check_allowed(("remesh",), names[0], allowed)
-    return found[0]
+    return sniffed[0]
 
 
 def _check_allowed(formats: Sequence[str], filename: str | None, allowed: Collection[str] | None) -> None:
@@ -140,14 +140,14 @@ def _check_allowed(formats: Sequence[str], filename: str | None, allowed: Collec
 def identify(
     digest: hashlib._Hash, format_: Format, filename: str | None, options: SurfaceOptions, owner: str | None
 ) -> str:
-    """The id of a surface: 20 hexadecimal digits of a SHA-256 over the upload's bytes, format, options, name and owner.
+    """Return the id of a surface: 20 hexadecimal digits of a SHA-256.
 
-    What the name of the first file implies, such as the position of an .hgt, counts as an option; the file's name
-    itself does not count.
+    It covers the upload's bytes, format, options, name and owner. What the name of the first file implies, such as the
+    position of an .hgt, counts as an option; the file's name itself does not count.
     """
-    told = dict(format_.named(filename)) if format_.named and filename else {}
+    implied = dict(format_.named(filename)) if format_.named and filename else {}
     whole = digest.copy()
-    words: list[object] = [format_.name, sorted({**told, **options.chosen}.items())]
+    words: list[object] = [format_.name, sorted({**implied, **options.chosen}.items())]
     # Nobody's surface without a name keeps the id that earlier versions gave it.
     if options.name is not None or owner is not None:
         words += [options.name, owner]
@@ -156,10 +156,10 @@ def identify(
 
 
 def plain_name(text: str) -> str | None:
-    """A name for display: the last part of a path, without characters that are unsafe on a terminal."""
+    """Return a name for display: the last part of a path, without characters that are unsafe on a terminal."""
     return printable(text.replace("\\", "/").rpartition("/")[2])
 
 
 def printable(text: str) -> str | None:
-    """A name without characters that are unsafe on a terminal; names come from strangers' containers too."""
+    """Return a name without characters that are unsafe on a terminal; names come from strangers' containers too."""
     return "".join(character for character in text if character.isprintable())[:_LONGEST_NAME].strip() or None

@@ -1,4 +1,4 @@
-"""Calling functions in separate processes, each with one call and only the rights that the call needs.
+"""Call functions in separate processes, each with one call and only the rights that the call needs.
 
 The processes are forked from one that has loaded everything and has read no untrusted data (`forkserver`). If one of
 them dies, the others continue, and the next call gets a new one.
@@ -106,7 +106,7 @@ class Pool:
         self._closed = False
 
     async def run(self, call: Call) -> Any:
-        """Make a call when a place is free; returns what the function returns.
+        """Make a call when a place is free, and return its result.
 
         Cancelling it kills the process; the process has ended when this raises.
 

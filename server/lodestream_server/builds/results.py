@@ -1,4 +1,4 @@
-"""Checking the result of a build: the server trusts only the bytes of the container, after checking them.
+"""Check the result of a build: the server trusts only the bytes of the container, after checking them.
 
 A file may have taken over the process that reads it. So the process decides only whether it has built, why not, and who
 vouches for the errors of an uploaded container; everything else is read from the container.
@@ -30,7 +30,7 @@ _MOST_AT_ONCE = 256 << 20
 
 
 def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
-    """The description of the container that a build has made, read from the container alone.
+    """Return the description of a new container, read from the container alone.
 
     Nobody writes to it any more: the process has ended, with all processes that it started.
 
@@ -60,8 +60,8 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
     from lodestream.container import read_index
 
     # A link could lead to what belongs to somebody else, and a pipe would be waited for. Nobody changes it any more.
-    found = path.lstat() if os.path.lexists(path) else None
-    if found is None or not stat.S_ISREG(found.st_mode) or found.st_nlink != 1:
+    status = path.lstat() if os.path.lexists(path) else None
+    if status is None or not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
         raise WrongAnswerError("expected a container in a file of its own")
     with path.open("rb") as file:
         handle = file.fileno()
@@ -81,7 +81,7 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
             return os.pread(handle, length, offset)
 
         try:
-            index = read_index(read, found.st_size)
+            index = read_index(read, status.st_size)
             errors = built.errors if finished.is_container(files[0]) else None
             info = finished.figures_of(index, {finished.ERRORS: errors}, files)
             return finished.checked(index, info)

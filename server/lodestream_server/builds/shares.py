@@ -48,7 +48,7 @@ class Turns:
 
     @asynccontextmanager
     async def turn(self, caller: str, rank: int = 0) -> AsyncIterator[None]:
-        """Have a turn for the length of the block, once it is this caller's.
+        """Wait for this caller's turn, and hold it for the length of the block.
 
         Parameters
         ----------

@@ -13,7 +13,7 @@ ATTRIBUTE = "precision="
 
 
 def stored(quality: Quality) -> dict[str, str]:
-    """The quality among the options of a surface, see `SurfaceOptions.chosen`."""
+    """Return the quality among the options of a surface, see `SurfaceOptions.chosen`."""
     precisions, rms = quality.texts()
     chosen = {}
     for text in precisions:
@@ -23,7 +23,7 @@ def stored(quality: Quality) -> dict[str, str]:
 
 
 def without_quality(chosen: Mapping[str, str]) -> tuple[Quality, dict[str, str]]:
-    """The quality among the options of a surface, and the other options.
+    """Split the options of a surface into its quality and the other options.
 
     Raises
     ------

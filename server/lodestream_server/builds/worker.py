@@ -220,7 +220,7 @@ class Refused:
 
 
 def preload() -> None:
-    """Import what builds and levels need, so that a process that is forked for one has it at once.
+    """Import the modules of builds and levels, so that forked processes have them at once.
 
     Libraries that read NetCDF are among it, if they are installed, since a process would take a second to import them.
     Libraries that read other formats are not: a process imports those when it comes to such a file.
@@ -263,7 +263,7 @@ def build(job: Job) -> Built | Parsed | Refused:
 
 
 def raise_passing(error: LodestreamError) -> None:
-    """Raise the error of the system that stands behind an error, if it is that the disk is full or something is in use.
+    """Raise the system error behind an error if it may pass: a full disk, or something in use.
 
     What was uploaded is not refused then: its build is begun again when there is room, or when the process of a server
     that was killed has let go of the folder that this one continues in.
@@ -278,7 +278,7 @@ def raise_passing(error: LodestreamError) -> None:
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    """An error, and what readers made it of."""
+    """Yield an error and the errors that readers made of it."""
     cause: BaseException | None = error
     while cause is not None:
         yield cause
@@ -286,7 +286,7 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
 
 
 def may_pass(error: LodestreamError) -> bool:
-    """Whether an upload was refused for what this server lacks, or forbids, and not for its bytes."""
+    """Return whether an upload was refused for something that this server lacks or forbids, not for its bytes."""
     if isinstance(error, TooLargeError | UnavailableError | UnsupportedVersionError):
         return True
     for cause in _causes(error):
@@ -299,7 +299,7 @@ def may_pass(error: LodestreamError) -> bool:
 
 
 def read_progress(folder: Path) -> float:
-    """The fraction of a build that is done, 0 to 1; safe whatever the build has put into its folder."""
+    """Return the fraction of a build that is done, 0 to 1; safe whatever the build has put into its folder."""
     try:
         handle = os.open(folder / _PROGRESS, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -337,23 +337,23 @@ def _build(job: Job) -> Built | Parsed:
             if job.shared:
                 save_surface(surface, FolderScratch(job.parsed))
                 return Parsed(sum(block.shape[0] * block.shape[1] for block in surface.blocks))
-            made = job.folder / _MADE
-            encode(surface, quality=quality, progress=report, out=made, memory=job.room, scratch=job.bands)
-            return Built(moved(made, path))
+            encoded = job.folder / _MADE
+            encode(surface, quality=quality, progress=report, out=encoded, memory=job.room, scratch=job.bands)
+            return Built(moved(encoded, path))
         container = encode(surface, quality=quality, progress=report)
     with NewFile(path) as file:
         file.write(container)
     return Built(hashlib.sha256(container).hexdigest())
 
 
-def moved(made: Path, path: Path) -> str:
-    """Put a container in its place, and on disk; returns its SHA-256."""
+def moved(container: Path, path: Path) -> str:
+    """Move a container to its place, and put it on disk; return its SHA-256."""
     digest = hashlib.sha256()
-    with made.open("rb") as source, NewFile(path) as target:
+    with container.open("rb") as source, NewFile(path) as target:
         while block := source.read(_BLOCK):
             digest.update(block)
             target.write(block)
-    made.unlink()
+    container.unlink()
     return digest.hexdigest()
 
 
@@ -362,7 +362,7 @@ def _read(job: Job, options: dict[str, str]) -> Surface:
     from lodestream.formats import read
     from lodestream.scratch import FolderScratch, Room
 
-    with warnings.catch_warnings(record=True) as found:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", FormatWarning)
         surface = read(
             *job.files,
@@ -373,8 +373,8 @@ def _read(job: Job, options: dict[str, str]) -> Surface:
             room=Room(lambda: FolderScratch(job.parsed), job.room // _PART),
             **options,
         )
-    said = [str(warning.message) for warning in found if warning.category is FormatWarning]
-    notes = dict.fromkeys([*said, *filter(None, [at_holes(surface)])])
+    messages = [str(warning.message) for warning in caught if warning.category is FormatWarning]
+    notes = dict.fromkeys([*messages, *filter(None, [at_holes(surface)])])
     if job.name is not None:
         surface.metadata["name"] = job.name
     elif job.filename is None:
@@ -385,7 +385,7 @@ def _read(job: Job, options: dict[str, str]) -> Surface:
 
 
 def reporter(folder: Path) -> Callable[[float], None]:
-    """What is told the fraction that is done, 0 to 1, and leaves it for `read_progress`."""
+    """Return a progress callback that stores the fraction for `read_progress`."""
     last = float("-inf")
 
     def report(fraction: float) -> None:

@@ -1,1 +1,1 @@
-"""What the server adds to the command line: ``serve``, ``fsck`` and ``token``."""
+"""Commands that the server adds to the command line: ``serve``, ``fsck`` and ``token``."""

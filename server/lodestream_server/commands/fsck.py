@@ -54,7 +54,7 @@ def register(subparsers: Any) -> None:
 
 
 def fsck(args: argparse.Namespace) -> int:
-    """Check a folder, repair it if requested, and print what was found; returns the exit code.
+    """Check a folder, repair it if requested, and print the findings; return the exit code.
 
     Raises
     ------
@@ -145,10 +145,10 @@ def _print(report: Report, waiting: Sequence[Record]) -> None:
         of = f" of surface {finding.surface}" if finding.surface and finding.what != "record" else ""
         repair = f" - {finding.repair}" if finding.repair else ""
         print(printable(f"{finding.what}{of}, {place}: {finding.problem}{repair}"))
-    found = len(report.damage)
+    n_damaged = len(report.damage)
     repaired = sum(finding.repaired for finding in report.damage)
     lost = sum(finding.lost for finding in report.damage)
-    problems = "nothing is damaged" if not found else f"{found} damaged"
+    problems = "nothing is damaged" if not n_damaged else f"{n_damaged} damaged"
     problems += f", {repaired} of these repaired" if repaired else ""
     problems += f", {lost} lost" if lost else ""
     problems += f", {len(waiting)} surfaces wait for a retry" if waiting else ""

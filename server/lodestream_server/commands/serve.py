@@ -55,7 +55,7 @@ def _type(setting: Setting) -> Callable[[str], Any]:
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Run a server until it is told to end; returns the exit code.
+    """Run a server until it is told to end; return the exit code.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def serve(args: argparse.Namespace) -> int:
 
 
 def chosen_settings(args: argparse.Namespace) -> Settings:
-    """The settings of the command line, completed from the environment.
+    """Return the settings of the command line, completed from the environment.
 
     Raises
     ------

@@ -26,7 +26,7 @@ _FRAMING = 256 * 1024
 
 
 class Offence(NamedTuple):
-    """What is wrong with a request: the code and the detail of the answer."""
+    """The code and the detail of the answer to a faulty request."""
 
     code: str
     detail: str
@@ -62,12 +62,12 @@ class CountedConnection(h11.Connection):
         return self._promised - self._taken if self._whole else 0
 
     def receive_data(self, data: bytes) -> None:
-        """Take bytes."""
+        """Count and take bytes."""
         self._came += len(data)
         super().receive_data(data)
 
     def next_event(self) -> Any:
-        """Like h11's.
+        """Return the next event, as h11's connection does.
 
         Raises
         ------
@@ -82,7 +82,10 @@ class CountedConnection(h11.Connection):
         return event
 
     def send(self, event: h11.Event) -> Any:
-        """Like h11's; adds ``Connection: close`` if much of the request's body has not arrived."""
+        """Send an event, as h11's connection does.
+
+        ``Connection: close`` is added if much of the request has not arrived.
+        """
         if type(event) is h11.Response and self.their_state is h11.SEND_BODY and not self._ends_soon():
             headers = [header for header in event.headers if header[0] != b"connection"] + [(b"connection", b"close")]
             event = h11.Response(status_code=event.status_code, headers=headers, reason=event.reason)

@@ -51,7 +51,7 @@ _TITLES = {
 
 
 def connections(settings: Settings, cuts: Cuts, pace: Pace, places: Places) -> type[H11Protocol]:
-    """The class of a server's HTTP connections; uvicorn creates one instance for each."""
+    """Return the class of a server's HTTP connections; uvicorn creates one instance for each."""
 
     class Chosen(_Connection):
         head_seconds = settings.head_seconds
@@ -170,14 +170,14 @@ class _Connection(H11Protocol):
             self._cut(code)
 
     def resume_reading(self) -> None:
-        """Go on with what has come already; then with what comes."""
+        """Continue with the bytes that were received meanwhile, then with new ones."""
         if self._held and not self._upgraded:
             self._feed_later()
         else:
             self._socket.resume_reading()
 
     def is_closing(self) -> bool:
-        """Whether no other request is taken."""
+        """Return whether the connection takes no other request."""
         return self._rest_timer is not None or self._socket.is_closing()
 
     def close(self) -> None:
@@ -294,7 +294,7 @@ class _Connection(H11Protocol):
 
 
 def _ended(watch: _Watch, places: Places, host: str) -> None:
-    """A connection has ended, as one or as a stream, whose own connection is another object."""
+    """Count a connection that has ended, also if it had become a stream, which has another object."""
     watch.end()
     places.leave(host)
 
@@ -313,7 +313,7 @@ class _Transport:
         self.resume_reading = connection.resume_reading
 
     def let_go(self) -> None:
-        """Forget the connection, which so needs no garbage collection."""
+        """Drop the reference to the connection, so that it needs no garbage collection."""
         self.close = self._transport.close
         self.is_closing = self._transport.is_closing
         self.resume_reading = self._transport.resume_reading
@@ -365,7 +365,7 @@ class _Watch:
         self._transport.write(data)
 
     def end(self) -> None:
-        """Stop looking, so that nothing of a connection that has ended is kept until the next look."""
+        """Stop watching, so that nothing of an ended connection is kept until the next check."""
         self._timer.cancel()
 
     def _look(self) -> None:
@@ -390,12 +390,14 @@ class _Watch:
         self._timer = self._loop.call_later(self._seconds, self._look)
 
     def _read(self) -> int:
-        """Bytes that the client's system has acknowledged, up to a constant."""
+        """Return the bytes that the client's system has acknowledged, up to a constant."""
         return self._written - self._transport.get_write_buffer_size() - _queued(self._transport)
 
 
 def _queued(transport: asyncio.Transport) -> int:
-    """Bytes in the system's buffer of a socket that the other side has not acknowledged; 0 where it does not say.
+    """Return the bytes of a socket's send buffer that the other side has not acknowledged.
+
+    0 if the system does not tell.
 
     The system takes more from a transport only when a third of that buffer is free, which may be a megabyte: a client
     that reads slowly but steadily would seem to read nothing for minutes.

@@ -36,7 +36,7 @@ class Allowance:
         self._seen = time.monotonic()
 
     def take(self) -> bool:
-        """Count one; returns whether it was allowed."""
+        """Count one, and return whether it was allowed."""
         now = time.monotonic()
         self._left = min(self._most, self._left + (now - self._seen) * self._rate) - 1
         self._seen = now

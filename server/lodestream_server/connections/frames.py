@@ -46,7 +46,7 @@ _EARNED = 4.0
 
 
 def stream_connections(cuts: Cuts, pace: Pace) -> type[WebSocketsSansIOProtocol]:
-    """The class of a server's WebSocket connections; uvicorn creates one instance for each."""
+    """Return the class of a server's WebSocket connections; uvicorn creates one instance for each."""
 
     class Chosen(_Connection):
         pass
@@ -57,7 +57,7 @@ def stream_connections(cuts: Cuts, pace: Pace) -> type[WebSocketsSansIOProtocol]
 
 
 def call_when_lost(connection: BaseProtocol, work: Callable[[], None]) -> None:
-    """Have a function called when a WebSocket connection has ended."""
+    """Call a function when a WebSocket connection has ended."""
     if isinstance(connection, _Connection):
         connection.when_lost = work
 

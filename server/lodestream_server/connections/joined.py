@@ -42,7 +42,7 @@ class Joined:
         self._counts = False
 
     def write(self, data: bytes) -> None:
-        """Send this, perhaps with what is written next."""
+        """Send bytes, joined with those of the next writes if they come soon."""
         self._held.append(data)
         self._size += len(data)
         self._turns = _TURNS
@@ -65,7 +65,7 @@ class Joined:
         self._transport.abort()
 
     def get_write_buffer_size(self) -> int:
-        """Bytes that have not been sent."""
+        """Return the bytes that have not been sent."""
         return self._size + self._transport.get_write_buffer_size()
 
     def __getattr__(self, name: str) -> Any:

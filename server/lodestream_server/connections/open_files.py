@@ -1,4 +1,4 @@
-"""The limit of open files of this process, and how many connections it allows."""
+"""The limit of open files of this process, and the number of connections that it allows."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def raise_file_limit(settings: Settings) -> None:
 
 
 def most_connections(settings: Settings) -> int:
-    """The largest number of connections: that of the settings, or what the limit of open files allows."""
+    """Return the largest number of connections: that of the settings, or what the limit of open files allows."""
     if settings.max_connections is not None:
         return settings.max_connections
     soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]

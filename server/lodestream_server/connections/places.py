@@ -1,4 +1,4 @@
-"""How many connections there are, in all and of each address."""
+"""Numbers of connections, in total and of each address."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["Places", "network_of"]
 
 
 def network_of(host: str) -> str:
-    """What connections of one household or machine have in common: an address, of IPv6 its /64 network."""
+    """Return the network of a household or machine: the address, of IPv6 its /64 network."""
     try:
         address = ipaddress.ip_address(host)
     except ValueError:
@@ -43,7 +43,7 @@ class Places:
         self._all = 0
 
     def take(self, host: str) -> tuple[int, str, str] | None:
-        """Count a connection; returns status, code and detail of the answer if it is one too many.
+        """Count a connection; return status, code and detail of the answer if it is one too many.
 
         A connection that is refused counts too, until `leave`.
 
@@ -68,7 +68,7 @@ class Places:
         return None
 
     def leave(self, host: str) -> None:
-        """A connection has ended."""
+        """Count a connection less."""
         network = network_of(host)
         self._all -= 1
         self._taken[network] -= 1
@@ -86,10 +86,10 @@ class Places:
 
 
 def _networks(names: Sequence[str]) -> list[ipaddress.IPv4Network | ipaddress.IPv6Network]:
-    found = []
+    networks = []
     for name in names:
         try:
-            found.append(ipaddress.ip_network(name, strict=False))
+            networks.append(ipaddress.ip_network(name, strict=False))
         except ValueError:  # a name that no address can be compared with
             continue
-    return found
+    return networks

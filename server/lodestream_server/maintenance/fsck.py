@@ -113,7 +113,7 @@ class Report:
         return all(finding.repaired for finding in self.damage)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values for JSON."""
         return {
             "folder": str(self.folder),
             "clean": self.clean,
@@ -210,7 +210,7 @@ def _container(at: Folders, record: Record, report: Report, indexes: dict[str, I
 
 
 def check_container(path: Path, sha256: str) -> Index | str:
-    """The index of a sound container, or a description of what is wrong with it.
+    """Return the index of a sound container, or a description of what is wrong with it.
 
     Raises
     ------

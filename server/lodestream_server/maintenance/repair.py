@@ -47,7 +47,7 @@ def set_aside(report: Report) -> None:
 
 
 async def rebuild(folder: Path, settings: Settings, *, retry: bool = False) -> dict[str, Record]:
-    """Build all queued surfaces, as a server would; returns the records of all surfaces after that.
+    """Build all queued surfaces, as a server would; return the records of all surfaces after that.
 
     Builds for which there is no disk space stay in the queue.
 

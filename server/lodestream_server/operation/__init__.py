@@ -1,1 +1,1 @@
-"""What an operator sees and sets: settings, logs, metrics, and turns of the event loop."""
+"""Operation: settings, logs, metrics, and turns of the event loop."""

@@ -6,7 +6,7 @@ __all__ = ["exceeds_share"]
 
 
 def exceeds_share(most: int, taken: int, by_caller: int) -> bool:
-    """Whether one more place is beyond the share of a caller.
+    """Return whether one more place is beyond the share of a caller.
 
     A caller may take as much as it leaves free for the others: one caller alone gets half of everything, the next one
     half of the rest. So a caller that has nothing yet finds a place, unless there are very many callers.

@@ -33,11 +33,11 @@ class WaitingClock:
         self._timer: asyncio.TimerHandle | None = None
 
     def __call__(self) -> float:
-        """Tell the seconds that were waited."""
+        """Return the seconds waited so far."""
         return self._waited
 
     async def waiting(self, coming: Awaitable[T]) -> T:
-        """Wait for something of the client's, and let the clock go meanwhile."""
+        """Await something from the client while the clock runs."""
         self._last = monotonic()
         self._timer = self._loop.call_later(_LOOK, self._look)
         try:
@@ -86,7 +86,7 @@ class LeastRate:
         self._began, self._before = self._clock(), count
 
     def shortfall(self, count: int) -> tuple[int, float] | None:
-        """Bytes and seconds of an interval that is over and was too slow; None otherwise.
+        """Return the bytes and seconds of an interval that has ended and was too slow; None otherwise.
 
         If an interval is over, the next one begins.
 

@@ -71,14 +71,14 @@ def event(log: logging.Logger, words: str, level: int = logging.INFO, **fields: 
 
 
 def new_request(offered: str | None) -> str:
-    """Begin a request; returns its id, which is the one that the client or a proxy sent if that is usable."""
+    """Begin a request; return its id, which is the one from the client or a proxy if that is usable."""
     name = offered if offered is not None and _USABLE_ID.fullmatch(offered) else secrets.token_hex(8)
     _request.set(name)
     return name
 
 
 def request_id() -> str | None:
-    """The id of the current request."""
+    """Return the id of the current request."""
     return _request.get()
 
 

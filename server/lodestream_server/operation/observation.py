@@ -84,6 +84,6 @@ class Observation:
 
 
 def _is_cancelled() -> bool:
-    """Whether this task is, and not only something that it waited for."""
+    """Return whether this task itself is cancelled, not only something that it awaited."""
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0

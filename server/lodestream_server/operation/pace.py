@@ -42,7 +42,7 @@ class Pace:
         self._waiting.append((work, copy_context()))
 
     async def turn(self) -> None:
-        """Wait until it is this task's turn."""
+        """Wait for this task's turn."""
         turn = asyncio.get_running_loop().create_future()
 
         def begin() -> None:

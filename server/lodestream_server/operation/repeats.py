@@ -17,7 +17,7 @@ _Key = tuple[str, int, str, str]
 
 
 @dataclass
-class _Told:
+class _Repeated:
     at: float
     more: int = 0
 
@@ -26,36 +26,36 @@ class Repeats:
     """Counts repeated log records. Times are seconds of any clock."""
 
     def __init__(self) -> None:
-        self._told: dict[_Key, _Told] = {}
+        self._repeated: dict[_Key, _Repeated] = {}
 
     def admit(self, record: logging.LogRecord, now: float) -> bool:
-        """Whether to log a record; warnings and errors that were logged less than a minute ago are counted instead."""
+        """Return whether to log a record; warnings and errors logged less than a minute ago are counted instead."""
         if record.levelno < logging.WARNING:
             return True
         key = _key(record)
-        told = self._told.get(key)
-        if told is not None:
-            told.more += 1
-        elif len(self._told) < _MOST:
-            self._told[key] = _Told(now)
-        return told is None
+        entry = self._repeated.get(key)
+        if entry is not None:
+            entry.more += 1
+        elif len(self._repeated) < _MOST:
+            self._repeated[key] = _Repeated(now)
+        return entry is None
 
     def due(self, now: float) -> list[logging.LogRecord]:
-        """A line for each record that was counted for a minute; records that did not repeat are forgotten."""
+        """Return a line for each record that was counted for a minute, and drop records that did not repeat."""
         lines = []
-        for key, told in list(self._told.items()):
-            if now - told.at >= SECONDS:
-                if told.more:
-                    lines.append(_line(key, told))
-                    self._told[key] = _Told(now)
+        for key, entry in list(self._repeated.items()):
+            if now - entry.at >= SECONDS:
+                if entry.more:
+                    lines.append(_line(key, entry))
+                    self._repeated[key] = _Repeated(now)
                 else:
-                    del self._told[key]
+                    del self._repeated[key]
         return lines
 
     def all(self) -> list[logging.LogRecord]:
-        """A line for each record that was counted; for use when the server ends."""
-        lines = [_line(key, told) for key, told in self._told.items() if told.more]
-        self._told.clear()
+        """Return a line for each record that was counted; for use when the server ends."""
+        lines = [_line(key, entry) for key, entry in self._repeated.items() if entry.more]
+        self._repeated.clear()
         return lines
 
 
@@ -64,8 +64,8 @@ def _key(record: logging.LogRecord) -> _Key:
     return record.name, record.levelno, record.getMessage(), "" if error is None else f"{type(error).__name__}: {error}"
 
 
-def _line(key: _Key, told: _Told) -> logging.LogRecord:
+def _line(key: _Key, entry: _Repeated) -> logging.LogRecord:
     name, level, message, error = key
     first = " ".join(filter(None, (message.partition("\n")[0], error)))
-    times = "once more" if told.more == 1 else f"{told.more} times more"
+    times = "once more" if entry.more == 1 else f"{entry.more} times more"
     return logging.LogRecord(name, level, "", 0, "%s (%s)", (first, times), None)

@@ -61,7 +61,7 @@ class Settings(Bounds):
     @model_validator(mode="before")
     @classmethod
     def _completed(cls, given: dict[str, Any]) -> dict[str, Any]:
-        """What whoever makes a server says, then the environment, where an empty variable counts as none."""
+        """Return the given settings, completed from the environment; an empty variable counts as missing."""
         for name, replacement in GONE.items():
             if name in given or os.environ.get(PREFIX + name.upper()):
                 raise ValueError(f"the setting {name} is gone: use {replacement}")
@@ -95,8 +95,8 @@ class Settings(Bounds):
     @property
     def memory_of_build(self) -> int:
         """Bytes of memory that one build may use."""
-        each = max(self._memory // self.workers, _LEAST_BUILD_MEMORY)
-        return each if self.build_memory is None else self.build_memory
+        share = max(self._memory // self.workers, _LEAST_BUILD_MEMORY)
+        return share if self.build_memory is None else self.build_memory
 
     @property
     def threads_of_build(self) -> int:
@@ -110,7 +110,7 @@ class Settings(Bounds):
 
     @property
     def memory_of_streams(self) -> int:
-        """Bytes that all streams together may have under way, beside what each of them may have in any case."""
+        """Bytes that all streams together may have in send buffers, beside the fixed share of each."""
         return self._memory // 4 if self.stream_memory is None else self.stream_memory
 
     @property

@@ -35,12 +35,12 @@ def sort_out(request: Request, size: int, etag: str) -> None:
     if not usable or request.headers.get("if-range", etag) != etag:
         request.scope["headers"] = [(name, value) for name, value in request.scope["headers"] if name != b"range"]
         return
-    for found in ranges:
-        if found is not None and (int(found[1]) >= size if found[1] else int(found[3]) == 0):
+    for requested in ranges:
+        if requested is not None and (int(requested[1]) >= size if requested[1] else int(requested[3]) == 0):
             raise HTTPException(
-                416, f"expected bytes of a file of {size}, got {found[0]}", {"content-range": f"bytes */{size}"}
+                416, f"expected bytes of a file of {size}, got {requested[0]}", {"content-range": f"bytes */{size}"}
             )
 
 
-def _ordered(found: re.Match[str] | None) -> bool:
-    return found is not None and not (found[1] and found[2] and int(found[2]) < int(found[1]))
+def _ordered(requested: re.Match[str] | None) -> bool:
+    return requested is not None and not (requested[1] and requested[2] and int(requested[2]) < int(requested[1]))

@@ -14,7 +14,7 @@ _CODE = re.compile(r"(`{1,2})([^`]+)\1")
 
 
 def render(document: Mapping[str, Any], address: str) -> str:
-    """The body of the page.
+    """Return the body of the page.
 
     Parameters
     ----------
@@ -96,6 +96,6 @@ def _table(head: tuple[str, ...], rows: list[tuple[str, str, str]]) -> str:
 
 
 def _text(text: str) -> str:
-    """Paragraphs, in which what stands between backticks is code."""
+    """Return paragraphs as HTML, with text between backticks as code."""
     shown = _CODE.sub(r"<code>\2</code>", escape(text, quote=False))
     return "".join(f"<p>{paragraph}</p>\n" for paragraph in shown.split("\n\n"))

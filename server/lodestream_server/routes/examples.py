@@ -123,7 +123,7 @@ PROBLEM_SCHEMA: dict[str, Any] = {
 
 
 def answer(description: str, example: dict[str, Any], *, location: bool = False) -> dict[str, Any]:
-    """An OpenAPI response with an example."""
+    """Return an OpenAPI response with an example."""
     documented: dict[str, Any] = {
         "description": description,
         "content": {"application/json": {"schema": {"type": "object"}, "example": example}},

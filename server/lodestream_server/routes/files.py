@@ -55,7 +55,7 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
 )
 @needs("read")
 async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
-    """A container never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
+    """Return a container. It never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
     path = parts.storage.container(sha256)
     etag = f'"{sha256}"'
     # What needs a token must not come out of a shared cache for those who have none.

@@ -35,7 +35,7 @@ _HEADERS = {
 
 
 def html_page(title: str, body: str) -> Response:
-    """An HTML page.
+    """Return an HTML page.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ _SCHEME = "token"
 
 
 def describe(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document of an application; computed once."""
+    """Return the OpenAPI document of an application; computed once."""
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         components = schema.setdefault("components", {})

@@ -51,7 +51,7 @@ async def level(
         str, Query(alias="format", description=f"{', '.join(MEDIA_TYPES)}; or a suffix of theirs, such as tif")
     ] = "npy",
 ) -> Response:
-    """The grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes.
+    """Return the grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes.
 
     Ranges of it are answered, so that a program such as GDAL (``/vsicurl/``) can read what it shows of a ``cog``.
     """
@@ -76,7 +76,7 @@ async def level(
 
 
 class _Borrowed(SentFile):
-    """A file that is given back once it was sent, or the client has gone."""
+    """A level file that is released once it was sent, or when the client has disconnected."""
 
     def __init__(self, loan: Loan, headers: dict[str, str], media_type: str) -> None:
         super().__init__(loan.path, headers=headers, media_type=media_type, stat_result=loan.path.stat())

@@ -38,14 +38,14 @@ lodestream pull URL out.npy --until-rms 1e-3d
 @readable(router, "/", include_in_schema=False)
 @needs(None)
 async def home(request: Request) -> Response:
-    """The page that shows the surfaces; where it is not built, one that says how to build it."""
+    """Return the page that shows the surfaces, or one that says how to build it."""
     return _sent(request, page.INDEX) or html_page("Lodestream", _HOME)
 
 
 @readable(router, "/assets/{name}", include_in_schema=False)
 @needs(None)
 async def asset(request: Request, name: str) -> Response:
-    """Scripts, styles and kernels of the page."""
+    """Return a script, style or kernel of the page."""
     answer = _sent(request, f"assets/{name}")
     if answer is None:
         raise NotFoundError(f"there is no {name[:80]!a} among the files of the page")
@@ -55,7 +55,7 @@ async def asset(request: Request, name: str) -> Response:
 @readable(router, "/view.json", include_in_schema=False)
 @needs(None)
 async def configuration() -> Response:
-    """What the page is to show: no files of a static host, but what this server has.
+    """Return the configuration of the page: it shows the surfaces of this server.
 
     An answer 404 says the same to the page, but browsers report it to people as an error.
     """
@@ -65,14 +65,14 @@ async def configuration() -> Response:
 @readable(router, "/docs", include_in_schema=False)
 @needs(None)
 async def docs(request: Request) -> Response:
-    """The HTTP interface, for people."""
+    """Return the HTTP interface, for people."""
     return html_page("Lodestream: the HTTP interface", render(request.app.openapi(), f"{_root(request)}/openapi.json"))
 
 
 @readable(router, "/openapi.json", include_in_schema=False)
 @needs(None)
 async def interface(request: Request) -> Response:
-    """The HTTP interface, for programs."""
+    """Return the HTTP interface, for programs."""
     root = _root(request)
     return JSONResponse(request.app.openapi() | ({"servers": [{"url": root}]} if root else {}))
 
@@ -80,7 +80,7 @@ async def interface(request: Request) -> Response:
 @readable(router, "/healthz", summary="Alive", responses={200: examples.answer("It answers", {"status": "ok"})})
 @needs(None)
 async def healthz() -> Response:
-    """Answer at once."""
+    """Answer at once, while the event loop runs."""
     return JSONResponse({"status": "ok", "version": lodestream.__version__})
 
 
@@ -95,7 +95,7 @@ async def healthz() -> Response:
 )
 @needs(None)
 async def readyz(parts: Parts) -> Response:
-    """Whether the process that builds come from has loaded what they need. Before that uploads wait, all else works.
+    """Return whether builds can start. Before that uploads wait, and all else works.
 
     ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``; ``missing``
     says for each mechanism that this machine lacks what a build may do.
@@ -114,7 +114,7 @@ async def readyz(parts: Parts) -> Response:
 )
 @needs("write")
 async def formats(parts: Parts) -> Response:
-    """The file formats that this server reads; lode are containers. A client encodes files of other formats itself."""
+    """Return the file formats that this server reads; lode are containers. Clients encode other formats themselves."""
     return JSONResponse({"formats": list(parts.settings.formats)})
 
 
@@ -127,19 +127,19 @@ async def formats(parts: Parts) -> Response:
 )
 @needs("admin")
 async def metrics(parts: Parts) -> Response:
-    """All metrics of the server since it started."""
+    """Return all metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
 
 
 def _sent(request: Request, name: str) -> Response | None:
-    found = page.assets().get(name)
-    if found is None:
+    page_file = page.assets().get(name)
+    if page_file is None:
         return None
-    unchanged = matches(request.headers.get("if-none-match"), found.etag)
+    unchanged = matches(request.headers.get("if-none-match"), page_file.etag)
     if unchanged is not None:
-        unchanged.headers.update(found.headers)
+        unchanged.headers.update(page_file.headers)
         return unchanged
-    return SentFile(found.path, headers=found.headers, media_type=found.media_type)
+    return SentFile(page_file.path, headers=page_file.headers, media_type=page_file.media_type)
 
 
 def _root(request: Request) -> str:

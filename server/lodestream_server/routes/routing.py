@@ -68,7 +68,7 @@ def readable(router: APIRouter, path: str, **options: Any) -> Callable[[_Route],
 
 
 def matches(header: str | None, etag: str) -> Response | None:
-    """A 304 answer if the client's If-None-Match names this entity tag, else None."""
+    """Return a 304 answer if the client's If-None-Match names this entity tag, else None."""
     named = [item.strip().removeprefix("W/") for item in (header or "").split(",")]
     if etag in named or "*" in named:
         return Response(status_code=304, headers={"etag": etag})

@@ -1,4 +1,4 @@
-"""What routes that answer with files share: the state of a surface, and a file that is sent whole or refused."""
+"""Shared by routes that answer with files: the state of a surface, and a file that is sent whole or refused."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class SentFile(FileResponse):
     """
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it; an error after its last byte is logged and not raised."""
+        """Send the file; an error after its last byte is logged and not raised."""
         head: Message | None = None
         complete = False
 
@@ -52,7 +52,7 @@ class SentFile(FileResponse):
 
 
 def ready(parts: State, surface: str) -> Record:
-    """The record of a surface that has a container.
+    """Return the record of a surface that has a container.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def ready(parts: State, surface: str) -> Record:
 
 @contextmanager
 def still_there(parts: State, surface: str) -> Iterator[None]:
-    """Around what reads the container of a surface: if there is none, raise what is true of the surface now.
+    """Guard the reading of a surface's container: if it is missing, raise the error of the surface's current state.
 
     It may have been deleted meanwhile, although another surface has the same container, or been made again.
 

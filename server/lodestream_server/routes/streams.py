@@ -284,12 +284,12 @@ class _Session:
         return steps > (0 if self._sender.state is State.ENDED else _PLANNED_AT_ONCE)
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
-        """Do what takes long beside the event loop, which serves the others meanwhile."""
+        """Run slow work in a thread, while the event loop serves other clients."""
         async with self._planning.turn(self._caller.key):
             return await _whole(asyncio.to_thread(work, *args))
 
     async def _next(self) -> tuple[bytes | None, ByteRange | None]:
-        """The message to send, or else the slice to read."""
+        """Return the message to send, or else the slice to read."""
         async with self._mine:
             message = self._sender.next_message()
             if message is not None:
@@ -347,7 +347,7 @@ class _Session:
 
 
 async def _whole(work: Coroutine[Any, Any, _Result]) -> _Result:
-    """Do all of it before a cancellation goes on: a thread does not stop for that, and it has the sender."""
+    """Finish work before a cancellation takes effect: a thread does not stop for that, and it uses the sender."""
     task = asyncio.ensure_future(work)
     try:
         return await asyncio.shield(task)

@@ -92,7 +92,7 @@ async def page(
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
     after: Annotated[str | None, Query(pattern=_PLACE, description="from `next` of the previous page")] = None,
 ) -> Response:
-    """Surfaces without their layers and levels; `next` is the address of the next page, or null."""
+    """Return surfaces without their layers and levels; `next` is the address of the next page, or null."""
     start = _position(after)
     following = parts.storage.records_after(start, limit + 1)
     shown = following[:limit]
@@ -114,7 +114,7 @@ async def page(
 )
 @needs("read")
 async def look(request: Request, parts: Parts, surface: str) -> Response:
-    """The state of a surface and, once it is ready, what ``lodestream info --json`` prints.
+    """Return the state of a surface and, once it is ready, what ``lodestream info --json`` prints.
 
     The state is queued, building or ready; or, with a reason, failed (the file is not a surface), waiting (it could not
     be built and needs a retry) or missing (its files are not on the server's disk now).
@@ -167,7 +167,7 @@ async def delete(request: Request, parts: Parts, surface: str) -> Response:
 
 
 def _changeable(request: Request, parts: State, surface: str) -> tuple[Record, Caller]:
-    """The record of a surface, and the caller, who may change it.
+    """Return the record of a surface and the caller, who must be allowed to change it.
 
     Raises
     ------
@@ -202,23 +202,23 @@ async def _keep(
 
 
 def _perhaps_known(request: Request, parts: State) -> bool:
-    """Whether an upload of this size may be there already: where there is no room, no other body is read."""
-    said = request.headers.get("content-length", "")
-    size = int(said) if said.isascii() and said.isdecimal() and len(said) < 19 else None
+    """Return whether an upload of this size may be stored already: without room, no other body is read."""
+    length = request.headers.get("content-length", "")
+    size = int(length) if length.isascii() and length.isdecimal() and len(length) < 19 else None
     form = request.headers.get("content-type", "").startswith("multipart/")
     return parts.storage.may_have_upload(size, form=form)
 
 
 def _known(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Record | None:
-    """The surface that this upload, of which only the hash was kept, has made already."""
+    """Return the existing surface of this upload, of which only the hash was kept; else None."""
     for record in parts.storage.records_of(received.digest.hexdigest()):
         try:
             # The same bytes, so they say the same of their format.
             surface, _ = _identify(received, parts.storage.upload_files(record), chosen, owner, parts)
         except FileNotFoundError:  # deleted since, or not there now
             continue
-        found = parts.storage.find(surface)
-        return found if found is not None and found.state in ("queued", "ready") else None
+        surface_record = parts.storage.find(surface)
+        return surface_record if surface_record is not None and surface_record.state in ("queued", "ready") else None
     return None
 
 

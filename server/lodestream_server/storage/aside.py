@@ -16,7 +16,7 @@ __all__ = ["set_aside"]
 
 
 def set_aside(at: Folders, path: Path) -> Path:
-    """Move a file or folder into ``damaged/``; returns its new path.
+    """Move a file or folder into ``damaged/``, and return its new path.
 
     If ``damaged/`` is on another disk, the file is copied, and removed here once the copy is on disk and equal.
 
@@ -27,8 +27,8 @@ def set_aside(at: Folders, path: Path) -> Path:
     """
     folder = at.damaged / path.parent.relative_to(at.root)
     folder.mkdir(parents=True, exist_ok=True)
-    for made in (folder.parent, at.damaged, at.root):
-        sync_folder(made)
+    for changed in (folder.parent, at.damaged, at.root):
+        sync_folder(changed)
     target = folder / path.name
     if target.exists():
         target = folder / f"{path.name}.{secrets.token_hex(4)}"
@@ -79,11 +79,11 @@ def _sync(path: Path) -> None:
 
 
 def _digests(path: Path) -> dict[str, str]:
-    found = {}
+    digests = {}
     for item in _files(path):
         if item.is_symlink():
-            found[str(item.relative_to(path))] = f"-> {item.readlink()}"
+            digests[str(item.relative_to(path))] = f"-> {item.readlink()}"
             continue
         with item.open("rb") as file:
-            found[str(item.relative_to(path))] = hashlib.file_digest(file, "sha256").hexdigest()
-    return found
+            digests[str(item.relative_to(path))] = hashlib.file_digest(file, "sha256").hexdigest()
+    return digests

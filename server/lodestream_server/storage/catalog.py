@@ -66,7 +66,7 @@ class Catalog:
         return len(self._records)
 
     def find(self, surface: str) -> Record | None:
-        """The record of a surface, if there is one."""
+        """Return the record of a surface, if there is one."""
         return self._records.get(surface)
 
     def put(self, record: Record) -> None:
@@ -91,11 +91,11 @@ class Catalog:
             self._forget(record)
 
     def count_of(self, owner: str | None) -> int:
-        """Number of an owner's surfaces."""
+        """Return the number of an owner's surfaces."""
         return self._owned.get(owner, 0)
 
     def kept(self, owner: str | None) -> int:
-        """Bytes of an owner's uploads and containers; shared ones count once."""
+        """Return the bytes of an owner's uploads and containers; shared ones count once."""
         return self._bytes.get(owner, 0)
 
     def _charge(self, record: Record) -> None:
@@ -114,7 +114,7 @@ class Catalog:
                 del self._things[record.owner, name]
 
     def _forget(self, before: Record, after: Record | None = None) -> None:
-        """Take out what only the earlier record of a surface said."""
+        """Remove a surface's earlier record from the indexes that its new record is not in."""
         self._count(before, -1)
         if after is None or before.created != after.created:
             del self._order[bisect_left(self._order, (before.created, before.id))]
@@ -141,52 +141,52 @@ class Catalog:
         return [(index, key) for index, key in keys if key is not None]
 
     def all(self) -> list[Record]:
-        """Every record, oldest first."""
+        """Return every record, oldest first."""
         return self._known(self._order[:])
 
     def after(self, position: Position, most: int) -> list[Record]:
-        """At most `most` records that come after a position in the order."""
+        """Return at most `most` records that come after a position in the order."""
         start = bisect_right(self._order, position)
         return self._known(self._order[start : start + most])
 
     def of_digest(self, sha256: str) -> Iterator[Record]:
-        """The surfaces whose uploaded files have this hash."""
+        """Return the surfaces whose uploaded files have this hash."""
         return self._chosen(self._digests, sha256)
 
     def has_upload(self, folder: str) -> bool:
-        """Whether a surface uses the upload folder of this name."""
+        """Return whether a surface uses the upload folder of this name."""
         return folder in self._uploads
 
     def has_container(self, sha256: str) -> bool:
-        """Whether a surface has a container, or had it before the container was lost."""
+        """Return whether a surface has a container, or had it before the container was lost."""
         return sha256 in self._containers
 
     def of_container(self, sha256: str) -> list[str]:
-        """The ids of the surfaces that have a container, or had it before it was lost."""
+        """Return the ids of the surfaces that have a container, or had it before it was lost."""
         return list(self._containers.get(sha256, ()))
 
     def one_of_container(self, sha256: str) -> Record | None:
-        """One of the surfaces that have a container or had it before it was lost; all describe it in the same way."""
+        """Return one of the surfaces that have or had a container; all describe it in the same way."""
         return next(self._chosen(self._containers, sha256), None)
 
     def serves(self, sha256: str) -> bool:
-        """Whether a ready surface has this container."""
+        """Return whether a ready surface has this container."""
         return sha256 in self._served
 
     def has_size(self, size: int | None, *, form: bool) -> bool:
-        """Whether an upload of this size that did not fail may exist; a form is larger than its contents.
+        """Return whether an upload of this size that did not fail may exist; a form is larger than its contents.
 
         It does not check every upload: for a form the answer may be True although none fits.
         """
         return bool(self._sizes) if size is None or form else size in self._sizes
 
     def _chosen(self, index: _Index, key: str) -> Iterator[Record]:
-        found = (self._records.get(surface) for surface in tuple(index.get(key, ())))
-        return (record for record in found if record is not None)
+        records = (self._records.get(surface) for surface in tuple(index.get(key, ())))
+        return (record for record in records if record is not None)
 
     def _known(self, positions: list[Position]) -> list[Record]:
-        found = (self._records.get(surface) for _, surface in positions)
-        return [record for record in found if record is not None]
+        records = (self._records.get(surface) for _, surface in positions)
+        return [record for record in records if record is not None]
 
 
 def _add(counter: Counter[_T], key: _T, change: int) -> None:

@@ -202,8 +202,8 @@ class Containers:
                 )
             # Those that nobody has open make room. Who has nothing yet finds a place.
             everybody = self._coming.total() + self._bytes_of(set().union(*self._open.values()))
-            own = self._coming[caller] + self._bytes_of(self._open.get(caller, ()))
-            share(self._most, (everybody + size, own + size if own else 0))
+            of_caller = self._coming[caller] + self._bytes_of(self._open.get(caller, ()))
+            share(self._most, (everybody + size, of_caller + size if of_caller else 0))
             self._coming[caller] += size
         try:
             yield
@@ -238,12 +238,12 @@ class _Reader:
 
 
 def most_for_indexes() -> int:
-    """Bytes of memory that indexes may take: an eighth of the memory available."""
+    """Return the bytes of memory that indexes may take: an eighth of the memory available."""
     return memory_limit() // 8
 
 
 def index_memory(file: BinaryIO) -> tuple[int, int]:
-    """Bytes of memory that a container's index takes, from the lengths of its sections.
+    """Estimate the bytes of memory of a container's index from the lengths of its sections.
 
     Returns
     -------
@@ -271,7 +271,7 @@ def index_memory(file: BinaryIO) -> tuple[int, int]:
 
 
 def _parts(handle: int, length: int) -> int:
-    """How many blocks, patches, interfaces and channels the header tells, whose payload has so many bytes.
+    """Return the number of blocks, patches, interfaces and channels in a header whose payload has ``length`` bytes.
 
     0 if it cannot be read: it is refused then when the index is read.
     """
@@ -292,7 +292,7 @@ def _parts(handle: int, length: int) -> int:
 
 
 def _read_index(file: BinaryIO) -> Index:
-    """The index without masks and metadata, which no plan needs."""
+    """Read the index without masks and metadata, which no plan needs."""
     from lodestream.container import read_index
 
     handle = file.fileno()

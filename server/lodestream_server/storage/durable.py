@@ -60,7 +60,7 @@ class Disk:
 
 
 def _remove_deep(top: Path) -> None:
-    """Remove a folder however deep its folders are, and whatever may be done in them."""
+    """Remove a folder, however deep it is and whatever its permissions are."""
     while inner := [entry.path for entry in os.scandir(top) if entry.is_dir(follow_symlinks=False)]:
         for folder in inner:
             os.chmod(folder, 0o700)
@@ -99,7 +99,7 @@ class NewFile:
         self.size += len(data)
 
     def __enter__(self) -> Self:
-        """Give itself."""
+        """Return the file itself."""
         return self
 
     def __exit__(

@@ -97,67 +97,67 @@ class Folders:
         return *self.kept, self.incoming, self.work
 
     def record(self, surface: str) -> Path:
-        """The record of a surface."""
+        """Return the path of a surface's record."""
         return self.records / f"{surface}.json"
 
     def tombstone(self, surface: str) -> Path:
-        """The record of a surface that is being deleted."""
+        """Return the path of the record of a surface that is being deleted."""
         return self.records / f"{surface}{_DELETED}"
 
     def upload(self, record: Record) -> Path:
-        """The folder of a surface's upload."""
+        """Return the folder of a surface's upload."""
         return self.uploads / record.folder
 
     def files(self, record: Record) -> list[Path]:
-        """The uploaded files of a surface, in order."""
+        """Return the paths of the uploaded files of a surface, in order."""
         return [self.upload(record) / str(number) for number in range(len(record.filenames))]
 
     def copy(self, record: Record) -> Path:
-        """The copy of a surface's record beside its uploaded files."""
+        """Return the path of the copy of a surface's record beside its uploaded files."""
         return self.upload(record) / f"{record.id}.json"
 
     def copies_of(self, record: Record) -> list[Path]:
-        """The copies of a surface's record, including the name used by earlier versions."""
+        """Return the paths of the copies of a surface's record, including the name used by earlier versions."""
         earlier = [self.upload(record) / "record.json"] if record.folder == record.id else []
         return [self.copy(record), *earlier]
 
     def container(self, sha256: str | None) -> Path:
-        """A container."""
+        """Return the path of a container."""
         return self.containers / f"{sha256}.lode"
 
     def all_records(self) -> Iterator[Path]:
-        """All records, sorted by name."""
+        """Yield the paths of all records, sorted by name."""
         return (path for path in _listed(self.records) if path.suffix == ".json")
 
     def tombstones(self) -> Iterator[Path]:
-        """The records of all surfaces that are being deleted."""
+        """Yield the paths of the records of all surfaces that are being deleted."""
         return (path for path in _listed(self.records) if path.suffix == _DELETED)
 
     def all_uploads(self) -> Iterator[Path]:
-        """All upload folders; entries with other names are not Lodestream's."""
+        """Yield all upload folders; entries with other names are not Lodestream's."""
         return (path for path in _listed(self.uploads) if _UPLOAD.fullmatch(path.name))
 
     def all_containers(self) -> Iterator[Path]:
-        """All containers."""
+        """Yield the paths of all containers."""
         return (path for path in _listed(self.containers) if _CONTAINER.fullmatch(path.name))
 
     def copies(self, upload: Path) -> Iterator[Path]:
-        """The records beside the files of an upload."""
+        """Yield the paths of the records beside the files of an upload."""
         return (path for path in _listed(upload) if _COPY.fullmatch(path.name))
 
     def unfinished(self) -> Iterator[Path]:
-        """Records that were being written when the process ended."""
+        """Yield the paths of records that were being written when the process ended."""
         for folder in (self.records, *self.all_uploads()):
             yield from (path for path in _listed(folder) if path.suffix == ".new")
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file exists; raises the system's error if that cannot be decided, which `Path.is_file` may hide."""
+    """Return whether a file exists; raise the system's error if that is unknown, which `Path.is_file` may hide."""
     return stat.S_ISREG(_mode(path))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether a folder exists; raises the system's error if that cannot be decided."""
+    """Return whether a folder exists; raise the system's error if that is unknown."""
     return stat.S_ISDIR(_mode(path))
 
 

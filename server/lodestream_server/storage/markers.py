@@ -75,16 +75,16 @@ def establish(at: Folders) -> str:
             f"`lodestream fsck --adopt {at.root}`"
         )
     if marking is None:
-        found = identity(at.records)
-        if found is not None and all(identity(folder) for folder in at.kept):
-            return found
+        number = identity(at.records)
+        if number is not None and all(identity(folder) for folder in at.kept):
+            return number
         marking = _Marking(secrets.token_hex(16), {})
     _mark(at, marking)
     return marking.number
 
 
 def identity(folder: Path) -> str | None:
-    """The number in the marker of a folder; None if there is no marker.
+    """Return the number in the marker of a folder; None if there is no marker.
 
     Raises
     ------
@@ -101,17 +101,17 @@ def identity(folder: Path) -> str | None:
 
 
 def fault(at: Folders) -> str | None:
-    """The reason why a server would not start in a folder; None if it would."""
+    """Return the reason why a server would not start in a folder; None if it would."""
     marking = _marking(at)
     if marking is not None and marking.found:
         return _fault_of_adopted(at, marking)
-    found = {folder: identity(folder) for folder in at.kept}
-    known = {mark for mark in (*found.values(), marking and marking.number) if mark is not None}
+    marks = {folder: identity(folder) for folder in at.kept}
+    known = {mark for mark in (*marks.values(), marking and marking.number) if mark is not None}
     if len(known) > 1:
-        told = ", ".join(f"{folder.name}/ {mark or 'none'}" for folder, mark in found.items())
-        return f"expected the same marker in each folder of {at.root}, got {told}"
+        listing = ", ".join(f"{folder.name}/ {mark or 'none'}" for folder, mark in marks.items())
+        return f"expected the same marker in each folder of {at.root}, got {listing}"
     if known and marking is None:
-        without = [f"{folder.name}/" for folder, mark in found.items() if mark is None]
+        without = [f"{folder.name}/" for folder, mark in marks.items() if mark is None]
         if without:
             return f"expected the marker of this data folder in {' and '.join(without)} of {at.root}, got none"
         return None
@@ -165,7 +165,7 @@ def _fault_of_unmarked(at: Folders) -> str | None:
 
 
 def _needed(at: Folders) -> dict[Path, int]:
-    """How many records speak of an upload, and of a container."""
+    """Return how many records refer to an upload, and to a container, by folder."""
     needed = dict.fromkeys((at.uploads, at.containers), 0)
     for path in at.all_records():
         try:

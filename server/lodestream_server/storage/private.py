@@ -22,7 +22,7 @@ _OTHERS = 0o077
 
 
 def make_private(folder: Path) -> bool:
-    """Create a folder that only its owner can access; returns whether it is new.
+    """Create a folder that only its owner can access, and return whether it is new.
 
     Raises
     ------

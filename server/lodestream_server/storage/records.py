@@ -81,12 +81,12 @@ class Record:
         return self.upload or self.id
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values that `from_json` accepts."""
+        """Return plain values that `from_json` accepts."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, values: Any) -> Record:
-        """A record from plain values; keys added by later versions are ignored.
+        """Return a record from plain values; keys added by later versions are ignored.
 
         Raises
         ------
@@ -123,7 +123,7 @@ def read_record(path: Path) -> Record:
 
 
 def serialize(record: Record) -> bytes:
-    """A record as bytes for its file.
+    """Return a record as bytes for its file.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def serialize(record: Record) -> bytes:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON would return it: numbers that are not finite become null, bytes become hexadecimal digits."""
+    """Return a value as JSON would return it: numbers that are not finite as null, bytes as hexadecimal digits."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, bytes):

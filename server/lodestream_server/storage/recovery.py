@@ -1,4 +1,4 @@
-"""What a server start does with its folder; nothing that was acknowledged is removed.
+"""Recovery of the data folder at a server's start; nothing that was acknowledged is removed.
 
 ============================================  ==========================================================================
 what is found                                 what is done
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 def recover(at: Folders) -> list[Record]:
-    """Put a folder in order that no server uses; returns its records, each with its current state.
+    """Put the data folder in order while no server uses it; return its records, each with its current state.
 
     Raises
     ------
@@ -63,18 +63,18 @@ def recover(at: Folders) -> list[Record]:
             records[surface] = _stand_in(at, surface, problem)
     _count_attempts(at, records)
     _take_from_twins(at, records)
-    found = {surface: present(at, record) for surface, record in records.items()}
-    _set_strays_aside(at, found)
-    queued = {surface for surface, record in found.items() if record.state == "queued"}
+    current = {surface: present(at, record) for surface, record in records.items()}
+    _set_strays_aside(at, current)
+    queued = {surface for surface, record in current.items() if record.state == "queued"}
     work.clean(at, queued)
     for path in at.incoming.iterdir():
         remove(path)
     remove(at.levels)
-    return list(found.values())
+    return list(current.values())
 
 
 def present(at: Folders, record: Record) -> Record:
-    """A record with the state that the files on disk show: ready, queued, waiting or missing.
+    """Return a record with the state that its files on disk show: ready, queued, waiting or missing.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def present(at: Folders, record: Record) -> Record:
 
 
 def has_container(at: Folders, record: Record) -> bool:
-    """Whether the container of a surface exists and has the format version that this server reads."""
+    """Return whether the container of a surface exists and has the format version that this server reads."""
     if record.container is None:
         return False
     path = at.container(record.container)
@@ -110,12 +110,12 @@ def has_container(at: Folders, record: Record) -> bool:
 
 
 def has_upload(at: Folders, record: Record) -> bool:
-    """Whether all uploaded files of a surface exist."""
+    """Return whether all uploaded files of a surface exist."""
     return bool(record.filenames) and all(is_file(path) for path in at.files(record))
 
 
 def finish_delete(at: Folders, record: Record, *, last_upload: bool, last_container: bool) -> None:
-    """Remove the files of a deleted surface, whose record has been made a tombstone; the tombstone is removed last.
+    """Remove the files of a deleted surface, whose record is a tombstone; the tombstone is removed last.
 
     Parameters
     ----------
@@ -132,14 +132,14 @@ def finish_delete(at: Folders, record: Record, *, last_upload: bool, last_contai
         remove(at.container(record.container))
         sync_folder(at.containers)
     upload = at.upload(record)
-    own = at.copies_of(record)
-    if last_upload and all(path in own for path in at.copies(upload)):
+    record_copies = at.copies_of(record)
+    if last_upload and all(path in record_copies for path in at.copies(upload)):
         remove(upload)
         if upload.exists():
             raise OSError(f"expected to remove {upload}, which is still there")
         sync_folder(at.uploads)
     elif upload.exists():
-        for copy in own:
+        for copy in record_copies:
             remove(copy)
         sync_folder(upload)
     remove(at.tombstone(record.id))
@@ -147,7 +147,7 @@ def finish_delete(at: Folders, record: Record, *, last_upload: bool, last_contai
 
 
 def stray_containers(at: Folders, records: Collection[Record]) -> list[Path]:
-    """Containers that no record refers to; none if a surface exists whose record may lack its container."""
+    """Return containers without a record; none if a record may lack its container's name."""
     if any(record.container is None and record.state != "failed" for record in records):
         return []
     known = {record.container for record in records}
@@ -155,7 +155,7 @@ def stray_containers(at: Folders, records: Collection[Record]) -> list[Path]:
 
 
 def _load(at: Folders) -> tuple[dict[str, Record], dict[str, str]]:
-    """The records by surface, and what is wrong with those that cannot be used."""
+    """Return the records by surface, and the problems of records that cannot be used."""
     records, unusable = {}, {}
     for path in at.all_records():
         try:
@@ -214,9 +214,9 @@ def _adopt(at: Folders, records: dict[str, Record], unusable: dict[str, str]) ->
 
 def _take_from_twins(at: Folders, records: dict[str, Record]) -> None:
     # A record from beside an upload does not know its container; that of a surface that was made alike may.
-    made = {key: record for record in records.values() if (key := _recipe(record)) and has_container(at, record)}
+    twins = {key: record for record in records.values() if (key := _recipe(record)) and has_container(at, record)}
     for surface, record in records.items():
-        twin = made.get(_recipe(record) or ()) if record.container is None and record.state != "failed" else None
+        twin = twins.get(_recipe(record) or ()) if record.container is None and record.state != "failed" else None
         if twin is not None:
             records[surface] = replace(record, state="ready", container=twin.container, info=twin.info)
             with suppress(OSError):  # a full disk: it is found again at the next start

@@ -80,7 +80,7 @@ class Storage:
         return len(self._catalog)
 
     def get(self, surface: str) -> Record:
-        """The record of a surface.
+        """Return the record of a surface.
 
         Raises
         ------
@@ -93,27 +93,27 @@ class Storage:
         return record
 
     def find(self, surface: str | None) -> Record | None:
-        """The record of a surface, if there is one."""
+        """Return the record of a surface, if there is one."""
         return self._catalog.find(surface or "")
 
     def records(self) -> list[Record]:
-        """All records, oldest first."""
+        """Return all records, oldest first."""
         return self._catalog.all()
 
     def records_after(self, position: Position, most: int) -> list[Record]:
-        """At most `most` records that come after a position in the order of `records`."""
+        """Return at most `most` records that come after a position in the order of `records`."""
         return self._catalog.after(position, most)
 
     def records_of(self, upload_sha256: str) -> Iterator[Record]:
-        """The surfaces whose uploaded files have this hash."""
+        """Return the surfaces whose uploaded files have this hash."""
         return self._catalog.of_digest(upload_sha256)
 
     def count_of(self, owner: str | None) -> tuple[int, int]:
-        """Number of surfaces: all of them, and those of an owner."""
+        """Return the number of surfaces: all of them, and those of an owner."""
         return len(self._catalog), self._catalog.count_of(owner)
 
     def kept(self, owner: str | None) -> int:
-        """Bytes on disk of an owner's surfaces."""
+        """Return the bytes on disk of an owner's surfaces."""
         return self._catalog.kept(owner)
 
     def new_upload(self) -> Path:
@@ -121,20 +121,20 @@ class Storage:
         return make_folder(self._at.incoming / secrets.token_hex(8))
 
     def work_folder(self, surface: str) -> Path:
-        """Path of a folder for a build of a surface; the build creates it when it begins and removes it when it ends.
+        """Return the path of a folder for a build, which the build creates at its begin and removes at its end.
 
         A folder that still exists at the next start shows that the server ended during the build.
         """
         return work.new_attempt(self._at, surface)
 
     def bands_folder(self, surface: str) -> Path:
-        """Path of the folder in which builds by bands of a surface continue."""
+        """Return the path of the folder in which builds by bands of a surface continue."""
         return work.bands_of(self._at, surface)
 
     def begin_work(self, surface: str, attempt: Path, may_continue: bool) -> bool:
-        """Create the folders of a build; returns whether what an interrupted attempt had made is there.
+        """Create the folders of a build; return whether the files of an interrupted attempt are there.
 
-        Where the build may not continue, that is removed.
+        Where the build may not continue, they are removed.
         """
         with self._working:
             continued = work.begin(self._at, surface, attempt, may_continue)
@@ -143,12 +143,12 @@ class Storage:
         return continued
 
     def end_work(self, surface: str, attempt: Path, keep: bool = False) -> None:
-        """Remove what a build has left, but for what its next attempt continues from if that is to be kept."""
+        """Remove the files of a build; with ``keep``, not those from which its next attempt continues."""
         with self._working:
             work.end(self._at, surface, attempt, keep)
 
     def forget_work(self, surface: str) -> None:
-        """Remove what an interrupted attempt had made."""
+        """Remove the files of an interrupted attempt."""
         with self._working:
             work.forget(self._at, surface)
 
@@ -158,11 +158,11 @@ class Storage:
         return self._at.levels
 
     def upload_files(self, record: Record) -> list[Path]:
-        """The uploaded files of a surface, in order."""
+        """Return the uploaded files of a surface, in order."""
         return self._at.files(record)
 
     def container(self, sha256: str) -> Path:
-        """Path of a container.
+        """Return the path of a container.
 
         Raises
         ------
@@ -185,29 +185,29 @@ class Storage:
         return is_file(path) and (self._catalog.serves(sha256) or other_version(path) is None)
 
     def place_of(self, sha256: str) -> Path:
-        """Path of a container, whether it exists or not."""
+        """Return the path of a container, whether it exists or not."""
         return self._at.container(sha256)
 
     def surfaces_of(self, sha256: str) -> list[str]:
-        """The ids of the surfaces that have a container, or had it before it was lost."""
+        """Return the ids of the surfaces that have a container, or had it before it was lost."""
         return self._catalog.of_container(sha256)
 
     def container_bytes(self, sha256: str) -> int | None:
-        """Size of a container when it was stored; None if unknown."""
+        """Return the size of a container when it was stored; None if unknown."""
         record = self._catalog.one_of_container(sha256)
         size = None if record is None or record.info is None else record.info.get("bytes")
         return size if isinstance(size, int) else None
 
     def has_container(self, sha256: str | None) -> bool:
-        """Whether a surface has a container, or had it before it was lost."""
+        """Return whether a surface has a container, or had it before it was lost."""
         return sha256 is not None and self._catalog.has_container(sha256)
 
     def may_have_upload(self, size: int | None, *, form: bool) -> bool:
-        """Whether an upload of this size, or a form around one, may exist; None: of any size."""
+        """Return whether an upload of this size, or a form around one, may exist; None: of any size."""
         return self._catalog.has_size(size, form=form)
 
     def gone(self, sha256: str) -> LodestreamError:
-        """Why a container that was known a moment ago could not be read.
+        """Return the error for a container that was known a moment ago and could not be read.
 
         It was deleted (NotFoundError), its disk is missing (MissingError), or it was deleted and stored again meanwhile
         (BusyError).
@@ -228,7 +228,7 @@ class Storage:
                 return MissingError(f"the container {sha256} is not on the server's disk now")
 
     def add(self, record: Record, upload: Path) -> tuple[Record, bool]:
-        """Store an upload; returns the surface's record, and whether it must be built.
+        """Store an upload; return the surface's record, and whether it must be built.
 
         A surface that failed, waits or is missing is queued again. If another owner has a surface of the same bytes,
         options and name, its container is used at once.
@@ -264,9 +264,9 @@ class Storage:
                 record = replace(record, created=known.created, container=known.container, info=known.info)
                 if known.upload is None and known.filenames:  # its id does not tell its name from another
                     record = replace(record, name=known.name, filenames=known.filenames)
-            made = self._like_its_twin(record) or self._with_its_container(record) or record
-            self._place(made, upload, known)
-            return made, made.state == "queued"
+            stored = self._like_its_twin(record) or self._with_its_container(record) or record
+            self._place(stored, upload, known)
+            return stored, stored.state == "queued"
 
     def _upload_folder(self, record: Record) -> str | None:
         # Files that are here already, perhaps under a name of an earlier version, are not kept twice.
@@ -344,13 +344,13 @@ class Storage:
             outdated = before is not None and other_version(self._at.container(before)) is not None
             if before is not None and not outdated:
                 _log.warning("building %s again gave another container than before: %s", surface, sha256)
-            made = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
-            serialize(made)  # before anything has changed: a figure or a text may be such that it cannot be written
+            stored = replace(record, state="ready", reason=None, container=sha256, info=info, attempts=0)
+            serialize(stored)  # before anything has changed: a figure or a text may be such that it cannot be written
             container = self._at.container(sha256)
             there = is_file(container)
             try:
                 rename(built, container)
-                self._write(made)
+                self._write(stored)
             except OSError:
                 if not there:
                     discard(container)
@@ -380,17 +380,16 @@ class Storage:
             record = self._catalog.find(surface)
             if record is None:
                 return
-            made = _stopped(record, "waiting", reason)
+            stored = _stopped(record, "waiting", reason)
             try:
-                self._write(made)
+                self._write(stored)
             except OSError as error:
                 # What this says is found out again after a restart.
                 _log.error("%s: the record could not be written: %s", surface, error)
-                self._catalog.put(made)
+                self._catalog.put(stored)
 
     def retry(self, surface: str) -> Record:
-        """Queue a surface again that failed, waits or is missing; returns its record, queued if there is something to
-        build from.
+        """Queue a surface again that failed, waits or is missing; return its record, queued if a build is possible.
 
         Raises
         ------
@@ -406,14 +405,14 @@ class Storage:
             again = replace(record, attempts=0)
             if record.state != "missing":  # otherwise it keeps why it is, unless something of it is there now
                 again = replace(again, state="queued", reason=None)
-            made = present(self._at, again)
-            if made.state != "missing":
-                self._write(made)
+            stored = present(self._at, again)
+            if stored.state != "missing":
+                self._write(stored)
             elif record.state == "failed":  # an earlier version dropped its upload
                 return record
             else:
-                self._catalog.put(made)
-            return made
+                self._catalog.put(stored)
+            return stored
 
     def lose(self, surface: str) -> None:
         """Update the state of a surface whose upload was not found."""
@@ -423,7 +422,7 @@ class Storage:
                 self._catalog.put(present(self._at, record))
 
     def has_upload(self, record: Record) -> bool:
-        """Whether all uploaded files of a surface are on disk.
+        """Return whether all uploaded files of a surface are on disk.
 
         Raises
         ------
@@ -472,7 +471,7 @@ class Storage:
                 )
 
     def _check_mounted(self) -> None:
-        """Refuse to change anything while a folder is not there: what is written then would be under its mount."""
+        """Refuse changes while a folder is missing: files would be written below its mount point."""
         for folder in self._at.kept:
             if markers.identity(folder) != self._identity:
                 raise MissingError(
@@ -492,7 +491,7 @@ def _stopped(record: Record, state: State, reason: str) -> Record:
 
 
 def _may_be(known: Record, record: Record) -> bool:
-    """Whether an upload may be another one of a surface: ids are hashes, and not very long ones."""
+    """Return whether an upload may belong to a surface of the same id: ids are short hashes."""
     if not known.filenames:  # all that is known of it is its id
         return True
     same = known.upload_sha256 in (None, record.upload_sha256)

@@ -122,7 +122,7 @@ class _Nowhere:
 
 
 def digest_of(files: Iterable[Path]) -> str:
-    """What `Upload.digest` was when these files were uploaded, in hexadecimal digits."""
+    """Return the `Upload.digest` that these files had when they were uploaded, in hexadecimal digits."""
     digest = hashlib.sha256()
     for path in files:
         size = 0
@@ -135,7 +135,7 @@ def digest_of(files: Iterable[Path]) -> str:
 
 
 def check_upload(files: Sequence[Path], record: Record) -> str | None:
-    """What is wrong with the files of an upload; None if nothing is.
+    """Return the problem of the files of an upload; None if they are intact.
 
     Raises
     ------
@@ -143,9 +143,9 @@ def check_upload(files: Sequence[Path], record: Record) -> str | None:
         If they exist and cannot be read: the disk has a problem, which may pass.
     """
     try:
-        found = sum(path.stat().st_size for path in files)
-        if found != record.upload_bytes:
-            return f"expected {record.upload_bytes} bytes, got {found}"
+        size = sum(path.stat().st_size for path in files)
+        if size != record.upload_bytes:
+            return f"expected {record.upload_bytes} bytes, got {size}"
         digest = digest_of(files) if record.upload_sha256 else None
     except (FileNotFoundError, NotADirectoryError) as error:
         return f"expected {len(files)} files: {error.strerror}"
@@ -275,7 +275,7 @@ async def receive(request: Request, folder: Path | None, settings: Settings, nam
 
 
 def take_apart(upload: Upload, content_type: str | None, name: str | None = None) -> Body:
-    """The reader for a body of this type: raw, or the parts of a form.
+    """Return the parser for a body of this type: raw, or the parts of a form.
 
     Raises
     ------

@@ -10,7 +10,7 @@ __all__ = ["other_version"]
 
 
 def other_version(path: Path) -> str | None:
-    """A message that names both versions, if a container has another version than this server reads; else None.
+    """Return a message that names both versions, if a container has another version than this server reads; else None.
 
     Only the first bytes are read. The result is also None if they are damaged, or if the file is not a container, does
     not exist or cannot be read.

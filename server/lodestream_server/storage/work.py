@@ -31,17 +31,17 @@ _BANDS = "bands"
 
 
 def new_attempt(at: Folders, surface: str) -> Path:
-    """The path of the folder of another attempt, under a new name: whoever writes late to one finds none."""
+    """Return the path of a folder for another attempt, under a new name, so that late writers cannot find it."""
     return at.work / surface / secrets.token_hex(8)
 
 
 def bands_of(at: Folders, surface: str) -> Path:
-    """The folder in which attempts continue."""
+    """Return the folder in which attempts continue."""
     return at.work / surface / _BANDS
 
 
 def begin(at: Folders, surface: str, attempt: Path, may_continue: bool) -> bool:
-    """Make the folders of an attempt; returns whether there is anything to continue from.
+    """Make the folders of an attempt; return whether there is anything to continue from.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def begin(at: Folders, surface: str, attempt: Path, may_continue: bool) -> bool:
 
 
 def end(at: Folders, surface: str, attempt: Path, keep: bool) -> None:
-    """Remove what an attempt has left, and also what others would continue from unless it is to be kept."""
+    """Remove the files of an attempt; unless ``keep``, also those from which others would continue."""
     discard(attempt)
     if not keep or _is_empty(bands_of(at, surface)):
         forget(at, surface)
@@ -76,7 +76,7 @@ def forget(at: Folders, surface: str) -> None:
 
 
 def begun(at: Folders) -> set[str]:
-    """Surfaces during whose attempts the server ended."""
+    """Return the surfaces during whose attempts the server ended."""
     return {path.name for path in _folders(at) if _has_attempts(path)}
 
 

@@ -158,7 +158,7 @@ def test_one_and_the_same_failure_is_told_once_and_counted() -> None:
 def test_very_many_different_failures_take_no_memory() -> None:
     made = Repeats()
     assert all(made.admit(line("failed %s", number), 0) for number in range(5000))
-    assert len(made._told) <= 1000
+    assert len(made._repeated) <= 1000
 
 
 def test_the_log_counts_and_tells_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
