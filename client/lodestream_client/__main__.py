@@ -1,4 +1,4 @@
-"""Where the command ``lodestream`` begins; nothing else is loaded before Ctrl-C is seen to (`starting`)."""
+"""Entry point of the command ``lodestream``; nothing else is loaded before Ctrl-C is handled (`starting`)."""
 
 from __future__ import annotations
 

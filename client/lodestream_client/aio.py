@@ -118,21 +118,21 @@ async def retry(
 
 
 async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; also exported as ``list``; errors as in `lodestream_client.sync`.
+    """Return all surfaces of a server; also exported as ``list``; errors as in `lodestream_client.sync`.
 
     Examples
     --------
     >>> import asyncio, lodestream_client
     >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
-    >>> found = asyncio.run(lodestream_client.list("http://127.0.0.1:8000"))
-    >>> url in [description.url for description in found]
+    >>> surfaces = asyncio.run(lodestream_client.list("http://127.0.0.1:8000"))
+    >>> url in [description.url for description in surfaces]
     True
     """
     return await _run(api.list_surfaces(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
-    """State and description of one surface; errors as in `lodestream_client.sync`.
+    """Return the state and the description of one surface; errors as in `lodestream_client.sync`.
 
     Examples
     --------
@@ -145,7 +145,7 @@ async def describe(url: str, *, token: str | None = None) -> Description:
 
 
 async def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
-    """Description of a container file on any web server: what ``lodestream info --json`` prints.
+    """Return the description of a container file on any web server, as ``lodestream info --json`` prints it.
 
     `max_vertices` limits the memory of the container's tables, see `connect`. Errors as in `lodestream_client.sync`.
 
@@ -160,7 +160,7 @@ async def describe_file(url: str, *, token: str | None = None, max_vertices: int
 
 
 async def identify(url: str, *, token: str | None = None) -> Identity:
-    """What identifies a surface's container, or a container file; errors as in `lodestream_client.sync`.
+    """Return the identity of a surface's container, or of a container file; errors as in `lodestream_client.sync`.
 
     Examples
     --------
@@ -200,7 +200,7 @@ async def fetch_range(
 
 
 class _GivenUpError(Exception):
-    """Nobody waits for the encoder any more."""
+    """The upload was cancelled, so that the encoder must end."""
 
 
 async def _prepared(
@@ -208,14 +208,14 @@ async def _prepared(
 ) -> Parcel:
     given_up = threading.Event()
 
-    def told(stage: str, fraction: float) -> None:
+    def report(stage: str, fraction: float) -> None:
         if given_up.is_set():
             raise _GivenUpError  # a thread cannot be ended from outside, and a program waits for it at its end
         if progress is not None:
             progress(stage, fraction)
 
     try:
-        return await asyncio.to_thread(prepared, sources, asked, told, read_there, local)
+        return await asyncio.to_thread(prepared, sources, asked, report, read_there, local)
     except asyncio.CancelledError:
         given_up.set()
         raise

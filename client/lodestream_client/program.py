@@ -26,10 +26,10 @@ _MODULES = (demo, encode, decode, convert, info, push, retry, pull, view, surfac
 
 
 def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """The command line, with the sub-commands that other packages add through ``lodestream.commands``.
+    """Return the parser of the command line, with the sub-commands of other packages (``lodestream.commands``).
 
-    Those are looked for only where ``argv``, what is to be parsed, does not begin with one of the client's own: looking
-    takes a third of the time of a short command.
+    Other packages are searched only if ``argv`` does not begin with one of the client's own commands: the search takes
+    a third of the time of a short command.
     """
     parser: argparse.ArgumentParser = Parser(
         prog="lodestream",
@@ -47,9 +47,9 @@ def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     from importlib.metadata import entry_points
 
     # By name: a second, stale installation on the path may announce the same.
-    found = {entry.name: entry for entry in entry_points(group="lodestream.commands")}
-    for name in sorted(found):
-        _register(found[name], subparsers)
+    entries = {entry.name: entry for entry in entry_points(group="lodestream.commands")}
+    for name in sorted(entries):
+        _register(entries[name], subparsers)
     return parser
 
 

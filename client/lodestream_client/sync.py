@@ -243,7 +243,7 @@ def retry(url: str, *, wait: bool = True, progress: Progress | None = None, toke
 
 
 def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, ...]:
-    """All surfaces of a server; also exported as ``list``.
+    """Return all surfaces of a server; also exported as ``list``.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, .
 
 
 def describe(url: str, *, token: str | None = None) -> Description:
-    """State and description of one surface.
+    """Return the state and the description of one surface.
 
     Raises
     ------
@@ -283,7 +283,7 @@ def describe(url: str, *, token: str | None = None) -> Description:
 
 
 def describe_file(url: str, *, token: str | None = None, max_vertices: int | None = None) -> Mapping[str, Any]:
-    """Description of a container file on any web server: what ``lodestream info --json`` prints.
+    """Return the description of a container file on any web server, as ``lodestream info --json`` prints it.
 
     `max_vertices` limits the memory of the container's tables, see `connect`.
 
@@ -307,7 +307,7 @@ def describe_file(url: str, *, token: str | None = None, max_vertices: int | Non
 
 
 def identify(url: str, *, token: str | None = None) -> Identity:
-    """What identifies a surface's container, or a container file.
+    """Return the identity of a surface's container, or of a container file.
 
     Raises
     ------
@@ -388,7 +388,7 @@ def _run(flow: Flow[T], url: str, token: str | None, timeout: float = calls.TIME
 
 
 def run(client: httpx.Client, flow: Flow[T], url: str, token: str | None) -> T:
-    """Carry out the calls of a flow of `requests.api` on a client that is kept; returns the flow's result.
+    """Carry out the calls of a flow of `requests.api` on an existing client, and return the flow's result.
 
     Raises
     ------

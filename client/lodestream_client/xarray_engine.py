@@ -108,9 +108,9 @@ class LodeBackend(BackendEntrypoint):
             raise OptionError(f"expected block= of 0 to {blocks - 1}, or xarray.open_datatree, for {blocks} blocks")
         if block is not None and not 0 <= (block := check_integer("a block", block)) < blocks:
             raise OptionError(f"expected a block of 0 to {blocks - 1}, got {block}")
-        found = container.dataset(level, block or 0, region)
+        block_dataset = container.dataset(level, block or 0, region)
         drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
-        return found.drop_vars(drop, errors="ignore")
+        return block_dataset.drop_vars(drop, errors="ignore")
 
     def open_datatree(self, filename_or_obj: Any, **options: Any) -> xr.DataTree:
         """Open all blocks of a container, as ``block_0``, ``block_1``, ...; parameters as of `open_dataset`.
@@ -122,7 +122,7 @@ class LodeBackend(BackendEntrypoint):
         return xr.DataTree.from_dict(self.open_groups_as_dict(filename_or_obj, **options))
 
     def open_groups_as_dict(self, filename_or_obj: Any, **options: Any) -> dict[str, xr.Dataset]:
-        """The Datasets of all blocks by their path; see `open_datatree`."""
+        """Return the Datasets of all blocks by their path; see `open_datatree`."""
         drop = options.pop("drop_variables", None) or ()
         level, token = options.pop("level", None), options.pop("token", None)
         container = Container(_place(filename_or_obj), token, options.pop("max_vertices", None))
@@ -130,11 +130,11 @@ class LodeBackend(BackendEntrypoint):
             raise OptionError(f"expected level, token or max_vertices, got {next(iter(options))!r}")
         names = [drop] if isinstance(drop, str) else list(drop)
         count = len(container.header.blocks)
-        found = [container.dataset(level, number).drop_vars(names, errors="ignore") for number in range(count)]
-        return {f"/block_{number}": each for number, each in enumerate(found)}
+        datasets = [container.dataset(level, number).drop_vars(names, errors="ignore") for number in range(count)]
+        return {f"/block_{number}": block_dataset for number, block_dataset in enumerate(datasets)}
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Whether this is a name that ends in ``.lode``, or the URL of a surface."""
+        """Return whether a name ends in ``.lode`` or is the URL of a surface."""
         if not isinstance(filename_or_obj, str | os.PathLike):
             return False
         name = os.fspath(filename_or_obj)
@@ -153,7 +153,7 @@ def _place(name: Any) -> str:
 
 
 class Container:
-    """A container whose values are decoded when they are asked for; may be pickled, and is opened again then.
+    """A container that decodes values when they are asked for; a pickled one is opened again.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class Container:
         return _opened_again, (*self._given, self._mark())
 
     def _mark(self) -> str:
-        """What the header and the index are known by again."""
+        """Return a digest by which header and index are recognised."""
         return hashlib.sha256(b"".join(data for _, data in self._kept)).hexdigest()
 
     def _first(self, offset: int, length: int) -> bytes:
@@ -208,7 +208,7 @@ class Container:
         return bytes(run)
 
     def dataset(self, level: int | None, block: int, region: Region | None = None) -> xr.Dataset:
-        """The lazy Dataset of a block, at a level or (None) at full resolution, or of a window of the only one.
+        """Return the lazy Dataset of a block, at a level or (None) at full resolution, or of a window of the only one.
 
         Raises
         ------
@@ -226,14 +226,14 @@ class Container:
             packing = self._packing(part) if level == finest else {}
             return indexing.LazilyIndexedArray(array), {"preferred_chunks": chunks} | packing
 
-        found = dataset(grid, lazily)
-        found.set_close(self.close)
-        return found
+        lazy = dataset(grid, lazily)
+        lazy.set_close(self.close)
+        return lazy
 
     def _packing(self, part: Part) -> dict[str, Any]:
-        """The encoding that makes integers with holes integers again in a file, where the surface says which is none.
+        """Return the encoding that writes holes of integers as the surface's nodata value; empty if it has none.
 
-        Another value would have to be looked for among all; and those of a level or with errors may be any.
+        Another value would have to be searched among all values; and values of a level or with errors may be any.
         """
         header, nodata = self.header, self._index.metadata_values.get("nodata")
         integers = part.stored == header.dtype != part.dtype
@@ -256,8 +256,8 @@ class Container:
             # Several blocks are decoded whole anyway; of one the header knows the shape of a level.
             known = header.level_shape(level)
             if known is None:
-                one = self.whole(level, ()).blocks[block]
-                return Grid.of(one, metadata)
+                decoded = self.whole(level, ()).blocks[block]
+                return Grid.of(decoded, metadata)
             if region is None and header.point_channels == 1:
                 metadata = level_positions(metadata, header, level)
             shape = known
@@ -270,7 +270,7 @@ class Container:
         return Grid(shape, closed, channels, header.dtype, attributes, header.masked, metadata)
 
     def whole(self, level: int, attributes: tuple[str, ...], region: Region | None = None) -> Surface:
-        """The surface at a level, or the region of it that was opened, with these attributes; decoded once, and kept.
+        """Return the surface at a level, or its opened region, with these attributes; it is decoded once, and kept.
 
         ``region`` is as of `window`.
         """
@@ -282,7 +282,7 @@ class Container:
             return self._levels[key]
 
     def window(self, level: int, region: Region, attributes: tuple[str, ...]) -> Block:
-        """A window of the only block at a level, with these attributes; it has a valid point.
+        """Return a window of the only block at a level, with these attributes; it has a valid point.
 
         ``region`` has rows and columns of the full grid.
         """
@@ -291,12 +291,12 @@ class Container:
             if key in self._windows:
                 self._windows.move_to_end(key)
                 return self._windows[key].blocks[0]
-        found = self._decoded(Target(level=level, region=region, attributes=attributes)).surface()
+        surface = self._decoded(Target(level=level, region=region, attributes=attributes)).surface()
         with self._lock:
-            self._windows[key] = found
+            self._windows[key] = surface
             while len(self._windows) > _WINDOWS:
                 self._windows.popitem(last=False)
-        return found.blocks[0]
+        return surface.blocks[0]
 
     def _decoded(self, target: Target) -> View:
         decoder = Decoder(target, max_vertices=self._given[2])
@@ -312,7 +312,7 @@ class Container:
 
 
 def _opened_again(place: str, token: str | None, max_vertices: int | None, mark: str) -> Container:
-    """A container that was pickled.
+    """Open a container that was pickled.
 
     Raises
     ------
@@ -327,7 +327,7 @@ def _opened_again(place: str, token: str | None, max_vertices: int | None, mark:
 
 
 def _runs(places: Sequence[ByteRange]) -> list[list[ByteRange]]:
-    """Ranges in their order, those together that are read at once."""
+    """Return ranges in their order, grouped into those that are read together."""
     runs: list[list[ByteRange]] = []
     for place in places:
         if runs and 0 <= place.offset - runs[-1][-1].end <= _GAP:
@@ -366,7 +366,7 @@ class _Lazy(BackendArray):
         return indexing.explicit_indexing_adapter(key, self.shape, indexing.IndexingSupport.BASIC, self._taken)
 
     def _taken(self, key: tuple[int | slice, ...]) -> NDArray[Any]:
-        """Values at numbers and slices along each axis."""
+        """Return the values at numbers and slices along each axis."""
         header, names = self._container.header, () if self._part.attribute is None else (self._part.attribute,)
         if len(header.blocks) > 1:
             return np.array(values_of(self._container.whole(self._level, names).blocks[self._block], self._part)[key])
@@ -394,7 +394,7 @@ class _Lazy(BackendArray):
         return np.array(cut[row, column, *key[2:]])  # a copy, since others take theirs from the same window
 
     def _around(self, region: Region, shape: tuple[int, int]) -> Region:
-        """A window of the level that is a surface: it has two points or more, one of them valid.
+        """Return a window of the level that is a surface: two points or more, one of them valid.
 
         ``shape`` is that of the level, which has such points.
         """
@@ -414,7 +414,7 @@ class _Lazy(BackendArray):
 
 
 def _span(at: int | slice, length: int) -> tuple[tuple[int, int], int | slice]:
-    """The places from the first to the last that an index takes, and the index among these."""
+    """Return the span from the first to the last place of an index, and the index within it."""
     if not isinstance(at, slice):
         place = int(at) % length
         return (place, place + 1), 0

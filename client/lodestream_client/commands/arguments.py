@@ -1,4 +1,4 @@
-"""What several sub-commands share: their parsers, and options that belong to no surface and no target."""
+"""Code shared by sub-commands: their parsers, and options that belong to no surface and no target."""
 
 from __future__ import annotations
 
@@ -61,13 +61,13 @@ def add_token_option(parser: argparse.ArgumentParser) -> None:
 
 
 def token_of(args: argparse.Namespace) -> str | None:
-    """The token given, or the environment's."""
+    """Return the given token, or that of the environment."""
     token: str | None = args.token or os.environ.get("LODESTREAM_TOKEN")
     return token or None
 
 
 def standard_input_once(args: argparse.Namespace, names: Sequence[str]) -> tuple[str, ...]:
-    """The names of files to read; ends the program if standard input (``-``) is named twice."""
+    """Return the names of files to read; end the program if standard input (``-``) is named twice."""
     if names.count("-") > 1:
         args.parser.error("standard input (-) is named twice")
     return tuple(names)
@@ -90,7 +90,7 @@ def add_rate_option(parser: argparse.ArgumentParser) -> None:
 
 
 def add_size_option(parser: argparse.ArgumentParser, *, decodes: bool = True) -> None:
-    """Add ``--max-vertices``; if nothing is decoded, only the container's tables count."""
+    """Add ``--max-vertices``. Where nothing is decoded, it limits the container's tables."""
     what = (
         "refuse a surface that has more than N vertices or needs more than about 128 N bytes of memory, before that "
         "memory is allocated"

@@ -1,4 +1,4 @@
-"""Options of a build that may be larger than memory: how much of it to take, where files go, who works."""
+"""Options of a build that may be larger than memory: its memory, its folders, and its workers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class BuildingOptions:
-    """What the command line says of a build.
+    """Options of a build from the command line.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ def add_memory_option(group: argparse._ActionsContainer) -> None:
 
 
 def building_options(args: argparse.Namespace) -> BuildingOptions:
-    """The options that `add_building_options` adds."""
+    """Return the options that `add_building_options` has added."""
     return BuildingOptions(args.memory, args.scratch, args.dask)
 
 
 @contextmanager
 def reading_folder(options: BuildingOptions, out: str, key: str | None) -> Iterator[Path]:
-    """A folder for what is read, of this process alone, and a note if the build is cut and can continue.
+    """Make a folder for the arrays that are read; note if an interrupted build can continue.
 
     Parameters
     ----------

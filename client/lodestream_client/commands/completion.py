@@ -1,4 +1,4 @@
-"""``lodestream completion``: what a shell needs to complete commands and options."""
+"""``lodestream completion``: shell code that completes commands and options."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def complete(parser: argparse.ArgumentParser) -> None:
-    """Answer a shell that asks for completions, and end the program."""
+    """Answer a shell's request for completions, and end the program."""
     _library().autocomplete(parser, always_complete_options="long")
 
 

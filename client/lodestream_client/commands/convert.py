@@ -44,7 +44,7 @@ def register(subparsers: Subparsers) -> None:
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """What the command line asks of a conversion: `files` and `out` are names, ``-`` standard input and output."""
+    """Options of a conversion from the command line: `files` and `out` are names, ``-`` standard input and output."""
 
     files: tuple[str, ...]
     out: str
@@ -53,7 +53,7 @@ class ConvertOptions:
 
 
 def _options(args: argparse.Namespace) -> ConvertOptions:
-    """The options; ends the program if the command line is wrong."""
+    """Return the options; end the program if the command line is wrong."""
     standard_output_once(args, "surface")
     files = standard_input_once(args, args.files)
     if Path(args.out).suffix.lower() == ".lode":
@@ -75,7 +75,7 @@ def _is_container(name: str) -> bool:
 
 
 def _surface(options: ConvertOptions) -> Surface:
-    """The surface of the files, or of the container."""
+    """Return the surface of the files, or of the container."""
     first = options.files[0]
     if not _is_container(first):
         return read_surface(options.files, options.surface)
@@ -93,7 +93,7 @@ def _surface(options: ConvertOptions) -> Surface:
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
-    """Read, write, report."""
+    """Read the files, write OUT, and report."""
     from lodestream.coordinates.seams import shapes_in_files
 
     options = _options(args)
@@ -114,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_blocks(surface: Surface, out: str) -> None:
-    """Say by its name that OUT cannot hold several blocks."""
+    """Refuse several blocks, by its name, if OUT cannot hold them."""
     from lodestream.formats import check_blocks, for_writing, written
 
     try:

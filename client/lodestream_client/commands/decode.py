@@ -1,4 +1,4 @@
-"""``lodestream decode``: a container, or what is asked for of it, into a file."""
+"""``lodestream decode``: a container, or a part of it, into a file."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class DecodeOptions:
 
 
 def _options(args: argparse.Namespace) -> DecodeOptions:
-    """The options; ends the program if the command line is wrong."""
+    """Return the options; end the program if the command line is wrong."""
     target = target_of(args)
     standard_output_once(args, "surface")
     return DecodeOptions(args.container, args.out, target, args.max_vertices, args.partial, args.memory, args.json)
@@ -82,7 +82,7 @@ def _options(args: argparse.Namespace) -> DecodeOptions:
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
-    """Decode, write, report."""
+    """Decode a container, write OUT, and report."""
     options = _options(args)
     check_out(options.out)
     target, started = options.target, time.monotonic()
@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _advice(partial: bool, job: _Job, error: StreamError) -> str:
-    """How more can be had of a container that is cut or damaged, if it can."""
+    """Return advice how to get more from a container that is cut or damaged; empty if there is none."""
     if job.decoder.layers:
         return "--partial writes the last complete layer before that"
     if job.by_level and isinstance(error, TruncatedStreamError):
@@ -133,7 +133,7 @@ def _advice(partial: bool, job: _Job, error: StreamError) -> str:
 
 
 class _Job:
-    """One container on its way through a decoder."""
+    """The decoding of one container."""
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class _Job:
         self._progress = progress
 
     def decode(self) -> None:
-        """Decode as far as the target says; `ended` says why it ends there."""
+        """Decode as far as the target asks; `ended` then has the reason of the end."""
         from lodestream.container import read_index
         from lodestream.container.capacity import Capacity
 

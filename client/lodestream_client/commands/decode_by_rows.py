@@ -1,4 +1,4 @@
-"""``lodestream decode`` of surfaces that do not fit into memory: by bands of rows or by blocks, by way of a file."""
+"""``lodestream decode`` of surfaces that do not fit into memory: by bands of rows or by blocks, through files."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ _VALUES, _FILE = "values", "file"
 
 
 def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callable[[float], None]) -> bool:
-    """Decode by bands, if the whole surface or a level of it is wanted, takes more memory than there is, and can be.
+    """Decode a surface, or a level of it, by bands, if it takes more memory than there is.
 
-    It is decoded into files beside the one that is written, from which that is written then.
+    It is decoded into files beside OUT, from which OUT is written.
 
     Returns
     -------
@@ -131,12 +131,15 @@ class _Needs:
             self.reason = why_not_by_pieces(header, self._limit, decoder.level)
 
     def whole(self, memory: int) -> bool:
-        """Whether it is decoded in one piece: it cannot be by bands, or there is room for it and for its writer."""
+        """Return whether to decode in one piece.
+
+        Bands are not possible, or there is memory for the surface and its writer.
+        """
         writing = self._format.memory * self._together + self._values
         return self.reason is not None or (self.decoding <= memory and writing <= self._limit)
 
     def check(self, memory: int) -> None:
-        """Refuse what takes more than was given or, if nothing was, than there is.
+        """Refuse a decoding that takes more memory than was given or, by default, than there is.
 
         Raises
         ------
@@ -204,10 +207,10 @@ def _decode(
 
 
 def _write(outcome: Outcome, out: Path, folder: Path) -> None:
-    """Write the file in a folder of its own, where writers may leave others too, and put it in its place.
+    """Write OUT in a folder of its own, since writers may leave other files there, and move it to its place.
 
-    What is there and no file, such as a pipe, is written to as it is. Where a folder is to be written, its writer says
-    what is in its way. A file and a folder together, as of .vtm, are put in place by their writer, which names both.
+    A pipe or a device is written to directly. The writer of a folder reports itself what is in its way. A file with a
+    folder, as of .vtm, is put in place by its writer, which names both.
     """
     from lodestream.formats import for_writing
 
@@ -217,12 +220,12 @@ def _write(outcome: Outcome, out: Path, folder: Path) -> None:
         outcome.write(str(out))
         return
     folder.mkdir()
-    made = folder / out.name
+    written = folder / out.name
     try:
-        outcome.write(str(made))
-        made.replace(out.resolve())  # a link stays a link
+        outcome.write(str(written))
+        written.replace(out.resolve())  # a link stays a link
     except LodestreamError as error:
-        error.args = tuple(str(part).replace(str(made), str(out)) for part in error.args)
+        error.args = tuple(str(part).replace(str(written), str(out)) for part in error.args)
         raise
     except OSError as error:
         error.filename, error.filename2 = str(out), None

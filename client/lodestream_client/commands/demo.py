@@ -1,4 +1,4 @@
-"""``lodestream demo``: all of Lodestream once, on this machine."""
+"""``lodestream demo``: a demonstration of all of Lodestream on this machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def register(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show it all."""
+    """Run the demo."""
     from ..demo import show
 
     return show(args.out, as_json=args.json)

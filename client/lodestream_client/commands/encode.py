@@ -85,7 +85,7 @@ class EncodeOptions:
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
-    """The options; ends the program if the command line is wrong."""
+    """Return the options; end the program if the command line is wrong."""
     if args.each is not None:
         files = (*args.files, *([] if args.out is None else [args.out]))
         if len(files) > 1 or files[0] == "-":
@@ -101,7 +101,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
-    """Read, encode, write."""
+    """Read the files, encode them, and write the container."""
     from lodestream.library import require
 
     options = _options(args)
@@ -117,28 +117,28 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_each(options: EncodeOptions, along: str, folder: Path) -> int:
-    """Write a container for each step or variable; 1 if any could not be made."""
+    """Write a container for each step or variable; return 1 if any failed."""
     file = options.files[0]
     require_parent(folder)
     surfaces = parts(file, along, options.surface)
     folder.mkdir(exist_ok=True)
-    made: list[dict[str, Any]] = []
+    reports: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
     for part, name in named_files(surfaces):
         try:
-            made.append(encode_files(replace(options, out=str(folder / name), surface=part.options), part))
+            reports.append(encode_files(replace(options, out=str(folder / name), surface=part.options), part))
         except (LodestreamError, OSError) as error:
             failed.append({"file": file, along: part.label, "reason": reason_of(error)})
             note(f"{part.label}: {failed[-1]['reason']}")
     if options.json:
-        print_json({"surfaces": made, "failed": failed})
+        print_json({"surfaces": reports, "failed": failed})
     elif failed:
         note(f"{len(failed)} of {len(surfaces)} surfaces failed")
     return 1 if failed else 0
 
 
 def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, Any]:
-    """Make the container, say so on standard error, and return what ``--json`` prints.
+    """Write the container, report on standard error, and return the object that ``--json`` prints.
 
     Parameters
     ----------
@@ -160,10 +160,10 @@ def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, 
             part.mark(surface)
         if options.surface.quality.rms is None:  # a stream for one error is refused instead
             _note_memory(surface, options.building.memory)
-        made = _made(surface, options, executor)
-        size = len(made) if made is not None else Path(options.out).stat().st_size
-        if made is not None:
-            sys.stdout.buffer.write(made)
+        container = _made(surface, options, executor)
+        size = len(container) if container is not None else Path(options.out).stat().st_size
+        if container is not None:
+            sys.stdout.buffer.write(container)
         return _report(surface, size, time.monotonic() - started, options)
 
 
@@ -212,7 +212,7 @@ def read_surface(
 
 
 def _reading_key(options: EncodeOptions) -> str | None:
-    """What decides about what is read; None: it is not to be kept, or what comes over standard input."""
+    """Return the key under which read arrays are kept; None if they are not kept, or come from standard input."""
     if options.building.scratch is None or "-" in options.files:
         return None
     from lodestream.encoding.reading import reading_key
@@ -224,7 +224,7 @@ def _reading_key(options: EncodeOptions) -> str | None:
 
 
 def _made(surface: Surface, options: EncodeOptions, executor: Executor | None) -> bytes | None:
-    """Encode into the file, or into bytes for standard output."""
+    """Encode into OUT, or return the bytes for standard output."""
     import lodestream as ls
 
     with progress_bar(LONG) as progress:
@@ -245,7 +245,7 @@ def _made(surface: Surface, options: EncodeOptions, executor: Executor | None) -
 
 
 def _note_memory(surface: Surface, memory: int | None) -> None:
-    """Say that more memory is taken than was asked for, where less is not enough."""
+    """Note that the encoding takes more memory than was asked for, if it cannot take less."""
     from lodestream.encoding.memory import least_memory, whole_memory
 
     least = min(least_memory(surface), whole_memory(surface))

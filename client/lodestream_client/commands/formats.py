@@ -1,4 +1,4 @@
-"""``lodestream formats``: which files are read and written."""
+"""``lodestream formats``: the file formats that are read and written."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def register(subparsers: Subparsers) -> None:
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """What the command line asks for: `what` is a file, ``-`` or a URL."""
+    """Options from the command line: `what` is a file, ``-`` or a URL."""
 
     what: str
     max_vertices: int | None
@@ -57,7 +57,7 @@ class InfoOptions:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look, print."""
+    """Read a description, and print it."""
     options = InfoOptions(args.what, args.max_vertices, token_of(args), args.json)
     details = _of_url(options) if addresses.is_url(options.what) else _of_file(options)
     if options.json:
@@ -185,7 +185,7 @@ def _short(value: object) -> str:
 def _states(
     kind: str, states: list[Mapping[str, Any]], channels: Sequence[str], fancy: bool, exact: int | None, last: str
 ) -> Any:
-    """A table of levels or layers; `exact` are the bytes of all, which end with every value, in a row named `last`."""
+    """Return a table of levels or layers; `exact`, the bytes of all, is shown in a last row named `last`."""
     from rich import box
     from rich.table import Table
 
@@ -199,8 +199,8 @@ def _states(
     for number, state in enumerate(states):
         place = [_size(state["shape"])] if grids else [str(state["level"])] if kind == "layers" else []
         figures = (f"{state['bytes']:,}", _figure(state.get("rms")), _figure(state.get("max")))
-        own = [_figure(rms) for rms, _ in state.get("channels", [])][: len(shown)]
-        table.add_row(*map(cell, (number, *place, *figures, *own)))
+        channel_figures = [_figure(rms) for rms, _ in state.get("channels", [])][: len(shown)]
+        table.add_row(*map(cell, (number, *place, *figures, *channel_figures)))
     if exact is not None:
         table.add_row(*map(cell, (last, states[-1]["level"], f"{exact:,}", "0", "0", *("0" for _ in shown))))
     return table

@@ -1,4 +1,4 @@
-"""Files named on the command line, standard input among them."""
+"""Files named on the command line, including standard input."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Inputs:
 
 @contextmanager
 def input_files(names: Sequence[str]) -> Iterator[Inputs]:
-    """The files with these names; standard input (``-``), at most once, is copied to a temporary file.
+    """Yield the files with these names; standard input (``-``), at most once, is copied to a temporary file.
 
     Readers and uploads need to know the length first, and the end of a container before its middle.
     """
@@ -44,20 +44,20 @@ def input_files(names: Sequence[str]) -> Iterator[Inputs]:
 
 
 def named(error: LodestreamError, name: str, advice: str = "") -> LodestreamError:
-    """The same error, with the file's name before its message and advice after it."""
+    """Return an error with the file's name before its message and advice after it."""
     words = f"{_STANDARD_INPUT if name == '-' else name}: {error}" + (f"; {advice}" if advice else "")
     error.args = (words, *error.args[1:])
     return error
 
 
 def reason_of(error: LodestreamError | OSError) -> str:
-    """Why a file failed, in words for a line about it."""
+    """Return the reason of an error in words, for a line about its file."""
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 @contextmanager
 def option_hints(names: Sequence[str]) -> Iterator[None]:
-    """Have errors and notes name options of formats as the command line has them: ``-o encoding=grey``.
+    """Rewrite options of formats in errors and notes as the command line has them: ``-o encoding=grey``.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def option_hints(names: Sequence[str]) -> Iterator[None]:
 
 
 def option_words(text: str, names: Sequence[str] = ()) -> str:
-    """A message of a reader with ``-o`` before options of formats, but ``--remesh``; see `option_hints`."""
+    """Return a reader's message with ``-o`` before options of formats, except ``--remesh``; see `option_hints`."""
     from lodestream.formats import formats
 
     keys = {key for format_ in formats() for key in format_.options}
@@ -92,7 +92,7 @@ def option_words(text: str, names: Sequence[str] = ()) -> str:
 
 
 def no_container(file: BinaryIO) -> str:
-    """Advice where a file is no container but one of another format; empty otherwise."""
+    """Return advice for a file of another format than a container; empty otherwise."""
     from lodestream.container.sections import SIGNATURE, is_container
 
     file.seek(0)

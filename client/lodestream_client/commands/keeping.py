@@ -76,7 +76,7 @@ class Kept:
 
     @property
     def words(self) -> str:
-        """A message for the user: how much is kept, or why nothing is."""
+        """A message for the user: the bytes that are kept, or the reason why none are."""
         if self._total:
             return f"{human_size(self._total)} are kept; pull --resume continues from there"
         return f"nothing is kept: {self._why_not}" if self._why_not else ""
@@ -107,7 +107,7 @@ class Kept:
             note(f"{human_size(self._total)} are here from an earlier pull")
 
     def follow(self, stream: Stream) -> None:
-        """Set the stream whose data `write` receives."""
+        """Set the stream from which `write` receives data."""
         self._stream = stream
 
     def write(self, offset: int, data: bytes) -> None:
@@ -124,13 +124,13 @@ class Kept:
             note(f"no more data are kept for pull --resume: {_reason(error)}")
 
     def read(self, offset: int, length: int) -> bytes | None:
-        """Cached bytes of the container; None if they are not cached."""
+        """Return cached bytes of the container; None if they are not cached."""
         if self._cached is None or not self._cached.ranges.covers(offset, length):
             return None
         return self._cached.read(offset, length)
 
     def failed(self, error: BaseException) -> None:
-        """Declare why the command failed; data that cannot be of use after this error are not kept."""
+        """Record the error of the command; data that are of no use after it are not kept."""
         if self._cached is None:
             return
         changed = isinstance(error, RemoteError) and error.code == "other-container"
@@ -139,7 +139,7 @@ class Kept:
         self._cached.discarded |= changed or refused or isinstance(error, CorruptStreamError)
 
     def done(self, whole: bool) -> None:
-        """Declare that OUT has been written, and whether it has the whole surface.
+        """Record that OUT has been written, and whether it has the whole surface.
 
         The cached data then stay if more of the surface may be requested: with ``--resume`` and not all of it received,
         or if an earlier command left data here.

@@ -79,17 +79,17 @@ def note_unmet(target: Target, ended: str, view: View, header: Header) -> None:
     from lodestream.planning.limits import ErrorLimits
 
     what = "window is only known to have at most" if view.bound else "surface has"
-    for which, name, found in ErrorLimits.of(target, header).unmet(view.rms, view.max_error, view.channels):
+    for which, name, error_found in ErrorLimits.of(target, header).unmet(view.rms, view.max_error, view.channels):
         error = {"rms": "RMS", "max": "maximum"}[which] + " error" + ("" if name is None else f" of {name}")
-        note(f"the requested {error} cannot be reached: the complete {what} {found:.6g}")
+        note(f"the requested {error} cannot be reached: the complete {what} {error_found:.6g}")
 
 
 def channel_errors(view: View, header: Header, target: Target) -> dict[str, tuple[float, float]]:
-    """RMS and maximum error of each channel that the target includes and the view tells, by name."""
+    """Return RMS and maximum error by name of each channel that is in the target and has errors in the view."""
     from lodestream.planning.selection import selection_of
 
-    told = zip(header.channel_names, view.channels, selection_of(target).channels(header), strict=False)
-    return {name: errors for name, errors, wanted in told if wanted}
+    channels = zip(header.channel_names, view.channels, selection_of(target).channels(header), strict=False)
+    return {name: errors for name, errors, wanted in channels if wanted}
 
 
 @dataclass(frozen=True)

@@ -144,17 +144,17 @@ class PullOptions:
 
     @property
     def name(self) -> str:
-        """What is written, in words."""
+        """Name of the output, for messages."""
         return "standard output" if self.out == "-" else self.out
 
     @property
     def whole(self) -> bool:
-        """Whether the target is all of the surface, where no limit is met before."""
+        """Whether the target is all of the surface, without a limit."""
         return self.target.region is None and self.target.attributes is None and self.target.level is None
 
 
 def _options(args: argparse.Namespace) -> PullOptions:
-    """The options; ends the program if the command line is wrong."""
+    """Return the options; end the program if the command line is wrong."""
     target = target_of(args)
     if args.transport == "ws" and not addresses.is_surface(args.url):
         args.parser.error("argument --transport: the URL of a file has no WebSocket")
@@ -182,7 +182,7 @@ def _options(args: argparse.Namespace) -> PullOptions:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Stream, write, report; of what came before an interruption too."""
+    """Stream, write and report, also after an interruption."""
     options = _options(args)
     check_out(options.out)
     if options.watch:
@@ -194,7 +194,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:
-    """The process that draws, if a picture is wanted: it starts while the stream does."""
+    """Start the process that draws, if a picture is wanted, while the stream starts."""
     if options.picture is None:
         return nullcontext()
     from ..viewer.drawing import Drawing
@@ -219,7 +219,7 @@ def _pull(options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
 def _written(
     options: PullOptions, kept: Kept, drawing: Drawing | None
 ) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
-    """What has been written, and what ended the stream before it had all that was asked for."""
+    """Write OUT; return the outcome, and the error or interrupt that ended the stream early."""
     import lodestream.decoding.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
 
     from .. import sync
@@ -247,7 +247,7 @@ def _written(
 def _receive(
     options: PullOptions, kept: Kept, drawing: Drawing | None, arrived: RangeSet
 ) -> tuple[Stream, Metadata, KeyboardInterrupt | LodestreamError | None]:
-    """The stream at its end, its metadata, and what ended it before it had all that was asked for.
+    """Receive; return the stream at its end, its metadata, and the error or interrupt that ended it early.
 
     Raises
     ------

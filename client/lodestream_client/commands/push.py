@@ -73,7 +73,9 @@ def register(subparsers: Subparsers) -> None:
 
 @dataclass(frozen=True)
 class PushOptions:
-    """What the command line asks of an upload: names of `files`, ``-`` for standard input, to the server at `url`.
+    """Options of an upload from the command line.
+
+    Names of `files`, ``-`` for standard input, to the server at `url`.
 
     `each` is what there is a surface for: `FILE`, a dimension, or ``variable``; None: the files are one surface.
     """
@@ -89,7 +91,7 @@ class PushOptions:
 
 
 def _options(args: argparse.Namespace) -> PushOptions:
-    """The options; ends the program if the command line is wrong."""
+    """Return the options; end the program if the command line is wrong."""
     files, url = [*args.first_file, *args.files], args.url
     if url is None:  # the word after --each was the first file, or the URL
         try:
@@ -113,7 +115,7 @@ def _options(args: argparse.Namespace) -> PushOptions:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Upload, wait, print the address."""
+    """Upload, wait, and print the URL."""
     options = _options(args)
     if options.each is not None:
         return _run_each(options)
@@ -127,8 +129,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_each(options: PushOptions) -> int:
-    """Upload one surface after another; 1 if any was refused. A server that is not reached ends it."""
-    made: list[dict[str, object]] = []
+    """Upload surfaces one after another; return 1 if any was refused. An unreachable server ends it."""
+    uploaded: list[dict[str, object]] = []
     failed: list[dict[str, str]] = []
     uploads = _files(options) if options.each == FILE else _parts(options, str(options.each))
     for label, words, upload in uploads:
@@ -142,18 +144,18 @@ def _run_each(options: PushOptions) -> int:
             note(reason if label in reason else f"{label}: {reason}")
             continue
         note_details(surface.details, f"{label}: ", option_words)
-        made.append({**surface.details, "url": surface.url, **words})
+        uploaded.append({**surface.details, "url": surface.url, **words})
         if not options.json:
             say(f"{surface.url} {label}")
     if options.json:
-        print_json({"surfaces": made, "failed": failed})
+        print_json({"surfaces": uploaded, "failed": failed})
     elif failed:
         note(f"{len(failed)} of {len(uploads)} {'files' if options.each == FILE else 'surfaces'} failed")
     return 1 if failed else 0
 
 
 def _files(options: PushOptions) -> list[_Upload]:
-    """The upload of each file."""
+    """Return an upload for each file."""
     return [
         (
             _STANDARD_INPUT if name == "-" else name,
@@ -165,7 +167,7 @@ def _files(options: PushOptions) -> list[_Upload]:
 
 
 def _parts(options: PushOptions, along: str) -> list[_Upload]:
-    """The upload of each step or variable of the only file."""
+    """Return an upload for each step or variable of the only file."""
     file = options.files[0]
     return [
         (part.name, {"file": file}, partial(_encoded, options, part)) for part in parts(file, along, options.surface)
@@ -186,7 +188,7 @@ def _encoded(options: PushOptions, part: Part) -> Description:
 
 
 def _filename(options: PushOptions, path: Path) -> str | None:
-    """The name that tells the server the format of the first file; None where its own name and content do.
+    """Return the file name that tells the server the format of the first file; None if its own name or content does.
 
     Raises
     ------

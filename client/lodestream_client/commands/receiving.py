@@ -1,4 +1,4 @@
-"""What `pull` shows while it receives, and fetches where its stream has not brought it."""
+"""Progress and metadata of `pull` while it receives."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _HURRY = 3.0
 
 
 class Progress:
-    """A bar that is moved with every message, and knows how long is left."""
+    """A progress bar that is updated with every message, and estimates the time left."""
 
     def __init__(self, target: Target) -> None:
         self.figures = ""
@@ -41,12 +41,12 @@ class Progress:
         self._bar.__exit__(*raised)
 
     def received(self, received: int, planned: int | None) -> None:
-        """So much of so much has come."""
+        """Set the bytes received and the bytes planned."""
         self._shown.update(self._task, total=planned, completed=received, figures=self.figures)
 
 
 class Metadata:
-    """The metadata of the surface of a stream, which stand at the end of a container: called, it returns them.
+    """The metadata of a stream's surface, which stand at the end of a container: call it to get them.
 
     They are fetched, at most once, if the stream has not brought them: after a stop of our own, which takes effect at
     once, and for what is written before the end.
@@ -79,7 +79,7 @@ class Metadata:
         self._values: Mapping[str, Any] | None = None
 
     def __call__(self) -> Mapping[str, Any]:
-        """The metadata; without a word none at all, while it is not known where they are and the stream goes on.
+        """Return the metadata; an empty mapping while the stream goes on and their place is unknown.
 
         Raises
         ------

@@ -29,7 +29,7 @@ def register(subparsers: Subparsers) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Ask, wait, print the address."""
+    """Ask the server, wait, and print the URL."""
     from .. import sync
 
     with progress_bar() as bar:

@@ -1,4 +1,4 @@
-"""Surfaces of a file that holds several, for ``encode --each`` and ``push --each``: each is read and made by itself."""
+"""Surfaces of a file that holds several, for ``encode --each`` and ``push --each``: each is read by itself."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class EachWord(argparse.Action):
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
     ) -> None:
-        """Keep the word, or the file that it was."""
+        """Store the word, or the file name that it was."""
         word = FILE if values is None else str(values)
         if not option_has_value(word):
             namespace.first_file = [word]
@@ -54,18 +54,18 @@ class EachFolder(argparse.Action):
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
     ) -> None:
-        """Keep the pair."""
+        """Store the word and the folder."""
         setattr(namespace, self.dest, values)
         _optional(parser, "out")
 
 
 def option_has_value(word: str) -> bool:
-    """Whether a word after ``--each`` says what, and is no file."""
+    """Return whether the word after ``--each`` is its value, not a file name."""
     return _WORD.fullmatch(word) is not None and not Path(word).exists()
 
 
 def _optional(parser: argparse.ArgumentParser, dest: str) -> None:
-    """Let an argument be absent."""
+    """Make an argument optional."""
     for action in parser._actions:  # argparse has no public way to change one
         if action.dest == dest:
             action.required = False
@@ -81,16 +81,16 @@ class Part:
 
     @property
     def name(self) -> str:
-        """What its surface is called."""
+        """Name of its surface."""
         return f"{self.series['name']} {self.label}"
 
     @property
     def label(self) -> str:
-        """What it is called among the others."""
+        """Its name among the parts of the file."""
         return self.member.label
 
     def mark(self, surface: Surface) -> None:
-        """Give a surface its name and its place in the series."""
+        """Set name and place in the series in a surface's metadata."""
         from lodestream.container.series import SERIES
 
         surface.metadata["name"] = self.name
@@ -98,7 +98,7 @@ class Part:
 
 
 def parts(file: str, along: str, options: SurfaceOptions) -> list[Part]:
-    """The surfaces of a file along a dimension, or its variables.
+    """Return the surfaces of a file along a dimension, or its variables.
 
     Raises
     ------
@@ -123,17 +123,17 @@ def parts(file: str, along: str, options: SurfaceOptions) -> list[Part]:
     ]
 
 
-def named_files(made: Sequence[Part]) -> Iterator[tuple[Part, str]]:
-    """Parts with names of their containers: their labels. Where two would have the same, all end in their numbers."""
-    names = [_file_name(part) for part in made]
+def named_files(surface_parts: Sequence[Part]) -> Iterator[tuple[Part, str]]:
+    """Yield parts with names of their containers: their labels, all with their numbers where two are equal."""
+    names = [_file_name(part) for part in surface_parts]
     # Some file systems take two spellings of a letter, or a large and a small one, for the same.
     if len({unicodedata.normalize("NFC", name).casefold() for name in names}) < len(names):
-        names = [f"{name}-{part.member.index}" for part, name in zip(made, names, strict=True)]
-    for part, name in zip(made, names, strict=True):
+        names = [f"{name}-{part.member.index}" for part, name in zip(surface_parts, names, strict=True)]
+    for part, name in zip(surface_parts, names, strict=True):
         yield part, f"{name}.lode"
 
 
 def _file_name(part: Part) -> str:
-    """The label without what a name of a file cannot have, but with its minus sign."""
+    """Return the label without characters that file names cannot have; a minus sign stays."""
     name = _UNSAFE.sub("-", part.label[:_LONGEST_NAME]).strip("-.")
     return f"-{name}" if name and part.label.startswith("-") else name or part.member.along

@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How files become a surface, as the command line says.
+    """Options from the command line that decide how files become a surface.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
 
 
 def surface_options(args: argparse.Namespace) -> SurfaceOptions:
-    """The options that `add_surface_options` adds.
+    """Return the options that `add_surface_options` has added.
 
     Ends the program if they are wrong, for example if a key is given twice.
     """
@@ -144,7 +144,9 @@ def surface_options(args: argparse.Namespace) -> SurfaceOptions:
 
 
 def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOptions:
-    """The options that `add_reading_options` adds, with a quality; ends the program if a key is given twice.
+    """Return the options that `add_reading_options` has added, and a quality.
+
+    End the program if a key is given twice.
 
     Names of attributes add up.
     """
@@ -162,7 +164,7 @@ def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOption
 
 
 def _remeshing(args: argparse.Namespace) -> dict[str, str]:
-    """The options of formats that ``--remesh`` and what goes with it stand for."""
+    """Return the options of formats that correspond to ``--remesh`` and its options."""
     if not getattr(args, "remesh", False):
         for name in ("blocks", "remesh_error"):
             if getattr(args, name, None) is not None:
@@ -173,7 +175,7 @@ def _remeshing(args: argparse.Namespace) -> dict[str, str]:
 
 
 def quality_of(args: argparse.Namespace) -> Quality:
-    """The quality that ``--precision`` and ``--rms`` ask for.
+    """Return the quality of ``--precision`` and ``--rms``.
 
     Ends the program if a precision is given twice, or one of the points together with ``--rms``.
     """

@@ -48,7 +48,7 @@ def register(subparsers: Subparsers) -> None:
 
 
 def run_list(args: argparse.Namespace) -> int:
-    """Ask, print one line for each: address, state, shape, bytes, name, series, owner, and why it is not ready."""
+    """Print one line for each surface: address, state, shape, bytes, name, series, owner, and why it is not ready."""
     from .. import sync
 
     surfaces = _chosen(sync.list_surfaces(args.url, token=token_of(args)), args)
@@ -80,7 +80,7 @@ def _name(surface: Description) -> str:
 
 
 def _size(surface: Description) -> Any:
-    """Bytes of the container, or of the upload while there is none; None where the server tells neither."""
+    """Return the bytes of the container, or of the upload while there is none; None if the server tells neither."""
     details = surface.details
     return details["bytes"] if details.get("bytes") is not None else details.get("upload_bytes")
 
@@ -96,23 +96,23 @@ _KEYS: Mapping[str, Callable[[Description], Any]] = {
 
 
 def _chosen(surfaces: Sequence[Description], args: argparse.Namespace) -> list[Description]:
-    """Those that are asked for, in the order that is asked for."""
+    """Return the surfaces that match the options, in the order of the options."""
     text = (args.search or "").casefold()
-    found = [
+    chosen = [
         surface
         for surface in surfaces
         if (args.state is None or surface.state == args.state)
         and any(text in word.casefold() for word in _words(surface))
     ]
     if args.sort:
-        found.sort(key=_KEYS[args.sort])
+        chosen.sort(key=_KEYS[args.sort])
     else:
-        found = _together(found)
-    return found[::-1] if args.reverse else found
+        chosen = _together(chosen)
+    return chosen[::-1] if args.reverse else chosen
 
 
 def _together(surfaces: Sequence[Description]) -> list[Description]:
-    """The surfaces of a series one after another by their index, where the first of them stands."""
+    """Return the surfaces with those of a series together, by index, at the place of the first of them."""
     first: dict[str, int] = {}
     places: list[tuple[int, int]] = []
     for number, surface in enumerate(surfaces):
@@ -124,7 +124,7 @@ def _together(surfaces: Sequence[Description]) -> list[Description]:
 
 
 def _series(surface: Description) -> str:
-    """The series of a surface, and its number in it, in words; empty: it is in none."""
+    """Return the series of a surface and its index as text; empty if it is in none."""
     from lodestream.container.series import place_of
 
     place = place_of(surface.details)
@@ -144,7 +144,7 @@ def _words(surface: Description) -> list[str]:
 
 
 def run_rm(args: argparse.Namespace) -> int:
-    """Remove."""
+    """Delete surfaces."""
     from .. import sync
 
     sync.delete(args.url, token=token_of(args))

@@ -58,18 +58,18 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _limits(given: Sequence[tuple[str | None, Tolerance]]) -> Limits | None:
-    """What an option that may be repeated says: an error of the whole surface, or errors of channels."""
-    found = dict(given)
-    if len(found) < len(given):
+    """Return the limits of an option that may be repeated: an error of the whole surface, or errors of channels."""
+    limits = dict(given)
+    if len(limits) < len(given):
         raise OptionError("expected each error once, got one given twice")
-    whole = found.pop(None, None)
-    if whole is not None and found:
+    whole = limits.pop(None, None)
+    if whole is not None and limits:
         raise OptionError("expected either an error of the whole surface or errors of channels, got both")
-    return whole or {name: limit for name, limit in found.items() if name is not None}
+    return whole or {name: limit for name, limit in limits.items() if name is not None}
 
 
 def target_of(args: argparse.Namespace) -> Target:
-    """The target of the command line; ends the program if its limits exclude each other."""
+    """Return the target of the command line; end the program if its limits exclude each other."""
     try:
         target = Target(
             level=args.level,

@@ -1,4 +1,4 @@
-"""The types of options' values: text of the command line into numbers, addresses, names."""
+"""Types of options: conversion of text from the command line into numbers, addresses and names."""
 
 from __future__ import annotations
 
@@ -166,10 +166,10 @@ def parse_region(text: str) -> Region:
     ArgumentTypeError
         If it is something else.
     """
-    found = re.fullmatch(r"(\d+):(\d+),(\d+):(\d+)", text.replace(" ", ""))
-    if found is None:
+    match = re.fullmatch(r"(\d+):(\d+),(\d+):(\d+)", text.replace(" ", ""))
+    if match is None:
         raise argparse.ArgumentTypeError(f"expected rows and columns such as 0:100,200:300, got {text!r}")
-    top, bottom, left, right = map(int, found.groups())
+    top, bottom, left, right = map(int, match.groups())
     return (top, bottom), (left, right)
 
 

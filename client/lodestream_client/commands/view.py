@@ -78,7 +78,7 @@ class ViewOptions:
 
     @property
     def name(self) -> str:
-        """What the surface is called until its source says."""
+        """Name of the surface, if its source has none."""
         if self.surface.name:
             return self.surface.name
         first = self.files[0]
@@ -157,7 +157,7 @@ def _options(args: argparse.Namespace) -> ViewOptions:
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
-    """Show it until Ctrl-C, or write it."""
+    """Show the surface until Ctrl-C, or write pictures or a folder."""
     options = _options(args)
     if options.png is not None:
         _draw(options, options.png)
@@ -204,7 +204,7 @@ def _serve(options: ViewOptions) -> None:
 
 
 def _wait() -> None:
-    """Wait for Ctrl-C, which is how this command ends; SIGTERM ends it as it ends any other."""
+    """Wait for Ctrl-C, the usual end of this command; SIGTERM ends it like any other."""
     try:
         threading.Event().wait()
     except Terminated:
@@ -235,7 +235,7 @@ def _draw(options: ViewOptions, out: Path) -> None:
 
 @contextmanager
 def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]], Source]]:
-    """What is shown, once it is certain that it can be read: a function that makes the container, told its progress."""
+    """Yield a function that makes the container, with a progress callback, once the source can be read."""
     from lodestream.library import require
 
     from ..viewer.sources import FileSource, RemoteSource
@@ -273,7 +273,7 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
 
 
 def _refuse_options(options: SurfaceOptions, what: str) -> None:
-    """Of what is encoded already, options of encoding would change nothing, without a word."""
+    """Refuse options of encoding for a container, which would have no effect."""
     if options.quality != Quality() or options.closed != "auto" or options.format_options:
         raise OptionError(
             f"expected a file to encode with --precision, --rms, --closed or -o, got {what}, which is shown as it is"
@@ -282,7 +282,7 @@ def _refuse_options(options: SurfaceOptions, what: str) -> None:
 
 @contextmanager
 def _source(options: ViewOptions) -> Iterator[Source]:
-    """The container that is shown, made here where a file is something else."""
+    """Yield the container to show; a file of another format is encoded here."""
     with _opened(options) as make:
         yield make(lambda _: None)
 

@@ -1,4 +1,4 @@
-"""What ``pull --watch`` writes and draws before the end: the surface as far as it has come."""
+"""Intermediate files and pictures of ``pull --watch``: the surface as received so far."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_picture(picture: Path) -> None:
 
 
 class Watch:
-    """The surface as far as it has come, in OUT and in a picture; a context manager that waits for what it has begun.
+    """Writes the surface received so far into OUT and a picture; a context manager that waits for started work.
 
     A thread writes, and a process draws, so that nothing waits for them: of the states that come meanwhile the newest
     is next.
@@ -105,9 +105,9 @@ class Watch:
             self._check()
 
     def write(self, view: View, layout: Layout) -> None:
-        """Have a state written and drawn that better ones follow, unless one of them comes first.
+        """Start to write and draw a state, unless a better one follows before.
 
-        What the format leaves out is not told here, since it is told of the last state.
+        Notes of what the format leaves out are given with the last state only.
 
         Raises
         ------

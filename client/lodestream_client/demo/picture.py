@@ -1,4 +1,4 @@
-"""The demo's picture: what the same number of bytes shows, side by side, whole and enlarged. The README shows one."""
+"""The demo's picture: what the same number of bytes shows, side by side, whole and enlarged."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def draw(panels: Sequence[Panel], window: tuple[slice, slice], path: Path) -> No
 
 
 def _relief(heights: Floats, low: float, high: float) -> Floats:
-    """Colours by height, shaded by slope: (H, W, 4), transparent where there is nothing."""
+    """Return colours by height, shaded by slope: (H, W, 4), transparent where there is nothing."""
     from matplotlib.colors import LinearSegmentedColormap
 
     slopes = np.gradient(heights * (_EXAGGERATION / CELL))

@@ -15,7 +15,10 @@ __all__ = ["beginning", "overview"]
 
 
 def beginning(heights: NDArray[np.int16], size: int) -> NDArray[np.float64]:
-    """The first `size` bytes of an array (H, W) as NPY: rows from the top, NaN where none have arrived; (H, W)."""
+    """Return an array (H, W) from the first `size` bytes of its NPY file.
+
+    Rows from the top, NaN where none have arrived.
+    """
     whole = io.BytesIO()
     np.save(whole, heights)
     header = whole.tell() - heights.nbytes
@@ -26,7 +29,7 @@ def beginning(heights: NDArray[np.int16], size: int) -> NDArray[np.float64]:
 
 
 def overview(heights: NDArray[np.int16], size: int) -> tuple[NDArray[np.float64], int]:
-    """The finest overview that fits into `size` bytes, interpolated to the full grid, and its reduction factor.
+    """Return the finest overview that fits into `size` bytes, interpolated to the full grid, and its reduction factor.
 
     The heights are (H, W), and so is the result. An overview of factor f contains the rounded means of f x f points,
     stored like in a cloud-optimised GeoTIFF: differences along the rows, then deflate. File headers are not counted.

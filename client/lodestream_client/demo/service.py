@@ -30,7 +30,7 @@ _LOG_TAIL = 2000
 
 @contextmanager
 def own_server() -> Iterator[str]:
-    """A server that is ready; yields its URL. It ends with the block.
+    """Start a server, yield its URL once it is ready, and end it with the block.
 
     Raises
     ------
@@ -67,8 +67,8 @@ def _await(process: subprocess.Popen[bytes], url: str, log: Path) -> None:
     with httpx.Client(trust_env=False, timeout=_READY_SECONDS) as client:
         while time.monotonic() < until:
             if process.poll() is not None:
-                said = log.read_text(errors="replace")[-_LOG_TAIL:].strip().splitlines() or ["it said nothing"]
-                raise LodestreamError(f"the server ended with code {process.returncode}: {said[-1]}")
+                lines = log.read_text(errors="replace")[-_LOG_TAIL:].strip().splitlines() or ["it said nothing"]
+                raise LodestreamError(f"the server ended with code {process.returncode}: {lines[-1]}")
             with contextlib.suppress(httpx.TransportError):
                 if client.get(f"{url}/readyz").is_success:
                     return

@@ -59,11 +59,13 @@ class _Moment:
     def agrees(self) -> bool:
         pairs = ((self.rms, self.rms_found), (self.max, self.max_found))
         # Containers tell errors in 20 bits of fraction, rounded up.
-        return all((1 - 1e-9) * found <= told <= (1 + 1e-6) * found for told, found in pairs)
+        return all((1 - 1e-9) * measured <= recorded <= (1 + 1e-6) * measured for recorded, measured in pairs)
 
 
 def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE) -> int:
-    """Run the demo and write its surface and, where matplotlib is, its picture into `folder`; the exit code.
+    """Run the demo, and write its surface and, if matplotlib is installed, its picture into `folder`.
+
+    Return the exit code.
 
     Parameters
     ----------
@@ -177,7 +179,7 @@ def _moment(seconds: float, view: View, heights: NDArray[np.int16]) -> _Moment:
 
 
 def _errors(points: NDArray[Any], heights: NDArray[np.int16]) -> tuple[float, float]:
-    """Root mean square and maximum of the differences."""
+    """Return the root mean square and the maximum of the differences."""
     difference = points.astype(np.float64) - heights
     return float(np.sqrt((difference**2).mean())), float(np.abs(difference).max())
 

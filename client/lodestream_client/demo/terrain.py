@@ -24,7 +24,7 @@ _NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1,
 
 
 def terrain(shape: tuple[int, int], progress: Callable[[float], None] = lambda done: None) -> NDArray[np.int16]:
-    """Heights in whole metres on a grid with 30 m between points.
+    """Return heights in whole metres on a grid with 30 m between points.
 
     Mountains rise, rivers cut them by the stream power law (h' = uplift - k area^m slope), slopes creep. Coarse grids
     are computed first and refined, so that a grid of a million points takes few steps.
@@ -57,7 +57,7 @@ def terrain(shape: tuple[int, int], progress: Callable[[float], None] = lambda d
 
 
 def bilinear(grid: Floats, rows: Floats, columns: Floats) -> Floats:
-    """Values of a grid (H, W) at fractional rows and columns within it, which broadcast to the shape of the result."""
+    """Return interpolated values of a grid (H, W) at fractional rows and columns within it, which broadcast."""
     i = np.minimum(rows.astype(np.intp), grid.shape[0] - 2)
     j = np.minimum(columns.astype(np.intp), grid.shape[1] - 2)
     down, across = rows - i, columns - j
@@ -104,14 +104,14 @@ def _eroded(heights: Floats, rise: Floats, cell: float, strength: float, rng: np
     factor = np.where(outlet, 0.0, strength * area[:nowhere] ** _AREA_EXPONENT / (distance * cell))
     raised = heights + rise
     raised[[0, -1]] = heights[[0, -1]]  # base level
-    # h = own + share * h[receiver], with more and more of the way down the river put in place of h[receiver].
-    own, share, below = raised.ravel() / (1 + factor), factor / (1 + factor), receivers
+    # h = settled + share * h[receiver], with more and more of the way down the river put in place of h[receiver].
+    settled, share, below = raised.ravel() / (1 + factor), factor / (1 + factor), receivers
     while share.any():
-        own = own + share * own[below]
+        settled = settled + share * settled[below]
         share = share * share[below]
         share[share < 1e-9] = 0.0
         below = below[below]
-    eroded: Floats = own.reshape(heights.shape)
+    eroded: Floats = settled.reshape(heights.shape)
     return eroded
 
 
@@ -122,15 +122,15 @@ def _receivers(heights: Floats, rng: np.random.Generator) -> tuple[NDArray[np.in
     receivers = np.arange(heights.size).reshape(heights.shape)
     steepest, distance = np.zeros_like(heights), np.ones_like(heights)
     padded = np.pad(heights, 1, constant_values=np.inf)
-    own = receivers.copy()
+    places = receivers.copy()
     for down, across in _NEIGHBOURS:
         length = float(np.hypot(down, across))
         neighbour = padded[1 + down : 1 + down + rows, 1 + across : 1 + across + columns]
         slope = (heights - neighbour) / length * rng.uniform(0.6, 1.4, heights.shape)
         better = slope > steepest
         steepest[better], distance[better] = slope[better], length
-        receivers[better] = (own + down * columns + across)[better]
-    receivers[[0, -1]] = own[[0, -1]]
+        receivers[better] = (places + down * columns + across)[better]
+    receivers[[0, -1]] = places[[0, -1]]
     return receivers.ravel(), distance.ravel()
 
 

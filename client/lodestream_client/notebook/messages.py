@@ -1,4 +1,4 @@
-"""What a widget's page asks over the comm, and what it is answered.
+"""Questions of a widget's page over the comm, and their answers.
 
 Each question is a mapping with ``kind`` and ``id``, and so is its answer, which has the same ``id``:
 
@@ -57,7 +57,7 @@ class Answers:
         self._program = program
 
     def to(self, question: Any) -> Message | None:
-        """The answer to a question; None where it has no ``id`` to answer to.
+        """Return the answer to a question; None where it has no ``id`` to answer to.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What a widget is given, as the bytes of a container that are read part by part."""
+"""Open the source of a widget, as a container that is read part by part."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Opened:
 
 
 def opened(source: Any, *, token: str | None = None, quality: Quality | None = None, name: str | None = None) -> Opened:
-    """Open what a widget is to show, and read its header and index.
+    """Open the source of a widget, and read its header and index.
 
     Parameters
     ----------
@@ -118,8 +118,8 @@ def _local(source: Any, quality: Quality | None) -> Source:
 
 def _encoded(surface: Surface | np.ndarray[Any, Any], quality: Quality | None, name: str) -> Source:
     data = ls.encode(surface, quality=quality)
-    own = surface.metadata.get("name") if isinstance(surface, Surface) else None
-    return MemorySource(data, own if isinstance(own, str) and own else name)
+    surface_name = surface.metadata.get("name") if isinstance(surface, Surface) else None
+    return MemorySource(data, surface_name if isinstance(surface_name, str) and surface_name else name)
 
 
 def _kind(source: Any) -> str:
@@ -127,7 +127,10 @@ def _kind(source: Any) -> str:
 
 
 def field_names(header: Header) -> list[str]:
-    """What a surface can be coloured by: kinds, attributes (a vector's length), and components of attributes."""
+    """Return the fields by which a surface can be coloured.
+
+    Kinds, attributes (a vector's length), and their components.
+    """
     names = [*_FIELDS, *(f"channel {channel}" for channel in range(3, header.point_channels))]
     for kind in header.attributes:
         names.append(kind.name)
@@ -137,7 +140,7 @@ def field_names(header: Header) -> list[str]:
 
 
 def limit_of(target: Target | None, header: Header) -> dict[str, float]:
-    """A target as the viewer has it: at most one limit, errors in the surface's unit.
+    """Return a target as the viewer takes it: at most one limit, errors in the surface's unit.
 
     Raises
     ------

@@ -183,7 +183,7 @@ class Widget(AnyWidget):
 
     @property
     def bytes_sent(self) -> int:
-        """Bytes of the container that have gone over the comm, to all places."""
+        """Bytes of the container sent over the comm, to all places where the widget is shown."""
         return self._answers.sent
 
     def stop(self) -> None:
@@ -191,11 +191,11 @@ class Widget(AnyWidget):
         self.send({"kind": "command", "command": "stop"})
 
     def resume(self) -> None:
-        """Go on after `stop`, the end of a target, or a failure."""
+        """Continue after `stop`, the end of a target, or a failure."""
         self.send({"kind": "command", "command": "resume"})
 
     def close(self) -> None:
-        """Remove the widget wherever it is shown, and close what it has opened."""
+        """Remove the widget wherever it is shown, and close its files and connections."""
         for task in self._later:
             task.cancel()
         super().close()
@@ -203,7 +203,7 @@ class Widget(AnyWidget):
             self._shown.resources.close()
 
     def _hear(self, _widget: Any, question: Any, _buffers: Any) -> None:
-        """Answer at once, or where that waits for another machine beside the kernel's other work."""
+        """Answer a question: at once, or beside the kernel's other work if another machine must be waited for."""
         loop = None
         if self._shown is not None and self._shown.remote:
             try:

@@ -33,12 +33,12 @@ _ADDRESS = re.compile("https?://[!-~]+", re.IGNORECASE)
 
 
 def is_url(text: str) -> bool:
-    """Whether this is a URL and not the name of a file."""
+    """Return whether a text is a URL, not a file name."""
     return text.lower().startswith(("http://", "https://"))
 
 
 def surfaces_url(url: str) -> str:
-    """The URL of a server's collection of surfaces, from the server's URL or from the collection's.
+    """Return the URL of a server's collection of surfaces, from the server's URL or from the collection's.
 
     Raises
     ------
@@ -50,12 +50,12 @@ def surfaces_url(url: str) -> str:
 
 
 def formats_url(url: str) -> str:
-    """The URL of the list of formats that a server reads, from the server's URL or from that of its surfaces."""
+    """Return the URL of the list of formats that a server reads, from the server's URL or from that of its surfaces."""
     return surfaces_url(url).removesuffix(_SURFACES) + "/v1/formats"
 
 
 def surface_url(url: str) -> str:
-    """The URL of one surface, without a slash at its end.
+    """Return the URL of one surface, without a slash at its end.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def surface_url(url: str) -> str:
 
 
 def source_url(url: str) -> str:
-    """The URL of something that can be pulled: a surface on a server, or a container file on any web server.
+    """Return the URL of something that can be pulled: a surface on a server, or a container file on any web server.
 
     Raises
     ------
@@ -89,23 +89,23 @@ def source_url(url: str) -> str:
 
 
 def is_surface(url: str) -> bool:
-    """Whether this is the URL of a surface, not of a file."""
+    """Return whether a URL is that of a surface, not of a file."""
     return _clean(url).rpartition("/")[0].endswith(_SURFACES)
 
 
 def stream_url(url: str, query: str | None = None) -> str:
-    """The WebSocket URL of a surface's stream."""
+    """Return the WebSocket URL of a surface's stream."""
     address = "ws" + surface_url(url).removeprefix("http") + "/stream"
     return address if query is None else f"{address}?{query}"
 
 
 def container_url(url: str) -> str:
-    """The URL from which a container can be fetched, given the URL of its surface or of its file."""
+    """Return the URL from which a container can be fetched, given the URL of its surface or of its file."""
     return f"{surface_url(url)}/container" if is_surface(url) else url
 
 
 def origin(url: str) -> str:
-    """Scheme, host and port of a URL. A token is only ever sent to the origin that it was given for.
+    """Return scheme, host and port of a URL. A token is sent only to the origin for which it was given.
 
     A WebSocket URL counts as the HTTP URL of the same server. Any other text has the empty origin.
     """
@@ -122,13 +122,13 @@ def origin(url: str) -> str:
     return f"{scheme}://{host}" if port == _PORTS[scheme] else f"{scheme}://{host}:{port}"
 
 
-def same_origin(one: str, other: str) -> bool:
-    """Whether two URLs have the same scheme, host and port."""
-    return origin(one) == origin(other) != ""
+def same_origin(first: str, second: str) -> bool:
+    """Return whether two URLs have the same scheme, host and port."""
+    return origin(first) == origin(second) != ""
 
 
 def counterpart(given: str, asked: str, landed: str) -> str:
-    """The URL to use instead of `given`, if a request for `asked` was redirected to `landed`.
+    """Return the URL to use instead of `given`, if a request for `asked` was redirected to `landed`.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def counterpart(given: str, asked: str, landed: str) -> str:
 
 
 def resolved(base: str, address: str) -> str:
-    """A URL from a server's answer, made absolute with `base`.
+    """Return a URL from a server's answer, made absolute with `base`.
 
     Raises
     ------
@@ -153,16 +153,16 @@ def resolved(base: str, address: str) -> str:
         If it is not an ``http`` or ``https`` URL in plain ASCII.
     """
     try:
-        found = urljoin(base, address)
+        url = urljoin(base, address)
     except ValueError:
-        found = ""
-    if not _ADDRESS.fullmatch(found) or not origin(found):
+        url = ""
+    if not _ADDRESS.fullmatch(url) or not origin(url):
         raise RemoteProtocolError(f"expected an address from {base}, got {address!a:.200}")
-    return found
+    return url
 
 
 def is_loopback(url: str) -> bool:
-    """Whether the URL is on this machine; proxies from the environment are then not used."""
+    """Return whether a URL is on this machine, so that proxies from the environment are not used."""
     host = urlsplit(url).hostname or ""
     if host == "localhost":
         return True

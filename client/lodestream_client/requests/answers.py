@@ -74,7 +74,7 @@ class Head:
 
     @classmethod
     def of(cls, response: httpx.Response) -> Head:
-        """The head of an answer of httpx."""
+        """Return the head of a response of httpx."""
         return cls(response.status_code, response.reason_phrase, dict(response.headers), str(response.url))
 
 
@@ -110,7 +110,7 @@ class Incoming:
             raise RemoteProtocolError(f"expected an unencoded answer of {asked}, got one encoded with {coding}")
 
     def take(self, chunk: bytes) -> bool:
-        """Take a chunk of the body; returns whether more is needed.
+        """Take a chunk of the body, and return whether more is needed.
 
         Raises
         ------
@@ -127,13 +127,13 @@ class Incoming:
         return False
 
     def answer(self) -> Answer:
-        """The complete answer."""
+        """Return the complete answer."""
         head = self._head
         return Answer(head.status, head.reason, head.headers, bytes(self._body), self._withheld)
 
 
 def withheld(token: str | None, given: str, asked: str, landed: str) -> str:
-    """Explanation for the user if a token was not sent along a redirect; empty if it was.
+    """Return an explanation for the user if a token was not sent along a redirect; empty if it was.
 
     Parameters
     ----------
@@ -159,12 +159,12 @@ def parse(data: bytes) -> Mapping[str, Any]:
         If they are not, or contain numbers that are not finite, or are nested too deeply.
     """
     try:
-        found = json.loads(data, parse_float=_finite, parse_constant=_finite)
+        document = json.loads(data, parse_float=_finite, parse_constant=_finite)
     except RecursionError:
         raise ValueError("lists and objects nested too deeply") from None
-    if not isinstance(found, dict):
+    if not isinstance(document, dict):
         raise ValueError("not an object")
-    within: list[Any] = [found]
+    within: list[Any] = [document]
     for _ in range(_DEEPEST):
         within = [
             item
@@ -173,7 +173,7 @@ def parse(data: bytes) -> Mapping[str, Any]:
             if isinstance(item, dict | list)
         ]
         if not within:
-            return found
+            return document
     raise ValueError("lists and objects nested too deeply")
 
 

@@ -60,7 +60,7 @@ _MOVED = (301, 302, 303, 307, 308)
 
 @dataclass(frozen=True)
 class Identity:
-    """What identifies a container, so that stored data of it can be found again.
+    """Identifies a container, so that stored data of it can be found again.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ def upload(
 
 
 def formats_read(url: str) -> Flow[frozenset[str] | None]:
-    """The formats that a server reads; None where it does not say: its answer to the upload says what is wrong."""
+    """Return the formats that a server reads; None if it does not tell, and then refuses the upload if it must."""
     # Not of another server: the upload that this is for follows no redirect either.
     answer = yield Call("GET", addresses.formats_url(url), redirected=False)
     if answer is None or answer.status != 200:
@@ -153,7 +153,7 @@ def retry(url: str, wait: bool, progress: Progress | None) -> Flow[Description]:
 
 
 def _followed(surface: Description, wait: bool, progress: Progress | None) -> Flow[Description]:
-    """Wait until a surface is ready, or will not become so by itself."""
+    """Wait until a surface is ready, or will not become ready by itself."""
     looks = itertools.chain(_LOOKS, itertools.repeat(_LOOKS_AFTER))
     while wait and not surface.ready:
         if surface.state in ENDS:
@@ -176,7 +176,7 @@ def _named(parameters: Mapping[str, str | list[str]], body: Body) -> Mapping[str
 
 
 def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
-    """All surfaces of a server, page by page.
+    """Return all surfaces of a server, page by page.
 
     Raises
     ------
@@ -204,14 +204,14 @@ def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
 
 
 def describe(url: str) -> Flow[Description]:
-    """State and description of one surface."""
+    """Return the state and the description of one surface."""
     address = addresses.surface_url(url)
     answer = yield Call("GET", address)
     return _described(_checked(answer, address), address)
 
 
 def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str, Any]]:
-    """Description of a container file on any web server."""
+    """Return the description of a container file on any web server."""
     from lodestream.container import describe
     from lodestream.transfer.range_download import RangeDownload
     from lodestream.transfer.receiver_state import ReceiverState
@@ -231,7 +231,7 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
 
 
 def identify(url: str) -> Flow[Identity]:
-    """What identifies a surface's container, or a file.
+    """Return the identity of a surface's container, or of a file.
 
     Raises
     ------
@@ -257,7 +257,7 @@ def identify(url: str) -> Flow[Identity]:
 
 
 def identity_of_file(url: str, version: str | None, size: int | None) -> Identity:
-    """What identifies a container file; `version` is its entity tag or date."""
+    """Return the identity of a container file; `version` is its entity tag or date."""
     if version is None or size is None:
         return Identity(None, None, None)
     return Identity(hashlib.sha256(f"{url}\n{version}\n{size}".encode()).hexdigest(), None, size)
@@ -271,9 +271,9 @@ def delete(url: str) -> Flow[None]:
 
 
 def fetch_range(url: str, offset: int, length: int, identity: Identity | None = None) -> Flow[bytes]:
-    """The bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file.
+    """Return the bytes ``offset`` to ``offset + length`` of a surface's container, or of a container file.
 
-    With an identity the answer must be of the container that it is of, as far as the answer says.
+    With an identity, the answer must be of the same container, as far as it tells.
 
     Raises
     ------
@@ -299,7 +299,7 @@ def fetch_range(url: str, offset: int, length: int, identity: Identity | None = 
 
 
 def _is_of(answer: Answer, url: str, identity: Identity) -> bool:
-    """Whether part of a file is of the container with this identity."""
+    """Return whether a part of a file belongs to the container with this identity."""
     version = answer.headers.get("etag") or answer.headers.get("last-modified")
     size = answer.headers.get("content-range", "").rpartition("/")[2]
     if _LENGTH.fullmatch(size) and int(size) != identity.size:
@@ -308,8 +308,8 @@ def _is_of(answer: Answer, url: str, identity: Identity) -> bool:
         return True
     if identity.container is None:
         return identity_of_file(url, version, identity.size) == identity
-    found = _TAG.fullmatch(version)  # a proxy may have put its own in the place of the server's
-    return found is None or found[1] == identity.container
+    tag = _TAG.fullmatch(version)  # a proxy may have put its own in the place of the server's
+    return tag is None or tag[1] == identity.container
 
 
 def _refuse(answer: Answer | None, url: str) -> Answer:

@@ -56,20 +56,20 @@ class Body:
         self._done = 0
 
     def count(self, size: int) -> None:
-        """Note that `size` more bytes have been read."""
+        """Count `size` more bytes as read."""
         self._done += size
         if self._sent is not None:
             self._sent(min(self._done / max(self.size, 1), 1.0))
 
     def form(self) -> list[tuple[str, tuple[str, BinaryIO, str]]]:
-        """Several files as the parts of a form, as httpx expects them."""
+        """Return several files as the parts of a form, as httpx expects them."""
         return [
             ("file", (name, cast("BinaryIO", _Counted(file, self)), "application/octet-stream"))
             for name, file in self.files
         ]
 
     def chunks(self) -> Iterator[bytes]:
-        """The contents of the one file, chunk by chunk."""
+        """Yield the contents of the one file, chunk by chunk."""
         file = _Counted(self.files[0][1], self)
         while chunk := file.read(_CHUNK):
             yield chunk
@@ -96,7 +96,7 @@ def _length(file: BinaryIO) -> int:
 
 
 def are_files(sources: Sequence[Source]) -> bool:
-    """Whether these are files, and not a surface in memory.
+    """Return whether the sources are files, not a surface in memory.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def are_files(sources: Sequence[Source]) -> bool:
 
 
 def check_asked(asked: Asked) -> None:
-    """Refuse options that no server takes, before any is asked.
+    """Refuse invalid options before any request.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def prepared(
     read_there: Collection[str] | None = None,
     local: bool = False,
 ) -> Parcel:
-    """Prepare an upload; a surface in memory is encoded, and so are files that the server does not read.
+    """Prepare an upload; encode a surface in memory, and files that the server does not read.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def prepared(
 
 @contextmanager
 def opened(parcel: Parcel, sent: Callable[[float], None] | None = None) -> Iterator[Body]:
-    """Open the files of an upload.
+    """Open the files of an upload, and yield its body.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def _is_container(file: BinaryIO) -> bool:
 
 
 def _parameters(asked: Asked) -> dict[str, str | list[str]]:
-    """The query of an upload."""
+    """Return the query of an upload."""
     parameters: dict[str, str | list[str]] = {}
     precisions, rms = asked.quality.texts()
     if precisions:

@@ -1,4 +1,4 @@
-"""What a request over HTTP needs done, as values, and how httpx is asked to do it."""
+"""Requests over HTTP as values, and the arguments with which httpx makes them."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
 
 
 def client_options(url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False) -> dict[str, Any]:
-    """Arguments for an httpx client of the server at `url`.
+    """Return the arguments of an httpx client of the server at `url`.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def _trusted() -> ssl.SSLContext:
 
 
 def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
-    """Arguments for the ``request`` method of an httpx client, except the body of a single file.
+    """Return the arguments of the ``request`` method of an httpx client, except the body of a single file.
 
     The token is sent only to the server at `url`, wherever redirects lead.
     """

@@ -1,4 +1,4 @@
-"""Files that are encoded here and sent as a container, because the server does not read their format or by request."""
+"""Encode files here and send a container, because the server does not read their format or on request."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _NO_OPTIONS = (
 
 
 def checked_options(options: Mapping[str, str | Sequence[str]]) -> dict[str, Any]:
-    """Return options of a format as keywords of `lodestream.read`.
+    """Return options of a format as keyword arguments of `lodestream.read`.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def encoded_here(
     folder: Path,
     progress: Callable[[str, float], None] | None,
 ) -> Path | None:
-    """Encode files of one surface, if the server does not read their format.
+    """Encode files of one surface if the server does not read their format.
 
     Parameters
     ----------
@@ -123,9 +123,9 @@ def encoded_here(
 def _others(
     source: Any, name: str | None, read_there: Collection[str], folder: Path
 ) -> tuple[frozenset[str] | None, Sequence[str], bool]:
-    """The formats that the server does not read, those of them that a file may have, and whether it surely has one.
+    """Return the formats that the server does not read, the formats that a file may have, and whether one is certain.
 
-    A variant, as VMEC's NetCDF, is known only to its reader. It refuses one that is not allowed before it reads values.
+    A variant, as VMEC's NetCDF, is known only to its reader, which refuses it before it reads values.
     """
     from lodestream.formats import formats, sniff
 
@@ -159,7 +159,7 @@ def _head(source: Any) -> bytes:
 
 
 def _path(source: Any, copy: Path) -> Path:
-    """The path of a file, of its copy if it has no name."""
+    """Return the path of a file; of its copy if it has no name."""
     if isinstance(source, str | os.PathLike):
         return Path(source)
     with copy.open("wb") as file:

@@ -1,4 +1,4 @@
-"""Surfaces in memory: recognising them, and encoding them before they are sent."""
+"""Surfaces in memory: recognise them, and encode them before they are sent."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Asked:
 
 
 def in_memory(source: object) -> bool:
-    """Whether a source is a surface or an array, not a file; decided without importing their libraries.
+    """Return whether a source is a surface or an array, not a file, without importing their libraries.
 
     Raises
     ------
@@ -73,9 +73,9 @@ def in_memory(source: object) -> bool:
         return True
     if isinstance(source, list | tuple | memoryview) or any(hasattr(source, name) for name in _ARRAYS):
         return True
-    found = "a file open for text" if isinstance(source, io.TextIOBase) else type(source).__name__
+    kind = "a file open for text" if isinstance(source, io.TextIOBase) else type(source).__name__
     raise InputError(
-        f"expected the name of a file, an open binary file, its bytes, a Surface or an array of points, got {found}"
+        f"expected the name of a file, an open binary file, its bytes, a Surface or an array of points, got {kind}"
     )
 
 
@@ -84,8 +84,9 @@ def _is_bytes(source: object) -> bool:
 
 
 def encoded(source: object, asked: Asked, progress: Callable[[str, float], None] | None) -> bytes:
-    """The container of a surface or an array. What a container does not keep is a `FormatWarning`, and one of its
-    ``notes``.
+    """Return the container of a surface or an array.
+
+    Values that a container does not keep are a `FormatWarning`, and are listed in its ``notes``.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ def encoded(source: object, asked: Asked, progress: Callable[[str, float], None]
 
 
 def _surface(source: Any, asked: Asked) -> Surface:
-    """With the closure and the name that are asked for, whoever's the given one is."""
+    """Return a copy of the surface with the closure and the name that are asked for."""
     from lodestream.formats.nodata import checked, with_nodata
     from lodestream.scratch import IN_MEMORY
     from lodestream.surface import Block, Surface
@@ -150,7 +151,7 @@ def _surface(source: Any, asked: Asked) -> Surface:
 
 
 def noted(surface: Surface) -> dict[str, Any]:
-    """Its metadata, with a note of what a container does not keep: others are told by the container alone."""
+    """Return the metadata of a surface, with a note of values that a container does not keep."""
     from lodestream.container.metadata import check
     from lodestream.encoding.losses import at_holes
 

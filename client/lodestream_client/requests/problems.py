@@ -59,13 +59,13 @@ class NoStreamError(RemoteProtocolError):
 
 
 def from_code(code: str, message: str) -> LodestreamError:
-    """The exception for an error code of the server."""
+    """Return the exception for an error code of the server."""
     kind = _BY_CODE.get(code)
     return RemoteError(code, message) if kind is None else kind(message)
 
 
 def from_response(status: int, reason: str, body: bytes, url: str) -> LodestreamError:
-    """The exception for an HTTP answer.
+    """Return the exception for an HTTP answer.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
 
 
 def passes(error: LodestreamError) -> bool:
-    """Whether the same request may succeed a little later."""
+    """Return whether the same request may succeed a little later."""
     if isinstance(error, RemoteError):
         return error.code in _PASSING
     from lodestream.transfer.range_download import CutShortError
@@ -99,7 +99,7 @@ def passes(error: LodestreamError) -> bool:
 
 
 def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
-    """Whether something on the way seems to block WebSockets only, so that plain HTTP may work.
+    """Return whether something on the way seems to block WebSockets only, so that plain HTTP may work.
 
     A connection that broke during its handshake counts as a sign of this only if no handshake has succeeded (`met`).
     """
@@ -110,15 +110,15 @@ def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
         # A server that is asked for a stream by a plain GET, since something between took the rest of the handshake
         # away, knows no such path. What else it says in its own words it would say by the other transport too.
         code = _document(bytes(cause.response.body or b"")).get("code")
-        own = isinstance(code, str) and code in CODES
-        return not own or cause.response.status_code in _NO_HANDSHAKE
+        is_ours = isinstance(code, str) and code in CODES
+        return not is_ours or cause.response.status_code in _NO_HANDSHAKE
     if _broke_off(error):
         return not met
     return isinstance(error, NoStreamError) or isinstance(cause, ws.InvalidHandshake | ws.InvalidURI)
 
 
 def _broke_off(error: BaseException) -> bool:
-    """Whether a connection ended in the middle of an answer."""
+    """Return whether a connection ended in the middle of an answer."""
     import httpx
 
     cause = error.__cause__
@@ -137,7 +137,7 @@ def _document(body: bytes) -> Mapping[str, Any]:
 
 
 def from_connection(error: Exception, url: str) -> LodestreamError:
-    """The exception for a failed connection of websockets or httpx; `url` is that of the surface or server."""
+    """Return the exception for a failed connection of websockets or httpx; `url` is that of the surface or server."""
     import httpx
     from websockets import exceptions as ws
 

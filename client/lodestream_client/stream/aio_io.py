@@ -45,7 +45,7 @@ class AsyncIO:
         self._ahead: tuple[Get, asyncio.Task[httpx.Response]] | None = None
 
     async def perform(self, effect: Effect) -> Any:
-        """Carry out one effect; its result, or the error of the library, as the effect's class documents."""
+        """Carry out one effect, and return its result, or the library's error, as the effect's class documents."""
         match effect:
             case Dial():
                 return await self._dial(effect)
@@ -71,7 +71,7 @@ class AsyncIO:
         return None
 
     async def poll(self, effect: Effect) -> Any:
-        """Carry out one effect if that needs no waiting, as `perform`; otherwise the result is `WAITS`."""
+        """Carry out one effect like `perform` if that needs no waiting; otherwise return `WAITS`."""
         await asyncio.sleep(0)  # what has come is taken by the event loop, which had no turn while a view was drawn
         match effect:
             case Send():
@@ -86,7 +86,7 @@ class AsyncIO:
         return WAITS
 
     def _arrived(self) -> bool:
-        """Whether more of the answer has come."""
+        """Return whether more of the answer has arrived."""
         stream = None if self._response is None else self._response.extensions.get("network_stream")
         return stream is not None and bool(stream.get_extra_info("is_readable"))
 
@@ -153,14 +153,14 @@ class AsyncIO:
             self._ahead = get, asyncio.create_task(self._ask(get))
 
     async def _forget(self) -> None:
-        """Give up the answer that was asked for ahead."""
+        """Cancel the request that was made ahead."""
         ahead, self._ahead = self._ahead, None
         if ahead is None:
             return
         ahead[1].cancel()
-        (found,) = await asyncio.gather(ahead[1], return_exceptions=True)
-        if not isinstance(found, BaseException):
-            await found.aclose()
+        (answer,) = await asyncio.gather(ahead[1], return_exceptions=True)
+        if not isinstance(answer, BaseException):
+            await answer.aclose()
 
     async def hang_up(self, how: HangUp) -> None:
         """Carry out `HangUp`."""
@@ -168,7 +168,7 @@ class AsyncIO:
         await self._leave(how)
 
     async def _leave(self, how: HangUp) -> None:
-        """Close what is open, but for what was asked for ahead."""
+        """Close all that is open, except the request that was made ahead."""
         if self._socket is not None and how.abort:
             self._socket.transport.abort()
         elif self._socket is not None and how.over:

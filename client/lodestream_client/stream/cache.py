@@ -43,14 +43,14 @@ class _TakenError(Exception):
 
 
 def cache_folder() -> Path:
-    """The folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
+    """Return the folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
     chosen = os.environ.get("LODESTREAM_CACHE")
     base = os.environ.get("XDG_CACHE_HOME", "").strip() or os.path.expanduser("~/.cache")
     return Path(chosen) if chosen else Path(base, "lodestream")
 
 
 def is_name(name: object) -> bool:
-    """Whether a text is a valid name: 64 hexadecimal digits."""
+    """Return whether a text is a valid name: 64 hexadecimal digits."""
     return isinstance(name, str) and _NAME.fullmatch(name) is not None
 
 
@@ -107,7 +107,7 @@ class CacheFile:
             raise
 
     def read(self, offset: int, length: int) -> bytes:
-        """Read cached bytes; all of the range must be in `ranges`."""
+        """Return cached bytes; all of the range must be in `ranges`."""
         data = bytearray()
         number = bisect_right(self._records, (offset, 1 << 63, 0)) - 1
         while len(data) < length:
@@ -147,7 +147,7 @@ class CacheFile:
         self.ranges.add(offset, length)
 
     def _recover(self, size: int) -> int:
-        """Read what is there; the end of the last record that is whole. What follows it is cut off."""
+        """Read the records of the file; return the end of the last whole one, behind which the file is cut off."""
         head = _HEAD.pack(_MAGIC, _VERSION, size)
         end = len(head)
         with open(self._handle, "rb", closefd=False) as file:
@@ -169,12 +169,12 @@ class CacheFile:
         return end
 
     def _is_new(self, offset: int, length: int) -> bool:
-        """Whether no byte of a range is cached yet."""
+        """Return whether no byte of a range is cached yet."""
         return length > 0 and next(self.ranges.overlap(offset, length), None) is None
 
 
 def forget_old(folder: Path) -> None:
-    """Remove files that were not used for a month, and those without data, which a program that was killed leaves.
+    """Remove files that were not used for a month, and files without data, which a killed program leaves.
 
     Files of other programs in the folder are not touched.
     """
@@ -183,8 +183,8 @@ def forget_old(folder: Path) -> None:
     before = time.time() - _DAYS_KEPT * 24 * 3600
     for path in folder.glob("*.part"):
         try:
-            found = path.lstat()
-            if not is_name(path.stem) or (found.st_mtime >= before and found.st_size > _HEAD.size):
+            status = path.lstat()
+            if not is_name(path.stem) or (status.st_mtime >= before and status.st_size > _HEAD.size):
                 continue
             handle = _locked(path)
         except (OSError, _TakenError):
@@ -196,7 +196,7 @@ def forget_old(folder: Path) -> None:
 
 
 def _locked(path: Path, create: int = 0) -> int:
-    """Open a file of ours, locked until it is closed.
+    """Open a cache file, locked until it is closed.
 
     Raises
     ------
@@ -221,16 +221,16 @@ def _locked(path: Path, create: int = 0) -> int:
 
 
 def _check_ours(handle: int, path: Path) -> None:
-    """Refuse what is no file that this program made, before anything is done to it."""
-    found = os.fstat(handle)
-    own = stat.S_ISREG(found.st_mode) and found.st_uid == os.geteuid() and found.st_nlink <= 1
+    """Refuse a file that this program did not make, before anything is done to it."""
+    status = os.fstat(handle)
+    is_ours = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid() and status.st_nlink <= 1
     # A program that was killed may have left less than a head.
-    if not own or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
+    if not is_ours or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
         raise FileExistsError(errno.EEXIST, "not a file of an earlier pull; it is not changed", str(path))
 
 
 def _is_at(handle: int, path: Path) -> bool:
-    """Whether this is still the file of that name."""
+    """Return whether an open file still has this name."""
     try:
         return os.path.samestat(os.fstat(handle), path.lstat())
     except FileNotFoundError:

@@ -45,7 +45,7 @@ class Core:
 
     @property
     def effect(self) -> Effect | None:
-        """What is to be done next; None if the stream is over. The first look begins the stream.
+        """The next effect to carry out; None if the stream is over. The first access begins the stream.
 
         Raises
         ------
@@ -69,9 +69,10 @@ class Core:
         return self._effect
 
     def next_view(self) -> View | None:
-        """The next view that nobody has taken; None if there is none now, or something is to be sent first.
+        """Return the next new view; None if there is none now, or something must be sent first.
 
-        So the server has its credit, or the next request, and the link is busy, while somebody looks at the view.
+        Sending first gives the server its credit, or the next request, so that the link is busy while the caller
+        handles the view.
         """
         view = None if isinstance(self._effect, Send | Ahead) else self.session.next_view()
         if view is not None:
@@ -79,7 +80,7 @@ class Core:
         return view
 
     def shown(self) -> None:
-        """Declare that from now on somebody looks at a view."""
+        """Declare that the caller handles a view from now on."""
         if self._viewed is None:
             self._viewed = self.session.clock()
 

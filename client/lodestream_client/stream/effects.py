@@ -1,4 +1,4 @@
-"""What a stream needs done, as values: the effects that its core yields, and the results that the core is given.
+"""Effects of a stream as values, which its core yields, and the results that it is given.
 
 The core decides; `sync_stream` and `aio_stream` only carry out. Where an effect fails, the core is given the error as
 the library raised it, and decides what it means.
@@ -111,7 +111,7 @@ class Get:
     seconds: float
 
     def asks_as(self, other: Get) -> bool:
-        """Whether both ask for the same, however long they may take."""
+        """Return whether both request the same, whatever their timeouts are."""
         return (self.url, self.headers) == (other.url, other.headers)
 
 

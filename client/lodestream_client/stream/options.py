@@ -39,7 +39,7 @@ class ConnectOptions:
 
 
 class ConnectKeywords(TypedDict, total=False):
-    """The same as keywords, so that type checkers know those of `connect`."""
+    """The options of `connect` as keywords, for type checkers."""
 
     target: Target | None
     token: str | None

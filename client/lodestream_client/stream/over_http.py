@@ -27,7 +27,7 @@ _OF_THE_FILE = {200, 206, 416}
 
 
 def receive(session: Session) -> Flow[None]:
-    """Request what is missing, one range after the other, and the next one while the one before it comes.
+    """Request missing ranges one after the other, each while the one before it arrives.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def _get(session: Session, url: str, request: RangeRequest, left: float | None) 
 
 
 def _answered(session: Session, request: Get, *, beside: bool) -> Flow[Head]:
-    """The head of an answer that is about the file; any other is raised."""
+    """Return the head of an answer for the file; raise any other answer."""
     import httpx
 
     session.transports.beside = session.transports.beside and not beside
@@ -102,7 +102,7 @@ def _answered(session: Session, request: Get, *, beside: bool) -> Flow[Head]:
 
 
 def _body(session: Session, download: RangeDownload, turns: int, url: str) -> Flow[None]:
-    """Read an answer to its end, or until the stream ends or something else comes first."""
+    """Read an answer to its end, or until the stream ends or another region comes first."""
     while True:
         left = _tick(session, download)
         if session.ended is not None or _elsewhere(session, download, turns):
@@ -129,20 +129,20 @@ def _chunk(session: Session) -> Flow[bytes]:
 
 
 def _elsewhere(session: Session, download: RangeDownload, turns: int) -> bool:
-    """Whether another region comes first by now, and too much of this answer is left to wait for its end."""
+    """Return whether another region now comes first, and too much of this answer is left to wait for its end."""
     return session.turns != turns and download.left > MIN_WINDOW
 
 
 def _next_request(session: Session, download: RangeDownload) -> RangeRequest | None:
-    made: list[RangeRequest | None] = []
+    requests: list[RangeRequest | None] = []
 
     def ask() -> list[DownloadEvent]:
         request, events = download.request(session.clock())
-        made.append(request)
+        requests.append(request)
         return events
 
     session.take(ask)
-    return made[0]
+    return requests[0]
 
 
 def _tick(session: Session, download: RangeDownload) -> float | None:

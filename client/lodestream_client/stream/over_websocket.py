@@ -25,7 +25,7 @@ _OFFENCES = {1002, 1003, 1007, 1009}
 
 
 def receive(session: Session) -> Flow[None]:
-    """Open a WebSocket and receive what is missing.
+    """Open a WebSocket, and receive what is missing.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def _heard(session: Session, download: Download, seconds: float) -> Flow[bytes |
 
 
 def _lost(session: Session, download: Download, error: ConnectionClosed) -> NoReturn:
-    """Raise what the end of a WebSocket stands for."""
+    """Raise the error for the end of a WebSocket."""
     if error.rcvd is None and error.sent is not None and error.sent.code in _OFFENCES:
         raise RemoteProtocolError(
             f"{session.url} sent an invalid WebSocket message: {error.sent.reason or error.sent.code}"

@@ -1,4 +1,4 @@
-"""Receiving at a limited rate: the time that each message would take on a link of that rate."""
+"""Limit the rate of receiving: the time that each message would take on a link of that rate."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class Link:
         self._free_at = float("-inf")
 
     def delay(self, size: int, now: float) -> float:
-        """Seconds from `now` until `size` more bytes have passed."""
+        """Return the seconds from `now` until `size` more bytes have passed."""
         self._free_at = max(self._free_at, now) + size / self.rate
         return self._free_at - now
 
 
 def window_for(rate: float) -> int:
-    """The credit, in bytes, that keeps a link of `rate` bytes per second busy and no more."""
+    """Return the credit, in bytes, that keeps a link of `rate` bytes per second busy and no more."""
     return round(min(max(rate * _WINDOW_SECONDS, _WINDOW_LEAST), MAX_CREDIT))

@@ -1,4 +1,4 @@
-"""Which transport a stream uses, and when to try again after it broke: the policy, without I/O.
+"""The choice of a stream's transport, and when to try again after it broke: the policy, without I/O.
 
 The transport is a WebSocket, or HTTP Range if WebSockets do not get through or the URL is that of a plain file.
 """
@@ -69,7 +69,7 @@ class Transports:
         self._attempts, self._since = 0, now
 
     def failed(self, error: LodestreamError, now: float, *, progressed: bool) -> float:
-        """Record that an attempt failed; returns the seconds to wait before the next one.
+        """Record a failed attempt, and return the seconds to wait before the next one.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""One surface being received: what is wanted and what has come, over whichever transport. No I/O.
+"""A surface being received: wanted and received data, over any transport. No I/O.
 
 A session is changed by the flow that receives (`over_websocket`, `over_http`), and at any time by whoever stops the
 stream or turns it to another region, perhaps from another thread.
@@ -132,7 +132,7 @@ class Session:
 
     @property
     def ended(self) -> str | None:
-        """Why the stream ended; None while it has not."""
+        """Reason why the stream ended; None while it has not."""
         if self.reception.ended is None and self._truncated:
             return "truncated"
         if self.reception.ended is None and self._abandoned:
@@ -141,22 +141,22 @@ class Session:
 
     @property
     def shows(self) -> bool:
-        """Whether there is a view that nobody has taken."""
+        """Whether there is a new view."""
         return bool(self._views)
 
     def next_view(self) -> View | None:
-        """The next view that nobody has taken; None if there is none now."""
+        """Return the next new view; None if there is none now."""
         with self.lock:
             return self._views.popleft() if self._views else None
 
     def messages(self) -> list[bytes]:
-        """The messages to send over the WebSocket now, in order; each is returned once. To be called with `lock`."""
+        """Return the messages to send over the WebSocket now, in order, each once. Call it with `lock` held."""
         return self.download.data_to_send() if self.download is not None else []
 
     # What its user may do at any time.
 
     def stop(self) -> None:
-        """Want no more."""
+        """Stop: no more data are wanted."""
         with self.lock:
             self.stopped = True
             self._views.clear()
@@ -181,13 +181,13 @@ class Session:
             self.turns += 1
 
     def close(self) -> None:
-        """Want no more, and have the connection closed within the time that is allowed for this."""
+        """Stop, and have the connection closed within the allowed time."""
         if self.ended is None:
             self.stop()
         self.close_by = self.clock() + self.options.close_timeout
 
     def abandon(self) -> None:
-        """Declare that nobody receives any more."""
+        """Declare that the caller receives no more."""
         self._abandoned = True
 
     def truncate(self) -> None:
@@ -197,21 +197,21 @@ class Session:
     # What the flows that receive use.
 
     def tick(self) -> float | None:
-        """Look at the clock, and stop if the target's time is over; returns the seconds left, None without a limit."""
+        """Check the clock, and stop if the target's time is over; return the seconds left, None without a limit."""
         with self.lock:
             if self.download is None or self.transports.transport == "http":
                 return self.reception.tick(self.clock())
             return self.download.tick(self.clock())
 
     def patience(self, left: float | None = None) -> float:
-        """Seconds to wait for the other side; no longer than `left`."""
+        """Return the seconds to wait for the server; at most `left`."""
         seconds = self.silence
         if self.close_by is not None:
             seconds = max(min(seconds, self.close_by - self.clock()), _LEAST_PATIENCE)
         return seconds if left is None else min(seconds, left)
 
     def take(self, receive: Callable[[], list[DownloadEvent]]) -> None:
-        """Receive something, keep its views, and tell of the progress.
+        """Call `receive`, queue the views of its events, and report progress.
 
         Raises
         ------
@@ -229,7 +229,7 @@ class Session:
             self.options.progress(self.reception.received, self.reception.planned)
 
     def pace(self, size: int) -> Flow[None]:
-        """Wait as long as so many bytes take at the rate allowed."""
+        """Wait as long as so many bytes take at the allowed rate."""
         if self._link is None:
             return
         until = self.clock() + self._link.delay(size, self.clock())
@@ -241,7 +241,7 @@ class Session:
             yield Wait(until if left is None else min(until, self.clock() + left))
 
     def over(self) -> bool:
-        """Whether a connection that broke is not to be replaced, since nothing more is wanted."""
+        """Return whether a broken connection need not be replaced, since no more data are wanted."""
         reception = self.reception
         if not self.stopped and self.close_by is None and reception.stopped_for is None:
             if reception.tick(self.clock()) != 0:
@@ -252,18 +252,18 @@ class Session:
         return True
 
     def silent(self) -> SilenceError:
-        """The error of a server that has said nothing for too long."""
+        """Return the error for a server that has been silent for too long."""
         return SilenceError(
             f"expected more of the stream, but {self.url} has sent nothing for {self.silence:g} seconds"
         )
 
     def authorization(self, url: str) -> dict[str, str]:
-        """The header with the token, which is only for the server itself, wherever an answer may point."""
+        """Return the header with the token, which is sent only to the server itself, whatever its answers point to."""
         token = self.options.token
         if token is None or not addresses.same_origin(url, self.url):
             return {}
         return {"Authorization": f"Bearer {token}"}
 
     def landed(self, asked: str, url: str) -> None:
-        """Note where a request was redirected to: the token does not go to another origin."""
+        """Record the target of a redirect; the token is not sent to another origin."""
         self.withheld = answers.withheld(self.options.token, self.url, asked, url)

@@ -1,4 +1,4 @@
-"""What both kinds of stream tell of themselves."""
+"""Properties that both kinds of stream share."""
 
 from __future__ import annotations
 
@@ -64,18 +64,18 @@ class BaseStream:
 
     @property
     def decoder(self) -> Decoder:
-        """Decodes what has arrived so far; after `stop` it may hold more than the last view."""
+        """The decoder of the data that have arrived; after `stop` it may hold more than the last view."""
         return self._reception.decoder
 
     @property
     def header(self) -> Opened | None:
-        """The server's first message over the WebSocket: the container's SHA-256 and size, and how much is planned."""
+        """The server's first message over the WebSocket: SHA-256 and size of the container, and the planned bytes."""
         download = self._session.download
         return download.answer if download is not None else None
 
     @property
     def identity(self) -> Identity:
-        """What identifies the container, as far as the server has told it."""
+        """Identity of the container, as far as the server has told it."""
         container, size = self._reception.container, self._reception.size
         if container is not None:
             return Identity(container, container, size)
@@ -119,14 +119,14 @@ class BaseStream:
 
     @property
     def ended(self) -> str | None:
-        """Why the stream ended; None while it has not.
+        """Reason why the stream ended; None while it has not.
 
         complete, level, rms, max, bytes or seconds, as the target says; stopped by this side; truncated by an error.
         """
         return self._session.ended
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: how much has come, and the last view."""
+        """Return the HTML for a notebook: the bytes received, and the last view."""
         from lodestream.interop.html import table
 
         planned = "" if self.planned is None else f" of {self.planned:,}"

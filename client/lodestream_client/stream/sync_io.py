@@ -48,7 +48,7 @@ class SyncIO:
         self._ahead: tuple[Get, Future[httpx.Response]] | None = None
 
     def perform(self, effect: Effect) -> Any:
-        """Carry out one effect; its result, or the error of the library, as the effect's class documents."""
+        """Carry out one effect, and return its result, or the library's error, as the effect's class documents."""
         match effect:
             case Dial():
                 return self._dial(effect)
@@ -71,7 +71,7 @@ class SyncIO:
         return None
 
     def poll(self, effect: Effect) -> Any:
-        """Carry out one effect if that needs no waiting, as `perform`; otherwise the result is `WAITS`."""
+        """Carry out one effect like `perform` if that needs no waiting; otherwise return `WAITS`."""
         match effect:
             case Send():
                 return self.send()
@@ -85,7 +85,7 @@ class SyncIO:
         return WAITS
 
     def _arrived(self) -> bool:
-        """Whether more of the answer has come."""
+        """Return whether more of the answer has arrived."""
         stream = None if self._answer is None else self._answer.extensions.get("network_stream")
         return stream is not None and bool(stream.get_extra_info("is_readable"))
 
@@ -169,7 +169,7 @@ class SyncIO:
         self._ahead = get, coming
 
     def _forget(self) -> None:
-        """Give up the answer that was asked for ahead: it is closed when it comes."""
+        """Cancel the request that was made ahead; its answer is closed when it arrives."""
         ahead, self._ahead = self._ahead, None
         if ahead is not None:
             ahead[1].add_done_callback(_close)
@@ -180,7 +180,7 @@ class SyncIO:
         self._leave(how)
 
     def _leave(self, how: HangUp) -> None:
-        """Close what is open, but for what was asked for ahead."""
+        """Close all that is open, except the request that was made ahead."""
         if self._socket is not None and (how.abort or how.over):
             _cut(self._socket)
         self._socket, self._answer, self._body = None, None, iter(())
@@ -194,7 +194,7 @@ class SyncIO:
 
 
 def _cut(connection: ClientConnection) -> None:
-    """End a connection without waiting for the other side's close frame. What was sent is still delivered."""
+    """End a connection without waiting for the other side's close frame. Sent data are still delivered."""
     from websockets.exceptions import ConnectionClosed
 
     with suppress(OSError):

@@ -74,9 +74,9 @@ class Stream(BaseStream):
         self._abandon(abort=isinstance(error, KeyboardInterrupt))
 
     def latest(self) -> Iterator[View]:
-        """Iterate over views for somebody who draws more slowly than they come: the newest that is there, each time.
+        """Iterate over the newest views, for a program that draws more slowly than they arrive.
 
-        Views before it are left out. The last view of the stream is always among them.
+        Earlier views are left out. The last view of the stream is always among them.
         """
         for view in self:
             newest, failed = view, None
@@ -136,7 +136,7 @@ class Stream(BaseStream):
         self._io.close(HangUp(abort=abort))
 
     def _step(self, *, wait: bool = True) -> bool:
-        """Carry out the next effect, perhaps only if it needs no waiting; returns whether that was done."""
+        """Carry out the next effect, optionally only if it needs no waiting; return whether that was done."""
         if (effect := self._core.effect) is None:
             return False
         try:

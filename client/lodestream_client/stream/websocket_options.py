@@ -1,4 +1,4 @@
-"""How both shells open a WebSocket: the arguments for the ``connect`` of websockets."""
+"""Arguments with which both kinds of stream open a WebSocket."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MAX_QUEUE = 256
 
 
 def socket_options(dial: Dial, make: Callable[..., Any], landed: list[str]) -> dict[str, Any]:
-    """Keyword arguments that open a WebSocket as asked.
+    """Return the keyword arguments of the ``connect`` of websockets.
 
     Parameters
     ----------

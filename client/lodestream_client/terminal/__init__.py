@@ -1,1 +1,1 @@
-"""What a person sees at a terminal: output that is escaped, and how an interrupt ends a command."""
+"""Terminal: escaped output, and the end of a command after an interrupt."""

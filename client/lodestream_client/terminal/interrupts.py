@@ -1,4 +1,4 @@
-"""How a command ends when it is interrupted: by Ctrl-C, which sends SIGINT, or by SIGTERM."""
+"""End a command when it is interrupted: by Ctrl-C, which sends SIGINT, or by SIGTERM."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Terminated(KeyboardInterrupt):
 
 
 def exit_code(interrupt: KeyboardInterrupt) -> int:
-    """128 plus the number of the signal, as shells do it: 130 after SIGINT, 143 after SIGTERM."""
+    """Return 128 plus the number of the signal, as shells do: 130 after SIGINT, 143 after SIGTERM."""
     return 128 + (signal.SIGTERM if isinstance(interrupt, Terminated) else signal.SIGINT)
 
 
@@ -47,7 +47,7 @@ def raising() -> Iterator[None]:
 
 @contextmanager
 def unwrapping() -> Iterator[None]:
-    """Undo that a KeyboardInterrupt was turned into another exception, as class bodies do.
+    """Raise a KeyboardInterrupt again that was turned into another exception, as class bodies do.
 
     Raises
     ------

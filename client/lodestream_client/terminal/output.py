@@ -68,7 +68,7 @@ def say(text: str) -> None:
 
 
 def say_columns(rows: Sequence[Sequence[str]]) -> None:
-    """Print each row on one line, however long, in columns; without those that are empty in all rows.
+    """Print each row on one line, however long, in columns; columns that are empty in all rows are left out.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def say_script(text: str) -> None:
 
 
 def cell(*lines: object) -> Text:
-    """The contents of a table cell, printed literally."""
+    """Return the contents of a table cell, printed literally."""
     from rich.text import Text
 
     return Text("\n".join(printable(str(line)) for line in lines))
@@ -129,7 +129,7 @@ class _Printable(logging.Formatter):
 def _show_warning(
     others: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any, **more: Any
 ) -> None:
-    """What a file leaves out is a note, not a line of the program."""
+    """Print a warning about data that a file leaves out as a note, not as a line of the program."""
     if issubclass(category, FormatWarning):
         note(str(message))
     else:
@@ -137,7 +137,7 @@ def _show_warning(
 
 
 def point_words(details: Mapping[str, Any]) -> str:
-    """The number of points and holes of a surface, from the keys of ``info``."""
+    """Return the number of points and holes of a surface as text, from the keys of ``info``."""
     total, holes, kept = _points(details), details.get("holes") or 0, details.get("non_finite") or 0
     words = f", {kept} of these infinite or partly NaN, whose values are kept" if kept else ""
     return f"{total}, {holes} of them holes{words}" if holes else str(total)
@@ -148,13 +148,13 @@ def _points(details: Mapping[str, Any]) -> int:
 
 
 def note_holes(holes: int, total: int, of: str = "") -> None:
-    """Report how many points are holes, if any are; `of` stands before it."""
+    """Note how many points are holes, if any are; `of` stands before it."""
     if holes:
         note(f"{of}{holes} of {total} points are holes")
 
 
 def note_details(details: Mapping[str, Any], of: str = "", words: Callable[[str], str] = str) -> None:
-    """Report the notes of a server's build: what was left out or chosen, and holes; `of` stands before each.
+    """Print the notes of a server's build, of lost or chosen data and holes; `of` stands before each.
 
     ``words`` puts a note as the command line has it.
     """
@@ -171,7 +171,7 @@ def print_json(value: Mapping[str, Any]) -> None:
 
 
 def human_size(size: float) -> str:
-    """A number of bytes with a unit."""
+    """Return a number of bytes as text with a unit."""
     for unit in ("B", "kB", "MB"):
         if size < 1000:
             return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
@@ -180,7 +180,7 @@ def human_size(size: float) -> str:
 
 
 def human_time(seconds: float) -> str:
-    """Remaining time as text."""
+    """Return the remaining time as text."""
     whole = math.ceil(seconds)
     if whole < 60:
         return f"{whole} s left"
@@ -189,7 +189,7 @@ def human_time(seconds: float) -> str:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """A console for tables; wide if the output is not a terminal, so that lines in a file or pipe do not wrap."""
+    """Return a console for tables; wide if the output is not a terminal, so that lines do not wrap."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
@@ -197,16 +197,16 @@ def console(*, stderr: bool = False) -> Console:
 
 
 class Progress(Protocol):
-    """A bar for each task that is under way, as rich has them."""
+    """A bar for each running task, with rich's interface."""
 
     def add_task(self, description: str, *, total: float | None, **fields: Any) -> Any:
-        """Begin one; what `update` and `remove_task` know it by."""
+        """Add a task, and return its identifier for `update` and `remove_task`."""
 
     def update(self, task_id: Any, **changes: Any) -> None:
-        """Change what is given: ``completed``, ``total``, ``description``, fields."""
+        """Change the given values: ``completed``, ``total``, ``description``, fields."""
 
     def remove_task(self, task_id: Any) -> None:
-        """Show it no longer."""
+        """Remove a task."""
 
 
 class _Unseen:
@@ -224,7 +224,7 @@ class _Unseen:
 
 @contextmanager
 def progress_bar(period: float = 30.0) -> Iterator[Progress]:
-    """A progress bar on standard error; not shown if that is not a terminal.
+    """Show a progress bar on standard error, if that is a terminal.
 
     If a task has a field ``limit``, it is the maximum number of seconds that it may take.
 
@@ -291,7 +291,7 @@ def require_folder(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path`, with the same suffix, that replaces it if the block succeeds."""
+    """Yield a temporary file beside `path`, with the same suffix, that replaces it if the block succeeds."""
     require_folder(path)
     temporary = path.with_name(f".{path.stem[:50]}-{secrets.token_hex(6)}{path.suffix}")
     try:

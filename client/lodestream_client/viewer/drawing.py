@@ -1,4 +1,4 @@
-"""The process that draws the pictures of ``pull``, which takes seconds of a processor that the stream does not miss.
+"""A process that draws the pictures of ``pull``, so that seconds of drawing do not delay the stream.
 
 This module run as a program is that process. It reads a pickled `Picture` after another from its standard input and
 answers each on standard output with a pickled PNG, or with the error; its first answer says that it is ready. It ends
@@ -33,7 +33,7 @@ __all__ = ["Drawing", "command"]
 
 
 def command() -> list[str]:
-    """The command of the process that draws."""
+    """Return the command line of the process that draws."""
     return [sys.executable, "-P", "-m", "lodestream_client.viewer.drawing"]
 
 
@@ -79,10 +79,10 @@ class Drawing:
                 _close(self._process.stdin)
 
     def offer(self, view: View, layout: Layout, metadata: Mapping[str, Any]) -> None:
-        """Have a state drawn, unless another one is being drawn, or has been just now.
+        """Start to draw a state, unless another one is being drawn or was drawn just now.
 
-        Between two pictures passes as long as the first one took. So at most half of a processor draws, and the last
-        picture waits for another one less often. If a picture could not be drawn, `draw` raises that.
+        The pause between two pictures is as long as the first one took. So drawing takes at most half of a processor,
+        and the last picture waits less often for another one. If a picture could not be drawn, `draw` raises the error.
         """
         if self._answer.done() and self._answer.exception() is None and monotonic() >= self._next:
             self._send(view, layout, metadata)
@@ -101,7 +101,7 @@ class Drawing:
             self._answer.result()
 
     def _state(self, view: View, metadata: Mapping[str, Any]) -> _State:
-        """What one picture of a stream is told from another by."""
+        """Return the values that tell one picture of a stream from another."""
         name = metadata.get("name")
         return view.bytes, view.complete, name if isinstance(name, str) else self._name
 
@@ -140,13 +140,13 @@ class Drawing:
 
 
 def _close(pipe: Any) -> None:
-    """Close a pipe to a process that has ended, which takes no more of what was not sent yet."""
+    """Close a pipe to an ended process, which takes no more of the buffered data."""
     with suppress(OSError):
         pipe.close()
 
 
 def serve(pictures: BinaryIO, answers: BinaryIO) -> None:
-    """Draw pictures until there are no more; see the head of this module.
+    """Draw pictures until the input ends; see the head of this module.
 
     Parameters
     ----------

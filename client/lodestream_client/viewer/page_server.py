@@ -38,7 +38,7 @@ _ABSOLUTE = re.compile(r"https?://([^/?#]*)(.*)", re.IGNORECASE)  # RFC 9112, se
 
 
 def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """First and past-the-last byte of the one range that a Range header asks for; None: all of the file.
+    """Return the first and the past-the-last byte of the one range in a Range header; None: all of the file.
 
     Parameters
     ----------
@@ -52,14 +52,14 @@ def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
     ValueError
         If no byte of the range is in the file.
     """
-    found = None if header is None else _RANGE.fullmatch(header.replace(" ", ""))
-    if found is None or found[0] == "bytes=-":
+    match = None if header is None else _RANGE.fullmatch(header.replace(" ", ""))
+    if match is None or match[0] == "bytes=-":
         return None
-    if not found[1]:
-        first, stop = max(size - int(found[2]), 0), size
+    if not match[1]:
+        first, stop = max(size - int(match[2]), 0), size
     else:
-        first, stop = int(found[1]), min(int(found[2]) + 1, size) if found[2] else size
-        if found[2] and int(found[2]) < first:
+        first, stop = int(match[1]), min(int(match[2]) + 1, size) if match[2] else size
+        if match[2] and int(match[2]) < first:
             return None
     if first >= stop:
         raise ValueError(f"expected a range within {size} bytes, got {header}")
@@ -102,12 +102,12 @@ class PageServer(ThreadingHTTPServer):
         self._waiting: dict[socket.socket, None] = {}  # for a request; those that have waited longest are first
 
     def server_bind(self) -> None:
-        """Bind, and do not ask for the name of this machine, for which some wait seconds."""
+        """Bind, without asking for the name of this machine, which takes seconds on some."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = "127.0.0.1", self.server_address[1]
 
     def config(self) -> dict[str, Any]:
-        """What the page is to show, see ``client/web/src/page``."""
+        """Return the configuration of the page, see ``client/web/src/page``."""
         surface: dict[str, Any] = {"name": self.name, "src": _SURFACE}
         if self.source is None:
             surface["progress"] = self.progress
@@ -116,7 +116,7 @@ class PageServer(ThreadingHTTPServer):
         return {"surfaces": [surface], "live": True}
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: browsers close connections whenever they like."""
+        """Ignore errors: browsers close connections at any time."""
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Give a connection a thread. If all are taken, the connection that has waited longest for a request ends.
@@ -156,12 +156,12 @@ class PageServer(ThreadingHTTPServer):
         self._places.release()
 
     def wait_for_request(self, connection: socket.socket) -> None:
-        """Note that a connection waits for a request, and may be ended to make room."""
+        """Mark a connection as waiting for a request; it may be ended to make room."""
         with self._lock:
             self._waiting[connection] = None
 
     def begin_answer(self, connection: socket.socket) -> bool:
-        """Note that a request has arrived, which is to be answered; whether its connection was not ended before."""
+        """Mark a connection as being answered; return whether it had not been ended before."""
         with self._lock:
             return self._waiting.pop(connection, self) is None
 
@@ -215,7 +215,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, send)
 
     def _wrong_head(self) -> HTTPStatus | None:
-        """Why a request is refused by its first lines alone; None: it is not."""
+        """Return the status with which a request is refused by its first lines alone; None if it is not."""
         # Another page cannot read what it gets from here, unless its host's name was made to lead here.
         hosts = [*self.headers.get_all("host", []), *filter(None, _addressed(self.path)[:1])]
         if "host" not in self.headers or any(host.strip().lower() not in self.server.hosts for host in hosts):
@@ -227,7 +227,7 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse what the standard library does not understand as everything else is refused."""
+        """Answer requests that the standard library refuses in the same form as others."""
         self.close_connection = True
         self._refuse(HTTPStatus(code), (lambda _: None) if self.command == "HEAD" else self._send)
 
@@ -287,13 +287,13 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _addressed(target: str) -> tuple[str | None, str]:
-    """Host and port that the target of a request names, if it does, and its path and query."""
+    """Return the host and port in the target of a request, if there is one, and its path and query."""
     absolute = _ABSOLUTE.fullmatch(target)
     return (None, target) if absolute is None else (absolute[1], absolute[2])
 
 
 def _turn_away(connection: socket.socket) -> None:
-    """Answer that all connections are taken, as far as that can be done without waiting."""
+    """Answer that all connections are taken, as far as that is possible without waiting."""
     status = HTTPStatus.SERVICE_UNAVAILABLE
     body = f"{status.phrase}\n"
     fields = {**HEADERS, "content-type": _WORDS, "content-length": str(len(body)), "connection": "close"}
@@ -317,7 +317,7 @@ def _chained(begun: bytes, rest: Iterator[bytes]) -> Iterator[bytes]:
 
 @contextmanager
 def serving(server: PageServer) -> Iterator[None]:
-    """Serve in a thread for as long as the block lasts."""
+    """Serve in a thread for the length of the block."""
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
     thread.start()
     try:

@@ -34,7 +34,7 @@ _LONGEST = 100  # characters of a name
 def view_after(
     source: Source, most: int | None, max_vertices: int | None = None, region: Region | None = None
 ) -> tuple[View, Layout | None]:
-    """What a stream of a container, or of a window of it, shows after at most so many bytes.
+    """Return the view of a container, or of a window of it, after at most so many bytes of its stream.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def view_after(
 
 
 def least_size(source: Source, max_vertices: int | None = None, region: Region | None = None) -> int:
-    """Bytes that the first picture of a container takes; the parameters are those of `view_after`."""
+    """Return the bytes that the first picture of a container takes; the parameters are those of `view_after`."""
     capacity = Decoder(max_vertices=max_vertices).capacity
     index = read_index(partial(read_fully, source), source.size, Capacity(capacity.max_vertices))
     return plan(index, Target(region=region)).marks[0].bytes
@@ -91,14 +91,14 @@ def require_matplotlib() -> None:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a picture shows: blocks of points of one level, with what is known of their angles, and the title."""
+    """The content of a picture: points of one level by block, the known angles, and the title."""
 
     surface: Surface
     title: str
 
     @classmethod
     def of(cls, view: View, layout: Layout | None, name: str) -> Picture:
-        """A view of a surface, with its bytes and its errors as title.
+        """Return the picture of a view, with its bytes and its errors as title.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Picture:
         return cls(Surface(blocks=blocks, metadata=surface.metadata), f"{title}\n{human_size(view.bytes)}, {errors}")
 
     def png(self) -> bytes:
-        """Draw it.
+        """Draw the picture, and return it as PNG.
 
         Raises
         ------
@@ -140,13 +140,13 @@ class Picture:
 
 
 def write_png(png: bytes, path: Path) -> None:
-    """Write a drawn picture, in place of one that is there."""
+    """Write a drawn picture, replacing an earlier one."""
     with replacing(path) as temporary:
         temporary.write_bytes(png)
 
 
 def _level(layout: Layout) -> int | None:
-    """The coarsest level with enough nodes for the picture; None: the finest."""
+    """Return the coarsest level with enough nodes for the picture; None: the finest."""
     for level in range(layout.levels):
         shapes = [layout.shape(grid, level) for grid in range(len(layout.grids))]
         if max(max(shape) for shape in shapes) >= _PIXELS:

@@ -1,4 +1,4 @@
-"""Where the bytes of a container come from that is shown: a file, memory, or a server."""
+"""Sources of the bytes of a shown container: a file, memory, or a server."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Source(Protocol):
     tag: str
 
     def read(self, offset: int, length: int) -> bytes:
-        """At most ``length`` bytes from ``offset`` on, at least one.
+        """Return at most ``length`` bytes from ``offset`` on, at least one.
 
         Raises
         ------
@@ -47,7 +47,7 @@ class Source(Protocol):
 
 
 def read_fully(source: Source, offset: int, length: int) -> bytes:
-    """All bytes of a part, fewer only where the container ends.
+    """Return all bytes of a range, fewer only where the container ends.
 
     Raises
     ------
@@ -76,7 +76,7 @@ class MemorySource:
         self._data = memoryview(data)
 
     def read(self, offset: int, length: int) -> bytes:
-        """At most ``length`` bytes from ``offset`` on."""
+        """Return at most ``length`` bytes from ``offset`` on."""
         return bytes(self._data[offset : offset + min(length, _AT_ONCE)])
 
 
@@ -91,7 +91,7 @@ class FileSource:
         self._path = path
 
     def read(self, offset: int, length: int) -> bytes:
-        """At most ``length`` bytes from ``offset`` on.
+        """Return at most ``length`` bytes from ``offset`` on.
 
         Raises
         ------
@@ -147,7 +147,7 @@ class RemoteSource:
         self._open.close()
 
     def read(self, offset: int, length: int) -> bytes:
-        """At most ``length`` bytes from ``offset`` on.
+        """Return at most ``length`` bytes from ``offset`` on.
 
         Raises
         ------
@@ -162,7 +162,7 @@ class RemoteSource:
 
 
 def _name(url: str, token: str | None) -> str | None:
-    """The name that a server has for a surface."""
+    """Return the name that a server has for a surface."""
     from ..requests import addresses
 
     if not addresses.is_surface(url):
