@@ -1,1 +1,1 @@
-"""Surfaces as the objects of other libraries, and back: xarray, pyvista, trimesh, zarr; loaded on use."""
+"""Surfaces as objects of other libraries, and back: xarray, pyvista, trimesh, zarr; imported on use."""

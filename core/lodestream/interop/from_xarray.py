@@ -49,7 +49,7 @@ def from_xarray(
     nodata: object = None,
     **options: str,
 ) -> Surface:
-    """A surface of a Dataset or DataArray, or of several blocks from a DataTree.
+    """Convert a Dataset or DataArray to a surface, or a DataTree to a surface of several blocks.
 
     See `lodestream.Surface.from_xarray`. What is large for the ``room`` is read by windows, into files.
 
@@ -76,13 +76,13 @@ def _of_any(
         nodes = [node.to_dataset() for node in data.subtree if node.data_vars or MARK in node.attrs]
         if not nodes:
             raise FormatError("expected a DataTree with a variable over two dimensions, got none")
-        found = [_of_dataset(xr, node, attributes, closed, room, options) for node in nodes]
-        if len(found) == 1:
-            return found[0]
-        blocks = [block for surface in found for block in surface.blocks]
+        surfaces = [_of_dataset(xr, node, attributes, closed, room, options) for node in nodes]
+        if len(surfaces) == 1:
+            return surfaces[0]
+        blocks = [block for surface in surfaces for block in surface.blocks]
         # What is true of the first block in its order is true of all only where each has kept its own.
-        lost = {key for key in ORDERED if any(key not in surface.metadata for surface in found)}
-        metadata = {key: value for key, value in found[0].metadata.items() if key not in lost}
+        lost = {key for key in ORDERED if any(key not in surface.metadata for surface in surfaces)}
+        metadata = {key: value for key, value in surfaces[0].metadata.items() if key not in lost}
         return Surface(blocks=blocks, metadata=metadata)
     if isinstance(data, xr.DataArray):
         name = "z" if data.name is None or data.name in data.coords else str(data.name)
@@ -114,13 +114,13 @@ def _of_dataset(
 
 
 def _places(array: Any) -> dict[str, str]:
-    """What a file would say of the coordinates of an array or a Dataset that are none of its dimensions."""
+    """Return the attribute that a file would have for non-dimension coordinates of an array or a Dataset."""
     names = [str(name) for name in array.coords if name not in array.dims]
     return {"coordinates": " ".join(names)} if names else {}
 
 
 def _as_in_a_file(xr: Any, data: Any, left_out: Collection[str], room: Room) -> Any:
-    """A shallow copy with values and attributes as a file has them: decoding has moved some to the encoding.
+    """Return a shallow copy with values and attributes as in a file: xarray's decoding moves some to the encoding.
 
     Values that are not to be read stay as they are.
     """
@@ -135,12 +135,12 @@ def _as_in_a_file(xr: Any, data: Any, left_out: Collection[str], room: Room) -> 
 
 
 def _as_stored(xr: Any, variable: Any, room: Room, places: Mapping[str, str] | None = None, read: bool = True) -> Any:
-    """A variable with the attributes of its file: times as numbers, and integers where its floats are such with NaN."""
+    """Return a variable as in its file: times as numbers, floats that were integers with a fill value as integers."""
     if variable.dtype.kind in "mM" or (variable.ndim < 2 and variable.dtype.kind == "O"):
         variable = _numbered(xr, variable)
     encoding = variable.encoding
-    told = {key: encoding[key] for key in REFERENCES if key in encoding}
-    attrs = {**(places or {}), **variable.attrs, **told, **_unpacked_limits(xr, variable)}
+    references = {key: encoding[key] for key in REFERENCES if key in encoding}
+    attrs = {**(places or {}), **variable.attrs, **references, **_unpacked_limits(xr, variable)}
     missing = [number for key in _MISSING for number in np.ravel(encoding.get(key, ())).tolist()]
     dtype = np.dtype(encoding.get("dtype") or variable.dtype)
     if read and dtype.kind in "iu" and variable.dtype.kind == "f" and not is_packed(encoding):
@@ -154,7 +154,7 @@ def _as_stored(xr: Any, variable: Any, room: Room, places: Mapping[str, str] | N
 
 
 def _numbered(xr: Any, variable: Any) -> Any:
-    """Dates and spans of time as the numbers of a file; other objects as they are."""
+    """Return dates and durations as the numbers of a file; other objects unchanged."""
     try:
         encoded = xr.conventions.encode_cf_variable(variable.to_base_variable())
     except Exception:  # of objects of any class
@@ -168,13 +168,13 @@ def _numbered(xr: Any, variable: Any) -> Any:
 
 
 def _with_sign(dtype: np.dtype[Any], encoding: Mapping[str, Any]) -> np.dtype[Any]:
-    """The type of the values of a file that has integers of it, as ``_Unsigned`` says."""
+    """Return the dtype of values that a file stores as integers, with ``_Unsigned`` applied."""
     kind = {"true": "u", "false": "i"}.get(str(encoding.get("_Unsigned", "")).lower(), dtype.kind)
     return np.dtype(f"{kind}{dtype.itemsize}")
 
 
 def _unpacked_limits(xr: Any, variable: Any) -> dict[str, Any]:
-    """Limits of values that were packed in a file: they are numbers as stored there if they are integers."""
+    """Return the limits of packed values: integers among them are in packed units."""
     encoding = variable.encoding
     if not is_packed(encoding) or is_packed(variable.attrs):
         return {}
@@ -185,7 +185,7 @@ def _unpacked_limits(xr: Any, variable: Any) -> dict[str, Any]:
 
 
 def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room: Room) -> NDArray[Any] | None:
-    """Floats as the integers that they are, NaN as the first of the missing values; None where they are no integers."""
+    """Return floats as integers, with NaN as the first of the missing values; None if they are no integers."""
     limits, result, anything = np.iinfo(dtype), room.empty(variable.shape, dtype), False
     numbers = [dtype.type(number) for number in missing if limits.min <= number <= limits.max and number == int(number)]
     if len(numbers) < len(missing):
@@ -201,15 +201,15 @@ def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room:
         whole = known.astype(dtype)
         if not (whole == known).all() or any((whole == number).any() for number in numbers):
             return None
-        own = np.full(values.shape, numbers[0] if numbers else 0, dtype)
-        own[valid] = whole
-        result[window] = own
+        stored = np.full(values.shape, numbers[0] if numbers else 0, dtype)
+        stored[valid] = whole
+        result[window] = stored
         anything |= bool(known.size)
     return result if anything else None
 
 
 def _names(data: Any, mark: Mark | None, options: Mapping[str, str], attributes: list[str] | None) -> dict[str, str]:
-    """Which variable is the surface, where that is known before the conventions are asked."""
+    """Return the name of the surface's variable, if it is known before the conventions are asked."""
     if {"variable", "x", "y"} & set(options):
         return {}
     if mark is not None and (named := mark.options(data)):

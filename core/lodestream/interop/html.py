@@ -1,4 +1,4 @@
-"""What notebooks show of surfaces, views and streams: a small picture, sizes, errors."""
+"""HTML of surfaces, views and streams for notebooks: a small picture, sizes, errors."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _MOST = 8
 
 
 def surface_html(surface: Surface) -> str:
-    """A surface as HTML: picture, blocks, attributes, name and unit."""
+    """Return a surface as HTML: picture, blocks, attributes, name and unit."""
     shapes = [block.shape for block in surface.blocks]
     return table("Surface", _of_surface(surface, shapes), small_png(surface))
 
 
 def view_html(view: View, surface: Surface, shapes: Sequence[tuple[int, int]]) -> str:
-    """A view as HTML: picture, bytes and errors besides what there is of its surface.
+    """Return a view as HTML: picture, bytes, errors, and the rows of its surface.
 
     Parameters
     ----------
@@ -41,7 +41,10 @@ def view_html(view: View, surface: Surface, shapes: Sequence[tuple[int, int]]) -
 
 
 def errors(view: View, metadata: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Bytes and errors of a view, as rows. A remeshed surface is never called exact, which its mesh is not."""
+    """Return rows with the bytes and errors of a view.
+
+    A remeshed surface is never called exact, since its mesh is not.
+    """
     exact = view.complete and view.rms == 0 and remesh_words(metadata) is None
     return [
         ("bytes", f"{view.bytes:,}"),
@@ -77,7 +80,7 @@ def _listed(words: Sequence[str]) -> str:
 
 
 def table(title: str, rows: Iterable[tuple[str, str]], picture: bytes | None) -> str:
-    """Rows of a name and a value, beside a PNG; all of it text that is escaped, control characters too."""
+    """Return rows of names and values beside a PNG, as HTML; all text is escaped, control characters too."""
     cells = "".join(
         f'<tr><th style="text-align:left">{html.escape(printable(name))}</th>'
         f'<td style="text-align:left">{html.escape(printable(value))}</td></tr>'

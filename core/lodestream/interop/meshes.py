@@ -1,4 +1,4 @@
-"""Grids of a mesh that another library holds, by the rules of OBJ and PLY."""
+"""Surfaces from meshes of other libraries, by the rules of OBJ and PLY."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def from_mesh(
     attributes: Mapping[str, ArrayLike] | None,
     remeshing: Mapping[str, object],
 ) -> Surface:
-    """See `lodestream.Surface.from_mesh`.
+    """Convert arrays of a mesh to a surface, see `lodestream.Surface.from_mesh`.
 
     Parameters
     ----------

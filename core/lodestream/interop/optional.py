@@ -1,4 +1,4 @@
-"""Libraries that an extra installs: imported on use, with an error that names the extra."""
+"""Optional libraries: imported on use, with an error that names the extra that installs them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["require_library"]
 
 
 def require_library(name: str, extra: str) -> Any:
-    """A module of another library.
+    """Return a module of another library.
 
     Parameters
     ----------

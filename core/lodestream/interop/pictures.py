@@ -1,4 +1,4 @@
-"""Surfaces drawn by matplotlib: heights as a shaded map, others in space."""
+"""Draw surfaces with matplotlib: heights as a shaded map, others in space."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def draw_surface(figure: Figure, surface: Surface, pixels: int) -> None:
 
 
 def small_png(surface: Surface) -> bytes | None:
-    """A small picture of a surface as PNG; None where matplotlib is not installed."""
+    """Return a small picture of a surface as PNG; None where matplotlib is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ def small_png(surface: Surface) -> bytes | None:
 
 
 def _as_map(surface: Surface) -> Block:
-    """The heights of a surface with north at the top, where its metadata say where they lie."""
+    """Return the heights of a surface with north at the top, if its metadata give their position."""
     block = surface.blocks[0]
     metadata = surface.metadata
     if not any(metadata.get(key) is not None for key in ("grid", "axes", "geotransform")):
@@ -90,7 +90,7 @@ def _as_map(surface: Surface) -> Block:
 
 
 def _thinned(block: Block) -> Block:
-    """Every so many rows and columns of a block, where it has more than a small picture shows."""
+    """Return a block with fewer rows and columns, if it has more than a small picture shows."""
     rows, columns = (slice(None, None, max(1, length // SMALL)) for length in block.shape)
     mask = None if block.mask is None else block.mask[rows, columns]
     if mask is not None and not mask.any():
@@ -133,18 +133,18 @@ def _in_space(figure: Figure, surface: Surface, pixels: int) -> None:
         points = _placed(_valid(block.points.astype(np.float64), block.mask))
         points = _without_jumps(_wrapped(points, block.closed, periods), periods)
         points[..., 2] *= lift
-        every = [max(1, -(-count // most)) for count in points.shape[:2]]
+        strides = [max(1, -(-count // most)) for count in points.shape[:2]]
         if min(points.shape[:2]) == 1:
             axes.plot(*points.reshape(-1, 3).T, color="#3b6ea5")
         else:
             x, y, z = np.moveaxis(points, 2, 0)
-            axes.plot_surface(x, y, z, rstride=every[0], cstride=every[1], color="#8fb3d9", linewidth=0)
+            axes.plot_surface(x, y, z, rstride=strides[0], cstride=strides[1], color="#8fb3d9", linewidth=0)
     axes.set_aspect("equal")
     axes.set_axis_off()
 
 
 def _valid(points: NDArray[np.float64], mask: NDArray[np.bool_] | None) -> NDArray[np.float64]:
-    """Points (row, column, ...) with NaN in holes."""
+    """Return points (row, column, ...) with NaN in holes."""
     if mask is not None:
         points[~mask] = np.nan
     points[~np.isfinite(points)] = np.nan
@@ -152,7 +152,7 @@ def _valid(points: NDArray[np.float64], mask: NDArray[np.bool_] | None) -> NDArr
 
 
 def _placed(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (row, column, xyz) of heights (row, column), of points in a plane, or of points in space."""
+    """Return points (row, column, xyz) from heights (row, column), points in a plane, or points in space."""
     if points.ndim == 2:
         rows, columns = np.indices(points.shape, np.float64)
         return np.stack([columns, -rows, points], axis=2)
@@ -165,7 +165,7 @@ def _placed(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _wrapped(
     points: NDArray[np.float64], closed: tuple[bool, bool], periods: tuple[float, float, float]
 ) -> NDArray[np.float64]:
-    """Points (row, column, xyz) with the first ones of closed axes repeated, where angles go on by a full turn."""
+    """Return points (row, column, xyz) with the first ones of closed axes repeated; angles continue by a full turn."""
     for axis in (0, 1):
         if not closed[axis]:
             continue
@@ -183,7 +183,7 @@ def _wrapped(
 
 
 def _go_on(points: NDArray[np.float64], first: NDArray[np.float64], around: NDArray[np.float64], axis: int) -> None:
-    """Add 360 to x or y of `first`, where that is how they go on along an axis; around: (row, column, xyz)."""
+    """Add a full turn to x or y of `first`, if they continue like this along an axis; around: (row, column, xyz)."""
     steps = np.diff(points, axis=axis)
     for channel in (0, 1):
         turns = around[..., channel]
@@ -196,21 +196,21 @@ def _go_on(points: NDArray[np.float64], first: NDArray[np.float64], around: NDAr
 
 
 def _periods(metadata: dict[str, Any]) -> tuple[float, float, float]:
-    """Full turns of x, y and z; 0: no angle."""
+    """Return the full turns of x, y and z; 0 for a coordinate that is no angle."""
     periods = [0.0, 0.0, 0.0]
     angles = metadata.get("angles")
-    said = [(each.get("channel"), each.get("period")) for each in angles or () if isinstance(each, dict)]
+    entries = [(angle.get("channel"), angle.get("period")) for angle in angles or () if isinstance(angle, dict)]
     turn = metadata.get("turn")
     if isinstance(turn, (list, tuple)) and len(turn) == 3:
-        said.append((turn[0], turn[1]))
-    for channel, period in said:
+        entries.append((turn[0], turn[1]))
+    for channel, period in entries:
         if isinstance(period, (int, float)) and channel in (0, 1, 2):
             periods[channel] = abs(float(period))
     return periods[0], periods[1], periods[2]
 
 
 def _without_jumps(points: NDArray[np.float64], periods: tuple[float, float, float]) -> NDArray[np.float64]:
-    """Points with NaN where an angle changes by more than half a turn from the row or column before."""
+    """Return points with NaN where an angle changes by more than half a turn from the row or column before."""
     for channel, period in enumerate(periods):
         if not period:
             continue
@@ -222,7 +222,7 @@ def _without_jumps(points: NDArray[np.float64], periods: tuple[float, float, flo
 
 
 def _lift(surface: Surface) -> float:
-    """What z is multiplied by: 1, but where z has another unit than x and y, so that the relief can be seen."""
+    """Return the factor of z: not 1 if z has another unit than x and y, so that the relief can be seen."""
     boxes = [_box(_placed(_valid(block.points.astype(np.float64), block.mask))) for block in surface.blocks]
     low = np.nanmin([box[0] for box in boxes], axis=0)
     high = np.nanmax([box[1] for box in boxes], axis=0)

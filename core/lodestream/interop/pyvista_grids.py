@@ -38,7 +38,7 @@ _WORDS = ("name", "unit", "crs")
 
 
 def read(path: str | os.PathLike[str], *, level: int | None = None) -> pyvista.StructuredGrid | pyvista.MultiBlock:
-    """A container file for pyvista: what ``pyvista.read("NAME.lode")`` gives.
+    """Read a container file for pyvista; ``pyvista.read("NAME.lode")`` calls this.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def read(path: str | os.PathLike[str], *, level: int | None = None) -> pyvista.S
 
 
 def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:
-    """See `lodestream.Surface.to_pyvista`."""
+    """Convert a surface to grids of pyvista, see `lodestream.Surface.to_pyvista`."""
     pv = require_library("pyvista", "pyvista")
     grids: list[pyvista.StructuredGrid] = [_structured(pv, surface, n) for n in range(len(surface.blocks))]
     for grid, mark in zip(grids, marks_of(surface), strict=True):
@@ -83,21 +83,21 @@ def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:
 
 
 def _structured(pv: Any, surface: Surface, number: int) -> Any:
-    own = grid_of_block(surface, number)
-    rows, columns = own.points.shape[:2]
+    layout = grid_of_block(surface, number)
+    rows, columns = layout.points.shape[:2]
     grid = pv.StructuredGrid()
-    points = own.points if own.points.dtype.kind == "f" else own.points.astype(np.float64)
+    points = layout.points if layout.points.dtype.kind == "f" else layout.points.astype(np.float64)
     grid.points = np.ascontiguousarray(points.reshape(-1, 3))
     grid.dimensions = columns, rows, 1
-    for name, values in own.attributes.items():
+    for name, values in layout.attributes.items():
         grid.point_data[name] = np.ascontiguousarray(values.reshape(rows * columns, *values.shape[2:]))
-    if own.hidden_points.any():
-        grid.point_data[GHOSTS] = own.hidden_points.reshape(-1).astype(np.uint8) * HIDDEN_POINT
-    if own.hidden_cells.any():
-        grid.cell_data[GHOSTS] = own.hidden_cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
+    if layout.hidden_points.any():
+        grid.point_data[GHOSTS] = layout.hidden_points.reshape(-1).astype(np.uint8) * HIDDEN_POINT
+    if layout.hidden_cells.any():
+        grid.cell_data[GHOSTS] = layout.hidden_cells.reshape(-1).astype(np.uint8) * HIDDEN_CELL
     data = grid.point_data
     for name, width, role in ((NORMAL, 3, "active_normals_name"), (TEXTURE, 2, "active_texture_coordinates_name")):
-        if name in own.attributes and own.attributes[name].shape[2:] == (width,):
+        if name in layout.attributes and layout.attributes[name].shape[2:] == (width,):
             setattr(data, role, name)
     for key in _WORDS:
         if isinstance(surface.metadata.get(key), str):
@@ -106,7 +106,7 @@ def _structured(pv: Any, surface: Surface, number: int) -> Any:
 
 
 def _text(name: str, text: str) -> Any:
-    """A text as VTK has it: `field_data` of pyvista takes ASCII alone, and gives any."""
+    """Return a text as an array of VTK: `field_data` of pyvista takes ASCII only."""
     from vtkmodules.vtkCommonCore import vtkStringArray
 
     array = vtkStringArray()
@@ -116,7 +116,7 @@ def _text(name: str, text: str) -> Any:
 
 
 def from_pyvista(data: pyvista.DataObject, **remeshing: Any) -> Surface:
-    """See `lodestream.Surface.from_pyvista`.
+    """Convert an object of pyvista to a surface, see `lodestream.Surface.from_pyvista`.
 
     Raises
     ------
@@ -145,8 +145,8 @@ def from_pyvista(data: pyvista.DataObject, **remeshing: Any) -> Surface:
             if isinstance(grid, pv.DataObject):
                 raise FormatError(f"expected structured grids or a mesh of polygons, got {type(grid).__name__}")
             raise InputError(f"expected a grid of pyvista, got {type(grid).__name__}")
-        own, block, face = _block(grid)
-        plain.append(own)
+        unmasked, block, face = _block(grid)
+        plain.append(unmasked)
         blocks.append(block)
         faces.append(face)
         words |= _words(grid)
@@ -164,7 +164,7 @@ def from_pyvista(data: pyvista.DataObject, **remeshing: Any) -> Surface:
 
 
 def _block(grid: Any) -> tuple[Block, Block, dict[str, Any]]:
-    """A grid as a block without holes and with them, and what is to be said of its faces."""
+    """Return a grid as a block without holes, as a block with holes, and the metadata of its faces."""
     i, j, k = (int(length) for length in grid.dimensions)
     if 1 not in (i, j, k):
         raise FormatError(
@@ -197,12 +197,12 @@ def _rows(values: Any, shape: tuple[int, int]) -> NDArray[Any]:
 
 
 def _kept(name: str, values: Any) -> bool:
-    """Whether data of the points become an attribute: numbers, and not VTK's own."""
+    """Return whether point data become an attribute: numbers that are not VTK's own."""
     return not name.startswith(_OWN) and np.asarray(values).dtype.kind in "iuf"
 
 
 def _no_numbers(data: Any) -> list[str]:
-    """Names of data of the points that are no attributes, such as flags and texts."""
+    """Return the names of point data that are no attributes, such as flags and texts."""
     return [name for name, values in data.point_data.items() if not name.startswith(_OWN) and not _kept(name, values)]
 
 
@@ -212,7 +212,7 @@ def _warn_no_numbers(names: list[str]) -> None:
 
 
 def _words(grid: Any) -> dict[str, str]:
-    """Name, unit and CRS of the field data."""
+    """Return name, unit and CRS from the field data."""
     words: dict[str, str] = {}
     for key in _WORDS:
         if key in grid.field_data:
@@ -225,7 +225,7 @@ def _words(grid: Any) -> dict[str, str]:
 
 
 def _of_polygons(data: Any, remeshing: Mapping[str, object]) -> Surface:
-    """A surface of faces of three or four corners."""
+    """Return the surface of a mesh whose faces have three or four corners."""
     if not data.GetPolys().GetNumberOfCells():
         raise FormatError(f"expected faces that join points to a grid, got {data.n_points:,} points and no face")
     pv, polygons = require_library("pyvista", "pyvista"), data.GetPolys()

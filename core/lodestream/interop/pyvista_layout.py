@@ -1,4 +1,4 @@
-"""How blocks lie in grids of pyvista, and what a grid keeps in its field data so that the same surface comes back.
+"""The layout of blocks in grids of pyvista, and the field data from which the same surface comes back.
 
 Longitudes do not jump: they stay unwrapped, and the end of a closed axis goes on where it began, one turn further.
 """
@@ -29,7 +29,7 @@ GHOSTS = "vtkGhostType"
 
 
 def grid_of_block(surface: Surface, number: int) -> Grid:
-    """One block as pyvista has grids, each axis that is closed or has a seam with its first points again at the end.
+    """Return a block as a grid of pyvista: a closed axis, or one with a seam, repeats its first points at the end.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def grid_of_block(surface: Surface, number: int) -> Grid:
     grid, block, given = grid_of(whole, number, "pyvista"), whole.blocks[number], surface.blocks[number]
     closed, shown = wraps(block), ~grid.hidden_points
     planes = coordinates(whole) if block.points.ndim == 2 and any(closed) else ()
-    seams = [length > own for length, own in zip(block.shape, given.shape, strict=True)]
+    seams = [length > size for length, size in zip(block.shape, given.shape, strict=True)]
     for axis in (0, 1):
         there = np.moveaxis(shown, axis, 0)
         ends = np.moveaxis(grid.points, axis, 0)
@@ -63,13 +63,13 @@ def grid_of_block(surface: Surface, number: int) -> Grid:
 
 
 def _padded(plane: NDArray[Any], closed: tuple[bool, bool], axis: int) -> NDArray[Any]:
-    """A coordinate with the end of the other axis, where that is closed too."""
+    """Return a coordinate with its first line along the other axis repeated, if that axis is closed."""
     ends = [(0, int(closed[other] and other != axis)) for other in (0, 1)]
     return np.pad(plane, ends, mode="reflect", reflect_type="odd")
 
 
 def marks_of(surface: Surface) -> list[str]:
-    """What the field data of each block's grid keep, as JSON; what JSON cannot hold is a note."""
+    """Return the field data of each block's grid, as JSON; a note is issued of values that JSON cannot hold."""
     metadata, lost = in_json(surface.metadata)
     if lost:
         warn(f"the grid is made without {', '.join(lost)}, which JSON cannot hold")
@@ -82,7 +82,7 @@ def marks_of(surface: Surface) -> list[str]:
 
 
 def as_it_was(grids: Sequence[Any], blocks: Sequence[Block], words: Mapping[str, str]) -> Surface | None:
-    """The surface that `marks_of` describes, with the values that the grids have now.
+    """Restore the surface that `marks_of` describes, with the present values of the grids.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def as_it_was(grids: Sequence[Any], blocks: Sequence[Block], words: Mapping[str,
 
 
 def _kept(grid: Any, block: Block, mark: Mapping[str, Any]) -> Block:
-    """A block without the ends that are repeated, in its own type where that holds its values."""
+    """Return a block without its repeated ends, in its original type if that holds its values."""
     (rows, columns), (wrap_rows, wrap_columns), dtype = mark["shape"], mark["closed"], mark["dtype"]
     cut = slice(0, int(rows)), slice(0, int(columns))
     channels = int(mark["channels"])
@@ -127,24 +127,27 @@ def _kept(grid: Any, block: Block, mark: Mapping[str, Any]) -> Block:
 
 
 def _hidden(data: Any, bit: int) -> NDArray[np.bool_]:
-    """What an array of VTK hides, of any length."""
+    """Return the mask of points or cells that a ghost array of VTK hides, of any length."""
     hidden: NDArray[np.bool_] = np.asarray(data[GHOSTS]) & bit != 0
     return hidden
 
 
 def _same(grid: Any, block: Block, surface: Surface, number: int) -> bool:
-    """Whether the surface makes this grid."""
+    """Return whether the surface is converted to this grid."""
     if any(length > there for length, there in zip(shapes_in_files(surface)[number], block.shape, strict=True)):
         return False
-    own = grid_of_block(surface, number)
-    if own.points.shape != block.points.shape or list(own.attributes) != list(block.attributes):
+    expected = grid_of_block(surface, number)
+    if expected.points.shape != block.points.shape or list(expected.attributes) != list(block.attributes):
         return False
-    sides = (grid.point_data, own.hidden_points, HIDDEN_POINT), (grid.cell_data, own.hidden_cells, HIDDEN_CELL)
+    sides = (
+        (grid.point_data, expected.hidden_points, HIDDEN_POINT),
+        (grid.cell_data, expected.hidden_cells, HIDDEN_CELL),
+    )
     for data, hidden, bit in sides:
         if hidden.any() != (GHOSTS in data) or (GHOSTS in data and (_hidden(data, bit) != hidden.reshape(-1)).any()):
             return False
-    shown = ~own.hidden_points
-    return np.array_equal(own.points[shown], block.points[shown]) and all(
+    shown = ~expected.hidden_points
+    return np.array_equal(expected.points[shown], block.points[shown]) and all(
         np.array_equal(values, block.attributes[name], equal_nan=values.dtype.kind == "f")
-        for name, values in own.attributes.items()
+        for name, values in expected.attributes.items()
     )

@@ -19,7 +19,7 @@ __all__ = ["dataset", "to_xarray", "tree"]
 
 
 def to_xarray(surface: Surface) -> xarray.Dataset | xarray.DataTree:
-    """A Dataset of a surface of one block; a DataTree with ``block_0``, ``block_1``, ... of several.
+    """Return a Dataset of a surface of one block; a DataTree with ``block_0``, ``block_1``, ... of several.
 
     See `lodestream.Surface.to_xarray`.
     """
@@ -29,11 +29,11 @@ def to_xarray(surface: Surface) -> xarray.Dataset | xarray.DataTree:
 
 
 def tree(datasets: Sequence[xarray.Dataset]) -> xarray.DataTree:
-    """Datasets of blocks as one DataTree."""
-    found: xarray.DataTree = require_library("xarray", "xarray").DataTree.from_dict(
-        {f"block_{number}": each for number, each in enumerate(datasets)}
+    """Return the datasets of blocks as one DataTree."""
+    result: xarray.DataTree = require_library("xarray", "xarray").DataTree.from_dict(
+        {f"block_{number}": block for number, block in enumerate(datasets)}
     )
-    return found
+    return result
 
 
 def _of_block(surface: Surface, block: Block) -> xarray.Dataset:
@@ -46,7 +46,7 @@ def _of_block(surface: Surface, block: Block) -> xarray.Dataset:
 
 
 def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> xarray.Dataset:
-    """Put the variables of a block together.
+    """Return the Dataset of a block from its variables.
 
     Parameters
     ----------
@@ -66,5 +66,5 @@ def dataset(grid: Grid, given: Callable[[Part], tuple[Any, dict[str, Any]]]) -> 
         else:
             variables[part.name] = xr.Variable(part.dims, values, part.attrs, encoding | mapping)
     attrs = dataset_attributes(grid) | {MARK: mark_text(grid, parts, "the Dataset is made")}
-    found: xarray.Dataset = xr.Dataset(variables, places, attrs)
-    return found
+    result: xarray.Dataset = xr.Dataset(variables, places, attrs)
+    return result

@@ -25,7 +25,7 @@ _WORDS = ("name", "unit", "crs")
 
 
 def to_trimesh(surface: Surface) -> trimesh.Trimesh:
-    """See `lodestream.Surface.to_trimesh`.
+    """Convert a surface to a mesh of trimesh, see `lodestream.Surface.to_trimesh`.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def to_trimesh(surface: Surface) -> trimesh.Trimesh:
     visual = _visual(tm, attributes)
     normals = attributes.pop(NORMAL) if _fits(attributes, NORMAL, (3,), "f") else None
     metadata = {key: value for key, value in surface.metadata.items() if isinstance(value, str | int | float)}
-    made: trimesh.Trimesh = tm.Trimesh(
+    result: trimesh.Trimesh = tm.Trimesh(
         vertices,
         faces,
         vertex_normals=normals,
@@ -53,7 +53,7 @@ def to_trimesh(surface: Surface) -> trimesh.Trimesh:
         metadata=metadata,
         process=False,  # vertices stay as they are, those with and without faces
     )
-    return made
+    return result
 
 
 def _fits(attributes: dict[str, NDArray[Any]], name: str, widths: tuple[int, ...], kinds: str) -> bool:
@@ -62,7 +62,7 @@ def _fits(attributes: dict[str, NDArray[Any]], name: str, widths: tuple[int, ...
 
 
 def _visual(tm: Any, attributes: dict[str, NDArray[Any]]) -> Any:
-    """Colours or places in a texture as trimesh has them, taken out of the attributes."""
+    """Return colours or texture coordinates as trimesh has them, and remove them from the attributes."""
     if _fits(attributes, COLOR, (3, 4), "u") and attributes[COLOR].dtype == np.uint8:
         return tm.visual.ColorVisuals(vertex_colors=attributes.pop(COLOR))
     if _fits(attributes, TEXTURE, (2,), "f"):
@@ -71,7 +71,7 @@ def _visual(tm: Any, attributes: dict[str, NDArray[Any]]) -> Any:
 
 
 def from_trimesh(mesh: trimesh.Trimesh, **remeshing: Any) -> Surface:
-    """See `lodestream.Surface.from_trimesh`.
+    """Convert a mesh of trimesh to a surface, see `lodestream.Surface.from_trimesh`.
 
     Raises
     ------
