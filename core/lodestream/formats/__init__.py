@@ -1,4 +1,4 @@
-"""Reading and writing files: one table of formats, selected by content.
+"""Read and write files: one table of formats, selected by content.
 
 The first bytes of a file decide its format; the suffix only helps with text. No reader opens another file that the
 first one names. Every reader checks what a header announces before it allocates memory. Libraries are imported when a

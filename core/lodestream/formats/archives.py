@@ -1,4 +1,4 @@
-"""ZIP archives into a file that can only be written, as a pipe or the body of a response is."""
+"""ZIP archives in a file that can only be written, such as a pipe or the body of a response."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class _Written:
         self.write = file.write
 
     def flush(self) -> None:
-        """Nothing: who opened the file does."""
+        """Do nothing: the owner of the file flushes it."""
 
 
 @contextmanager
 def new_archive(file: BinaryIO) -> Iterator[ZipFile]:
-    """An archive that is written to `file`, of which only ``write`` is used."""
+    """Yield an archive that is written to `file`, of which only ``write`` is used."""
     written: Any = _Written(file)
     with ZipFile(written, "w", ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
         yield archive
@@ -36,7 +36,7 @@ def new_archive(file: BinaryIO) -> Iterator[ZipFile]:
 
 @contextmanager
 def new_member(archive: ZipFile, name: str) -> Iterator[BinaryIO]:
-    """A member of an archive, to be written."""
+    """Yield a member of an archive, for writing."""
     info = ZipInfo(name, _DATE)
     info.compress_type = ZIP_DEFLATED
     info.external_attr = 0o644 << 16

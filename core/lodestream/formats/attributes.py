@@ -1,4 +1,4 @@
-"""Attributes of points and the columns that formats keep them in: one name for colours, normals and textures."""
+"""Attributes of points and their columns in files: one name for colours, normals and textures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NUMBERED = re.compile(r"(.+)_0")
 
 
 def group(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Make attributes of columns.
+    """Group columns into attributes.
 
     Colours become "color" (red, green, blue, alpha), normals "normal", places in a texture "uv"; columns that are
     numbered from 0 ("momentum_0", "momentum_1") become one attribute of several components; others keep their name.
@@ -58,7 +58,7 @@ def group(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _together(name: str, columns: Mapping[str, NDArray[Any]]) -> tuple[str, tuple[str, ...]] | None:
-    """The attribute that begins with a column, and the columns that it is made of; None where it stands alone."""
+    """Return the attribute that begins with a column, and its columns; None if the column stands alone."""
     numbered = _NUMBERED.fullmatch(name)
     members: tuple[str, ...] = ()
     if numbered is not None:
@@ -81,7 +81,7 @@ def _together(name: str, columns: Mapping[str, NDArray[Any]]) -> tuple[str, tupl
 
 
 def split(attributes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Make columns of attributes, as `group` takes them, under the names that readers of PLY know.
+    """Split attributes into columns, as `group` takes them, under the names that readers of PLY know.
 
     Parameters
     ----------

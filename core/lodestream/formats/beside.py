@@ -13,9 +13,9 @@ __all__ = ["folder_beside"]
 
 @contextmanager
 def folder_beside(file: BinaryIO) -> Iterator[Path]:
-    """A folder that is gone afterwards, on the disk of an open file: what goes there may be as large as that.
+    """Make a temporary folder on the disk of an open file: its files may be as large as that one.
 
-    The system's folder for such files is often small, or memory. It is taken where the file is no file on a disk.
+    The system's folder for temporary files is often small, or memory. It is taken if the file is not on a disk.
     """
     name = getattr(file, "name", None)
     path = Path(name) if isinstance(name, str) else None

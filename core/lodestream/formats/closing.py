@@ -16,13 +16,13 @@ MIN_CLOSED = 3
 
 
 def wraps(block: Block) -> Closed:
-    """Along which axes the first points of a block are repeated."""
+    """Return along which axes the first points of a block are repeated."""
     rows, columns = (closed and length >= MIN_CLOSED for closed, length in zip(block.closed, block.shape, strict=True))
     return rows, columns
 
 
 def wrapped_ends(values: NDArray[Any], block: Block) -> NDArray[Any]:
-    """An array over the points of a block, (H, W) or (H, W, C), the first ones repeated where an axis is closed."""
+    """Return an array over the points of a block, (H, W) or (H, W, C), with the first line of closed axes repeated."""
     ends = [(0, int(wrap)) for wrap in wraps(block)]
     result: NDArray[Any] = np.pad(values, [*ends, (0, 0)][: values.ndim], mode="wrap") if any(wraps(block)) else values
     return result

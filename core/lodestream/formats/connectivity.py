@@ -1,4 +1,4 @@
-"""Points that lines join one after another."""
+"""Points that lines join one after another to a curve."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MIN_CLOSED = 3
 
 
 def find_curve(points: int, segments: NDArray[np.int64], places: Sequence[int], what: str = "line") -> bool:
-    """Check that `segments` join the points one after another; say whether the last is joined to the first.
+    """Check that `segments` join the points one after another; return whether the last is joined to the first.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Binary glTF 2.0 (.glb) of any surface, written only.
+"""Write binary glTF 2.0 (.glb) of any surface.
 
 The container is written here because it is a header and two chunks, while libraries for it keep the whole file in
 memory. Source: Khronos Group, glTF 2.0 Specification, sections 3.6 (accessors), 3.7 (meshes) and 4 (GLB).
@@ -38,7 +38,7 @@ _UNIT = 5e-4
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like binary glTF."""
+    """Return whether a file begins like binary glTF."""
     return head.startswith(_MAGIC)
 
 
@@ -90,7 +90,7 @@ class _Content:
         self.size = 0
 
     def add(self, values: NDArray[Any], target: int, **more: Any) -> int:
-        """Add an array whose rows are whole words of four bytes; give the number of its accessor."""
+        """Add an array whose rows are whole words of four bytes, and return the number of its accessor."""
         kinds = {"f4": _FLOAT, "u4": _UINT, "u1": _BYTE}
         code = values.dtype.str[1:]
         width = values.shape[1] if values.ndim == 2 else 1
@@ -103,7 +103,7 @@ class _Content:
 
 
 def _places(mesh: Output) -> tuple[NDArray[np.float32], list[float] | None]:
-    """Coordinates as float32, and from where they count if that is not 0."""
+    """Return coordinates as float32, and their origin if that is not 0."""
     exact = np.stack([column.astype(np.float64) for column in mesh.coordinates], axis=-1)
     with np.errstate(over="ignore"):
         places = exact.astype(np.float32)
@@ -124,7 +124,7 @@ def _indices(mesh: Output) -> tuple[NDArray[np.uint32], int]:
 
 
 def _add_attributes(content: _Content, mesh: Output, attributes: dict[str, int]) -> list[str]:
-    """Add the attributes; give the names of those that lose bits."""
+    """Add the attributes, and return the names of those that lose bits."""
     rounded = []
     for name, values in mesh.attributes.items():
         width = values.shape[1] if values.ndim == 2 else 1

@@ -47,20 +47,20 @@ class _Axis:
     values: Vector
 
     def places(self, coordinates: Vector) -> NDArray[np.intp]:
-        """Where coordinates, shape (N,), stand on the axis."""
+        """Return the indices of coordinates, shape (N,), on the axis."""
         if self.values[0] <= self.values[-1]:
             return np.searchsorted(self.values, coordinates)
         return len(self.values) - 1 - np.searchsorted(self.values[::-1], coordinates)
 
 
 def speaks_of_places(names: Sequence[str]) -> bool:
-    """Whether columns of these names have x and y."""
+    """Return whether columns of these names include x and y."""
     words = [name.lower().split("(")[0].split("[")[0].strip() for name in names]
     return any(word in _X for word in words) and any(word in _Y for word in words)
 
 
 def is_whole_grid(x: Vector, y: Vector) -> bool:
-    """Whether points, shape (N,) each, are all nodes of a grid along x and y, each once."""
+    """Return whether points, shape (N,) each, are all nodes of a grid along x and y, each once."""
     across, down = _different(x), _different(y)
     if across is None or down is None or min(len(across), len(down)) < 2 or len(across) * len(down) != len(x):
         return False
@@ -128,7 +128,7 @@ def surface(source: Source, table: Vector, names: Sequence[str]) -> Surface:
 
 
 def _roles(names: Sequence[str]) -> tuple[int, int, int]:
-    """The columns of x, y and z: by their names, else the first three."""
+    """Return the columns of x, y and z: by their names, else the first three."""
     words = [name.lower().split("(")[0].split("[")[0].strip() for name in names]
     if not speaks_of_places(names):
         return 0, 1, 2
@@ -139,7 +139,7 @@ def _roles(names: Sequence[str]) -> tuple[int, int, int]:
 
 
 def _different(values: Vector) -> Vector | None:
-    """The different values of a vector, rising; None where they are not all finite."""
+    """Return the distinct values of a vector, rising; None if they are not all finite."""
     result = np.empty(0)
     for part in rows_at_once(values.shape):
         if not np.isfinite(values[part]).all():
@@ -149,7 +149,7 @@ def _different(values: Vector) -> Vector | None:
 
 
 def _axes(x: Vector, y: Vector) -> tuple[_Axis, _Axis]:
-    """The axes of the grid that points, shape (N,) each, are the nodes of.
+    """Return the axes of the grid whose nodes the points, shape (N,) each, are.
 
     Raises
     ------
@@ -187,7 +187,7 @@ _HINT = (
 
 
 def _order(values: Vector) -> int:
-    """1 where values never fall, -1 where they never rise, else 0."""
+    """Return 1 if values never fall, -1 if they never rise, else 0."""
     rising = falling = True
     last = values[0]
     for part in rows_at_once(values.shape):
@@ -199,7 +199,10 @@ def _order(values: Vector) -> int:
 
 
 def _direction(quick: Vector, slow: Vector) -> int:
-    """1 where a coordinate mostly rises from point to point while the other stays, -1 where it falls; 0 for neither."""
+    """Return 1 if a coordinate mostly rises from point to point while the other stays, -1 if it falls.
+
+    0 for neither.
+    """
     rising = 0
     for part in rows_at_once(quick.shape):
         along = np.diff(slow[part]) == 0
@@ -208,7 +211,7 @@ def _direction(quick: Vector, slow: Vector) -> int:
 
 
 def _without_gaps(values: Vector, name: str, whole: bool) -> Vector:
-    """An axis of rising values with those that are missing between multiples of its step, if it is even otherwise.
+    """Return an axis of rising values, with missing multiples of its step filled in if it is even otherwise.
 
     Parameters
     ----------
@@ -251,7 +254,7 @@ def _check_repeated(
     columns: NDArray[np.intp],
     places: tuple[Vector, Vector],
 ) -> None:
-    """Refuse points of one place with different values; those with the same are one.
+    """Refuse points of the same place with different values; equal ones count as one.
 
     Raises
     ------

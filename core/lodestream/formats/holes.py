@@ -1,4 +1,4 @@
-"""Numbers that can stand for holes: which of them no valid value is, found by bands of rows."""
+"""Choose a fill value that no valid sample has, scanning the data in bands of rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Rows = Callable[[slice], NDArray[Any]]
 
 
 def occurs(value: Any, rows: Rows, shape: tuple[int, ...], mask: NDArray[np.bool_] | None) -> bool:
-    """Whether a valid value is this number.
+    """Return whether a valid value equals this number.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def occurs(value: Any, rows: Rows, shape: tuple[int, ...], mask: NDArray[np.bool
 
 
 def fill_of(rows: Rows, dtype: np.dtype[Any], mask: NDArray[np.bool_], nodata: Any = None) -> Any:
-    """A number for holes, in the type of the values.
+    """Return a fill value for holes, in the type of the values.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def fill_of(rows: Rows, dtype: np.dtype[Any], mask: NDArray[np.bool_], nodata: A
 
 
 def _finite(nodata: Any) -> float | None:
-    """A number that metadata give; None where they give none that is finite."""
+    """Return a finite number from the metadata; None if there is none."""
     if isinstance(nodata, bool) or not isinstance(nodata, int | float):
         return None
     try:
@@ -81,7 +81,7 @@ def _finite(nodata: Any) -> float | None:
 
 
 def _integers(rows: Rows, dtype: np.dtype[Any], mask: NDArray[np.bool_], wanted: float | None) -> Iterator[float]:
-    """Integers that may be free, the likely ones first."""
+    """Yield integers that may be free, the likely ones first."""
     limits = np.iinfo(dtype)
     yield from () if wanted is None else (wanted,)
     yield from (-9999, limits.min, limits.max)
@@ -95,7 +95,7 @@ def _integers(rows: Rows, dtype: np.dtype[Any], mask: NDArray[np.bool_], wanted:
 
 
 def _gap(rows: Rows, low: int, high: int, mask: NDArray[np.bool_]) -> Iterator[int]:
-    """The least integer above the least valid value that none of them is; nothing where there is none up to the last.
+    """Yield the smallest integer above the smallest valid value that no valid sample has; nothing if there is none.
 
     Of n values one of n + 1 successive integers is free.
     """

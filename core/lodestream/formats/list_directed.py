@@ -1,4 +1,7 @@
-"""Numbers of a text file as Fortran's list-directed output writes them: repeat counts, commas, exponents with D."""
+"""Read numbers of a text file as Fortran's list-directed output writes them.
+
+Repeat counts, commas, exponents with D.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,7 @@ _EMPTY_VALUE = re.compile(rb"(?:^|,)\s*,")
 
 
 def is_text(head: bytes) -> bool:
-    """Whether a file that begins with `head` holds nothing but numbers in text."""
+    """Return whether a file that begins with `head` holds only numbers in text."""
     return not head.translate(None, _CHARACTERS) and bool(head.strip())
 
 
@@ -83,7 +86,7 @@ def read_numbers(path: Path, memory: int | None = None) -> tuple[NDArray[np.floa
 
 
 def _chunks(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Give the file in pieces of whole lines, each with the number of its first line."""
+    """Yield the file in pieces of whole lines, each with the number of its first line."""
     line, rest = 1, b""
     with path.open("rb") as file:
         while block := file.read(_CHUNK):
@@ -97,7 +100,7 @@ def _chunks(path: Path) -> Iterator[tuple[int, bytes]]:
 
 
 def _numbers(line: int, text: bytes, room: int) -> NDArray[np.float64]:
-    """Convert a piece as a whole; where that fails, find the line that is to blame."""
+    """Convert a piece as a whole; if that fails, find the line at fault."""
     try:
         return _converted(text, room)
     except TooLargeError:
@@ -141,7 +144,7 @@ def _check_room(count: int, room: int) -> None:
 
 
 def _leading_integers(text: bytes) -> tuple[int, bool]:
-    """Count the integers at the start of a piece; say whether there is nothing else in it."""
+    """Count the integers at the start of a piece; return whether it has nothing else, too."""
     words = text.translate(_TRANSLATION).split()
     pairs = [word.rpartition(b"*") for word in takewhile(lambda word: not set(word) - set(b"0123456789*"), words)]
     count = sum(int(times or b"1") if value else 0 for times, _, value in pairs)

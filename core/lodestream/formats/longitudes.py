@@ -1,4 +1,4 @@
-"""Surfaces that go once around the Earth: closed where the step in longitude fits."""
+"""Height fields that go once around the Earth: closed if the step in longitude fits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STRETCH = 1.5
 
 
 def _fits(count: int, step: float) -> bool:
-    """Whether so many steps are a full turn."""
+    """Return whether so many steps are a full turn."""
     return count > 2 and abs(abs(count * step) - TURN) <= _TOLERANCE * abs(step)
 
 
@@ -74,7 +74,7 @@ def close_uneven(surface: Surface, axis: int, longitudes: NDArray[np.float64], c
 
 
 def next_around(longitudes: NDArray[np.float64]) -> float:
-    """The first of longitudes in degrees, shape (N,), by whole turns as near to the last one as it can be."""
+    """Return the first longitude in degrees, of shape (N,), shifted by whole turns to be nearest to the last one."""
     return float(np.unwrap([longitudes[-1], longitudes[0]], period=TURN)[1])
 
 
@@ -92,7 +92,7 @@ def _closed(surface: Surface, axis: int, closed: Closed | None, repeats: bool, a
 
 
 def encircles(longitude: NDArray[np.float64], latitude: NDArray[np.float64], axis: int) -> bool:
-    """Whether an axis of a curvilinear grid leads back to where it began.
+    """Return whether an axis of a curvilinear grid leads back to where it began.
 
     Parameters
     ----------

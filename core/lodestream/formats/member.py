@@ -1,4 +1,4 @@
-"""One of the surfaces of a file that holds several: how it is read, and where it stands among them."""
+"""A surface of a file that holds several: the options that read it, and its place among the others."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Member:
     label: str
 
     def place(self, file: str) -> Place:
-        """Its place in the series of a file that is called so."""
+        """Return its place in the series of a file of this name."""
         value = self.value[:LONGEST] if isinstance(self.value, str) else self.value
         name = f"{file} {self.variable}".strip()
         return Place(name[:LONGEST], self.along[:LONGEST], self.index, value, self.unit[:LONGEST])

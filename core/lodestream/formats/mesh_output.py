@@ -1,4 +1,4 @@
-"""The mesh of a surface as the formats for meshes write it, and what they say about the rest."""
+"""The mesh of a surface for mesh formats, and their notes about the rest."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def output_of(surface: Surface) -> Output:
 
 
 def extra_channels(block: Block) -> dict[int, str]:
-    """The channels of points beyond the third, and what they are called as attributes."""
+    """Return the channels of points beyond the third, with their names as attributes."""
     result = {}
     for channel in range(3, block.points.shape[2] if block.points.ndim == 3 else 0):
         name = f"attribute_{channel - 3}"
@@ -92,7 +92,7 @@ def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], NDArray[
 
 
 def exact_float(values: NDArray[Any], name: str, kind: str) -> NDArray[Any]:
-    """Values of any shape in the smallest type of floats that holds them; floats as they are.
+    """Return values of any shape in the smallest floating type that holds them; floats unchanged.
 
     Raises
     ------
@@ -109,7 +109,7 @@ def exact_float(values: NDArray[Any], name: str, kind: str) -> NDArray[Any]:
 
 
 def words_of(kind: str, surface: Surface) -> dict[str, str]:
-    """What a file says of a surface in words: name, unit and CRS, each on one line; the rest is left out, with a note.
+    """Return name, unit and CRS of a surface as texts of one line each; a note is issued of the rest.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def write_lines(file: BinaryIO, keyword: str, columns: Sequence[NDArray[Any]]) -
 
 
 def _spell(dtype: np.dtype[Any]) -> str:
-    """Choose the shortest of the usual spellings that reads back as the same number."""
+    """Return the shortest of the usual formats that reads back as the same number."""
     if dtype.kind in "iu":
         return "%d"
     return "%.9g" if dtype.itemsize == 4 else "%r"

@@ -1,4 +1,4 @@
-"""A number that marks holes though its file does not say so, as ``gdal_translate -a_nodata`` has it."""
+"""A value that marks holes although its file does not say so, as with ``gdal_translate -a_nodata``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WHOLE = re.compile(r"[-+]?[0-9]{1,20}")
 
 
 def checked(value: object) -> int | float:
-    """Return the number that `value`, a number or its text, stands for; NaN and infinities are allowed.
+    """Return the number in `value`, a number or its text; NaN and infinities are allowed.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def checked(value: object) -> int | float:
 
 
 def with_nodata(surface: Surface, nodata: int | float, room: Room) -> Surface:
-    """Make holes of the points that have the value `nodata`, and issue a note of how many there are.
+    """Turn points with the value `nodata` into holes, and issue a note of their number.
 
     Values are compared in their own type. A height is a hole if it has the value. A point of several coordinates is one
     if all of them have it (a depth camera's 0, 0, 0). Where no point does, z counts: x and y are kept there in
@@ -91,7 +91,7 @@ def with_nodata(surface: Surface, nodata: int | float, room: Room) -> Surface:
 
 
 def _of_type(nodata: int | float, dtype: np.dtype[Any]) -> Any:
-    """The number in the type of the values; None where the type does not have it."""
+    """Return the number in the type of the values; None if the type does not have it."""
     if dtype.kind == "f":
         try:
             with np.errstate(over="ignore"):
@@ -106,12 +106,12 @@ def _of_type(nodata: int | float, dtype: np.dtype[Any]) -> Any:
 
 
 def _equal(values: NDArray[Any], value: Any) -> NDArray[np.bool_]:
-    """Whether each of some values, of any shape, is this one; NaN equals NaN."""
+    """Return whether each value, of an array of any shape, equals this one; NaN equals NaN."""
     return np.isnan(values) if value != value else np.asarray(values == value)
 
 
 def _in_all(points: NDArray[Any], value: Any) -> NDArray[np.bool_]:
-    """Whether all coordinates of some rows of points, shape (row, column) or (row, column, channel), are this value."""
+    """Return whether all coordinates of points, shape (row, column) or (row, column, channel), have this value."""
     return _equal(points, value) if points.ndim == 2 else np.asarray(_equal(points[..., :3], value).all(axis=2))
 
 
@@ -120,7 +120,7 @@ def _occurs_in_all(points: NDArray[Any], value: Any) -> bool:
 
 
 def _masked(block: Block, value: Any, by_z: bool, room: Room) -> tuple[Block, int, int]:
-    """The block with its new holes, how many these are, and how many points of this value were holes before."""
+    """Return the block with its new holes, their number, and the number of such points that were holes before."""
     points = block.points
     mask = room.empty(block.shape, np.bool_)
     count = known = 0

@@ -15,7 +15,7 @@ _HOLDING = ("npy", "geotiff", "cog", "netcdf", "zarr")
 
 
 def note_infinities(surface: Surface, format_name: str) -> None:
-    """Warn of points that are infinite, or NaN in part, where a format has holes in their place."""
+    """Note points that are infinite, or partly NaN, if a format has holes in their place."""
     if format_name in _HOLDING:
         return
     count = sum(_infinite(block) for block in surface.blocks)

@@ -1,4 +1,4 @@
-"""Notes of readers and writers about what they leave out: one line for each loss."""
+"""Notes of readers and writers about lost data: one line for each loss."""
 
 from __future__ import annotations
 
@@ -44,22 +44,24 @@ def warn(text: str) -> None:
 
 
 def listing(names: Iterable[Any]) -> str:
-    """The first names, shortened, and how many more there are."""
+    """Return the first names, shortened, and the number of the others."""
     texts = [str(name) for name in names]
     shown = [text if len(text) <= _LONGEST_NAME else f"{text[: _LONGEST_NAME - 3]}..." for text in texts[:_MOST_NAMES]]
     return ", ".join(shown) + (f" and {number(len(texts) - _MOST_NAMES)} more" if len(texts) > _MOST_NAMES else "")
 
 
 def warn_left_out(kind: str, names: Collection[str], why: str = "which it cannot hold") -> None:
-    """Issue a note about what a file cannot hold, if there is anything."""
+    """Issue a note about data that a file cannot hold, if there are any."""
     if names:
         warn(f"{kind} is written without {listing(names)}, {why}")
 
 
 def with_nul_shown(kind: str, surface: Surface) -> Surface:
-    """A surface whose metadata and names of attributes have no NUL, at which libraries in C end a text or refuse it.
+    """Return a surface without NUL in metadata and names of attributes.
 
-    It is written as Python writes it, with a note, as writers of meshes do with all control characters.
+    Libraries in C end a text there, or refuse it.
+
+    NUL is replaced by Python's escape, with a note, as writers of meshes do with all control characters.
     """
     metadata = {key: _nul_shown(value) for key, value in surface.metadata.items()}
     changed = [f"control characters of {key}" for key, value in metadata.items() if value != surface.metadata[key]]
@@ -91,7 +93,7 @@ def _nul_shown(value: Any) -> Any:
 
 
 def keep_words(words: dict[str, str], key: str, text: str) -> None:
-    """Keep what a comment says of unit and CRS, as our writers of meshes put it; the first counts."""
+    """Keep unit and CRS from a comment, as our writers of meshes put them; the first ones count."""
     text = text.strip()
     if key in words or not text or (key == "crs" and not _WKT.match(text)) or key not in ("unit", "crs"):
         return
@@ -99,7 +101,7 @@ def keep_words(words: dict[str, str], key: str, text: str) -> None:
 
 
 def metadata_left_out(surface: Surface, held: Collection[str]) -> list[str]:
-    """What of the metadata, in words, a user would miss in a file that holds but some of them.
+    """Return a list, in words, of metadata that a user would miss in a file that holds only some of them.
 
     Parameters
     ----------
@@ -127,7 +129,10 @@ def _maps(value: Any) -> list[dict[str, Any]]:
 
 
 def survives(values: NDArray[Any], dtype: Any) -> bool:
-    """Whether every value, of an array of any shape, is the same number in another type; NaN are."""
+    """Return whether every value, of an array of any shape, is the same number in another type.
+
+    NaN counts as the same.
+    """
     if values.dtype == dtype:
         return True
     with np.errstate(over="ignore", invalid="ignore"):

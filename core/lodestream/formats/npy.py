@@ -1,4 +1,4 @@
-"""NPY: one array, checked against the size of its file before memory is taken."""
+"""NPY: one array, whose size is checked against its file before memory is allocated."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _HEADER_READERS = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.
 
 @dataclass(frozen=True, slots=True)
 class NpyHeader:
-    """What the header of an NPY file says of the array that follows."""
+    """Shape and type of the array, from the header of an NPY file."""
 
     shape: tuple[int, ...]
     fortran: bool
@@ -61,12 +61,14 @@ class NpyHeader:
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like NPY."""
+    """Return whether a file begins like NPY."""
     return head.startswith(MAGIC)
 
 
 def read_header(file: IO[bytes]) -> NpyHeader:
-    """Read the header at the start of `file` and go to the first byte of the array; nothing is unpickled.
+    """Read the header at the start of `file`, and leave the file at the first byte of the array.
+
+    Nothing is unpickled.
 
     Raises
     ------
@@ -135,17 +137,17 @@ def read(source: Source) -> Surface:
 
 
 def native(values: NDArray[Any], source: Source) -> NDArray[Any]:
-    """Values, shape (row, ...), in the byte order of the machine: as they are, or copied to where there is room."""
+    """Return values, shape (row, ...), in native byte order: unchanged, or copied to where there is room."""
     if values.dtype.isnative:
         return values
     copy = source.empty(values.shape, values.dtype.newbyteorder("="))
-    for row, own in enumerate(values):
-        copy[row] = own
+    for row, line in enumerate(values):
+        copy[row] = line
     return copy
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write the points as they are; holes of floating-point numbers are NaN."""
+    """Write the points unchanged; holes of floating-point numbers are NaN."""
     closure = ["closure"] * any(surface.closed)
     warn_left_out("NPY", [*surface.attributes, *closure, *metadata_left_out(surface, ())])
     if surface.mask is not None and surface.points.dtype.kind != "f":
@@ -166,7 +168,7 @@ def write_array(file: BinaryIO, array: NDArray[Any]) -> None:
 
 
 def with_holes(surface: Surface) -> NDArray[Any]:
-    """The points of the only block, (H, W) or (H, W, C), NaN in holes where their type has it."""
+    """Return the points of the only block, (H, W) or (H, W, C), with NaN in holes if their type has it."""
     points, mask = surface.points, surface.mask
     if mask is None or points.dtype.kind != "f":
         return points

@@ -1,4 +1,4 @@
-"""NPZ: an archive of arrays, of which one is the surface and others say where it lies."""
+"""Read NPZ: an archive of arrays, one of which is the surface, while others give its places."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _ENCRYPTED = 1
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like a ZIP archive, full or empty."""
+    """Return whether a file begins like a ZIP archive, full or empty."""
     return head.startswith((b"PK\x03\x04", b"PK\x05\x06"))
 
 
@@ -110,7 +110,7 @@ class _Contents:
         return ", ".join(words[:10] + ["..."] * (len(words) > 10)) or "nothing"
 
     def values(self, name: str) -> NDArray[Any]:
-        """One array, whose header was found to be allowed."""
+        """Return an array, whose header has been checked."""
         header = self.headers[name]
         self.source.check_expansion(header.nbytes)
         with self.archive.open(self.members[name]) as file:
@@ -121,7 +121,7 @@ class _Contents:
         return values
 
     def coordinate(self, letter: str, shape: tuple[int, ...], heights: str) -> Coordinate | None:
-        """The array of x or y; None where there is none."""
+        """Return the array of x or y; None if there is none."""
         name = self.coordinate_name(letter, shape, heights)
         if name is None:
             return None
@@ -129,7 +129,7 @@ class _Contents:
         return Coordinate(self.values(name), _along(letter, shape)[self.headers[name].shape], degrees)
 
     def coordinate_name(self, letter: str, shape: tuple[int, ...], heights: str) -> str | None:
-        """The name of that array: the one that the option names, or a usual one with a fitting shape."""
+        """Return the name of the array of x or y: that of the option, or a usual name with a fitting shape."""
         shapes = _along(letter, shape)
         if letter in self.source.options:
             name = str(self.source.options[letter])
@@ -152,7 +152,7 @@ class _Contents:
         return name
 
     def scalars(self) -> dict[str, Any]:
-        """The single numbers."""
+        """Return the single numbers."""
         return {
             name: np.asarray(self.values(name)).reshape(-1)[0].item()
             for name, header in self.headers.items()
@@ -160,40 +160,40 @@ class _Contents:
         }
 
     def mask(self, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-        """The array that says which points are no holes; None where there is none of this shape."""
+        """Return the mask of valid points; None if there is none of this shape."""
         header = self.headers.get(MASK)
         if header is None or header.dtype.kind != "b" or header.shape != shape:
             return None
         return np.asarray(self.values(MASK))
 
     def attributes(self, surface: str, taken: Collection[str]) -> dict[str, NDArray[Any]]:
-        """The other arrays (H, W) or (H, W, K) beside a surface that has the name that our writer gives it."""
+        """Return the other arrays (H, W) or (H, W, K) beside a surface under the name that our writer uses."""
         if surface not in (HEIGHTS, POINTS):
             return {}
         shape = self.headers[surface].shape[:2]
-        found = {
+        headers = {
             name: header
             for name, header in self.headers.items()
             if name not in taken and header.shape[:2] == shape and refuse_array(header.shape, header.dtype) is None
         }
-        channels = sum(prod(header.shape[2:]) for header in found.values())
+        channels = sum(prod(header.shape[2:]) for header in headers.values())
         if channels:
             self.source.check_array((*shape, max(channels, 2)), np.dtype(np.float64))  # of all together
-            self.source.check_expansion(sum(header.nbytes for header in found.values()))
-        return {name: self.values(name) for name in found}
+            self.source.check_expansion(sum(header.nbytes for header in headers.values()))
+        return {name: self.values(name) for name in headers}
 
     def words(self) -> dict[str, str]:
-        """The texts that `WORDS` names."""
-        found = {}
+        """Return the texts of the names in `WORDS`."""
+        texts = {}
         for name in WORDS:
             header = self.headers.get(name)
             if header is not None and header.dtype.kind == "U" and header.shape == () and header.nbytes <= _LONGEST:
-                found[name] = str(self.values(name))
-        return found
+                texts[name] = str(self.values(name))
+        return texts
 
 
 def _along(letter: str, shape: tuple[int, ...]) -> dict[tuple[int, ...], int | None]:
-    """The shapes that x or y may have, and the axis that each runs along: None for both."""
+    """Return the shapes that x or y may have, and the axis of each: None for both."""
     axis = 1 - "xy".index(letter)
     return {shape: None, (shape[axis],): axis}
 
@@ -259,7 +259,7 @@ def _choose(contents: _Contents) -> str:
 
 
 def _bounds(scalars: Mapping[str, Any], shape: tuple[int, ...]) -> list[float] | None:
-    """The geotransform that spacings and an extent agree on, of cells or of points; None where they do not."""
+    """Return the geotransform on which spacings and an extent, of cells or of points, agree; None if they do not."""
     if len(shape) != 2:
         return None
     transform: list[float] = []

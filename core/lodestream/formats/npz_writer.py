@@ -1,4 +1,4 @@
-"""NPZ, written: the points, where they lie, which are holes, and attributes, each as an array of its own."""
+"""Write NPZ: points, their places, the mask of holes and attributes, each as an array of its own."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def _vector(plane: NDArray[Any], axis: int) -> NDArray[Any]:
-    """One line of a coordinate (H, W) along an axis, where all are the same; else the whole."""
+    """Return one line of a coordinate (H, W) along an axis, if all lines are equal; else all of it."""
     line = plane[0] if axis == 1 else plane[:, 0]
     whole = np.broadcast_to(line[None, :] if axis == 1 else line[:, None], plane.shape)
     return np.ascontiguousarray(line if plane.tobytes() == whole.tobytes() else plane)

@@ -1,4 +1,4 @@
-"""OFF as text: vertices, with normals, colours and places in a texture if its first word says so, and faces.
+"""Read OFF as text: vertices and faces, with normals, colours and texture coordinates if the first word announces them.
 
 Geomview's manual describes it. Colours of faces are left out.
 """
@@ -28,7 +28,7 @@ _LEAST_BYTES = 6
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins with OFF, or with one of the words that say more than that."""
+    """Return whether a file begins with OFF, or with one of the words that say more than that."""
     return _KEYWORD.match(head) is not None
 
 
@@ -62,7 +62,7 @@ def read(source: Source) -> Surface:
 
 
 class _Lines:
-    """The lines of a file that say anything, one after another, without comments."""
+    """Lines with content, one after another, without comments."""
 
     def __init__(self, source: Source) -> None:
         content = source.path.read_bytes().replace(b"\r\n", b"\n").replace(b"\r", b"\n")
@@ -84,7 +84,7 @@ class _Lines:
         self._place = 0
 
     def counts(self) -> tuple[int, int]:
-        """Vertices and faces that the file promises."""
+        """Return the numbers of vertices and faces that the file announces."""
         words = self._rows[0] if self._rows else []
         if words[:1] == [b"BINARY"]:
             raise FormatError("expected OFF as text, got OFF BINARY")
@@ -103,7 +103,7 @@ class _Lines:
         return rows, numbers
 
     def vertices(self, count: int) -> tuple[NDArray[np.float64], dict[str, NDArray[Any]]]:
-        """Points and what belongs to them."""
+        """Return points and their attributes."""
         rows, numbers = self._take(count, "vertices")
         if not rows:
             raise FormatError("expected at least one vertex, got none")
@@ -148,7 +148,7 @@ class _Lines:
         raise AssertionError("one of the rows is wrong")
 
     def faces(self, count: int, vertices: int) -> tuple[NDArray[np.int32], bool]:
-        """Corners of faces, and whether some of these have colours."""
+        """Return the corners of faces, and whether some faces have colours."""
         rows, numbers = self._take(count, "faces")
         corners = np.full((count, 4), -1, np.int32)
         coloured = False
@@ -179,7 +179,7 @@ class _Lines:
 
 
 def _colours(values: NDArray[np.float64]) -> NDArray[Any]:
-    """Colours as bytes where they are whole numbers up to 255, as they are otherwise."""
+    """Return colours as bytes if they are whole numbers up to 255, else unchanged."""
     whole = (values == np.trunc(values)).all() and values.min() >= 0 and values.max() <= 255
     return values.astype(np.uint8) if whole and values.max() > 1 else values.copy()
 

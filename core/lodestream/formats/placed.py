@@ -1,4 +1,4 @@
-"""Heights that come with coordinates, as vectors or as arrays of their own."""
+"""Heights with coordinates, as vectors or as arrays of their own."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class _Line:
 
 
 def _line(coordinate: Coordinate) -> _Line | None:
-    """None for an array over both axes, and where rules cannot take the place of x and y.
+    """Return a coordinate as a line; None for an array over both axes, and if no rule can replace x and y.
 
     These are values that are not finite or are all the same, and uneven ones of a type that points cannot have.
     Longitudes that jump stay as they are where unwrapping would round them.
@@ -150,14 +150,14 @@ def _line(coordinate: Coordinate) -> _Line | None:
 
 
 def _closed_along(surface: Surface, axis: int, line: _Line, closed: Closed | None) -> Surface:
-    """Heights, closed along an axis where its longitudes go around the Earth."""
+    """Return heights with an axis closed whose longitudes go around the Earth."""
     if line.even:
         return close_around(surface, (axis, line.step), closed)
     return close_uneven(surface, axis, line.values.astype(np.float64), closed)
 
 
 def _with_next(rule: Rule, length: int) -> Rule:
-    """A rule of longitudes of a closed axis of this length: a list says how long the step over the seam is."""
+    """Return the rule of longitudes of a closed axis of this length; a list includes the step over the seam."""
     if rule[-1] != VALUES or len(rule) - 1 > length:
         return rule  # that step is as long as the others, or a last value that repeats the first was merged
     values = rule[:-1]
@@ -165,7 +165,7 @@ def _with_next(rule: Rule, length: int) -> Rule:
 
 
 def _georeference(x: Coordinate, y: Coordinate, across: _Line, down: _Line) -> dict[str, Any] | None:
-    """The metadata that say where heights lie; None where no rules make every coordinate again, bit for bit."""
+    """Return the metadata for the places of heights; None if no rules restore every coordinate bit for bit."""
     dtype = np.result_type(across.given, down.given)
     transform: list[float] = []
     rules: dict[str, Any] = {}
@@ -187,17 +187,17 @@ def _georeference(x: Coordinate, y: Coordinate, across: _Line, down: _Line) -> d
     if x.axis == 0:
         rules["rows"] = "x"
     # Without even spacing a geotransform says nothing.
-    found: dict[str, Any] = {"geotransform": transform} if across.even and down.even else {"axes": rules}
+    metadata: dict[str, Any] = {"geotransform": transform} if across.even and down.even else {"axes": rules}
     for start, line, axis in ((0, across, x.axis), (3, down, y.axis)):
         place, still = np.arange(len(line.values), dtype=np.float64), np.zeros((1, 1))
         row, column = (place[:, None], still) if axis == 0 else (still, place[None, :])
         centres = evaluate([*transform[start : start + 3], 0.5], row, column, False)
         if centres.tobytes() != line.values.astype(np.float64).tobytes():
-            found["axes"] = rules
+            metadata["axes"] = rules
     lows = [(channel, line.low) for channel, line in enumerate((across, down)) if line.low is not None]
     if lows:
-        found["angles"] = [{"channel": channel, "period": TURN, "low": low} for channel, low in lows]
-    return found
+        metadata["angles"] = [{"channel": channel, "period": TURN, "low": low} for channel, low in lows]
+    return metadata
 
 
 def _plane(coordinate: Coordinate, shape: tuple[int, ...]) -> NDArray[Any]:

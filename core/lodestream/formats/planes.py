@@ -1,4 +1,4 @@
-"""Index planes of volumes: which ones a reader takes, and how each is laid out in rows and columns."""
+"""Index planes of volumes: the planes that a reader takes, and the layout of each in rows and columns."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Dims = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """The surface that is taken of one block.
+    """The surface taken from one block.
 
     Attributes
     ----------
@@ -48,37 +48,37 @@ class Cut:
     shape: tuple[int, int]
 
     def view(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The surface in the block's values, an array of shape (k * j * i, ...) with i running fastest; not copied."""
+        """Return the surface in the values of a block, shape (k * j * i, ...) with i running fastest; a view."""
         i, j, k = self.dims
         volume = values.reshape(k, j, i, *values.shape[1:])
         return volume[self.key].reshape(*self.shape, *values.shape[1:])
 
     def of(self, values: NDArray[Any], room: Room = IN_MEMORY) -> NDArray[Any]:
-        """A copy of `view`, shape (row, column) and more, in the machine's byte order, made some rows at a time.
+        """Return a copy of `view`, shape (row, column) and more, in the machine's byte order, made some rows at a time.
 
         ``room`` says whether it lies in memory or in a file.
         """
         view = self.view(values)
-        found = room.empty(view.shape, view.dtype.newbyteorder("="))
+        copy = room.empty(view.shape, view.dtype.newbyteorder("="))
         for rows in rows_at_once(view.shape):
-            found[rows] = view[rows]
-        return found
+            copy[rows] = view[rows]
+        return copy
 
 
 def stacked(channels: Sequence[NDArray[Any]], room: Room) -> NDArray[Any]:
-    """Arrays of shape (row, column) as the channels of one in the machine's byte order, where there is room for it.
+    """Return arrays of shape (row, column) as the channels of one array in native byte order.
 
     It is made some rows at a time, and the arrays are not copied.
     """
-    found = room.empty((*channels[0].shape, len(channels)), channels[0].dtype.newbyteorder("="))
-    for rows in rows_at_once(found.shape):
+    stack = room.empty((*channels[0].shape, len(channels)), channels[0].dtype.newbyteorder("="))
+    for rows in rows_at_once(stack.shape):
         for number, values in enumerate(channels):
-            found[rows, :, number] = values[rows]
-    return found
+            stack[rows, :, number] = values[rows]
+    return stack
 
 
 def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[list[Cut]], dict[str, Any]]:
-    """Decide which surfaces are taken of each block, by the option ``plane``.
+    """Return the surfaces to take from each block, by the option ``plane``.
 
     An axis of one point is dropped. Of a volume the plane i0 is taken where the option is not given, with a warning; of
     several planes each is a surface.
@@ -106,10 +106,10 @@ def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[list[Cut]], dict[
             f"took plane {_DEFAULT} of a volume of {_words(volumes[0])} points; choose others with plane=, like j3,k-1"
         )
     result = [[_cut(dims, axis, index) for axis, index in (planes if min(dims) > 1 else planes[:1])] for dims in blocks]
-    every = [cut for of_block in result for cut in of_block]
-    points = sum(cut.shape[0] * cut.shape[1] for cut in every)
-    largest = max(every, key=lambda cut: cut.shape[0] * cut.shape[1])
-    words = f"{len(every)} blocks" if len(every) > 1 else f"{largest.shape[0]} x {largest.shape[1]}"
+    all_cuts = [cut for of_block in result for cut in of_block]
+    points = sum(cut.shape[0] * cut.shape[1] for cut in all_cuts)
+    largest = max(all_cuts, key=lambda cut: cut.shape[0] * cut.shape[1])
+    words = f"{len(all_cuts)} blocks" if len(all_cuts) > 1 else f"{largest.shape[0]} x {largest.shape[1]}"
     source.check_vertices(points, f"{points:,} ({words})")
     if not volumes:
         return result, {}
@@ -119,8 +119,8 @@ def cuts(source: Source, blocks: Sequence[Dims]) -> tuple[list[list[Cut]], dict[
 
 def _parse(value: Any) -> list[tuple[int, int]]:
     words = str(_DEFAULT if value is None else value).lower().split(",")
-    found = [re.fullmatch(r"\s*([ijk])(-?\d{1,9})\s*", word) for word in words[:_MOST_PLANES]]
-    planes = [(_AXES.index(match[1]), int(match[2])) for match in found if match is not None]
+    matches = [re.fullmatch(r"\s*([ijk])(-?\d{1,9})\s*", word) for word in words[:_MOST_PLANES]]
+    planes = [(_AXES.index(match[1]), int(match[2])) for match in matches if match is not None]
     if len(planes) < len(words) or len(set(planes)) < len(planes):
         raise OptionError(
             f"expected plane= an axis and an index, such as i0, j3 or k-1, or up to {_MOST_PLANES} different planes "

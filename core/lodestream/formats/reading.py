@@ -1,4 +1,4 @@
-"""Reading files: the first bytes decide the format, its row of the table does the rest."""
+"""Read files: the first bytes decide the format, whose row of the table has the reader."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
 
 
 def _readable_as(name: str) -> tuple[Format, ...]:
-    """The format that is read under this name, or those whose files end so without the dot, as .xyz of two.
+    """Return the format that is read under this name, or the formats with this suffix, such as .xyz.
 
     Raises
     ------
@@ -237,13 +237,13 @@ def _check_regular(path: Path) -> None:
 
 
 def _of_folder(path: Path, wanted: str | None) -> Format:
-    found = next((it for it in FORMATS if it.folder and it.folder(path)), None)
-    if wanted is not None and found not in (candidates := _readable_as(wanted)):
+    match = next((it for it in FORMATS if it.folder and it.folder(path)), None)
+    if wanted is not None and match not in (candidates := _readable_as(wanted)):
         names = " or ".join(format_.name for format_ in candidates)
-        raise FormatError(f"expected a file of format {names}, got {'a folder' if found is None else found.name}")
-    if found is None:
+        raise FormatError(f"expected a file of format {names}, got {'a folder' if match is None else match.name}")
+    if match is None:
         raise FormatError("expected a regular file or the folder of a Zarr store, got another folder")
-    return found
+    return match
 
 
 def _readable() -> str:
@@ -252,7 +252,7 @@ def _readable() -> str:
 
 
 def _describe(head: bytes) -> str:
-    """Say how a file begins, in characters that are safe to print."""
+    """Return the beginning of a file as text that is safe to print."""
     text = head[:40].decode("ascii", "replace")
     if all(character.isprintable() or character.isspace() for character in text) and "\ufffd" not in text:
         return f"text that begins with {' '.join(text.split())!r}"

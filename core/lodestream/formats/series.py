@@ -1,4 +1,4 @@
-"""The surfaces that one file holds: one for each step along a dimension, or for each variable."""
+"""Surfaces of one file: one for each step along a dimension, or for each variable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def members(
     format_name: str | None = None,
     options: Mapping[str, Any],
 ) -> list[Member]:
-    """List the surfaces of a file along a dimension, or its variables, without reading their values.
+    """Return the surfaces of a file along a dimension, or its variables, without reading their values.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What a reader is given, and the limits that it checks before it takes memory."""
+"""The input of a reader, and the limits that it checks before it allocates memory."""
 
 from __future__ import annotations
 
@@ -81,11 +81,14 @@ class Source:
     room: Room = IN_MEMORY
 
     def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
-        """A new array of this shape, (row, ...), whatever it holds: a large one lies in a file, if there is room."""
+        """Return a new array of this shape, (row, ...), not initialised.
+
+        A large one lies in a file, if there is room.
+        """
         return self.room.empty(shape, dtype)
 
     def check_vertices(self, count: int, shape: str) -> None:
-        """Refuse a surface of too many vertices; `shape` says in words where the count comes from.
+        """Refuse a surface of too many vertices; `shape` tells in words where the count comes from.
 
         Raises
         ------
@@ -129,11 +132,11 @@ class Source:
             )
 
     def metadata(self, format_name: str) -> dict[str, Any]:
-        """Metadata that every reader gives."""
+        """Return the metadata that all readers give."""
         return {"name": self.stem, "format": format_name}
 
     def integer_option(self, name: str, low: int, high: int) -> int | None:
-        """Value of the option `name` as an integer from `low` to `high`; None when it was not given.
+        """Return the value of the option `name` as an integer from `low` to `high`; None if it was not given.
 
         Raises
         ------
@@ -153,7 +156,7 @@ class Source:
 
 
 def refuse_array(shape: tuple[int, ...], dtype: np.dtype[Any]) -> str | None:
-    """Say why an array of this shape and type is no surface; None when it is one."""
+    """Return the reason why an array of this shape and type is no surface; None if it is one."""
     if dtype.kind in _KINDS:
         return f"expected integers or floating-point numbers, got {_KINDS[dtype.kind]} ({dtype})"
     if dtype.kind == "f" and dtype.itemsize not in _FLOAT_SIZES:
@@ -180,11 +183,11 @@ def check_allowed(names: Sequence[str], allowed: Collection[str] | None) -> None
 
 
 def number(value: int) -> str:
-    """Write a count with separators, as messages show it."""
+    """Return a count with separators, for messages."""
     return f"{value:,}"
 
 
 def with_name(error: InputError, label: str) -> InputError:
-    """Put the file's name in front of a message, which stays one line whatever either holds."""
+    """Return an error with the file's name before its message, which stays one line whatever either holds."""
     message = f"{label}: {error}"
     return type(error)("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message))

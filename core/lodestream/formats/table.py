@@ -1,4 +1,4 @@
-"""The table of formats: who recognises, reads and writes each, and under which names."""
+"""The table of formats: names, suffixes, recognition, readers and writers."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ class Format:
 
 
 def _raster(name: str, **more: Any) -> Format:
-    """The row of a raster that GDAL reads; `more` says how it is written."""
+    """Return the row of a raster that GDAL reads; `more` has the fields for writing."""
     driver = DRIVERS[name]
     return Format(
         name=name,
@@ -269,5 +269,5 @@ FORMATS = (
 
 
 def formats() -> tuple[Format, ...]:
-    """All formats that can be read or written."""
+    """Return all formats that can be read or written."""
     return FORMATS

@@ -1,4 +1,4 @@
-"""Arrays as text: a surface in one file, its coordinates in a file each, or a line "x y z" for each node of a grid."""
+"""Read arrays as text: a surface in one file, or each coordinate in one, or a line "x y z" for each node of a grid."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ _MOST_COLUMNS = 64
 
 @dataclass(frozen=True)
 class _Layout:
-    """How the numbers of a file are written.
+    """Layout of the numbers of a file.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class _Layout:
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file of such a suffix begins with a line of numbers, comments and one line of names aside.
+    """Return whether a file of such a suffix begins with a line of numbers, comments and one line of names aside.
 
     A .xyz has at least three columns, and does not begin with the dimensions of a PLOT3D file.
     """
@@ -105,7 +105,7 @@ def sniff(head: bytes, suffix: str) -> bool:
 
 
 def _begins_with_points(lines: Sequence[bytes], whole: bool) -> bool:
-    """Whether the first lines of a .xyz are points, x, y, z and more, and not PLOT3D's dimensions and numbers."""
+    """Return whether the first lines of a .xyz are points, x, y, z and more, not the dimensions of a PLOT3D file."""
     rows = [_words(line, _delimiter(line)) for line in (lines if whole else lines[:-1] or lines)]
     if len(rows[0]) < 3 or any(len(row) != len(rows[0]) for row in rows):
         return False
@@ -161,13 +161,13 @@ def read(source: Source) -> Surface:
 
 
 def _are_points(layout: _Layout, array: NDArray[np.float64]) -> bool:
-    """Whether lines of four numbers or more, whose columns have no names, are points: the first two are a grid."""
+    """Return whether lines of four or more numbers without names are points: the first two numbers form a grid."""
     able = 3 < layout.columns <= _MOST_COLUMNS and layout.rows >= _FEWEST_POINTS
     return able and gridded_points.is_whole_grid(array[:, 0], array[:, 1])
 
 
 def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
-    """All numbers of a file, shape (line, column); a large array lies where the source has room."""
+    """Return all numbers of a file, shape (line, column); a large array goes where the source has room."""
     rows, columns = layout.rows, layout.columns
     array = source.empty((rows, columns), np.dtype(np.float64))
     done = 0
@@ -187,7 +187,7 @@ def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
 
 
 def _numbers(file: IO[bytes], layout: _Layout) -> Iterator[str]:
-    """The lines of numbers of a file, without comments, and without the line of names."""
+    """Yield the lines of numbers of a file, without comments and the line of names."""
     lines = (text for text in map(_stripped, _lines(file)) if text)
     if layout.heading:
         next(lines)
@@ -205,7 +205,7 @@ def _lines(file: IO[bytes]) -> Iterator[bytes]:
 
 
 def _stripped(line: bytes) -> bytes:
-    """A line without comment, white space at its ends, and quotation marks around all of its numbers."""
+    """Return a line without comment, white space at its ends, and quotation marks around all of its numbers."""
     text = line.strip()
     text = b"" if text.startswith(_COMMENT) else text.split(b"#")[0].rstrip()
     quoted = text.startswith(b'"') and (_QUOTED.fullmatch(text) or _QUOTED_COMMAS.fullmatch(text))
@@ -213,12 +213,12 @@ def _stripped(line: bytes) -> bytes:
 
 
 def _has_numbers(text: bytes) -> bool:
-    """Whether a line is one of numbers, or would be without its quotation marks: the reader says what these mean."""
+    """Return whether a line has numbers only, perhaps in quotation marks, which the reader interprets."""
     return _LINE.fullmatch(text.replace(b'"', b"")) is not None
 
 
 def _delimiter(line: bytes) -> str | None:
-    """What stands between numbers of a line; a comma between semicolons belongs to a number."""
+    """Return the delimiter of the numbers of a line; a comma between semicolons belongs to a number."""
     return next((mark for mark in (";", ",") if mark.encode() in line), None)
 
 
@@ -228,7 +228,7 @@ def _words(line: bytes, delimiter: str | None) -> list[str]:
 
 
 def _layout(path: Path) -> _Layout:
-    """Go through a file for the layout of its numbers."""
+    """Scan a file for the layout of its numbers."""
     rows, columns, quoted = 0, 0, False
     delimiter: str | None = None
     names: tuple[str, ...] = ()
@@ -268,7 +268,10 @@ def _quotes(line: bytes) -> FormatError:
 
 
 def _names(heading: bytes, comment: bytes, columns: int, delimiter: str | None) -> tuple[str, ...]:
-    """Names of columns in the line before the numbers; those in a comment only if they speak of x and y."""
+    """Return the names of columns in the line before the numbers.
+
+    Names in a comment count only if x and y are among them.
+    """
     for line, sure in ((heading, True), (comment, False)):
         words = _words(line, delimiter if delimiter and delimiter.encode() in line else _delimiter(line))
         fits = columns >= 3 and len(words) == columns and all(map(_NAME.fullmatch, words))

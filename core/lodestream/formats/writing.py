@@ -1,4 +1,4 @@
-"""Writing files: a name's suffix decides the format."""
+"""Write files: the suffix of a name decides the format."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def check_blocks(format_: Format, count: int) -> None:
 
 
 def for_writing(path: str | os.PathLike[str]) -> Format:
-    """The format in which a file of this name is written.
+    """Return the format in which a file of this name is written.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def for_writing(path: str | os.PathLike[str]) -> Format:
 
 
 def written(name: str) -> Format:
-    """The format of this name, or whose files end so, that can be one file: ``geotiff``, ``tif`` and ``tiff`` are one.
+    """Return the format of a name or suffix (``geotiff``, ``tif`` and ``tiff`` are one) that can be one file.
 
     Raises
     ------
@@ -57,10 +57,10 @@ def written(name: str) -> Format:
     """
     formats = {it.name: it for it in FORMATS if it.write}
     by_suffix = {suffix[1:]: it for it in formats.values() for suffix in it.suffixes_out}
-    found = (by_suffix | formats).get(name)
-    if found is None:
+    match = (by_suffix | formats).get(name)
+    if match is None:
         raise OptionError(f"expected format to be one of {', '.join(formats)}, got {name[:80]!a}")
-    return found
+    return match
 
 
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
@@ -139,7 +139,7 @@ def write_stream(surface: Surface, format_name: str, file: BinaryIO) -> None:
 
 
 def _prepared(surface: Surface, format_: Format) -> Surface:
-    """The surface as a writer takes it: with its repeated rows, columns and angles, unless that restores them."""
+    """Return the surface for a writer: with its repeated rows, columns and angles, unless the writer restores them."""
     check_blocks(format_, len(surface.blocks))
     surface = restore(surface) if format_.restored else surface
     note_infinities(surface, format_.name)

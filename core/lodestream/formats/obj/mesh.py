@@ -1,4 +1,4 @@
-"""What an OBJ file says: points, attributes of corners, faces and lines.
+"""Content of an OBJ file: points, attributes of corners, faces and lines.
 
 The reader is our own because the usual libraries cut quads into triangles or end the process on a bad file. References
 to other files (``mtllib``) are skipped.
@@ -64,7 +64,7 @@ _WORDS = {b"v": "a point of 3 numbers (or 6, with a colour)", b"vt": "1 to 3 num
 
 
 class ObjFile:
-    """What has been read so far, in arrays of one run of lines each.
+    """The content read so far, in arrays, each of a run of lines.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class ObjFile:
             self._add(line, run)
 
     def _add(self, line: int, run: list[bytes]) -> None:
-        """Add lines that begin alike; a run without surprises is converted as a whole, any other line by line."""
+        """Add lines with the same keyword; a regular run is converted as a whole, any other line by line."""
         keyword = run[0][:2].strip()
         if keyword in _KINDS and self._add_values_at_once(line, keyword, run):
             return
@@ -143,9 +143,9 @@ class ObjFile:
             self._keep_comment(text)
             return
         if words[0] in IGNORED:
-            said = self._others.setdefault(words[0], set())
-            if len(said) < _ENOUGH:
-                said.add(b" ".join(words[1:]).lower())
+            arguments = self._others.setdefault(words[0], set())
+            if len(arguments) < _ENOUGH:
+                arguments.add(b" ".join(words[1:]).lower())
             return
         # Text that begins with something else is no OBJ, whatever it is called.
         foreign = words[0] not in READ and self._counts[b"v"] > 0 and bool(_KEYWORD.fullmatch(words[0]))
@@ -170,7 +170,7 @@ class ObjFile:
         self._keep_faces(line, 1, [row if row.max() >= 0 else None for row in rows])
 
     def _pass_over(self, words: list[bytes]) -> None:
-        """Count a statement of another program, which says nothing of points and faces."""
+        """Count a statement of another program, which has no points and faces."""
         second = words[1] if len(words) > 1 and words[0] == b"t" and _KEYWORD.fullmatch(words[1]) else b""
         kind = b" ".join(filter(None, (words[0], second))).decode("ascii")
         if kind not in self._foreign and len(self._foreign) >= _MOST_KINDS:
@@ -178,7 +178,7 @@ class ObjFile:
         self._foreign[kind] = self._foreign.get(kind, 0) + 1
 
     def _corner(self, line: int, word: bytes, text: bytes) -> tuple[int, int, int]:
-        """The point, texture and normal of a corner; -1 where it has none."""
+        """Return point, texture coordinates and normal of a corner; -1 for each that it does not have."""
         parts = word.split(b"/")
         result = [-1, -1, -1]
         for place, part in enumerate(parts[:3]):
@@ -232,24 +232,24 @@ class ObjFile:
             keep_words(self.words, key.decode("utf-8", "replace"), rest.decode("utf-8", "replace"))
 
     def notes(self) -> tuple[str, ...]:
-        """What the file says that a surface does not have, in words."""
-        found = []
+        """Return a list, in words, of content that a surface cannot hold."""
+        lines = []
         for kinds, what, least in _LEFT_OUT:
-            said = set().union(*(self._others.get(kind, set()) for kind in kinds))
-            if len(said - _NOTHING) >= least:
-                found.append(f"{what} ({', '.join(kind.decode() for kind in kinds if kind in self._others)}) left out")
+            arguments = set().union(*(self._others.get(kind, set()) for kind in kinds))
+            if len(arguments - _NOTHING) >= least:
+                lines.append(f"{what} ({', '.join(kind.decode() for kind in kinds if kind in self._others)}) left out")
         if self._foreign:
             foreign = ", ".join(f"{kind} ({number(count)})" for kind, count in self._foreign.items())
-            found.append(f"statements that are no geometry left out: {foreign}")
+            lines.append(f"statements that are no geometry left out: {foreign}")
         if self.face_count and self.segments:
-            found.append("lines (l) beside faces left out")
+            lines.append("lines (l) beside faces left out")
         for place, what in ((1, "places in a texture (vt)"), (2, "normals (vn)")):
             if self._counts[_KINDS[place]] and all(run is None for run in self._corners[place]):
-                found.append(f"{what} that no face names left out")
-        return tuple(found)
+                lines.append(f"{what} that no face names left out")
+        return tuple(lines)
 
     def points(self) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-        """Points, (V, 3), and their attributes.
+        """Return points, (V, 3), and their attributes.
 
         Raises
         ------
@@ -264,7 +264,7 @@ class ObjFile:
         return np.ascontiguousarray(points[:, :3]), {COLOR: np.ascontiguousarray(points[:, 3:])}
 
     def mesh(self) -> Mesh:
-        """The points and faces, with what their corners have.
+        """Return the points and faces, with the attributes of corners.
 
         Raises
         ------
@@ -296,17 +296,17 @@ class ObjFile:
         return np.concatenate(runs)
 
     def face_line(self, face: int) -> int:
-        """The number of the line that holds a face."""
+        """Return the number of the line of a face."""
         first, line = self._face_starts[bisect_right(self._face_starts, face, key=lambda start: start[0]) - 1]
         return line + face - first
 
     def face_name(self, face: int) -> str:
-        """How to name a face in a message."""
+        """Return the name of a face for messages."""
         return f"face {face + 1} (line {self.face_line(face)})"
 
 
 def _runs(path: Path) -> Iterator[tuple[int, list[bytes]]]:
-    """Give the lines in runs that begin with the same two bytes, each with the number of its first line."""
+    """Yield the lines in runs that begin with the same two bytes, each with the number of its first line."""
     line, rest = 1, b""
     with path.open("rb") as file:
         while True:
@@ -331,7 +331,7 @@ def _start(line: bytes) -> bytes:
 def _table(
     run: list[bytes], keyword: bytes, width: int, convert: Callable[[list[bytes]], NDArray[Any]]
 ) -> NDArray[Any] | None:
-    """Convert lines of `keyword` and exactly `width` numbers; None when any line is of another form."""
+    """Convert lines of `keyword` and exactly `width` numbers; None if any line has another form."""
     words = b" ".join(run).split()
     if len(words) != len(run) * (width + 1) or any(word != keyword for word in words[:: width + 1]):
         return None  # with a line too long and one too short, a number stands where the keyword should
@@ -351,7 +351,7 @@ def _integers(words: list[bytes]) -> NDArray[np.int64]:
 
 
 def _fitting(keyword: bytes, values: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Rows of numbers without a weight; None when there are too many or too few of them."""
+    """Return rows of numbers without a weight; None if there are too many or too few."""
     width = values.shape[1]
     if keyword != b"v":
         return values if (width == 3 if keyword == b"vn" else 1 <= width <= 3) else None

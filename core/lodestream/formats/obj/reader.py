@@ -1,4 +1,4 @@
-"""OBJ: points, faces and lines, read."""
+"""Read OBJ: points, faces and lines."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TEXT = bytes((*b"\t\n\f\r", *range(0x20, 0x7F), *range(0x80, 0x100)))
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file is text named .obj, or text that begins with an OBJ statement and is not named otherwise."""
+    """Return whether a file is text named .obj, or text of another name that begins with an OBJ statement."""
     if head.translate(None, _TEXT):
         return False
     if suffix == ".obj":

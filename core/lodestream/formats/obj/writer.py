@@ -1,4 +1,4 @@
-"""OBJ of any surface."""
+"""Write OBJ of any surface."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def _colors(mesh: Output, channels: Sequence[str]) -> tuple[list[NDArray[Any]], set[str]]:
-    """Three columns that follow the coordinates, or none, and the names of the attributes that they hold."""
+    """Return three columns to write after the coordinates, or none, and the names of their attributes."""
     color = mesh.attributes.get(COLOR)
     if color is not None and color.ndim == 2 and color.shape[1] in (3, 4):
         values = color[:, :3]
@@ -70,7 +70,7 @@ def _is_vector(mesh: Output, key: str) -> bool:
 def _write_corners(
     file: BinaryIO, faces: NDArray[np.int64], places: NDArray[np.int64], middle: str, others: int, keyword: str = "f"
 ) -> None:
-    """Write faces whose corners name a place and, as often as there are `others`, the vertex itself."""
+    """Write faces whose corners name a place and, `others` times, the vertex itself."""
     line = " ".join([keyword] + [f"%d{middle}"] * faces.shape[1]) + "\n"
     for start in range(0, len(faces), _ROWS):
         block = faces[start : start + _ROWS]

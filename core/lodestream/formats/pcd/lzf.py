@@ -19,7 +19,7 @@ _AT_ONCE = 1 << 22
 
 
 def decompress(content: bytes, size: int) -> NDArray[np.uint8]:
-    """Decompress bytes that are known to make `size` bytes: uint8, shape (size,).
+    """Decompress bytes to exactly `size` bytes: uint8, shape (size,).
 
     Raises
     ------

@@ -1,4 +1,6 @@
-"""PCD 0.7 (Point Cloud Data): organised clouds, whose points lie on a grid, from text, binary and compressed files.
+"""Read PCD 0.7 (Point Cloud Data).
+
+Organised clouds, whose points lie on a grid, from text, binary and compressed files.
 
 The reader is our own because no library checks what the header promises before it takes memory. Source: the format's
 page in the documentation of the Point Cloud Library, "The PCD file format".
@@ -48,7 +50,7 @@ class _Header:
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins with the lines of a PCD header."""
+    """Return whether a file begins with the lines of a PCD header."""
     lines = [line for line in head.splitlines() if line.strip() and not line.startswith(b"#")]
     return (bool(lines) and lines[0].split()[0] == b"VERSION") or head.startswith(b"# .PCD")
 
@@ -178,7 +180,7 @@ def _cells(row: list[bytes], width: int, place: int, count: int) -> list[bytes]:
 
 
 def _bad_line(rows: list[list[bytes]], header: _Header, width: int) -> FormatError:
-    """Find the first line that does not hold the values of a point."""
+    """Return the error of the first line that does not hold the values of a point."""
     fields = [header.record[name] for name in header.record.names or ()]
     dtypes = [dtype.base for dtype in fields for _ in range(dtype.shape[0] if dtype.shape else 1)]
     for index, row in enumerate(rows):
@@ -204,7 +206,10 @@ def _read_binary(source: Source, header: _Header) -> dict[str, NDArray[Any]]:
 
 
 def _read_compressed(source: Source, header: _Header) -> dict[str, NDArray[Any]]:
-    """Read fields that stand one after another, compressed together; what fills up a page after them is left."""
+    """Read fields that are stored one after another and compressed together.
+
+    Padding of a page after them is ignored.
+    """
     from .lzf import decompress  # compiled, so not before a file needs it
 
     promised = header.points * header.record.itemsize
@@ -239,7 +244,7 @@ def _unpadded(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _with_colors(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Unpack colours, which are four bytes called a number of any type: blue, green, red, alpha."""
+    """Unpack colours, which are four bytes in a number of any type: blue, green, red, alpha."""
     for name, order in (("rgba", (2, 1, 0, 3)), ("rgb", (2, 1, 0))):
         packed = columns.get(name)
         if packed is not None and packed.ndim == 1 and packed.dtype.itemsize == 4 and COLOR not in columns:

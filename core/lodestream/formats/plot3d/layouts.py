@@ -1,4 +1,4 @@
-"""What may lie in a PLOT3D file: nothing in it says so, hence every layout whose size is that of the file is found.
+"""Find the layout of a PLOT3D file: no file describes it, so every layout with the size of the file is tried.
 
 A grid file holds, after the dimensions of its blocks, x, y and z of each block, one array after another with i running
 fastest, and possibly IBLANK. A Q file holds four reference numbers and five fields (four in two dimensions); a function
@@ -69,7 +69,7 @@ class Numbers(Protocol):
         """Read integers; None where there are none."""
 
     def array(self, place: int, count: int, layout: Layout, kind: str) -> NDArray[Any]:
-        """Give numbers of kind ``f`` or ``i``, shape (count,); a binary file's are not copied.
+        """Return numbers of kind ``f`` or ``i``, shape (count,); those of a binary file are not copied.
 
         Raises
         ------
@@ -117,16 +117,16 @@ class Layout:
 
     @property
     def item(self) -> int:
-        """Places that a number takes."""
+        """Places of a number."""
         return self.precision or 1
 
     @property
     def integer(self) -> int:
-        """Places that an integer takes."""
+        """Places of an integer."""
         return 4 if self.precision else 1
 
     def lengths(self) -> Iterator[int]:
-        """Give the length of each record in places, those of the header first."""
+        """Yield the length of each record in places, those of the header first."""
         if self.multi:
             yield self.integer
         per_block = self.dimensions + (self.kind == "function")
@@ -137,12 +137,12 @@ class Layout:
             yield prod(dims) * (fields * self.item + self.iblank * self.integer)
 
     def size(self) -> int:
-        """Size of such a file in places."""
+        """Return the size of such a file in places."""
         lengths = list(self.lengths())
         return sum(lengths) + 2 * _MARKER * self.records * len(lengths)
 
     def places(self) -> list[tuple[int, int]]:
-        """Place and length of each record's content."""
+        """Return place and length of each record's content."""
         result, place = [], 0
         for length in self.lengths():
             place += _MARKER * self.records
@@ -151,12 +151,12 @@ class Layout:
         return result
 
     def places_of_blocks(self) -> list[int]:
-        """Place where the fields of each block begin."""
+        """Return the place at which the fields of each block begin."""
         per_block = 2 if self.kind == "q" else 1  # the reference numbers of a Q file are a record of their own
         return [place for place, _ in self.places()[self.multi + per_block :: per_block]]
 
     def words(self) -> str:
-        """Write the layout in words, but for its points."""
+        """Return the layout in words, without its points."""
         words = [f"{self.dimensions} dimensions", "a count of blocks" if self.multi else "no count of blocks"]
         words += ["IBLANK"] * self.iblank
         if self.precision:
@@ -168,7 +168,7 @@ class Layout:
         return ", ".join(words)
 
     def points(self) -> str:
-        """Write the points of the blocks in words."""
+        """Return the points of the blocks in words."""
         blocks = [" x ".join(map(str, dims[: self.dimensions])) for dims in self.dims[:3]]
         return ", ".join(blocks) + (f" and {number(len(self.dims) - 3)} more" if len(self.dims) > 3 else "") + " points"
 
@@ -214,14 +214,14 @@ class _Binary:
 
 
 def open_numbers(path: Path, room: Room) -> Numbers:
-    """Open a file; text is read as a whole, where there is memory for it, a binary file is mapped into memory."""
+    """Open a file; text is read into memory, if there is enough, a binary file is memory-mapped."""
     with path.open("rb") as file:
         text = is_text(file.read(4096))
     return _Text(path, room) if text else _Binary(path)
 
 
 def dimensions_of(source: Source) -> dict[str, object]:
-    """What the option ``dimensions`` says of a file, for `find_layout`."""
+    """Return the restrictions of the option ``dimensions``, for `find_layout`."""
     chosen = source.integer_option(_DIMENSIONS, 2, 3)
     return {} if chosen is None else {_DIMENSIONS: chosen}
 
@@ -288,7 +288,9 @@ def find_layout(
 
 
 def _fields_of_overflow(numbers: Numbers) -> tuple[int, int] | None:
-    """The numbers of fields and species, NQ and NQC, in the header of a Q file of OVERFLOW; None: it is no such file.
+    """Return the numbers of fields and species, NQ and NQC, in the header of a Q file of OVERFLOW.
+
+    None in other files.
 
     Their record follows that of the number of grids, or is the first of a single grid: three dimensions for each grid,
     then NQ and NQC. Source: OVERFLOW User's Manual, section on file formats.
@@ -313,7 +315,7 @@ def _fields_of_overflow(numbers: Numbers) -> tuple[int, int] | None:
 
 
 def _plausible(numbers: Numbers, kinds: Sequence[str], wanted: Mapping[str, object]) -> Iterator[Layout]:
-    """Give the layouts whose header can be one, whatever the size."""
+    """Yield the layouts whose header is plausible, whatever the size of the file."""
 
     def choices(name: str) -> list[Any]:
         values = [wanted[name]] if name in wanted else list(_VALUES[name])
@@ -344,13 +346,13 @@ def _header(
             return None
         count = head[0]
         place += unit + 2 * marker
-    each = dimensions + (kind == "function")
-    values = numbers.integers(place, count * each, endian)
+    length = dimensions + (kind == "function")
+    values = numbers.integers(place, count * length, endian)
     if values is None or min(values) < 1 or max(values) > _MAX_POINTS:
         return None
-    if records and numbers.integers(place - _MARKER, 1, endian) != (unit * count * each,):
+    if records and numbers.integers(place - _MARKER, 1, endian) != (unit * count * length,):
         return None
-    rows = [values[start : start + each] for start in range(0, len(values), each)]
+    rows = [values[start : start + length] for start in range(0, len(values), length)]
     dims = tuple((row[0], row[1], row[2] if dimensions == 3 else 1) for row in rows)
     if kind == "function":
         variables = tuple(row[-1] for row in rows)
@@ -362,7 +364,10 @@ def _header(
 
 
 def _references(numbers: Numbers, layout: Layout) -> int:
-    """How many numbers the record of the reference numbers has; four where none is marked, or it is no such record."""
+    """Return the length of the record of reference numbers.
+
+    Four if records are not marked, or there is no such record.
+    """
     if layout.kind != "q" or not layout.records:
         return REFERENCES
     place, _ = layout.places()[1 + layout.multi]
@@ -372,7 +377,7 @@ def _references(numbers: Numbers, layout: Layout) -> int:
 
 
 def _is_padded(numbers: Numbers, layout: Layout) -> bool:
-    """Whether nothing but zeros follows, up to the end of a record."""
+    """Return whether only zeros follow, up to the end of a record."""
     left = numbers.size - layout.size()
     if numbers.text or numbers.size % _RECORD or not 0 < left < _LONGEST_RECORD:
         return False
@@ -381,7 +386,7 @@ def _is_padded(numbers: Numbers, layout: Layout) -> bool:
 
 
 def _marked(numbers: Numbers, layout: Layout) -> bool:
-    """Whether each record stands between two copies of its length."""
+    """Return whether each record stands between two copies of its length."""
     return not layout.records or all(
         numbers.integers(end, 1, layout.endian) == (length,)
         for place, length in layout.places()

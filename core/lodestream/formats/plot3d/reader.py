@@ -1,4 +1,4 @@
-"""PLOT3D: grids of one or several blocks, in text or binary, with IBLANK, and their Q and function files.
+"""Read PLOT3D: grids of one or several blocks, in text or binary, with IBLANK, and their Q and function files.
 
 The reader is our own because the usual ones ask for the layout, which the size of a file tells, or trust it.
 """
@@ -43,7 +43,7 @@ _REFERENCES = ("mach", "alpha", "reynolds", "time")
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file may begin with dimensions: PLOT3D has nothing else to be known by."""
+    """Return whether a file may begin with dimensions, the only mark of PLOT3D."""
     if suffix and suffix not in SUFFIXES:
         return False
     if is_text(head):
@@ -114,7 +114,7 @@ def _points(numbers: Numbers, layout: Layout, place: int, cut: Cut, room: Room) 
 
 
 def _iblank(numbers: Numbers, layout: Layout, place: int, cut: Cut) -> NDArray[Any] | None:
-    """IBLANK of a whole block, int32, shape (k * j * i,), where a file has it."""
+    """Return IBLANK of a whole block, int32, shape (k * j * i,), if a file has it."""
     if not layout.iblank:
         return None
     count = prod(cut.dims)
@@ -122,7 +122,7 @@ def _iblank(numbers: Numbers, layout: Layout, place: int, cut: Cut) -> NDArray[A
 
 
 def _says_more(blank: NDArray[Any]) -> bool:
-    """Whether IBLANK says more than which points are holes."""
+    """Return whether IBLANK has more than marks of holes."""
     return not all(np.isin(blank[part], (0, 1)).all() for part in rows_at_once(blank.shape))
 
 
@@ -152,7 +152,7 @@ class _Fields:
         self.metadata = {"scalars": self._references()} if q else {}
 
     def _references(self) -> dict[str, float]:
-        """Those of the first block, which all blocks should have."""
+        """Return the reference numbers of the first block, which all blocks should have."""
         places = self._layout.places()[1 + self._layout.multi :: 2]
         values = [self._numbers.array(place, len(_REFERENCES), self._layout, "f") for place, _ in places]
         more = self._layout.references - REFERENCES

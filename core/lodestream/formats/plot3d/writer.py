@@ -1,4 +1,4 @@
-"""PLOT3D, written: a grid file of one or several blocks, as Fortran's unformatted output, with IBLANK where needed.
+"""Write PLOT3D: a grid file of one or several blocks, as Fortran's unformatted output, with IBLANK where needed.
 
 Source: as of `layouts`.
 """
@@ -78,23 +78,23 @@ def _write_record(file: BinaryIO, length: int, *arrays: NDArray[Any]) -> None:
 
 
 def _arrays(surface: Surface, block: Block) -> list[NDArray[Any]]:
-    """x, y and z of a block with its closed axes repeated, (rows, columns) each; x and y of planar points."""
+    """Return x, y and z of a block with its closed axes repeated, (rows, columns) each; x and y of planar points."""
     points = block.points
     if points.ndim == 2:
         channels: list[NDArray[Any]] = [*coordinates(surface), points]
     else:
         channels = [points[..., channel] for channel in range(min(points.shape[2], 3))]
-    found = []
+    arrays = []
     for values, axis in zip(channels, "xyz", strict=False):
         values = exact_float(values, axis, _TITLE)
         if block.mask is not None and block.holes:
             values = np.where(block.mask, values, values[block.mask][0])
-        found.append(wrapped_ends(values, block))
-    return found
+        arrays.append(wrapped_ends(values, block))
+    return arrays
 
 
 def _blanks(block: Block, as_given: bool) -> NDArray[Any]:
-    """IBLANK of a block: what its attribute says, or where there are holes."""
+    """Return IBLANK of a block: its attribute, or 0 in holes."""
     values = _given(block) if as_given else None
     if values is None:
         values = np.ones(block.shape, np.int32) if block.mask is None else block.mask.astype(np.int32)
@@ -102,7 +102,7 @@ def _blanks(block: Block, as_given: bool) -> NDArray[Any]:
 
 
 def _given(block: Block) -> NDArray[Any] | None:
-    """The attribute of this name, where it is 0 in holes and nowhere else."""
+    """Return the attribute ``iblank`` if it is 0 in holes and nowhere else."""
     values = block.attributes.get(_IBLANK)
     if values is None or values.ndim != 2 or values.dtype.kind not in "iu":
         return None

@@ -73,7 +73,7 @@ def _read_text(path: Path, header: PlyHeader) -> dict[str, Table]:
 
 
 def _too_large(numbers: NDArray[np.float64], it: Property) -> NDArray[np.bool_]:
-    """Which numbers would be infinite in their floating type, but are not."""
+    """Return the mask of finite numbers that would be infinite in their floating type."""
     return np.isfinite(numbers) & (np.abs(numbers) > float(np.finfo(it.dtype).max))
 
 
@@ -101,7 +101,7 @@ class _Words:
         return {it.name: column for it, column in zip(properties, columns, strict=True)}
 
     def _chunks(self, width: int) -> Iterator[tuple[int, NDArray[np.float64]]]:
-        """Give the numbers of some rows at a time, all of one length."""
+        """Yield the numbers of some rows at a time, all of one length."""
         for start in range(0, self._element.rows, _CHUNK):
             stop = min(start + _CHUNK, self._element.rows)
             words = [row.split() for row in self._rows[self._start + start : self._start + stop]]
@@ -123,7 +123,7 @@ class _Words:
             raise
 
     def _fitting(self, numbers: NDArray[np.float64], it: Property, start: int) -> NDArray[np.float64]:
-        """Check that numbers fit into their type."""
+        """Check that numbers fit into their type, and return them."""
         if np.dtype(it.dtype).kind == "f":
             large = _too_large(numbers, it)
             if large.any():
@@ -219,7 +219,7 @@ def _read_binary(path: Path, header: PlyHeader) -> dict[str, Table]:
 
 
 def _record(element: Element, order: str, lengths: Mapping[str, int]) -> np.dtype[Any]:
-    """The type of a row, where all lists of a column have the same length."""
+    """Return the dtype of a row if all lists of a column have the same length."""
     fields: list[Any] = []
     for it in element.properties:
         if it.count:
@@ -264,7 +264,7 @@ def _binary_lists(data: NDArray[np.uint8], place: int, element: Element, order: 
 
 
 def _uniform_lists(data: NDArray[np.uint8], place: int, element: Element, order: str) -> tuple[Table, int] | None:
-    """Read lists that are all as long as the first, as those of a mesh of one kind of faces are."""
+    """Read lists that are all as long as the first, as in a mesh of equal faces; None if they are not."""
     if not element.rows:
         return None
     lengths: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""The header of a PLY file: which tables follow, of how many rows and which columns, text or binary."""
+"""The header of a PLY file: its tables, with their rows and columns, text or binary."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
-    """What stands before the tables.
+    """Everything that precedes the tables.
 
     Attributes
     ----------
@@ -135,8 +135,8 @@ def _check_size(header: PlyHeader, size: int) -> None:
     follows = size - header.end
     promised = 0
     for element in header.elements:
-        each = [np.dtype(it.count or it.dtype).itemsize if header.order else 2 for it in element.properties]
-        promised += element.rows * sum(each)
+        sizes = [np.dtype(it.count or it.dtype).itemsize if header.order else 2 for it in element.properties]
+        promised += element.rows * sum(sizes)
         if promised > follows + 1:  # the last number of a text may lack its end of line
             raise FormatError(
                 f"expected at least {number(promised)} bytes after the header for {number(element.rows)} rows of "

@@ -91,7 +91,7 @@ def read_curve(source: Source, header: PlyHeader) -> Surface:
 
 
 def words_of(header: PlyHeader) -> dict[str, str]:
-    """What comments say of unit and CRS."""
+    """Return unit and CRS from the comments."""
     words: dict[str, str] = {}
     for line in header.info:
         keep_words(words, *line.partition(" ")[::2])
@@ -99,7 +99,7 @@ def words_of(header: PlyHeader) -> dict[str, str]:
 
 
 def lists_left_out(header: PlyHeader) -> list[str]:
-    """What vertices have that is no number, in words."""
+    """Return a list, in words, of properties of vertices that are no numbers."""
     return [
         f"list {it.name} of vertices left out"
         for element in header.elements

@@ -75,7 +75,7 @@ def _plain(table: Table) -> dict[str, NDArray[Any]]:
 
 
 def _places(grid: Table, vertices: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """The vertex at each place of the grid, and which places have one."""
+    """Return the vertex at each place of the grid, and the mask of places with a vertex."""
     lists = next(iter(grid.values()), None)
     if not isinstance(lists, Lists) or len(grid) != 1:
         raise FormatError(f"expected {ELEMENT} with one property, a list, got {', '.join(grid) or 'none'}")

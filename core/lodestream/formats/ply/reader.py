@@ -1,4 +1,4 @@
-"""PLY: range grids, meshes and curves, read."""
+"""Read PLY: range grids, meshes and curves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["read", "sniff"]
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like PLY."""
+    """Return whether a file begins like PLY."""
     return head.startswith((b"ply\n", b"ply\r"))
 
 

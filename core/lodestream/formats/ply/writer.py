@@ -1,4 +1,4 @@
-"""PLY of any surface, binary and little-endian where its faces have the same number of corners."""
+"""Write PLY of any surface, binary and little-endian if its faces have the same number of corners."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def _columns(attributes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Columns of attributes in types and under names that PLY has."""
+    """Return the columns of attributes with types and names of PLY."""
     result: dict[str, NDArray[Any]] = {}
     rounded = []
     for name, column in split(attributes).items():
@@ -89,12 +89,12 @@ def _columns(attributes: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _same_shape(column: NDArray[Any], back: NDArray[Any] | None) -> bool:
-    """Whether an attribute comes back as it is, or without its one component."""
+    """Return whether an attribute comes back with its shape, or without its one component."""
     return back is not None and back.reshape(len(back), -1).shape == column.reshape(len(column), -1).shape
 
 
 def _words(surface: Surface) -> dict[str, str]:
-    """Name, unit and CRS in the characters that a header may have."""
+    """Return name, unit and CRS in characters that a header may have."""
     words = words_of("PLY", surface)
     plain = {key: _ascii(text, " -~") for key, text in words.items()}
     changed = [key for key, text in words.items() if plain[key] != text]

@@ -1,4 +1,4 @@
-"""ESRI ASCII grid, written: a header of a few words, then heights as text from the north-west corner on."""
+"""Write ESRI ASCII grids: a short header, then heights as text from the north-west corner on."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _write_rows(file: BinaryIO, heights: NDArray[Any], mask: NDArray[np.bool_] |
 
 
 def _nodata(surface: Surface, heights: NDArray[Any], mask: NDArray[np.bool_] | None) -> int | float | None:
-    """The number that stands for holes: the surface's own also where there are none; None where there is none."""
+    """Return the number that marks holes: the surface's nodata value even without holes; None without either."""
     valid = heights if mask is None else heights[mask]
     given = surface.metadata.get("nodata")
     candidates: list[int | float] = []

@@ -1,4 +1,4 @@
-"""COG: a GeoTIFF in tiles, with overviews and its directories first, so that a program reads a window of it by ranges.
+"""Write COG: a GeoTIFF in tiles, with overviews and its directories first, so that programs read windows by ranges.
 
 It is written by GDAL's COG driver, and read as a GeoTIFF. Source: OGC 21-026, Cloud Optimized GeoTIFF Standard.
 """
@@ -22,17 +22,17 @@ _PREDICTORS = {1: "NO", 2: "STANDARD", 3: "FLOATING_POINT"}
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Never: such a file is a GeoTIFF."""
+    """Return False: such a file is read as a GeoTIFF."""
     return False
 
 
 def write(surface: Surface, file: BinaryIO) -> None:
-    """Write what a GeoTIFF has, and overviews whose values are means of those that they stand for."""
+    """Write a GeoTIFF with overviews, whose values are means of the finer ones."""
     write_tiff(surface, file, _optimised)
 
 
 def _optimised(path: Path, predictor: int) -> Path:
-    """Make a COG of a GeoTIFF, which is removed: two files of that size are on the disk at most."""
+    """Make a COG from a GeoTIFF, which is removed, so that the disk holds at most two files of that size."""
     rasterio = gdal.require_rasterio("COG")
     from rasterio.shutil import copy
 

@@ -1,4 +1,4 @@
-"""The rasters that GDAL reads: a row for each of its drivers, with the checks that precede it.
+"""The rasters that GDAL reads: one row for each driver, with its checks.
 
 Any bytes are heights of SRTM, and the digits of an ESRI ASCII grid are counted by nobody else; what a longer check or
 another meaning of the values takes is in a module of its own (`tiff_guard`, `png`).
@@ -86,7 +86,7 @@ _CHUNK = 1 << 22
 
 
 def _check_ascii(source: Source) -> None:
-    """Check the size in the header and count the numbers behind it: GDAL reads what it needs and ignores the rest."""
+    """Check the size in the header, and count the numbers after it: GDAL ignores surplus numbers."""
     with source.path.open("rb") as file:
         head = file.read(_LONGEST_ASCII_HEADER)
         header: dict[bytes, bytes] = {}
@@ -116,7 +116,7 @@ _PATTERN, _SYSTEM, _UNITS = slice(150, 156), slice(156, 162), slice(528, 534)
 
 
 def _is_usgs_dem(head: bytes, suffix: str) -> bool:
-    """Whether the first record, of 1024 characters, has the numbers of a DEM in their columns."""
+    """Return whether the first record, of 1024 characters, has the numbers of a DEM in their columns."""
     return (
         len(head) >= 1024
         and head[_PATTERN] in (b"     1", b"     4")
@@ -133,7 +133,7 @@ _SRTM_SHAPES = ((1201, 1201), (3601, 3601), (3601, 1801))
 
 
 def _tile_of(name: str) -> Mapping[str, str]:
-    """The SRTM tile that a file's name begins with."""
+    """Return the SRTM tile with which a file's name begins."""
     match = _TILE.match(name)
     return {"tile": match[0].upper()} if match else {}
 
@@ -147,7 +147,7 @@ def _check_srtm(source: Source) -> None:
 
 
 def _located(surface: Surface, source: Source) -> Surface:
-    """Drop the position where neither a name nor an option gives it."""
+    """Drop the position if neither a name nor an option gives it."""
     if "tile" not in source.options:
         del surface.metadata["geotransform"], surface.metadata["crs"]
         warn("the name of an SRTM tile gives its position, but this one does not: use an option such as tile=N37W122")

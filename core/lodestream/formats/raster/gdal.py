@@ -1,4 +1,4 @@
-"""What GDAL reads: rasters through rasterio, each by exactly one of its drivers.
+"""Read rasters through rasterio, each by exactly one driver of GDAL.
 
 GDAL opens a VRT whatever its name, and through it any file or host; and it looks for further files beside the one that
 it opens. So the first bytes are checked before GDAL sees a file, one driver is allowed, and the file is opened by a
@@ -46,7 +46,7 @@ _MOST_BANDS = 1 << 12
 
 
 def require_rasterio(format_name: str) -> Any:
-    """The module rasterio, imported now.
+    """Import and return rasterio.
 
     Raises
     ------
@@ -89,8 +89,8 @@ def read(source: Source, driver: str, format_name: str, title: str, file_name: s
         geographic = bool(dataset.crs and dataset.crs.is_geographic)
     if mask is not None and points.dtype.kind == "f":
         for rows in _strips(points.shape):
-            own = points[rows]
-            own[np.isinf(own) & ~mask[rows]] = np.nan  # nodata that is infinite: no value, as the file says
+            strip = points[rows]
+            strip[np.isinf(strip) & ~mask[rows]] = np.nan  # nodata that is infinite: no value, as the file says
     surface = Surface(points, mask=mask, attributes=attributes, metadata=metadata)
     transform = metadata.get("geotransform")
     if geographic and transform and transform[2] == transform[4] == 0:
@@ -118,7 +118,7 @@ def _opened(source: Source, driver: str, title: str, file_name: str, options: di
 
 
 def _check(source: Source, dataset: Any, title: str) -> int:
-    """Check by the header alone; return the band to read as heights."""
+    """Check a dataset by its header alone; return the band to read as heights."""
     if dataset.subdatasets:
         raise FormatError(f"expected a {title} of one image, got {len(dataset.subdatasets)} images")
     if dataset.count > _MOST_BANDS:
@@ -140,13 +140,13 @@ def _check(source: Source, dataset: Any, title: str) -> int:
 
 
 def _strips(shape: tuple[int, ...]) -> Iterator[slice]:
-    """All rows, so many at a time that they are whole rows of tiles, and not many bytes."""
-    each = max(_TILE_ROWS, _AT_ONCE // max(shape[1], 1) // _TILE_ROWS * _TILE_ROWS)
-    return (slice(start, min(start + each, shape[0])) for start in range(0, shape[0], each))
+    """Yield slices of all rows, whole rows of tiles, not many bytes at a time."""
+    n_rows = max(_TILE_ROWS, _AT_ONCE // max(shape[1], 1) // _TILE_ROWS * _TILE_ROWS)
+    return (slice(start, min(start + n_rows, shape[0])) for start in range(0, shape[0], n_rows))
 
 
 def _values(dataset: Any, band: int, source: Source) -> NDArray[Any]:
-    """The values of a band, shape (row, column)."""
+    """Return the values of a band, shape (row, column)."""
     dtype = np.dtype(dataset.dtypes[band - 1])
     if not source.room.takes(dataset.height * dataset.width * dtype.itemsize):
         return np.asarray(dataset.read(band))
@@ -157,7 +157,7 @@ def _values(dataset: Any, band: int, source: Source) -> NDArray[Any]:
 
 
 def _others(dataset: Any, names: dict[str, int], source: Source) -> dict[str, NDArray[Any]]:
-    """The values of other bands, by name; shape (row, column)."""
+    """Return the values of other bands, by name; shape (row, column)."""
     size = dataset.height * dataset.width * max(np.dtype(kind).itemsize for kind in dataset.dtypes)
     if not names or source.room.takes(size):
         return {name: _values(dataset, band, source) for name, band in names.items()}
@@ -166,7 +166,7 @@ def _others(dataset: Any, names: dict[str, int], source: Source) -> dict[str, ND
 
 
 def _mask(dataset: Any, band: int, source: Source) -> NDArray[np.bool_] | None:
-    """Where there is a value, by nodata, by a mask inside the file or by transparency, as GDAL finds it."""
+    """Return the mask of cells with a value, by nodata, a mask inside the file or transparency, as GDAL finds it."""
     if all(flag.name == "all_valid" for flag in dataset.mask_flag_enums[band - 1]):
         return None
     mask = source.empty((dataset.height, dataset.width), np.dtype(np.bool_))
@@ -176,7 +176,7 @@ def _mask(dataset: Any, band: int, source: Source) -> NDArray[np.bool_] | None:
 
 
 def _attributes(dataset: Any, heights: int) -> dict[str, int]:
-    """Names of the bands beside the heights; one that only says what is transparent is in the mask already."""
+    """Return the bands beside the heights by name, without bands of transparency, which are in the mask."""
     names: dict[str, int] = {}
     alphas = _alphas(dataset)
     for band, description in enumerate(dataset.descriptions, 1):
@@ -188,7 +188,7 @@ def _attributes(dataset: Any, heights: int) -> dict[str, int]:
 
 
 def _warn_left_out(dataset: Any) -> None:
-    """Say what a file has that a surface has not."""
+    """Note data of a file that a surface cannot hold."""
     colors = enumerate(dataset.colorinterp, 1)
     left_out = [f"the colour table of band {band}" for band, color in colors if color.name == "palette"]
     left_out += [f"{len(dataset.gcps[0])} ground control points"] * bool(dataset.gcps[0])
@@ -200,7 +200,7 @@ def _warn_left_out(dataset: Any) -> None:
 
 
 def _alphas(dataset: Any) -> list[int]:
-    """The bands that only say what is transparent, which GDAL makes a mask of."""
+    """Return the bands of transparency, which GDAL turns into a mask."""
     kinds = zip(dataset.colorinterp, dataset.dtypes, strict=True)
     return [band for band, (color, kind) in enumerate(kinds, 1) if color.name == "alpha" and kind == "uint8"]
 
@@ -223,7 +223,7 @@ def _metadata(dataset: Any, band: int) -> dict[str, Any]:
 
 
 def _plain(nodata: float) -> int | float | str:
-    """Make the value one that MessagePack and JSON hold, which has no NaN; ``float()`` takes it back."""
+    """Return a value that MessagePack and JSON can hold, NaN as text; ``float()`` restores it."""
     if not math.isfinite(nodata):
         return str(nodata)
     return int(nodata) if abs(nodata) < 2**63 and nodata == int(nodata) else float(nodata)

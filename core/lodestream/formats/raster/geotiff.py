@@ -1,4 +1,4 @@
-"""GeoTIFF, written: bands of numbers with a place, a mask and a CRS, by GDAL's GTiff driver."""
+"""Write GeoTIFF: bands of numbers with a place, a mask and a CRS, by GDAL's GTiff driver."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], Path]) -> None:
-    """Write a GeoTIFF, and what is made of it to `file`.
+    """Write a GeoTIFF, and copy a file made from it to `file`.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], P
 
 @contextmanager
 def _told(folder: Path) -> Iterator[None]:
-    """Have errors of GDAL say what is wrong with the disk.
+    """Raise errors of the disk in place of GDAL's vague errors.
 
     Raises
     ------
@@ -133,7 +133,9 @@ def _told(folder: Path) -> Iterator[None]:
 def _check(
     dataset: Any, surface: Surface, bands: Sequence[NDArray[Any]], dtype: np.dtype[Any], nodata: float | None
 ) -> None:
-    """Read again what was written: GDAL writes by threads, whose errors nobody is told, as that a disk is full.
+    """Compare the written file with the surface.
+
+    Errors of GDAL's writing threads, such as a full disk, are not reported.
 
     Raises
     ------
@@ -148,30 +150,30 @@ def _check(
         for number, band in enumerate(bands, 1):
             written = band[rows].astype(dtype, copy=False)
             written = _shown(surface, written, rows, nodata) if number == 1 else written
-            found = dataset.read(number, window=window)
-            if not np.array_equal(found, written, equal_nan=found.dtype.kind == "f"):
+            stored = dataset.read(number, window=window)
+            if not np.array_equal(stored, written, equal_nan=stored.dtype.kind == "f"):
                 raise RasterioIOError(f"other values in rows {rows.start} to {rows.stop - 1}")
         if mask is not None and not np.array_equal(dataset.read_masks(1, window=window) > 0, mask[rows]):
             raise RasterioIOError(f"another mask in rows {rows.start} to {rows.stop - 1}")
 
 
 def _strips(shape: tuple[int, ...]) -> Iterator[slice]:
-    """All rows, some rows of tiles at a time: a surface may be larger than memory."""
-    each = max(_TILE, _AT_ONCE // shape[1] // _TILE * _TILE)
-    return (slice(start, min(start + each, shape[0])) for start in range(0, shape[0], each))
+    """Yield slices of all rows, some rows of tiles at a time: a surface may be larger than memory."""
+    n_rows = max(_TILE, _AT_ONCE // shape[1] // _TILE * _TILE)
+    return (slice(start, min(start + n_rows, shape[0])) for start in range(0, shape[0], n_rows))
 
 
 def _shown(surface: Surface, heights: NDArray[Any], rows: slice, nodata: float | None) -> NDArray[Any]:
-    """Some rows of the heights, in the type of all bands, with what stands for holes."""
+    """Return some rows of the heights, in the type of all bands, with the nodata value in holes."""
     if surface.mask is None:
         return heights
     kept = surface.blocks[0].kept
-    said = surface.mask[rows] if kept is None else surface.mask[rows] | kept[rows]
-    return np.where(said, heights, heights.dtype.type(0 if nodata is None else nodata))
+    valued = surface.mask[rows] if kept is None else surface.mask[rows] | kept[rows]
+    return np.where(valued, heights, heights.dtype.type(0 if nodata is None else nodata))
 
 
 def _profile(surface: Surface, count: int, dtype: np.dtype[Any], nodata: float | None) -> dict[str, Any]:
-    """How rasterio makes the file."""
+    """Return the profile with which rasterio makes the file."""
     rows, columns = surface.shape
     profile: dict[str, Any] = {
         "driver": "GTiff",
@@ -192,7 +194,7 @@ def _profile(surface: Surface, count: int, dtype: np.dtype[Any], nodata: float |
 
 
 def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]], np.dtype[Any]]:
-    """Names and values of all bands as the surface has them, and the one type that they have in a TIFF."""
+    """Return the names and values of all bands, and their common type in a TIFF."""
     names, bands = [""], [surface.points]
     for name, values in surface.attributes.items():
         parts = values.reshape(*surface.shape, -1)
@@ -207,7 +209,7 @@ def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]], np.dtype[An
 
 
 def _nodata(surface: Surface, dtype: np.dtype[Any]) -> float | None:
-    """The value that stands for holes in the type of all bands; None where there is none."""
+    """Return the nodata value in the type of all bands; None if there is none."""
     value = _number(surface.metadata.get("nodata"))
     if value is not None and _holds(dtype, value) and not _occurs(surface, dtype.type(value)):
         return value
@@ -215,12 +217,12 @@ def _nodata(surface: Surface, dtype: np.dtype[Any]) -> float | None:
 
 
 def _occurs(surface: Surface, value: Any) -> bool:
-    """Whether a valid height is this value."""
+    """Return whether a valid height is this value."""
     return occurs(value, surface.points.__getitem__, surface.shape, surface.mask)
 
 
 def _holds(dtype: np.dtype[Any], value: float) -> bool:
-    """Whether a type has a value, which GDAL is told as a float64: of larger integers it would be another one."""
+    """Return whether a type has a value, which GDAL takes as a float64; larger integers would be rounded."""
     if dtype.kind == "f":
         return bool(np.isnan(value) or abs(value) <= float(np.finfo(dtype).max))
     limits = np.iinfo(dtype)
@@ -228,7 +230,7 @@ def _holds(dtype: np.dtype[Any], value: float) -> bool:
 
 
 def _number(text: Any) -> float | None:
-    """The number that metadata give, which text may be; None where they give none."""
+    """Return a number of the metadata, which may be text; None if there is none."""
     try:
         return float(text) if isinstance(text, int | float | str) else None
     except (ValueError, OverflowError):
@@ -236,7 +238,7 @@ def _number(text: Any) -> float | None:
 
 
 def _locate(dataset: Any, surface: Surface) -> Any:
-    """Write the place and the CRS; give the latter, None where there is none."""
+    """Write the place and the CRS; return the CRS, None if there is none."""
     from rasterio.crs import CRS
     from rasterio.errors import CRSError
     from rasterio.transform import Affine

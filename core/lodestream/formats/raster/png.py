@@ -56,12 +56,12 @@ _KNOWN_TEXTS = (_TEXT, "Software")
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like PNG."""
+    """Return whether a file begins like PNG."""
     return head.startswith(_MAGIC)
 
 
 def named(name: str) -> Mapping[str, str]:
-    """The code of colours that a file's name speaks of."""
+    """Return the code of colours that a file's name suggests."""
     words = name.lower().replace("_", "-")
     for encoding, clues in (("terrarium", ("terrarium",)), ("terrain-rgb", ("terrain-rgb", "terrainrgb"))):
         if any(clue in words for clue in clues):
@@ -70,7 +70,7 @@ def named(name: str) -> Mapping[str, str]:
 
 
 def require_pillow() -> Any:
-    """Pillow's module for PNG, imported now."""
+    """Import and return Pillow's module for PNG."""
     try:
         from PIL import PngImagePlugin
     except ImportError:
@@ -79,7 +79,7 @@ def require_pillow() -> Any:
 
 
 def heights(surface: Surface, source: Source) -> Surface:
-    """Take the bands of a PNG for heights: the shades themselves, or what the colours stand for.
+    """Convert the bands of a PNG to heights: the shades themselves, or the values that the colours encode.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def heights(surface: Surface, source: Source) -> Surface:
 
 
 def check(source: Source) -> None:
-    """Refuse a PNG that is too large, of a kind of pixels that stands for no heights, or of fewer than it announces.
+    """Refuse a PNG that is too large, has pixels of a kind without heights, or fewer pixels than it announces.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def check(source: Source) -> None:
 
 
 def _check_pixels(source: Source) -> None:
-    """Count what the pixels expand to, because GDAL takes those that are missing for black."""
+    """Count the decompressed pixels: GDAL would replace missing ones by black."""
     with source.path.open("rb") as file:
         file.seek(16)
         width, height, depth, kind, _, _, interlaced = struct.unpack(">IIBBBBB", file.read(13))
@@ -142,8 +142,8 @@ def _check_pixels(source: Source) -> None:
         sizes = ((-(-(width - left) // right), -(-(height - top) // down)) for left, top, right, down in passes)
         wanted = sum(rows * (1 + (columns * bits + 7) // 8) for columns, rows in sizes if columns > 0 and rows > 0)
         file.seek(8)
-        found, expander = 0, zlib.decompressobj()
-        while found < wanted and len(head := file.read(8)) == 8:
+        expanded, expander = 0, zlib.decompressobj()
+        while expanded < wanted and len(head := file.read(8)) == 8:
             length, name = struct.unpack(">I4s", head)
             if name != b"IDAT":
                 file.seek(length + 4, 1)
@@ -151,14 +151,14 @@ def _check_pixels(source: Source) -> None:
             while length > 0 and (data := file.read(min(length, _PIECE))):
                 length -= len(data)
                 try:
-                    while data and found < wanted:
-                        found += len(expander.decompress(data, _PIECE))
+                    while data and expanded < wanted:
+                        expanded += len(expander.decompress(data, _PIECE))
                         data = expander.unconsumed_tail
                 except zlib.error as error:
                     raise FormatError(f"expected a whole PNG, got one with damaged pixels: {error}") from None
             file.seek(length + 4, 1)
-    if found < wanted:
-        raise FormatError(f"expected a whole PNG of {number(wanted)} bytes of pixels, got {number(found)}")
+    if expanded < wanted:
+        raise FormatError(f"expected a whole PNG of {number(wanted)} bytes of pixels, got {number(expanded)}")
 
 
 def _encoding(source: Source, colours: bool, text: Mapping[str, Any]) -> str:
@@ -187,7 +187,7 @@ def _rule(content: Any) -> dict[str, Any]:
 
 
 def _shaded(shades: NDArray[Any], rule: Mapping[str, Any]) -> NDArray[Any]:
-    """Heights of shades by the rule in the file's text."""
+    """Return heights from shades by the rule in the file's text."""
     try:
         first, origin, step, scale = (float(rule[key]) for key in ("first", "origin", "step", "scale"))
         dtype = np.dtype(str(rule["dtype"]))
@@ -226,7 +226,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def _shades(surface: Surface) -> tuple[NDArray[np.uint16], dict[str, Any], int | None]:
-    """Shades, the rule that gives heights back (none is needed for plain shades), and the shade of holes."""
+    """Return the shades, the rule that restores heights (empty for plain shades), and the shade of holes."""
     points, mask = surface.points, surface.mask
     valid = points if mask is None else points[mask]
     low, high = valid.min(), valid.max()

@@ -1,4 +1,4 @@
-"""What GDAL says of a raster in words: tags of the dataset and of its bands, descriptions, units, and what cells are.
+"""Text metadata of rasters: tags of the dataset and of its bands, descriptions, units, and the meaning of cells.
 
 In the metadata of a surface these are ``area_or_point``, ``tags`` (a map of namespaces, of which "" is GDAL's own, to
 maps of names to texts), ``description`` (of the band of heights), and ``bands``: for each attribute by its name, and
@@ -40,7 +40,7 @@ Tags = dict[str, dict[str, str]]
 
 
 def read_tags(dataset: Any, band: int, attributes: Mapping[str, int]) -> dict[str, Any]:
-    """The metadata of an open dataset that is words, as GDAL gives them.
+    """Return the text metadata of an open dataset, as GDAL gives them.
 
     Parameters
     ----------
@@ -60,18 +60,18 @@ def read_tags(dataset: Any, band: int, attributes: Mapping[str, int]) -> dict[st
     if dataset.descriptions[band - 1]:
         metadata["description"] = dataset.descriptions[band - 1]
     bands = {}
-    said = _Said.of(dataset)
+    facts = _BandFacts.of(dataset)
     for name, number in {"": band, **attributes}.items():
-        found = _band(dataset, said, number, name)
-        if found:
-            bands[name] = found
+        words = _band(dataset, facts, number, name)
+        if words:
+            bands[name] = words
     if bands:
         metadata["bands"] = bands
     return metadata
 
 
-class _Said(NamedTuple):
-    """What a dataset says of each band, read once: rasterio asks all bands whenever one is asked for."""
+class _BandFacts(NamedTuple):
+    """Facts of all bands, read once: rasterio reads all bands whenever one is asked for."""
 
     descriptions: Sequence[str | None]
     units: Sequence[str | None]
@@ -80,32 +80,32 @@ class _Said(NamedTuple):
     colors: Sequence[Any]
 
     @staticmethod
-    def of(dataset: Any) -> _Said:
-        return _Said(dataset.descriptions, dataset.units, dataset.scales, dataset.offsets, dataset.colorinterp)
+    def of(dataset: Any) -> _BandFacts:
+        return _BandFacts(dataset.descriptions, dataset.units, dataset.scales, dataset.offsets, dataset.colorinterp)
 
 
-def _band(dataset: Any, said: _Said, number: int, name: str) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+def _band(dataset: Any, facts: _BandFacts, number: int, name: str) -> dict[str, Any]:
+    words: dict[str, Any] = {}
     place = number - 1
     if name:  # the heights have these as metadata of their own
-        description = said.descriptions[place] or ""
+        description = facts.descriptions[place] or ""
         if description not in (name, "") or (not description and name != f"band_{number}"):
-            found["description"] = description
-        if said.units[place]:
-            found["unit"] = said.units[place]
-        if (said.scales[place], said.offsets[place]) != (1.0, 0.0):
-            found |= {"scale": float(said.scales[place]), "offset": float(said.offsets[place])}
-    color = said.colors[place].name
+            words["description"] = description
+        if facts.units[place]:
+            words["unit"] = facts.units[place]
+        if (facts.scales[place], facts.offsets[place]) != (1.0, 0.0):
+            words |= {"scale": float(facts.scales[place]), "offset": float(facts.offsets[place])}
+    color = facts.colors[place].name
     if color not in _USUAL and not (color == "gray" and not name):
-        found["color"] = color
+        words["color"] = color
     tags = _tags(dataset, number)
     if tags:
-        found["tags"] = tags
-    return found
+        words["tags"] = tags
+    return words
 
 
 def _tags(dataset: Any, band: int) -> Tags:
-    """The tags of a band, or of the dataset (0), by their namespaces; what is no text is left out, with a note."""
+    """Return the tags of a band, or of the dataset (0), by namespace; a note is issued of tags that are no text."""
     result: Tags = {}
     for namespace in dict.fromkeys(["", *dataset.tag_namespaces(band)]):
         if namespace in _MADE_UP:
@@ -131,7 +131,7 @@ def describe(
     bands: Sequence[NDArray[Any]],
     mask: NDArray[np.bool_] | None,
 ) -> None:
-    """Give an open dataset the words of a surface's metadata.
+    """Write the text metadata of a surface into an open dataset.
 
     Parameters
     ----------
@@ -151,33 +151,33 @@ def describe(
     if isinstance(metadata.get("area_or_point"), str):
         dataset.update_tags(**{_AREA_OR_POINT: metadata["area_or_point"]})
     described = [_described(metadata, name, number) for number, name in enumerate(names, 1)]
-    for number, found in enumerate(described, 1):
-        if found["description"]:
-            dataset.set_band_description(number, found["description"])
-        tags, stale = _fresh(_written(found.get("tags")), bands[number - 1], mask if number == 1 else None)
+    for number, words in enumerate(described, 1):
+        if words["description"]:
+            dataset.set_band_description(number, words["description"])
+        tags, stale = _fresh(_written(words.get("tags")), bands[number - 1], mask if number == 1 else None)
         if stale:
             warn(f"GeoTIFF is written without {listing(stale)} of band {number}, which describe other values")
         _set_tags(dataset, number, tags)
-    dataset.units = tuple(found["unit"] for found in described)
-    dataset.scales = tuple(found["scale"] for found in described)
-    dataset.offsets = tuple(found["offset"] for found in described)
-    colors = [getattr(ColorInterp, found["color"], None) for found in described]
+    dataset.units = tuple(words["unit"] for words in described)
+    dataset.scales = tuple(words["scale"] for words in described)
+    dataset.offsets = tuple(words["offset"] for words in described)
+    colors = [getattr(ColorInterp, words["color"], None) for words in described]
     if any(colors):
         dataset.colorinterp = [color or known for color, known in zip(colors, dataset.colorinterp, strict=True)]
 
 
 def _described(metadata: Mapping[str, Any], name: str, number: int) -> dict[str, Any]:
-    """What there is to say of one band, of whatever types the metadata are."""
+    """Return the description of one band, whatever types the metadata have."""
     bands = metadata.get("bands")
-    found = bands.get(name) if isinstance(bands, Mapping) else None
-    found = dict(found) if isinstance(found, Mapping) else {}
+    words = bands.get(name) if isinstance(bands, Mapping) else None
+    words = dict(words) if isinstance(words, Mapping) else {}
     if not name:
-        found |= {key: metadata.get(key) for key in ("description", "unit", "scale", "offset")}
-    elif "description" not in found:
-        found["description"] = "" if name == f"band_{number}" else name
-    texts = {key: str(found.get(key) or "") for key in ("description", "unit", "color")}
-    scale, offset = _finite(found.get("scale"), 1.0), _finite(found.get("offset"), 0.0)
-    return {**texts, "scale": scale, "offset": offset, "tags": found.get("tags")}
+        words |= {key: metadata.get(key) for key in ("description", "unit", "scale", "offset")}
+    elif "description" not in words:
+        words["description"] = "" if name == f"band_{number}" else name
+    texts = {key: str(words.get(key) or "") for key in ("description", "unit", "color")}
+    scale, offset = _finite(words.get("scale"), 1.0), _finite(words.get("offset"), 0.0)
+    return {**texts, "scale": scale, "offset": offset, "tags": words.get("tags")}
 
 
 def _finite(value: Any, otherwise: float) -> float:
@@ -186,7 +186,7 @@ def _finite(value: Any, otherwise: float) -> float:
 
 
 def _written(tags: Any) -> Tags:
-    """Of what the metadata call tags, those that can be written."""
+    """Return the tags in the metadata that can be written."""
     result: Tags = {}
     for namespace, values in tags.items() if isinstance(tags, Mapping) else ():
         if isinstance(values, Mapping) and namespace not in _MADE_UP:
@@ -197,29 +197,29 @@ def _written(tags: Any) -> Tags:
 
 
 def _fresh(tags: Tags, values: NDArray[Any], mask: NDArray[np.bool_] | None) -> tuple[Tags, list[str]]:
-    """Tags of a band without statistics of other values than these, such as those of a finer level."""
-    own = tags.get("", {})
-    stale = [key for key in own if key.startswith(_STATISTICS)]
+    """Return the tags of a band without statistics of other values, such as those of a finer level."""
+    plain = tags.get("", {})
+    stale = [key for key in plain if key.startswith(_STATISTICS)]
     if not stale:
         return tags, []
     try:
-        told = [float(own[key]) for key in (_LEAST, _GREATEST)]
+        stated = [float(plain[key]) for key in (_LEAST, _GREATEST)]
     except (KeyError, ValueError):
-        told = [math.nan, math.nan]
-    found = _range(values, mask)
-    if found is not None and np.allclose(told, found, _NEAR, 0):
+        stated = [math.nan, math.nan]
+    actual = _range(values, mask)
+    if actual is not None and np.allclose(stated, actual, _NEAR, 0):
         return tags, []
-    return {**tags, "": {key: value for key, value in own.items() if key not in stale}}, stale
+    return {**tags, "": {key: value for key, value in plain.items() if key not in stale}}, stale
 
 
 def _range(values: NDArray[Any], mask: NDArray[np.bool_] | None) -> tuple[float, float] | None:
-    """The least and the largest of the valid, finite values; None where there are none."""
+    """Return the smallest and the largest of the valid, finite values; None without any."""
     ends: list[float] = []
     for rows in rows_at_once(values.shape):
         finite = np.isfinite(values[rows])
-        own = values[rows][finite if mask is None else finite & mask[rows]]
-        if own.size:
-            ends += [float(own.min()), float(own.max())]
+        valid = values[rows][finite if mask is None else finite & mask[rows]]
+        if valid.size:
+            ends += [float(valid.min()), float(valid.max())]
     return (min(ends), max(ends)) if ends else None
 
 
@@ -236,23 +236,23 @@ def _set_tags(dataset: Any, band: int, tags: Tags) -> None:
 
 
 def missing(dataset: Any, metadata: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """What of these words a dataset that was written does not have, in words."""
+    """Return a list, in words, of text metadata that the written dataset does not have."""
     lost = _lost_tags(_tags(dataset, 0), metadata.get("tags"), "")
     if str(metadata.get("area_or_point", "")) == "Point" != dataset.tags().get(_AREA_OR_POINT):
         lost.append("area_or_point")
-    said = _Said.of(dataset)
+    facts = _BandFacts.of(dataset)
     for number, name in enumerate(names, 1):
-        found, place = _described(metadata, name, number), number - 1
+        words, place = _described(metadata, name, number), number - 1
         there = {
-            "description": said.descriptions[place] or "",
-            "unit": said.units[place] or "",
-            "scale": said.scales[place],
-            "offset": said.offsets[place],
-            "color": said.colors[place].name if found["color"] else "",
+            "description": facts.descriptions[place] or "",
+            "unit": facts.units[place] or "",
+            "scale": facts.scales[place],
+            "offset": facts.offsets[place],
+            "color": facts.colors[place].name if words["color"] else "",
         }
         of = f" of band {number}"
-        lost += [key + of for key, value in there.items() if value != found[key]]
-        lost += _lost_tags(_tags(dataset, number), found["tags"], of)
+        lost += [key + of for key, value in there.items() if value != words[key]]
+        lost += _lost_tags(_tags(dataset, number), words["tags"], of)
     bands = metadata.get("bands")
     if isinstance(bands, Mapping):
         lost += [f"what is known of band {name}" for name in bands if name not in names]
@@ -269,10 +269,10 @@ def _lost_tags(there: Tags, wanted: Any, of: str) -> list[str]:
         if not isinstance(values, Mapping):
             lost.append(f"tags {namespace}{of}")
             continue
-        found = there.get(str(namespace), {})
+        present = there.get(str(namespace), {})
         lost += [
             f"tag {namespace} {key}{of}".replace("  ", " ")
             for key, value in values.items()
-            if found.get(key) != value and not str(key).startswith(_STATISTICS)
+            if present.get(key) != value and not str(key).startswith(_STATISTICS)
         ]
     return lost

@@ -1,4 +1,4 @@
-"""What is checked of a TIFF before GDAL reads it."""
+"""Checks of a TIFF before GDAL reads it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _FORMS = {42: ("H", "HHII", "I", 4), 43: ("Q", "HHQQ", "Q", 8)}
 
 
 def check(path: Path) -> None:
-    """Refuse more words in the first directory than a surface keeps by far.
+    """Refuse a TIFF whose first directory has far more text than a surface keeps.
 
-    What is no whole directory is left to GDAL, which says what is wrong with it.
+    A damaged directory is left to GDAL, which reports the problem.
 
     Raises
     ------

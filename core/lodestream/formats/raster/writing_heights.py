@@ -1,4 +1,4 @@
-"""What formats for height fields need of a surface, and what they cannot say of it."""
+"""Checks of formats for height fields, and notes of what they cannot hold."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OFF = 1e-6
 
 
 def even_heights(surface: Surface, title: str) -> Surface:
-    """The surface as heights over an even lattice.
+    """Return the surface as heights over an even lattice.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def even_heights(surface: Surface, title: str) -> Surface:
 
 
 def geotransform(surface: Surface) -> Sequence[float] | None:
-    """The affine rule nearest to where heights lie, six numbers in GDAL's order; None for mere indices."""
+    """Return the affine rule nearest to the places of heights, six numbers in GDAL's order; None for mere indices."""
     metadata, (rows, columns) = surface.metadata, surface.shape
     if metadata.get("geotransform") is not None and "nodes" not in metadata:
         coordinates(surface, slice(0, 1))  # refuses what is none
@@ -47,7 +47,9 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
         return None
     coordinates(surface, slice(0, 1))  # refuses angles that are no rules
     transform, unwrapped = [], _unwrapped(surface)
-    for first, last in zip(*(coordinates(unwrapped, own) for own in (slice(0, 1), slice(rows - 1, rows))), strict=True):
+    for first, last in zip(
+        *(coordinates(unwrapped, edge) for edge in (slice(0, 1), slice(rows - 1, rows))), strict=True
+    ):
         origin = float(first[0, 0])
         across = (float(first[0, -1]) - origin) / max(columns - 1, 1)
         down = (float(last[0, 0]) - origin) / max(rows - 1, 1)
@@ -56,13 +58,13 @@ def geotransform(surface: Surface) -> Sequence[float] | None:
 
 
 def _unwrapped(surface: Surface) -> Surface:
-    """Heights whose longitudes do not jump, as those of an affine rule do not."""
+    """Return heights with longitudes that do not jump, as an affine rule has them."""
     metadata = {key: value for key, value in surface.metadata.items() if key != "angles"}
     return Surface(surface.points, mask=surface.mask, metadata=metadata)
 
 
 def warn_off(surface: Surface, transform: Sequence[float], title: str) -> None:
-    """Say how far the cells are from where the heights are."""
+    """Note how far the cells are from the places of the heights."""
     if not {"grid", "axes", "nodes"} & surface.metadata.keys():
         return
     exact = _unwrapped(surface)

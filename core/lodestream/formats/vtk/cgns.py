@@ -1,4 +1,4 @@
-"""CGNS: structured zones, in files of ADF or HDF5, read by VTK. No link to another file is followed."""
+"""Read CGNS through VTK: structured zones, in files of ADF or HDF5. No link to another file is followed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NODE, _TYPE, _LINK = b"NoDe", 96, b"LK"
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like ADF, or like HDF5 and is named .cgns."""
+    """Return whether a file begins like ADF, or like HDF5 and is named .cgns."""
     return _ADF in head[:64] or (head.startswith(_HDF5) and suffix == ".cgns")
 
 
@@ -40,9 +40,9 @@ def read(source: Source) -> Surface:
 
 
 def _check_adf(source: Source) -> None:
-    """Refuse what ADF would read as it is: a file that is cut short, or one with links.
+    """Refuse an ADF file that is cut short, or has links, both of which ADF itself would accept.
 
-    HDF5 finds the first itself, and says no to the second because VTK may open no second file.
+    HDF5 detects the first itself, and cannot follow a link because VTK may open no second file.
     """
     raw = np.memmap(source.path, np.uint8, "r").tobytes()
     if _ADF not in raw[:64]:

@@ -1,4 +1,4 @@
-"""Grids that VTK reads, as surfaces: points, attributes, and what is blanked as holes.
+"""Grids that VTK reads, as surfaces: points, attributes, and blanked points as holes.
 
 VTK runs in a process of its own (see `process`), so that no file can bring down this one, take its memory, or make
 it open another file.
@@ -97,7 +97,7 @@ class Reading:
 
 
 def check_arrays(count: int) -> None:
-    """Refuse a file of so many arrays that VTK would take too long to add them to its grids.
+    """Refuse a file with more arrays than VTK can add to its grids in reasonable time.
 
     Raises
     ------
@@ -166,7 +166,7 @@ _Arrays = Iterator[tuple[str, str, NDArray[Any]]]
 
 
 def _check_memory(source: Source, files: Sequence[Reading]) -> None:
-    """Refuse what VTK, which reads files as a whole, takes too much memory for."""
+    """Refuse a file that takes VTK, which reads files as a whole, too much memory."""
     needed = sum(_OF_ARRAYS * file.promised for file in files)
     if source.room.memory is not None and needed > source.room.memory:
         raise TooLargeError(
@@ -178,7 +178,7 @@ def _check_memory(source: Source, files: Sequence[Reading]) -> None:
 
 @contextmanager
 def _grids(file: Reading, room: Room) -> Iterator[tuple[list[Any], _Arrays]]:
-    """The description of the grids of a file, and their arrays, one after the other."""
+    """Yield the description of the grids of a file, and their arrays, one after the other."""
     if file.mapped is not None:
         mapped = file.mapped
         grid = {"dims": mapped.dims, "arrays": mapped.arrays, "left_out": mapped.left_out, "words": {}}
@@ -191,7 +191,7 @@ def _grids(file: Reading, room: Room) -> Iterator[tuple[list[Any], _Arrays]]:
 
 @contextmanager
 def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
-    """Start the process that reads a file; give the description of its grids and the pipe with their arrays."""
+    """Start the process that reads a file; yield the description of its grids and the pipe with their arrays."""
     budget = _MEMORY + 4 * file.promised
     seconds = _SECONDS + file.path.stat().st_size // _BYTES_A_SECOND
     limits = [str(budget), str(seconds)]
@@ -219,7 +219,7 @@ def _started(file: Reading) -> Iterator[tuple[list[Any], IO[bytes]]]:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a reader whose answer is no longer wanted, and do not wait for one that cannot be ended."""
+    """End a reader whose answer is no longer wanted, without waiting for one that cannot be ended."""
     assert process.stdout is not None
     process.stdout.close()  # who still writes gets an error
     # A confined process may signal no other (`lodestream.confinement`). A reader that a file has taken over, and that
@@ -231,7 +231,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _ended(process: subprocess.Popen[bytes], budget: int, seconds: int) -> UnavailableError:
-    """The error of a reader that has ended before its answer did: it has refused nothing, whatever ended it."""
+    """Return the error of a reader that ended before its answer: it has refused nothing, whatever ended it."""
     try:
         code = process.wait(_LAST_SECONDS)
         how = f"exit code {code}" if code >= 0 else signal.strsignal(-code) or f"signal {-code}"
@@ -248,7 +248,7 @@ def _printable(text: str) -> str:
 
 
 def _take(arrays: _Arrays, count: int, planes: Sequence[_Plane]) -> None:
-    """Take the arrays of one grid, and of each what the planes need."""
+    """Read the arrays of a grid, and give each to the planes."""
     dims = planes[0].cut.dims
     for role, name, values in islice(arrays, count):
         if role not in ("axis", "cell_ghost") and len(values) != prod(dims):
@@ -272,7 +272,7 @@ class _Plane:
         self._hidden: NDArray[np.bool_] | None = None
 
     def take(self, role: str, name: str, values: NDArray[Any]) -> None:
-        """Keep of one array what lies on the surface."""
+        """Keep the part of an array that lies on the surface."""
         if role == "axis":
             self._axes.append(values)
         elif role == "cell_ghost":
@@ -285,7 +285,7 @@ class _Plane:
             self._attributes[_attribute_name(role, name, values)] = self.cut.of(values, self._room)
 
     def block(self) -> tuple[Block, dict[str, Any]]:
-        """The surface, and what is to be said of its faces."""
+        """Return the block, and the metadata of its faces."""
         points, mask = self._points, self._mask
         if self._axes:
             points = _rectilinear(self._axes, self.cut)
@@ -317,7 +317,7 @@ def _attribute_name(role: str, name: str, values: NDArray[Any]) -> str:
 
 
 def _rectilinear(axes: Sequence[NDArray[Any]], cut: Cut) -> NDArray[Any]:
-    """The points of a grid that is the product of its axes."""
+    """Return the points of a grid that is the product of its axes."""
     i, j, k = cut.dims
     shapes = ((1, 1, i), (1, j, 1), (k, 1, 1))
     dtype = np.result_type(*axes)
@@ -329,7 +329,10 @@ def _rectilinear(axes: Sequence[NDArray[Any]], cut: Cut) -> NDArray[Any]:
 
 
 def _hidden_cells(values: NDArray[Any], cut: Cut) -> NDArray[np.bool_] | None:
-    """Which cells of a surface are hidden, (rows - 1, columns - 1); None for a volume, whose cells are not its own."""
+    """Return the mask of hidden cells, (rows - 1, columns - 1).
+
+    None for a volume, whose cells are not the surface's.
+    """
     rows, columns = (max(length - 1, 1) for length in cut.shape)
     hidden = values & HIDDEN_CELL != 0
     return hidden.reshape(rows, columns) if hidden.size == rows * columns and min(cut.shape) > 1 else None
@@ -338,7 +341,7 @@ def _hidden_cells(values: NDArray[Any], cut: Cut) -> NDArray[np.bool_] | None:
 def without_hidden(
     hidden: NDArray[np.bool_], mask: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.bool_], dict[str, Any]]:
-    """Make holes of the points all of whose cells are hidden; name the other hidden cells.
+    """Turn points whose cells are all hidden into holes; return the other hidden cells for the metadata.
 
     A cell with a hidden point says nothing more by being hidden: its other points are valid.
 

@@ -1,4 +1,4 @@
-"""Legacy files of VTK (.vtk): structured and rectilinear grids, as text or binary."""
+"""Read legacy files of VTK (.vtk): structured and rectilinear grids, as text or binary."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _BLOCK, _LONGEST_FIELD = 1 << 20, 1 << 10
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like a legacy file of VTK."""
+    """Return whether a file begins like a legacy file of VTK."""
     return head.startswith(_MAGIC)
 
 
@@ -61,7 +61,7 @@ def read(source: Source) -> Surface:
 
 
 def _check_arrays(source: Source) -> None:
-    """Count the arrays that the words of the file announce, wherever these stand: between them there may be bytes."""
+    """Count the arrays that keywords of the file announce, wherever they stand, even between binary values."""
     count, text = 0, b""
     with source.path.open("rb") as file:
         while True:
@@ -69,7 +69,7 @@ def _check_arrays(source: Source) -> None:
             text += block
             whole = len(text) - _LONGEST_FIELD if block else len(text)  # a field that is cut comes again
             count += sum(text.count(word, 0, max(whole, 0)) for word in _ARRAY)
-            count += sum(int(found[1]) for found in _FIELD.finditer(text) if found.start() < whole)
+            count += sum(int(match[1]) for match in _FIELD.finditer(text) if match.start() < whole)
             check_arrays(count)
             if not block:
                 return

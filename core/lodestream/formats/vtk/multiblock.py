@@ -1,4 +1,4 @@
-"""VTM: a file that names one .vts for each block, in a folder beside it; one archive where there is no folder.
+"""Write VTM: a file that names one .vts for each block, in a folder beside it; or one archive without a folder.
 
 Source: "VTK XML Formats" of the VTK documentation; names as ParaView gives them.
 """
@@ -27,7 +27,7 @@ _NAME = "surface"
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Never: its blocks are read, as further .vts files of one surface; what a .vtm names is not opened."""
+    """Return False: the blocks are read as .vts files of one surface, and files that a .vtm names are not opened."""
     return False
 
 
@@ -57,34 +57,34 @@ def write_beside(surface: Surface, path: Path) -> None:
     folder = path.with_suffix("")
     _check_folder(folder, path)
     token = secrets.token_hex(4)
-    made, old = (path.with_name(f".{folder.name}.{token}.{word}") for word in ("tmp", "old"))
+    new, old = (path.with_name(f".{folder.name}.{token}.{word}") for word in ("tmp", "old"))
     index = path.with_name(f".{path.name}.{token}.tmp")
     try:
-        made.mkdir()
+        new.mkdir()
         names = _names(folder.name, len(surface.blocks))
         for number, name in enumerate(names):
-            with (made / name).open("xb") as file:
+            with (new / name).open("xb") as file:
                 writer.write_block(surface, number, file)
         index.write_bytes(_index(folder.name, names))
         try:
             if folder.exists():
                 folder.rename(old)
-            made.rename(folder)
+            new.rename(folder)
             index.replace(path)
         finally:  # what is where says how far it came, after an interruption too
             unplaced = index.exists()
-            if unplaced and not made.exists():
+            if unplaced and not new.exists():
                 shutil.rmtree(folder, ignore_errors=True)
             if unplaced and old.exists():
                 old.rename(folder)
         shutil.rmtree(old, ignore_errors=True)
     finally:
         index.unlink(missing_ok=True)
-        shutil.rmtree(made, ignore_errors=True)
+        shutil.rmtree(new, ignore_errors=True)
 
 
 def _check_folder(folder: Path, path: Path) -> None:
-    """Refuse to replace what a writer of this module has not written."""
+    """Refuse to replace files that this module has not written."""
     if not folder.exists() and not folder.is_symlink():
         return
     ours = re.compile(re.escape(folder.name) + r"_\d+\.vts")

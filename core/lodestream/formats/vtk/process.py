@@ -1,4 +1,4 @@
-"""Run by a process of its own: read one file with one reader of VTK and write its grids to standard output.
+"""A separate process that reads one file with a reader of VTK and writes its grids to standard output.
 
 VTK takes what memory a file asks for, ends the process when it gets none, and CGNS opens the files that a file names.
 Here it may have only so much memory, may have no second file open beside the one that it reads, and where the kernel
@@ -50,7 +50,7 @@ _MAX_SECONDS = 600
 
 
 def main(kind: str, path: str, budget: int, seconds: int) -> None:
-    """Read the file `path` with the reader `kind`, in so many bytes beside those of VTK and a processor's seconds."""
+    """Read the file `path` with the reader `kind`, in so many bytes beside those of VTK, and processor seconds."""
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     messages = vtkStringOutputWindow()
     vtkOutputWindow.SetInstance(messages)
@@ -94,7 +94,7 @@ def main(kind: str, path: str, budget: int, seconds: int) -> None:
 
 
 def _limit(budget: int, seconds: int, path: Path) -> None:
-    """Allow so many bytes and seconds more, one file more, no other than this one, and no life after the parent's."""
+    """Limit memory and processor time, allow one open file more, only this one, and end with the parent."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
         with open("/proc/self/status") as status:
@@ -129,7 +129,7 @@ def _leaves(data: Any) -> Iterator[Any]:
 
 
 def _grid(data: Any) -> tuple[dict[str, Any], list[Any]]:
-    """Describe a grid; give its arrays, those of its points first."""
+    """Return the description of a grid and its arrays, those of its points first."""
     extent = data.GetExtent()
     dims = [extent[axis + 1] - extent[axis] + 1 for axis in (0, 2, 4)]
     if data.IsA("vtkRectilinearGrid"):
@@ -165,7 +165,7 @@ def _grid(data: Any) -> tuple[dict[str, Any], list[Any]]:
 
 
 def _role(attributes: Any, array: Any) -> str:
-    """What the file says that an array is."""
+    """Return the role that the file gives an array."""
     for role, getter in (("normals", "GetNormals"), ("texture", "GetTCoords"), ("scalars", "GetScalars")):
         if getattr(attributes, getter)() is array:
             return role
@@ -173,7 +173,7 @@ def _role(attributes: Any, array: Any) -> str:
 
 
 def _first_message(text: str) -> str:
-    """The words of the first error of VTK, without where in VTK it arose."""
+    """Return the text of VTK's first error, without its place in VTK's source."""
     for line in text.splitlines():
         words = line.split("): ", 1)[-1].strip()
         if words and not words.startswith(("ERROR:", "Warning:", "Generic Warning:", "ERR|")):

@@ -1,4 +1,4 @@
-"""VTS, the XML file of VTK for a structured grid, of any surface: grids stay grids, and holes are blanked.
+"""Write VTS, the XML file of VTK for a structured grid: grids stay grids, and holes are blanked.
 
 Source: "VTK XML Formats" of the VTK documentation; blanking as in VTK's vtkStructuredGrid.
 """
@@ -64,7 +64,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
 
 
 def write_block(surface: Surface, number: int, file: BinaryIO) -> None:
-    """Write one block, as `write` does those that are alone; what is lost of all is said with the first."""
+    """Write one block like `write`; losses of all blocks are reported with the first."""
     if number == 0:
         _warn_of_faces(surface)
         _warn_of_names(surface)
@@ -117,7 +117,7 @@ def _write_grid(surface: Surface, grid: Grid, file: BinaryIO) -> None:
 
 
 def grid_of(surface: Surface, number: int, kind: str = "VTS") -> Grid:
-    """One block as VTK has grids: with three coordinates, none of them NaN, and ends in place of closed axes.
+    """Return a block as a grid of VTK: three coordinates, none of them NaN, closed axes with repeated ends.
 
     Raises
     ------
@@ -150,11 +150,14 @@ def grid_of(surface: Surface, number: int, kind: str = "VTS") -> Grid:
 
 
 def _names(attributes: Iterable[str], kind: str) -> dict[str, str]:
-    """Names of attributes in a grid, by their own: none is VTK's, and none in a file is empty or beyond XML."""
+    """Return the names of attributes in a grid.
+
+    None is VTK's, and in a file none is empty or has characters beyond XML.
+    """
     names: dict[str, str] = {}
     free = {*attributes}
     for name in attributes:
-        label = (_NOT_XML.sub(lambda found: printable(found[0]), name) or "_") if kind == "VTS" else name
+        label = (_NOT_XML.sub(lambda match: printable(match[0]), name) or "_") if kind == "VTS" else name
         while (label != name and label in free | {*names.values()}) or label == _GHOSTS:
             label += "_"
         names[name] = label
@@ -162,7 +165,7 @@ def _names(attributes: Iterable[str], kind: str) -> dict[str, str]:
 
 
 def _warn_of_names(surface: Surface) -> None:
-    """Say which attributes have other names in a file."""
+    """Note which attributes have other names in a file."""
     names = _names(surface.blocks[0].attributes, "VTS")
     renamed = {name: label for name, label in names.items() if name != label}
     if (label := renamed.pop(_GHOSTS, None)) is not None:
@@ -173,7 +176,7 @@ def _warn_of_names(surface: Surface) -> None:
 
 
 def _warn_of_faces(surface: Surface) -> None:
-    """Say what a grid of quads does not tell."""
+    """Note the facts about faces that a grid of quads cannot hold."""
     faces = surface.metadata.get("faces")
     maps = [it for it in (faces if isinstance(faces, list) else [faces]) if isinstance(it, dict)]
     if any("diagonal" in it for it in maps):
@@ -194,7 +197,7 @@ def _coordinates(surface: Surface, block: Block) -> tuple[NDArray[Any], ...]:
 
 
 def _stacked(grids: Sequence[Grid]) -> Grid:
-    """One grid with the rows of all, the cells between two of them hidden."""
+    """Return one grid with the rows of all grids, the cells between two of them hidden."""
     width = max(grid.points.shape[1] for grid in grids)
     parts: list[Grid] = []
     for grid in grids:
@@ -235,14 +238,14 @@ def _array(name: str, values: NDArray[Any], offset: int) -> str:
 
 
 def _roles(attributes: dict[str, NDArray[Any]]) -> str:
-    """Say which array is what."""
+    """Return the XML attributes that name the active arrays."""
     roles = (("Scalars", COLOR, (3, 4)), ("Normals", NORMAL, (3,)), ("TCoords", TEXTURE, (2,)))
-    found = [
+    words = [
         f' {role}="{name}"'
         for role, name, widths in roles
         if name in attributes and attributes[name].shape[2:] in {(width,) for width in widths}
     ]
-    return "".join(found)
+    return "".join(words)
 
 
 def _field_data(surface: Surface) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""XML files of VTK with a structured grid (.vts), whose headers are checked before VTK sees them.
+"""Read XML files of VTK with a structured grid (.vts); their headers are checked before VTK sees them.
 
 Source: "VTK XML Formats" of the VTK documentation, and how VTK's vtkXMLDataParser.cxx reads blocks.
 """
@@ -61,7 +61,7 @@ _KEPT = 256
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like an XML file of VTK."""
+    """Return whether a file begins like an XML file of VTK."""
     return head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"<?xml", b"<VTKFile", b"<!--")) and b"<VTKFile" in head
 
 
@@ -99,7 +99,7 @@ class _Array:
         return self.attributes.get("Name", "of points")[:80]
 
     def promised(self) -> int:
-        """Bytes that the array takes in memory."""
+        """Return the bytes that the array takes in memory."""
         kind, components = self.attributes.get("type", ""), self.attributes.get("NumberOfComponents", "1")
         if kind not in _SIZES or not re.fullmatch(r"[1-9]\d{0,4}", components):
             raise FormatError(
@@ -110,8 +110,8 @@ class _Array:
 
 
 @dataclass(slots=True)
-class _Found:
-    """What the XML of a file says."""
+class _Content:
+    """Content of a file, as its XML describes it."""
 
     root: dict[str, str] = field(default_factory=dict)
     whole: tuple[int, ...] = ()
@@ -127,9 +127,12 @@ class _Found:
 
 
 def _checked(path: Path) -> tuple[Dims, int, Mapped | None]:
-    """Check the headers of a file; give the points of its grid along i, j and k, the bytes of its arrays, and them."""
-    found = _parsed(path)
-    kind = found.root.get("type", "none")
+    """Check the headers of a file.
+
+    Return the points along i, j and k, the bytes of its arrays, and the mapped arrays.
+    """
+    content = _parsed(path)
+    kind = content.root.get("type", "none")
     if kind == "vtkMultiBlockDataSet":
         raise FormatError(
             "expected the grids themselves, got a .vtm file, which only names other files, and these are never opened: "
@@ -138,33 +141,32 @@ def _checked(path: Path) -> tuple[Dims, int, Mapped | None]:
     if kind != "StructuredGrid":
         advice = _ADVICE.get(kind, "")
         raise FormatError(f"expected a VTK file of type StructuredGrid, got {kind[:60]}{advice}")
-    if not found.whole or not found.pieces:
+    if not content.whole or not content.pieces:
         raise FormatError("expected a StructuredGrid with a WholeExtent and a Piece, got none")
-    promised = sum(array.promised() for array in found.arrays)
-    for array in found.arrays:
-        _check_array(path, found, array)
-    i, j, k = _lengths(found.whole)
-    return (i, j, k), promised, _mapped(path, found, (i, j, k))
+    promised = sum(array.promised() for array in content.arrays)
+    for array in content.arrays:
+        _check_array(path, content, array)
+    i, j, k = _lengths(content.whole)
+    return (i, j, k), promised, _mapped(path, content, (i, j, k))
 
 
 #: Which role the point data have that an attribute of their element names.
 _ACTIVE = {"Normals": "normals", "TCoords": "texture", "Scalars": "scalars"}
 
 
-def _mapped(path: Path, found: _Found, dims: Dims) -> Mapped | None:
-    """The arrays of a file as maps of it; None where VTK must read them.
+def _mapped(path: Path, content: _Content, dims: Dims) -> Mapped | None:
+    """Return memory maps of the arrays of a file; None if VTK must read them.
 
-    That is where there is more than one piece, or data of fields, or cells are hidden, or arrays are not bytes as they
-    are in memory.
+    VTK must read a file with several pieces, field data or hidden cells, or whose arrays are not raw bytes.
     """
-    raw = found.appended is not None and found.appended.get("encoding", "base64") == "raw"
-    one = found.pieces == 1 and found.piece == found.whole and found.named == len(found.arrays)
-    if not raw or not one or found.root.get("compressor"):
+    raw = content.appended is not None and content.appended.get("encoding", "base64") == "raw"
+    is_whole = content.pieces == 1 and content.piece == content.whole and content.named == len(content.arrays)
+    if not raw or not is_whole or content.root.get("compressor"):
         return None
     arrays: list[tuple[str, str, NDArray[Any]]] = []
     left_out: list[str] = []
     names: set[tuple[str, str | None]] = set()
-    for array in found.arrays:
+    for array in content.arrays:
         key = array.section, array.attributes.get("Name")
         hides = key[1] == _GHOSTS and (array.section == "CellData" or array.attributes.get("type") != "UInt8")
         if hides or key in names or (not key[1] and array.section != "Points"):
@@ -173,37 +175,37 @@ def _mapped(path: Path, found: _Found, dims: Dims) -> Mapped | None:
         if array.section == "CellData":
             left_out.append(array.name)
             continue
-        values = _values(path, found, array)
+        values = _values(path, content, array)
         if values is None:
             return None
-        arrays.append((_role(found, array), "" if array.section == "Points" else str(key[1]), values))
+        arrays.append((_role(content, array), "" if array.section == "Points" else str(key[1]), values))
     points = [values for role, _, values in arrays if role == "points"]
     if len(points) != 1 or points[0].shape[1:] != (3,) or points[0].dtype.kind != "f":
         return None
-    arrays.sort(key=lambda one: one[0] != "points")
+    arrays.sort(key=lambda entry: entry[0] != "points")
     return Mapped(dims, tuple(arrays), tuple(left_out))
 
 
-def _role(found: _Found, array: _Array) -> str:
+def _role(content: _Content, array: _Array) -> str:
     if array.section == "Points":
         return "points"
     name = array.attributes.get("Name")
     if name == _GHOSTS:
         return "point_ghost"
-    return next((role for key, role in _ACTIVE.items() if found.active.get(key) == name), "point")
+    return next((role for key, role in _ACTIVE.items() if content.active.get(key) == name), "point")
 
 
-def _values(path: Path, found: _Found, array: _Array) -> NDArray[Any] | None:
-    """The values of an array, shape (point,) or (point, component), where they are appended as bytes."""
+def _values(path: Path, content: _Content, array: _Array) -> NDArray[Any] | None:
+    """Return the values of an array that is appended as bytes, shape (point,) or (point, component); else None."""
     if array.attributes.get("format") != "appended":
         return None
-    place, room = _place(path, found, array)
+    place, room = _place(path, content, array)
     words = _TYPE.fullmatch(array.attributes.get("type", ""))
     if place is None or words is None:
         return None
-    order = ">" if found.root.get("byte_order") == "BigEndian" else "<"
+    order = ">" if content.root.get("byte_order") == "BigEndian" else "<"
     dtype = np.dtype(f"{order}{_LETTERS[words[1]]}{int(words[2]) // 8}")
-    place += 8 if found.root.get("header_type", "UInt32") == "UInt64" else 4
+    place += 8 if content.root.get("header_type", "UInt32") == "UInt64" else 4
     components = int(array.attributes.get("NumberOfComponents", "1"))
     if array.tuples * components * dtype.itemsize > room:
         return None
@@ -212,54 +214,54 @@ def _values(path: Path, found: _Found, array: _Array) -> NDArray[Any] | None:
 
 
 class _Parser:
-    """Listens to expat, and keeps in `found` what a file says of its grid."""
+    """Handles the events of expat, and collects the description of the grid in `content`."""
 
     def __init__(self) -> None:
-        self.found = _Found()
+        self.content = _Content()
         self.expat = expat.ParserCreate()
         self.expat.StartElementHandler, self.expat.EndElementHandler = self._start, self._end
         self.expat.CharacterDataHandler = self._text
         self.expat.StartDoctypeDeclHandler = self.expat.EntityDeclHandler = _refuse
 
     def _start(self, name: str, attributes: dict[str, str]) -> None:
-        found = self.found
-        found.open_array = False
-        found.named += name in ("DataArray", "Array")
-        check_arrays(found.named)
+        content = self.content
+        content.open_array = False
+        content.named += name in ("DataArray", "Array")
+        check_arrays(content.named)
         if len(attributes) > _MOST_ATTRIBUTES:
             got = number(len(attributes))
             raise TooLargeError(f"expected at most {_MOST_ATTRIBUTES} attributes of {name[:40]!r}, got {got}")
         match name:
             case "VTKFile":
-                found.root = attributes
+                content.root = attributes
             case "StructuredGrid":
-                found.whole = _extent(attributes.get("WholeExtent", ""))
-            case "Piece" if found.whole:
-                found.piece = _extent(attributes.get("Extent", ""))
-                found.pieces += 1
-                _check_inside(found.piece, found.whole)
-            case "DataArray" if found.piece and found.section:
-                lengths = _lengths(found.piece)
-                if found.section == "CellData":
+                content.whole = _extent(attributes.get("WholeExtent", ""))
+            case "Piece" if content.whole:
+                content.piece = _extent(attributes.get("Extent", ""))
+                content.pieces += 1
+                _check_inside(content.piece, content.whole)
+            case "DataArray" if content.piece and content.section:
+                lengths = _lengths(content.piece)
+                if content.section == "CellData":
                     lengths = tuple(max(length - 1, 1) for length in lengths)
-                found.arrays.append(_Array(attributes, prod(lengths), found.section))
-                found.open_array = True
+                content.arrays.append(_Array(attributes, prod(lengths), content.section))
+                content.open_array = True
             case "AppendedData":
-                found.appended = attributes
-                found.appended_at = self.expat.CurrentByteIndex
+                content.appended = attributes
+                content.appended_at = self.expat.CurrentByteIndex
             case _ if name in _SECTIONS:
-                found.section = name
+                content.section = name
                 if name == "PointData":
-                    found.active = attributes
+                    content.active = attributes
 
     def _end(self, name: str) -> None:
-        self.found.open_array = False
+        self.content.open_array = False
         if name in _SECTIONS:
-            self.found.section = ""
+            self.content.section = ""
 
     def _text(self, characters: str) -> None:
-        if self.found.open_array:
-            array = self.found.arrays[-1]
+        if self.content.open_array:
+            array = self.content.arrays[-1]
             array.characters += len(characters)
             if len(array.text) < _KEPT:
                 array.text += "".join(characters.split())[:_KEPT]
@@ -269,26 +271,26 @@ def _refuse(*_: Any) -> None:
     raise FormatError("expected XML without a DOCTYPE or entities, got one")
 
 
-def _parsed(path: Path) -> _Found:
+def _parsed(path: Path) -> _Content:
     """Parse a file to its end, or as far as its appended data."""
     parser = _Parser()
-    found = parser.found
+    content = parser.content
     try:
         with path.open("rb") as file:
             read = 0
-            while found.appended is None and (chunk := file.read(_CHUNK)):
+            while content.appended is None and (chunk := file.read(_CHUNK)):
                 parser.expat.Parse(chunk)
                 read += len(chunk)
-                if found.appended is None and read - parser.expat.CurrentByteIndex > _LONGEST_TAG:
+                if content.appended is None and read - parser.expat.CurrentByteIndex > _LONGEST_TAG:
                     raise TooLargeError(
                         f"expected tags and comments of at most {number(_LONGEST_TAG)} bytes, got a longer one"
                     )
-            if found.appended is None:
+            if content.appended is None:
                 parser.expat.Parse(b"", True)
     except expat.ExpatError as error:
-        if found.appended is None:  # what is appended may be bytes, which are no XML
+        if content.appended is None:  # what is appended may be bytes, which are no XML
             raise FormatError(f"expected an XML file of VTK, got {error}") from None
-    return found
+    return content
 
 
 def _extent(text: str) -> tuple[int, ...]:
@@ -311,44 +313,44 @@ def _check_inside(piece: Sequence[int], whole: Sequence[int]) -> None:
         raise FormatError(f"expected pieces inside the WholeExtent {whole}, got {piece}")
 
 
-def _check_array(path: Path, found: _Found, array: _Array) -> None:
-    """Check that what stands before the bytes of an array says as many as its type and extent do."""
+def _check_array(path: Path, content: _Content, array: _Array) -> None:
+    """Check that the length before the bytes of an array agrees with its type and extent."""
     form = array.attributes.get("format", "ascii")
     if form == "ascii":
         return
     if form not in ("binary", "appended"):
         raise FormatError(f"expected array {array.name!r} as ascii, binary or appended, got {form[:40]!r}")
-    blocks = bool(found.root.get("compressor"))
-    wide = found.root.get("header_type", "UInt32") == "UInt64"
-    code = ("<" if found.root.get("byte_order") != "BigEndian" else ">") + ("Q" if wide else "I")
-    head, room = _head(path, found, array, struct.calcsize(code) * (3 if blocks else 1))
+    blocks = bool(content.root.get("compressor"))
+    wide = content.root.get("header_type", "UInt32") == "UInt64"
+    code = ("<" if content.root.get("byte_order") != "BigEndian" else ">") + ("Q" if wide else "I")
+    head, room = _head(path, content, array, struct.calcsize(code) * (3 if blocks else 1))
     if head is None:
         raise FormatError(f"expected array {array.name!r} inside the file, got none there")
     if blocks:
         count, length, last = struct.unpack(f"{code[0]}3{code[1]}", head)
-        said = (count - (last > 0)) * length + last if count else 0
+        stated = (count - (last > 0)) * length + last if count else 0
         least = (3 + count) * struct.calcsize(code)
     else:
-        said = struct.unpack(code, head)[0]
-        least = said + struct.calcsize(code)
-    if said != array.promised():
+        stated = struct.unpack(code, head)[0]
+        least = stated + struct.calcsize(code)
+    if stated != array.promised():
         raise FormatError(
             f"expected array {array.name!r} of {number(array.promised())} bytes by its extent and type, got a header "
-            f"that says {number(said)}"
+            f"that says {number(stated)}"
         )
     if least > room:
         raise FormatError(f"expected array {array.name!r} of at least {number(least)} bytes, got {number(room)}")
 
 
-def _head(path: Path, found: _Found, array: _Array, length: int) -> tuple[bytes | None, int]:
-    """The first bytes of an array, decoded, or None where the file has none; and for how many there is room."""
+def _head(path: Path, parsed: _Content, array: _Array, length: int) -> tuple[bytes | None, int]:
+    """Return the first bytes of an array, decoded, None if there are none; and the bytes that the file has for it."""
     in_base64 = 4 * ((length + 2) // 3)
     if array.attributes.get("format") == "binary":
         return _decoded(array.text.encode("ascii", "replace")[:in_base64], length), array.characters * 3 // 4
-    place, room = _place(path, found, array)
-    if found.appended is None or place is None:
+    place, room = _place(path, parsed, array)
+    if parsed.appended is None or place is None:
         return None, 0
-    raw = found.appended.get("encoding", "base64") == "raw"
+    raw = parsed.appended.get("encoding", "base64") == "raw"
     with path.open("rb") as file:
         file.seek(place)
         content = file.read(length if raw else in_base64)
@@ -357,16 +359,16 @@ def _head(path: Path, found: _Found, array: _Array, length: int) -> tuple[bytes 
     return _decoded(content, length), room * 3 // 4
 
 
-def _place(path: Path, found: _Found, array: _Array) -> tuple[int | None, int]:
-    """Where an appended array begins in the file, or None where it lies outside; and how many bytes follow there."""
+def _place(path: Path, content: _Content, array: _Array) -> tuple[int | None, int]:
+    """Return the offset of an appended array in the file, None if it is outside; and the bytes that follow."""
     offset = array.attributes.get("offset", "")
-    if found.appended is None or not re.fullmatch(r"\d{1,18}", offset):
+    if content.appended is None or not re.fullmatch(r"\d{1,18}", offset):
         return None, 0
     with path.open("rb") as file:
-        file.seek(found.appended_at)
+        file.seek(content.appended_at)
         start = file.read(1 << 12)
     mark = start.find(b"_", start.find(b">"))
-    place = found.appended_at + mark + 1 + int(offset)
+    place = content.appended_at + mark + 1 + int(offset)
     room = path.stat().st_size - place
     return (None, 0) if mark < 0 or room <= 0 else (place, room)
 
