@@ -198,6 +198,7 @@ def is_current(target: Path) -> bool:
 class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without types where it is not installed
     """hatchling's part: the library goes into the wheel, which is then one of this platform, for every Python.
 
+    A library of the tree that was made from these sources is taken as it is, unless ``CC`` names a compiler.
     With ``LODESTREAM_WHEEL_FOR=aarch64``, or another of `PORTABLE`, the wheel is one for every Linux on that machine.
     """
 
@@ -241,7 +242,8 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
 
 def _compile_for_wheel(folder: Path, machine: str | None) -> list[Path]:
     if machine is None:
-        return compile_all(folder)
+        present = [] if os.environ.get("CC") else libraries(NATIVE)
+        return present if present and all(map(is_current, present)) else compile_all(folder)
     if machine not in PORTABLE:
         raise RuntimeError(f"expected LODESTREAM_WHEEL_FOR to be one of {', '.join(PORTABLE)}, got {machine}")
     return compile_all(folder, zig(), machine)

@@ -179,6 +179,20 @@ def test_a_wheel_gets_its_library_from_outside_the_sources(monkeypatch: pytest.M
     assert sorted(path.name for path in build.NATIVE.iterdir()) == sorted(names)
 
 
+def test_a_wheel_gets_the_library_of_the_tree_if_that_is_current_and_no_compiler_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(build, "compile_library", lambda *_, **__: pytest.fail("nothing is to be compiled"))
+    data: dict[str, Any] = {"force_include": {}}
+    building = hook()
+    building.initialize("standard", data)
+    building.finalize("standard", data, "")
+    there = build.libraries(build.NATIVE)
+    assert list(data["force_include"]) == [str(path) for path in there]
+    assert all(map(build.is_current, there))
+
+
 def test_an_installation_that_fails_ends_without_a_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("CC", str(script(tmp_path / "cc", FAILS)))
     with pytest.raises(SystemExit, match="crti"):
