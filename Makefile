@@ -8,13 +8,16 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 
 demo: kernels ## stream a million points over a slow link, stop early, and show what came
 	@$(BIN)/lodestream demo $(ARGS)
+
+site: page kernels ## write build/site: the page and five generated surfaces, for any host of files
+	@$(BIN)/python -m lodestream_client.demo.site build/site
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Four
 # of pytest's share two processors, since some of the tests wait for a clock.

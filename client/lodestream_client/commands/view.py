@@ -36,6 +36,9 @@ __all__ = ["ViewOptions", "register", "run"]
 # The first bytes of a container, see docs/format.md.
 _MAGIC = b"\xf5LODE\r\n"
 
+# The container in a folder of --static.
+_SURFACE = "surface.lode"
+
 
 @dataclass(frozen=True)
 class ViewOptions:
@@ -176,7 +179,7 @@ def _write(options: ViewOptions, folder: Path) -> None:
 
     with _source(options) as source, progress_bar() as bar:
         task = bar.add_task("writing", total=1.0, figures="")
-        write_static(folder, assets(), source, lambda done: bar.update(task, completed=done))
+        write_static(folder, assets(), {_SURFACE: source}, lambda done: bar.update(task, completed=done))
     note(f"{folder} can be put on any host of files that answers Range; open its index.html there")
 
 

@@ -16,7 +16,7 @@ from .terrain import CELL
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Panel", "draw"]
+__all__ = ["Panel", "draw", "relief"]
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def draw(panels: Sequence[Panel], window: tuple[slice, slice], path: Path) -> No
     centred: dict[str, Any] = {"ha": "center", "va": "center"}
     for number, panel in enumerate(panels):
         left = _MARGIN + number * (across + _MARGIN)
-        lit = _relief(panel.heights.astype(np.float64), low, high)
+        lit = relief(panel.heights.astype(np.float64), low, high)
         for place, part, filtering in ((1, (slice(None), slice(None)), "antialiased"), (0, window, "bicubic")):
             bottom = _MARGIN + place * (down + _MARGIN)
             axes = figure.add_axes((left, bottom / tall, across, down / tall), facecolor=_EMPTY)
@@ -84,8 +84,21 @@ def draw(panels: Sequence[Panel], window: tuple[slice, slice], path: Path) -> No
     picture.save(path, format="PNG", optimize=True)
 
 
-def _relief(heights: Floats, low: float, high: float) -> Floats:
-    """Return colours by height, shaded by slope: (H, W, 4), transparent where there is nothing."""
+def relief(heights: Floats, low: float, high: float) -> Floats:
+    """Colour heights by height, and shade them by slope.
+
+    Parameters
+    ----------
+    heights : array (rows, columns)
+        In metres; NaN where there are none.
+    low, high : float
+        Heights at the two ends of the colours.
+
+    Returns
+    -------
+    array (rows, columns, 4) of float64
+        Red, green, blue and opacity, 0 to 1; transparent where there are no heights.
+    """
     from matplotlib.colors import LinearSegmentedColormap
 
     slopes = np.gradient(heights * (_EXAGGERATION / CELL))

@@ -89,13 +89,13 @@ def test_a_folder_that_was_interrupted_is_written_again(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_static(out, pages, source, interrupted)
+        write_static(out, pages, {"surface.lode": source}, interrupted)
     assert not (out / page.INDEX).exists()
     with monkeypatch.context() as patched:
         patched.setattr("lodestream_client.viewer.static.shutil.copyfile", lambda *_: interrupted(1))
         with pytest.raises(KeyboardInterrupt):
-            write_static(out, pages, source)
-    write_static(out, pages, source)
+            write_static(out, pages, {"surface.lode": source})
+    write_static(out, pages, {"surface.lode": source})
     assert (out / page.INDEX).is_file()
 
 
@@ -242,7 +242,7 @@ def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Pat
         try:
             assert (source.name, source.size) == ("hills", container.stat().st_size)
             assert source.read(10, 30) == container.read_bytes()[10:40]
-            write_static(tmp_path / "out", {}, source)
+            write_static(tmp_path / "out", {}, {"surface.lode": source})
         finally:
             source.close()
     assert (tmp_path / "out" / "surface.lode").read_bytes() == container.read_bytes()

@@ -1,0 +1,83 @@
+"""The public demo: a folder that a host of files serves, and surfaces that arrive as they were generated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from lodestream import page
+from lodestream_client import sync
+from lodestream_client.demo import site
+from tests.client.files import ranged
+
+
+@pytest.fixture
+def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page of two files, in place of the one that Node builds."""
+    folder = tmp_path / "built"
+    (folder / "assets").mkdir(parents=True)
+    (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
+    (folder / "assets" / "main-1.js").write_text("export {}")
+    assets = page.assets(folder)
+    monkeypatch.setattr("lodestream_client.demo.site.assets", lambda: assets)
+
+
+@pytest.mark.usefixtures("built")
+def test_a_host_of_files_serves_five_surfaces_of_different_kinds(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "site"
+    assert site.main([str(folder)]) == 0
+    kinds = set()
+    with ranged(folder) as host:
+        assert "<title>page</title>" in httpx.get(f"{host.url}/index.html", trust_env=False).text
+        config = httpx.get(f"{host.url}/view.json", trust_env=False).json()
+        assert config["live"] is False
+        assert [entry["src"] for entry in config["surfaces"]] == list(site.SURFACES)
+        for entry in config["surfaces"]:
+            assert (folder / entry["src"]).stat().st_size == entry["bytes"]
+            with sync.connect(f"{host.url}/{entry['src']}") as stream:
+                views = list(stream)
+            assert len(views) > 5
+            assert views[-1].complete
+            arrived, generated = views[-1].surface(), site.SURFACES[entry["src"]]()
+            assert entry["name"] == generated.metadata["name"]
+            for block, original in zip(arrived.blocks, generated.blocks, strict=True):
+                assert np.array_equal(block.points, original.points, equal_nan=True)
+                assert block.points.dtype == original.points.dtype
+                for name, values in original.attributes.items():
+                    assert np.array_equal(block.attributes[name], values, equal_nan=True)
+            first = generated.blocks[0]
+            kinds.add(
+                (len(generated.blocks), first.points.ndim, first.closed, first.holes > 0, tuple(first.attributes))
+            )
+    assert len(kinds) == len(site.SURFACES) == 5
+
+
+@pytest.mark.usefixtures("built")
+def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "view.json").write_text('{"zoom": 3}')
+    assert site.main([str(tmp_path / "out")]) == 1
+    assert "new, empty, or written by this command" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["view.json"]
+
+
+def test_a_page_that_is_not_built_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lodestream_client.demo.site.assets", dict)
+    assert site.main([str(tmp_path / "out")]) == 1
+    assert "make page" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert site.main([]) == 2
+
+
+def test_the_blocks_of_the_moon_share_the_points_of_their_sides() -> None:
+    blocks = [block.points for block in site.moon().blocks]
+    sides = np.concatenate(
+        [np.concatenate([points[0], points[-1], points[1:-1, 0], points[1:-1, -1]]) for points in blocks]
+    )
+    length = len(blocks[0]) - 2
+    assert len(np.unique(sides, axis=0)) == 12 * length + 8
