@@ -39,9 +39,7 @@ class Bounds(BaseModel):
     max_connections: int | None = _follows(
         1, "connections of all kinds: 5000, or fewer if the limit of open files (ulimit -n) does not allow as many"
     )
-    max_streams: int = _count(
-        2000, "open streams; in addition as many connections whose first message, with the token, has not arrived"
-    )
+    max_streams: int = _count(2000, "open streams; the same number of connections may be waiting to authenticate")
     max_level_requests: int = _count(32, "requests for levels as files that wait at the same time")
     max_client_level_requests: int = _count(
         16, "requests of one client for levels as files; each counts until the client has read its answer"
@@ -57,27 +55,26 @@ class Bounds(BaseModel):
     max_builds: int = _count(1000, "builds that wait or run")
     stream_memory: int | None = _follows(
         0,
-        "bytes that all streams together may have under way to clients, in buffers of the system, beside the 256 KiB "
-        "that each of them may have in any case: a quarter of `memory`; a stream gets an eighth of what is left, at "
-        "most 8 MiB",
+        "extra send buffer, in bytes, that all streams share: a quarter of `memory`. Every stream has 256 KiB of its "
+        "own; a fast one gets up to an eighth of what is left, at most 8 MiB",
     )
     build_memory: int | None = _follows(
         256 << 20,
-        "memory of one build, beside what its process begins with (250 MB of libraries, which builds share): `memory` "
-        "divided by `workers`, but at least 512 MiB",
+        "memory of one build: `memory` divided by `workers`, but at least 512 MiB. The 250 MB of libraries that all "
+        "builds share do not count",
     )
     build_seconds: float = _seconds(
         3600.0, "seconds that one build may take, by the clock, and in processor time for each of its threads"
     )
     level_seconds: float = _seconds(120.0, "seconds that making one level as a file may take")
     idle_seconds: float = _seconds(
-        60.0, "seconds for which a client may send nothing of an upload, do nothing in a stream, or not read its answer"
+        60.0, "seconds for which a client may send no part of an upload, be idle in a stream, or not read its answer"
     )
     least_rate: int = Field(
         default=1024,
         ge=0,
-        description="bytes a second that a client must send of an upload, and read of an answer that waits for it, at "
-        "least, on average over each `idle_seconds`; with 0 it is enough that something moves",
+        description="least average rate, in bytes a second over each `idle_seconds`, at which a client must send an "
+        "upload and read an answer; 0: any progress is enough",
     )
     head_seconds: float = _seconds(
         20.0, "seconds until the head of a request is complete, or until the token of a stream has arrived"
