@@ -23,7 +23,7 @@ from typing import Any
 from ..__main__ import processor
 from ..arrays import ROOT
 from ..measure import gates, keep
-from . import links, report
+from . import links, remeshed, report
 from .curves import Results
 from .registry import OURS, PEERS, versions
 from .seconds import gates as gates_of
@@ -41,18 +41,21 @@ def main() -> int:
     parser.add_argument("--again", action="store_true", help="measure again what is known")
     parser.add_argument("--tables", action="store_true", help="write the tables and figures of what is known")
     parser.add_argument("--links", action="store_true", help="measure streams over emulated links only")
+    parser.add_argument("--meshes", action="store_true", help="measure triangle meshes that are resampled only")
     options = parser.parse_args()
     results = known()
     if not options.tables:
         try:
-            if not options.links:
+            if not (options.links or options.meshes):
                 _measure(results, options)
-            if options.links or not (options.only or options.surfaces):
+            if options.meshes or not (options.links or options.only or options.surfaces):
+                _measure_meshes(results)
+            if options.links or not (options.meshes or options.only or options.surfaces):
                 _measure_links(results)
         except KeyboardInterrupt:
             print("stopped; what was measured is kept")
             return 130
-    if options.tables or not (options.only or options.surfaces):
+    if options.tables or not (options.only or options.surfaces or options.meshes):
         for path in report.write(results):
             print(f"wrote {path.relative_to(ROOT)}")
         for one in gates_of(Results(results)):
@@ -126,6 +129,15 @@ def _measure_links(results: dict[str, Any]) -> None:
     found = links.measure(Results(results)) | {"date": date.today().isoformat()}
     print(f"{time.perf_counter() - start:6.0f} s  streams over emulated links")
     _keep(results, lambda results: results.update(links=found))
+
+
+def _measure_meshes(results: dict[str, Any]) -> None:
+    found = remeshed.measure()
+    if not found:
+        print(f"no triangle meshes: expected some of {', '.join(remeshed.MESHES)} in {remeshed.FOLDER}")
+        return
+    _keep(results, lambda results: results.update(meshes=found))
+    print("\n".join(remeshed.page(found)))
 
 
 def _add(results: dict[str, Any], name: str, facts: dict[str, Any], key: str, run: dict[str, Any]) -> None:

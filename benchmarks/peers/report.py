@@ -10,10 +10,10 @@ from typing import Any
 import lodestream
 
 from ..arrays import ROOT
-from . import figures
+from . import figures, remeshed
 from .curves import Cell, Results, geometric_mean
 from .linked import linked
-from .prose import GATES, LOSSLESS, MEMORY, NOT_MEASURED, RULES, SPEED
+from .prose import GATES, LOSSLESS, MEMORY, NOT_MEASURED, RESAMPLED, RULES, SPEED
 from .registry import OURS, PEERS, old
 from .remarks import REMARKS, TERRACES, remark_of
 from .speed import memory_table, speed_table
@@ -54,6 +54,10 @@ def _page(results: Results, drawn: dict[str, Path]) -> Iterator[str]:
                 yield from _cells(cells)
                 if kind == "rms" and group in drawn:
                     yield f"\n![Bytes against RMS error: {group}]({drawn[group].relative_to(PAGE.parent)})"
+    if results.data.get("meshes"):
+        yield "\n## Triangle meshes that are resampled\n"
+        yield RESAMPLED
+        yield from remeshed.page(results.data["meshes"])
     yield "\n## Lossless\n"
     yield from _lossless(results)
     yield "\n## Speed\n"

@@ -1,0 +1,176 @@
+"""Triangle meshes that are resampled, beside the same meshes decimated and coded by Draco.
+
+Distances are those between two surfaces, both ways, against the input mesh; the root mean square is the larger one.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import lodestream as ls
+from lodestream.mesh import weld
+
+from ..arrays import ROOT
+from .curves import bytes_at
+from .tables import bold, table
+
+__all__ = ["MESHES", "distance", "measure", "page"]
+
+FOLDER = ROOT.parent / "shared" / "data" / "meshes"
+#: Scans, and a CAD model, for which Draco is the better choice.
+MESHES = ("stanford-bunny.obj", "armadillo.obj", "fandisk.obj")
+#: Errors of the table, in parts of the diagonal.
+ERRORS = (2e-3, 1e-3, 5e-4, 3e-4)
+#: Streams made for one error: in parts of the diagonal, of points, of which sliding along the surface is a part.
+_RMS = (4e-3, 2e-3, 1.4e-3, 1e-3, 7e-4, 5e-4, 3.5e-4, 2.5e-4)
+_BITS, _LEVEL = (8, 9, 10, 11, 12, 13), 10
+_KEPT = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015)
+_SAMPLES = 50_000
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Row = dict[str, Any]
+
+
+def measure() -> dict[str, Any]:
+    """Bytes and distances of all meshes that are there; empty if none is."""
+    return {name: _measured(FOLDER / name) for name in MESHES if (FOLDER / name).exists()}
+
+
+def _measured(path: Path) -> dict[str, Any]:
+    igl = importlib.import_module("igl")
+    vertices, faces = igl.read_triangle_mesh(str(path))[:2]
+    points, triangles = np.asarray(vertices, np.float64)[:, :3], np.asarray(faces, np.int64)
+    surface = ls.Surface.from_mesh(points, triangles, remesh=True, remesh_error=1e-4)
+    report = surface.metadata["remesh"]
+    rows: list[Row] = []
+    for error in _RMS:
+        container = ls.encode(surface, rms=error * report["diagonal"])
+        decoded = ls.decode(container)
+        rows.append({"setting": f"rms {error:g}", "bytes": len(container), "rms": _error(points, triangles, decoded)})
+        print(f"{path.name}: {rows[-1]}", flush=True)
+    return {
+        "vertices": len(points),
+        "faces": len(triangles),
+        "report": report,
+        "each": rows,
+        "stream": list(_layers(points, triangles, surface)),
+        "draco": list(_draco(points, triangles)),
+    }
+
+
+def _layers(points: Floats, triangles: Integers, surface: ls.Surface) -> Iterator[Row]:
+    """The layers of the one exact stream."""
+    container = ls.encode(surface)
+    reader = ls.Decoder()
+    reader.feed(container)
+    assert reader.index is not None
+    for layer in reader.index.layers:
+        prefix = ls.Decoder()
+        prefix.feed(container[: layer.end])
+        yield {"setting": "layer", "bytes": layer.end, "rms": _error(points, triangles, prefix.surface())}
+
+
+def _error(points: Floats, triangles: Integers, surface: ls.Surface) -> float:
+    mesh = weld(surface)
+    quads = np.asarray(mesh.quads, np.int64)
+    places = np.concatenate([block.points.reshape(-1, 3) for block in surface.blocks]).astype(np.float64)
+    halves = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return distance(points, triangles, places, halves)
+
+
+def _draco(points: Floats, triangles: Integers) -> Iterator[Row]:
+    """Draco at all settings, of the mesh and of meshes with fewer triangles (quadric decimation)."""
+    draco, simplification = importlib.import_module("DracoPy"), importlib.import_module("fast_simplification")
+    for kept in _KEPT:
+        some, fewer = points, triangles
+        if kept < 1:
+            some, fewer = simplification.simplify(
+                points.astype(np.float32), triangles.astype(np.int32), target_reduction=1 - kept
+            )
+        for bits in _BITS:
+            stream = draco.encode(
+                some.astype(np.float32), fewer.astype(np.uint32), quantization_bits=bits, compression_level=_LEVEL
+            )
+            back = draco.decode(stream)
+            there = np.asarray(back.points, np.float64).reshape(-1, 3), np.asarray(back.faces, np.int64).reshape(-1, 3)
+            error = distance(points, triangles, *there)
+            yield {"setting": f"{len(fewer)} triangles, {bits} bits", "bytes": len(stream), "rms": error}
+
+
+def distance(points: Floats, triangles: Integers, others: Floats, faces: Integers) -> float:
+    """Root mean square distance between two meshes, the larger of both ways, in parts of the first one's diagonal.
+
+    Parameters
+    ----------
+    points, others : float64 arrays of shape (V, 3)
+    triangles, faces : int64 arrays of shape (F, 3)
+    """
+    igl = importlib.import_module("igl")
+    there, _, _ = igl.point_mesh_squared_distance(_scattered(others, faces), points, triangles)
+    back, _, _ = igl.point_mesh_squared_distance(_scattered(points, triangles), others, faces)
+    return float(np.sqrt(max(there.mean(), back.mean())) / np.linalg.norm(np.ptp(points, axis=0)))
+
+
+def _scattered(points: Floats, faces: Integers) -> Floats:
+    """Points scattered over a mesh by area."""
+    random = np.random.default_rng(0)
+    a, b, c = (points[faces[:, corner]] for corner in range(3))
+    areas = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    chosen = np.minimum(np.searchsorted(areas, random.random(_SAMPLES) * areas[-1]), len(areas) - 1)
+    root, share = np.sqrt(random.random((_SAMPLES, 1))), random.random((_SAMPLES, 1))
+    return np.asarray((1 - root) * a[chosen] + root * (1 - share) * b[chosen] + root * share * c[chosen])
+
+
+def page(found: Mapping[str, Any]) -> Iterator[str]:
+    """Lines of Markdown: what was made of each mesh, and bytes to each error."""
+    head = ["mesh", "vertices", "blocks", "points", "RMS to", "RMS from", "largest", "folds"]
+    rows = []
+    for name, it in found.items():
+        report = it["report"]
+        unit = report["diagonal"]
+        largest = max(report["largest_to_input"], report["largest_from_input"]) / unit
+        rows.append(
+            [
+                name.removesuffix(".obj"),
+                f"{it['vertices']:,}",
+                f"{report['blocks']:,} of {int((report['quads'] / report['blocks']) ** 0.5) + 1}^2",
+                f"{report['quads'] / it['vertices']:.1f} x",
+                f"{report['rms_to_input'] / unit:.1e}",
+                f"{report['rms_from_input'] / unit:.1e}",
+                f"{largest:.1e}",
+                f"{report['folds']:,} ({report['folds'] / report['quads']:.2%})",
+            ]
+        )
+    yield from table(head, rows)
+    yield ""
+    head = ["mesh, RMS error", "Draco, decimated", "for this error", "ratio", "one exact stream", "ratio"]
+    rows = []
+    for name, it in found.items():
+        for error in ERRORS:
+            draco, each, stream = (bytes_at(it[key], "rms", error) for key in ("draco", "each", "stream"))
+            rows.append(
+                [
+                    f"{name.removesuffix('.obj')}, {error:.0e}",
+                    _bytes(draco),
+                    _bytes(each),
+                    _ratio(each, draco),
+                    _bytes(stream),
+                    _ratio(stream, draco),
+                ]
+            )
+    yield from table(head, rows)
+
+
+def _bytes(size: float | None) -> str:
+    return "not reached" if size is None else f"{size:,.0f}"
+
+
+def _ratio(size: float | None, peer: float | None) -> str:
+    return "" if size is None or peer is None else bold(size / peer, 1.0)
