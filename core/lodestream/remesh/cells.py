@@ -15,7 +15,7 @@ from ..errors import FormatError
 from .cleaning import refine
 from .triangulation import Floats, Integers, Triangulation, split_edges
 
-__all__ = ["LEAST_CELLS", "Cells", "grow_cells", "place_sites"]
+__all__ = ["LEAST_CELLS", "Cells", "Sites", "find_nearest", "grow_cells", "place_sites"]
 
 #: A component needs three cells round a corner if it is open, and four, as a tetrahedron, if it is closed.
 LEAST_CELLS = 4
@@ -51,7 +51,42 @@ class Cells:
         return int(self.labels.max()) + 1
 
 
-def place_sites(mesh: Triangulation, shares: Integers) -> Integers:
+@dataclass(frozen=True)
+class Sites:
+    """Sites, and how far from them triangles are.
+
+    Attributes
+    ----------
+    triangles : int64 array of shape (S,)
+        Those that are sites.
+    labels : int64 array of shape (F,)
+        For each triangle its nearest site.
+    distance : float64 array of shape (F,)
+        To that site, on the graph of neighbouring triangles.
+    """
+
+    triangles: Integers
+    labels: Integers
+    distance: Floats
+
+    def plus(self, mesh: Triangulation, triangles: Integers) -> Sites:
+        """These sites and further ones, round which alone distances are looked for."""
+        from scipy.sparse.csgraph import dijkstra
+
+        distance, _, source = dijkstra(
+            mesh.dual, indices=triangles, min_only=True, return_predecessors=True, limit=float(self.distance.max())
+        )
+        nearer = distance < self.distance
+        number = np.full(len(mesh.faces), -1)
+        number[triangles] = len(self.triangles) + np.arange(len(triangles))
+        return Sites(
+            np.concatenate([self.triangles, triangles]),
+            np.where(nearer, number[np.where(nearer, source, 0)], self.labels),
+            np.where(nearer, distance, self.distance),
+        )
+
+
+def place_sites(mesh: Triangulation, shares: Integers) -> Sites:
     """Place sites evenly, so many in each component.
 
     Parameters
@@ -60,19 +95,17 @@ def place_sites(mesh: Triangulation, shares: Integers) -> Integers:
     shares : int64 array
         Sites of each component.
 
-    Returns
-    -------
-    int64 array
-        The triangles that are sites.
     """
     from scipy.sparse.csgraph import dijkstra
 
     sites: list[Integers] = []
     order = np.argsort(mesh.components, kind="stable")
     bounds = np.searchsorted(mesh.components[order], np.arange(len(shares) + 1))
+    graphs = mesh.dual if len(shares) == 1 else mesh.dual[order][:, order]
     for component, share in enumerate(shares.tolist()):
-        faces = order[bounds[component] : bounds[component + 1]]
-        graph = mesh.dual if len(shares) == 1 else mesh.dual[faces][:, faces]
+        start, stop = bounds[component], bounds[component + 1]
+        faces = order[start:stop]
+        graph = graphs if len(shares) == 1 else graphs[start:stop, start:stop]
         centroids = mesh.centroids[faces]
         first = int(np.argmax(np.linalg.norm(centroids - centroids.mean(axis=0), axis=1)))
         chosen = [first]
@@ -83,10 +116,10 @@ def place_sites(mesh: Triangulation, shares: Integers) -> Integers:
             distance = np.minimum(distance, dijkstra(graph, indices=farthest, limit=distance[farthest]))
         sites.append(faces[np.unique(chosen)])
     placed = np.concatenate(sites)
+    result = find_nearest(mesh, placed)
     for _ in range(_LLOYD):
-        labels, _ = _nearest_sites(mesh, placed)
-        placed = _middles(mesh, labels, len(placed))
-    return placed
+        result = find_nearest(mesh, _middles(mesh, result.labels, len(placed)))
+    return result
 
 
 def _middles(mesh: Triangulation, labels: Integers, count: int) -> Integers:
@@ -100,14 +133,14 @@ def _middles(mesh: Triangulation, labels: Integers, count: int) -> Integers:
     return order[np.searchsorted(labels[order], np.arange(count))]
 
 
-def _nearest_sites(mesh: Triangulation, sites: Integers) -> tuple[Integers, Floats]:
-    """For each triangle its nearest site, and the distance to it."""
+def find_nearest(mesh: Triangulation, sites: Integers) -> Sites:
+    """Find the nearest site of each triangle."""
     from scipy.sparse.csgraph import dijkstra
 
     distance, _, source = dijkstra(mesh.dual, indices=sites, min_only=True, return_predecessors=True)
     labels = np.full(len(mesh.faces), -1)
     labels[sites] = np.arange(len(sites))
-    return labels[source], distance
+    return Sites(sites, labels[source], distance)
 
 
 @dataclass(frozen=True)
@@ -158,7 +191,7 @@ def _shape_of(mesh: Triangulation, labels: Integers, count: int) -> _Shape:
     return _Shape(broken, np.bincount(cell[corners[vertex]], minlength=count), meeting, corners)
 
 
-def grow_cells(mesh: Triangulation, sites: Integers, most: int) -> tuple[Cells, Integers]:
+def grow_cells(mesh: Triangulation, sites: Sites, most: int) -> tuple[Cells, Sites]:
     """Cut a mesh into cells round sites, and add sites until each cell can be a face of a base mesh.
 
     It ends, since triangles themselves are such cells (`refine` sees to those at the border).
@@ -167,15 +200,14 @@ def grow_cells(mesh: Triangulation, sites: Integers, most: int) -> tuple[Cells, 
     ----------
     mesh : Triangulation
         Refined.
-    sites : int64 array
-        Triangles.
+    sites : Sites
     most : int
         Greatest number of cells.
 
     Returns
     -------
     cells : Cells
-    sites : int64 array
+    sites : Sites
         Those given, and the added ones.
 
     Raises
@@ -184,26 +216,27 @@ def grow_cells(mesh: Triangulation, sites: Integers, most: int) -> tuple[Cells, 
         If more cells are needed.
     """
     for _ in range(_ROUNDS):
-        labels, distance = _nearest_sites(mesh, sites)
-        shape = _shape_of(mesh, labels, len(sites))
+        labels, count = sites.labels, len(sites.triangles)
+        shape = _shape_of(mesh, labels, count)
         wrong = np.flatnonzero(shape.broken | (shape.corner_count < 3))
         if not len(wrong):
             return _three_at_each_corner(mesh, labels), sites
-        sites = np.concatenate([sites, _more_sites(labels, distance, sites, wrong)])
-        if len(sites) > most:
+        more = _more_sites(sites, wrong)
+        if count + len(more) > most:
             break
+        sites = sites.plus(mesh, more)
     raise FormatError(
         f"expected a surface that at most {most:,} cells cover, got handles or holes that are smaller than a cell: "
         "fill or simplify them, or ask for more blocks"
     )
 
 
-def _more_sites(labels: Integers, distance: Floats, sites: Integers, wrong: Integers) -> Integers:
+def _more_sites(sites: Sites, wrong: Integers) -> Integers:
     """For each cell that is wrong its triangle farthest from the site."""
-    inside = np.flatnonzero(np.isin(labels, wrong))
-    inside = inside[~np.isin(inside, sites)]
-    order = inside[np.lexsort((-distance[inside], labels[inside]))]
-    _, first = np.unique(labels[order], return_index=True)
+    inside = np.flatnonzero(np.isin(sites.labels, wrong))
+    inside = inside[~np.isin(inside, sites.triangles)]
+    order = inside[np.lexsort((-sites.distance[inside], sites.labels[inside]))]
+    _, first = np.unique(sites.labels[order], return_index=True)
     return order[first]
 
 
@@ -222,7 +255,7 @@ def _three_at_each_corner(mesh: Triangulation, labels: Integers) -> Cells:
             break
         chosen = _apart(mesh, crowded)
         edges: NDArray[np.bool_] = np.asarray(np.isin(mesh.edges, chosen).any(axis=1))
-        takers = [_taker(mesh, labels, vertex) for vertex in chosen.tolist()]
+        takers = _takers(mesh, labels, chosen)
         mesh, parts = split_edges(mesh, edges)
         parents, labels = parents[parts], labels[parts]
         taker = np.full(len(mesh.vertices), -1)
@@ -237,19 +270,38 @@ def _three_at_each_corner(mesh: Triangulation, labels: Integers) -> Cells:
 def _apart(mesh: Triangulation, vertices: Integers) -> Integers:
     """Some of the vertices, no two of which have a triangle in common."""
     chosen: list[int] = []
-    taken = np.zeros(len(mesh.vertices), np.bool_)
-    faces = mesh.faces[np.isin(mesh.faces, vertices).any(axis=1)]
-    for vertex in vertices.tolist():
-        if not taken[vertex]:
+    faces = mesh.faces[np.isin(mesh.faces, vertices).any(axis=1)].tolist()
+    around: dict[int, list[int]] = {vertex: [] for vertex in vertices.tolist()}
+    for face in faces:
+        for vertex in face:
+            if vertex in around:
+                around[vertex] += face
+    taken: set[int] = set()
+    for vertex, neighbours in around.items():
+        if vertex not in taken:
             chosen.append(vertex)
-            taken[faces[(faces == vertex).any(axis=1)]] = True
+            taken.update(neighbours)
     return np.array(chosen)
 
 
-def _taker(mesh: Triangulation, labels: Integers, vertex: int) -> int:
-    """The cell that gets the triangles round a vertex: the one with the largest part of them."""
-    if mesh.at_border[vertex]:
-        edges = np.flatnonzero(mesh.border & (mesh.edges == vertex).any(axis=1))
-        return int(labels[mesh.sides[edges].max(axis=1)].min())
-    faces = np.flatnonzero((mesh.faces == vertex).any(axis=1))
-    return int(np.argmax(np.bincount(labels[faces], mesh.areas[faces] + 1e-300)))
+def _takers(mesh: Triangulation, labels: Integers, vertices: Integers) -> Integers:
+    """For each vertex the cell that gets the triangles round it: the one with the largest part of them.
+
+    At the border it is the one of less number of the two that have an edge of the border there.
+    """
+    count = int(labels.max()) + 1
+    place = np.full(len(mesh.vertices), -1)
+    place[vertices] = np.arange(len(vertices))
+    corner = np.flatnonzero(place[mesh.faces.reshape(-1)] >= 0)
+    face = corner // 3
+    keys, inverse = np.unique(place[mesh.faces.reshape(-1)[corner]] * count + labels[face], return_inverse=True)
+    areas = np.bincount(inverse.reshape(-1), mesh.areas[face] + 1e-300, len(keys))
+    order = np.lexsort((keys, -areas, keys // count))
+    _, first = np.unique(keys[order] // count, return_index=True)
+    takers = keys[order[first]] % count
+    edges = np.flatnonzero(mesh.border & (place[mesh.edges] >= 0).any(axis=1))
+    at_border = np.full(len(vertices), count)
+    for end in mesh.edges[edges].T:
+        there = place[end] >= 0
+        np.minimum.at(at_border, place[end[there]], labels[mesh.sides[edges[there]].max(axis=1)])
+    return np.where(at_border < count, at_border, takers)

@@ -5,19 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import FormatError
+from ..mesh.places import equal_places
 from .libraries import igl, sparse
 from .triangulation import Floats, Integers, Triangulation, split_edges
 
-__all__ = ["clean", "refine"]
+__all__ = ["clean", "longest_edges", "refine"]
 
 #: Rounds of halving edges: each shortens the longest to a half.
 _ROUNDS = 40
+#: Squares of edges over that of the longest one allowed, in all: for each edge that there is, and for each cell. Cells
+#: of well-shaped triangles have 100.
+_PARTS_OF_EDGE, _PARTS_OF_CELL = 2, 200
+#: A component has no area if it has no more than this part of the square of the diagonal.
+_LEAST_AREA = 1e-14
+#: Lengths of a diagonal within which products of four lengths are numbers.
+_SHORTEST, _LONGEST = 1e-60, 1e60
 
 
 def clean(vertices: Floats, faces: Integers) -> tuple[Triangulation, Integers, Integers]:
-    """Merge vertices at the same place, drop triangles without area and doubled ones, wind the others alike.
+    """Merge vertices at the same place, drop flat and doubled triangles, wind the others alike.
 
-    Where the triangles round a vertex are several fans, each fan gets a vertex of its own.
+    Flat are triangles that name a vertex twice, and components without area. Where the triangles round a vertex are
+    several fans, each fan gets a vertex of its own.
 
     Parameters
     ----------
@@ -35,19 +44,25 @@ def clean(vertices: Floats, faces: Integers) -> tuple[Triangulation, Integers, I
     Raises
     ------
     FormatError
-        If coordinates are not finite, there are no four triangles with an area, three triangles meet at an edge, or
-        the surface has one side only.
+        If coordinates are not finite, or their extent is beyond all measure; if there are no four triangles with an
+        area, three triangles meet at an edge, or the surface has one side only.
     """
     used = np.unique(faces)
     if not np.isfinite(vertices[used]).all():
         wrong = int((~np.isfinite(vertices[used]).all(axis=1)).sum())
         raise FormatError(f"expected finite coordinates of vertices, got {wrong:,} that are not")
-    places, inverse = np.unique(vertices, axis=0, return_inverse=True)
-    merged = inverse.reshape(-1)[faces]
+    with np.errstate(over="ignore"):
+        diagonal = float(np.linalg.norm(np.ptp(vertices[used], axis=0))) if len(used) else 0.0
+    if diagonal > 0 and not _SHORTEST < diagonal < _LONGEST:
+        raise FormatError(
+            f"expected a mesh with a diagonal from {_SHORTEST:g} to {_LONGEST:g}, got {diagonal:.3g}: take another unit"
+        )
+    places, inverse = equal_places(vertices)
+    merged = inverse[faces]
     distinct = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
     rows = np.flatnonzero(distinct)
     ordered = np.sort(merged[rows], axis=1)
-    _, first = np.unique(ordered, axis=0, return_index=True)
+    _, first = np.unique(equal_places(ordered)[1], return_index=True)
     rows = rows[np.sort(first)]
     if len(rows) < 4:
         raise FormatError(f"expected at least four triangles with an area, got {len(rows)}")
@@ -56,8 +71,11 @@ def clean(vertices: Floats, faces: Integers) -> tuple[Triangulation, Integers, I
     turned = (oriented != merged).any(axis=1)
     merged = np.where(turned[:, np.newaxis], merged[:, [0, 2, 1]], merged)
     mesh = _one_fan_each(Triangulation(places, merged))
-    if not mesh.areas.sum() > 0 or not mesh.diagonal > 0:
+    flat = (np.bincount(mesh.components, mesh.areas) <= _LEAST_AREA * mesh.diagonal**2)[mesh.components]
+    if flat.all():
         raise FormatError("expected triangles with an area, got none")
+    if flat.any():
+        mesh, rows, turned = _one_fan_each(Triangulation(mesh.vertices, mesh.faces[~flat])), rows[~flat], turned[~flat]
     return mesh, rows, turned
 
 
@@ -93,6 +111,27 @@ def _one_fan_each(mesh: Triangulation) -> Triangulation:
     vertex = np.empty(count, np.int64)
     vertex[fan] = mesh.faces.reshape(-1)
     return Triangulation(mesh.vertices[vertex], fan.reshape(-1, 3).astype(np.int64))
+
+
+def longest_edges(mesh: Triangulation, lengths: Floats, cells: Integers) -> Floats:
+    """The greatest lengths to which edges are to be halved, for each component.
+
+    They are those wanted, but where long and narrow triangles would become too many: a triangle becomes as many as the
+    square of the parts of its edges, so the sum of these squares is bounded.
+
+    Parameters
+    ----------
+    mesh : Triangulation
+    lengths : float64 array of shape (C,)
+        The lengths wanted.
+    cells : int64 array of shape (C,)
+        Cells of each component.
+    """
+    component = mesh.components[mesh.sides.max(axis=1)]
+    ends = mesh.vertices[mesh.edges]
+    total = np.bincount(component, ((ends[:, 1] - ends[:, 0]) ** 2).sum(axis=1), len(cells))
+    parts = _PARTS_OF_EDGE * np.bincount(component, minlength=len(cells)) + _PARTS_OF_CELL * cells
+    return np.asarray(np.maximum(lengths, np.sqrt(total / parts)))
 
 
 def refine(mesh: Triangulation, longest: Floats) -> tuple[Triangulation, Integers]:

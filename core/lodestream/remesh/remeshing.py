@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import TooLargeError
+from ..errors import FormatError, TooLargeError
 from .cells import LEAST_CELLS, Cells, grow_cells, place_sites
-from .cleaning import clean, refine
+from .cleaning import clean, longest_edges, refine
 from .distances import Distances, distances_of_vertices, folded_quads, measure
 from .layout import Block, lay_out
 from .maps import Maps
@@ -173,35 +173,42 @@ def _adapted(mesh: Triangulation, wanted: int, progress: Callable[[float], None]
     """Cells that lie evenly, and more of them where the surface of their blocks is far from the mesh."""
     areas = np.bincount(mesh.components, mesh.areas)
     shares = _shares(mesh, _EVEN * wanted)
-    fine, parents = refine(mesh, np.sqrt(areas / shares) / _FINENESS)
+    most = max(_MOST_CELLS, 4 * wanted)
+    if shares.sum() > most:
+        raise FormatError(
+            f"expected a surface that at most {most:,} cells cover, got {len(shares):,} components of {LEAST_CELLS} "
+            f"cells or more each: leave out the small ones, or ask for {-(-int(shares.sum()) // 4):,} blocks"
+        )
+    fine, parents = refine(mesh, longest_edges(mesh, np.sqrt(areas / shares) / _FINENESS, shares))
     # Components of the finer mesh may be numbered otherwise.
     number = np.empty(len(shares), np.int64)
     number[fine.components] = mesh.components[parents]
     sites = place_sites(fine, shares[number])
-    most = max(_MOST_CELLS, 4 * wanted)
     relaxation = Relaxation(mesh)
+    base: _Base | None = None
     budget = max(int(shares.sum() * (1 / _EVEN - 1)), 4)
     for turn in range(_TURNS + 1):
         progress(0.1 + 0.12 * turn)
         cells, sites = grow_cells(fine, sites, most)
-        base = _base_of(cells)
+        base = _base_of(cells, None if base is None else base.maps)
         if turn == _TURNS or not budget:
             break
         grids, points, normals = base.sampled(_FIRST)
         points, _ = relaxation.relax(grids, points, normals, _ROUNDS[1])
         distance = distances_of_vertices(mesh, grids, points)
         new = _worst(fine, mesh, distance, min(_SITES, budget))
-        new = np.setdiff1d(new, sites)
+        new = np.setdiff1d(new, sites.triangles)
         if not len(new):
             break
         budget -= len(new)
-        sites = np.concatenate([sites, new])
+        sites = sites.plus(fine, new)
+    assert base is not None
     return base
 
 
-def _base_of(cells: Cells) -> _Base:
+def _base_of(cells: Cells, known: Maps | None) -> _Base:
     rims = trace_rims(cells)
-    maps = Maps(cells, rims)
+    maps = Maps(cells, rims, known)
     count = cells.count
     centres, _ = maps.locate(np.arange(count), np.zeros(count), np.zeros(count))
     return _Base(cells, rims, maps, lay_out(rims, centres))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError, OptionError
 from ..mesh import Mesh
+from ..mesh.places import equal_places
 from ..surface import Block, Surface
 from .attributes import find_places, sample_attributes
 from .remeshing import DEFAULT_ERROR, Remeshing, remesh_triangles
@@ -158,8 +159,9 @@ def _apart(grids: Grids, points: Floats, dtype: np.dtype[Any]) -> NDArray[Any]:
     """The points in a type, none at the place of another: those with the same coordinates would count as one."""
     result = points.astype(dtype)
     for _ in range(_ROUNDS):
-        _, first, place = np.unique(result, axis=0, return_index=True, return_inverse=True)
-        same = np.flatnonzero(first[place.reshape(-1)] != np.arange(len(result)))
+        _, place = equal_places(result)
+        _, first = np.unique(place, return_index=True)
+        same = np.flatnonzero(first[place] != np.arange(len(result)))
         if not len(same):
             break
         means = _means(grids, result.astype(np.float64))

@@ -4,14 +4,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
 from lodestream.errors import FormatError, OptionError
 from lodestream.mesh import weld
-from lodestream.remesh.cells import Cells, grow_cells, place_sites
-from lodestream.remesh.cleaning import clean, refine
+from lodestream.remesh.cells import Cells, find_nearest, grow_cells, place_sites
+from lodestream.remesh.cleaning import clean, longest_edges, refine
 from lodestream.remesh.distances import folded_quads
 from lodestream.remesh.layout import Block, lay_out
 from lodestream.remesh.maps import Maps
@@ -19,6 +19,7 @@ from lodestream.remesh.remeshing import Remeshing, remesh_triangles
 from lodestream.remesh.rims import trace_rims
 from lodestream.remesh.samples import quads_of
 from lodestream.remesh.triangulation import Triangulation
+from tests.examples import examples
 
 from . import scenes
 
@@ -84,7 +85,8 @@ def cut(points: scenes.Floats, faces: scenes.Integers, count: int, seed: int | N
     else:
         chosen = [np.flatnonzero(fine.components == part) for part in range(parts)]
         random = np.random.default_rng(seed)
-        sites = np.concatenate([random.choice(part, size, False) for part, size in zip(chosen, shares, strict=True)])
+        triangles = [random.choice(part, size, False) for part, size in zip(chosen, shares, strict=True)]
+        sites = find_nearest(fine, np.concatenate(triangles))
     cells, _ = grow_cells(fine, sites, 4000)
     return cells
 
@@ -95,7 +97,7 @@ def blocks_of(cells: Cells) -> list[Block]:
     return lay_out(trace_rims(cells), centres)
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.integers(0, 10_000), st.sampled_from([*ALL]), st.integers(4, 60))
 def test_random_cells_are_paired_without_exception(seed: int, name: str, count: int) -> None:
     cells = cut(*ALL[name](), count, seed)
@@ -114,6 +116,34 @@ def test_cells_are_discs_and_no_triangle_is_turned_over_in_their_maps() -> None:
         rims = trace_rims(cells)
         assert min(map(len, rims.sides)) >= 3
         assert Maps(cells, rims).folded == 0
+
+
+def test_further_sites_are_found_as_if_all_had_been_there() -> None:
+    for scene in (scenes.torus, scenes.disc, scenes.components):
+        mesh, _, _ = clean(*scene())
+        triangles = np.random.default_rng(0).permutation(len(mesh.faces))
+        first = np.unique([*triangles[:9], *np.unique(mesh.components, return_index=True)[1]])
+        more = np.setdiff1d(triangles[9:14], first)
+        step, whole = find_nearest(mesh, first).plus(mesh, more), find_nearest(mesh, np.concatenate([first, more]))
+        np.testing.assert_array_equal(step.triangles, whole.triangles)
+        np.testing.assert_allclose(step.distance, whole.distance)
+        assert (step.labels == whole.labels).mean() > 0.999  # two sites may be equally near
+
+
+def test_maps_that_are_known_are_those_that_would_be_made() -> None:
+    mesh, _, _ = clean(*scenes.torus())
+    fine, _ = refine(mesh, np.array([0.1]))
+    sites = place_sites(fine, np.array([20]))
+    cells, sites = grow_cells(fine, sites, 1000)
+    before = Maps(cells, trace_rims(cells))
+    cells, _ = grow_cells(fine, sites.plus(fine, np.setdiff1d([5], sites.triangles)), 1000)
+    rims = trace_rims(cells)
+    count = np.arange(cells.count).repeat(30)
+    random = np.random.default_rng(1)
+    places = random.random(len(count)), random.random(len(count)) * 2 * np.pi
+    step, whole = Maps(cells, rims, before), Maps(cells, rims)
+    assert len(before.discs.keys() & whole.discs.keys()) > 10
+    np.testing.assert_allclose(step.locate(count, *places)[0], whole.locate(count, *places)[0], atol=1e-9)
 
 
 def test_borders_are_not_paid_for_with_blocks() -> None:
@@ -181,6 +211,65 @@ def test_fans_at_one_vertex_get_vertices_of_their_own() -> None:
     assert mesh.characteristic().tolist() == [2, 2]
 
 
+def beside(first: scenes.MeshArrays, second: scenes.MeshArrays) -> scenes.MeshArrays:
+    """Two meshes as one."""
+    return np.concatenate([first[0], second[0]]), np.concatenate([first[1], second[1] + len(first[0])])
+
+
+def sliver(height: float) -> scenes.MeshArrays:
+    """A strip of triangles of that height, two long, with vertices on both sides."""
+    x = np.linspace(0, 2, 9)
+    points = np.concatenate([np.column_stack([x, 0 * x, 0 * x + 5]), np.column_stack([x, 0 * x + height, 0 * x + 5])])
+    low = np.arange(8)
+    faces = np.concatenate([np.stack([low, low + 1, low + 10], -1), np.stack([low, low + 10, low + 9], -1)])
+    return points, faces
+
+
+def test_a_component_without_area_is_dropped() -> None:
+    """Its edges would be halved for ever."""
+    mesh, rows, turned = clean(*beside(scenes.cube(), sliver(0)))
+    assert (len(mesh.vertices), len(mesh.faces), len(rows), len(turned)) == (8, 12, 12, 12)
+    assert rows.max() == 11
+    result = remesh_triangles(*beside(sliver(0), scenes.cube()), blocks=24, error=1e-2)
+    assert result.rows.min() == 16
+    assert result.distances.rms < 1e-2
+
+
+@pytest.mark.parametrize("height", [1e-3, 1e-9])
+def test_a_narrow_component_is_cut_into_so_many_triangles_only(height: float) -> None:
+    result = remesh_triangles(*beside(scenes.cube(), sliver(height)), blocks=12, error=1e-2)
+    mesh = Triangulation(*sliver(height))
+    longest = longest_edges(mesh, np.sqrt(mesh.areas.sum() / np.array([4])) / 5, np.array([4]))
+    fine, _ = refine(mesh, longest)
+    assert len(fine.faces) < 10_000
+    _, count = edges_of(result)
+    assert count.max() == 2
+    assert result.distances.rms < 1e-2
+
+
+def test_more_components_than_cells_are_refused_at_once() -> None:
+    points, faces = scenes.cube()
+    places = np.arange(400)[:, None, None] * [3, 0, 0] + points
+    every = (np.arange(400)[:, None, None] * 8 + faces).reshape(-1, 3)
+    with pytest.raises(FormatError, match=r"got 400 components of 4 cells or more each: .* ask for [0-9]+ blocks"):
+        remesh_triangles(places.reshape(-1, 3), every)
+
+
+@pytest.mark.parametrize("size", [1e-100, 1e100, 1e300])
+def test_sizes_beyond_all_measure_are_refused(size: float) -> None:
+    points, faces = scenes.cube()
+    with pytest.raises(FormatError, match="take another unit"):
+        remesh_triangles(points * size, faces)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e30])
+def test_the_unit_does_not_matter(size: float) -> None:
+    points, faces = scenes.sphere()
+    usual, other = (remesh_triangles(points * unit, faces, blocks=24, error=1e-2) for unit in (1, size))
+    assert other.distances.rms == pytest.approx(usual.distances.rms, rel=0.2)
+    assert len(other.grids.numbers) == len(usual.grids.numbers)
+
+
 def moebius() -> scenes.MeshArrays:
     turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
     width = np.array([-0.3, 0.0, 0.3])[:, None]
@@ -214,7 +303,7 @@ def test_what_is_no_surface_is_refused(mesh: scenes.MeshArrays, words: str) -> N
 def test_a_surface_with_too_many_handles_is_refused_with_a_remedy() -> None:
     mesh, _, _ = clean(*scenes.gyroid())
     with pytest.raises(FormatError, match="ask for more blocks"):
-        grow_cells(mesh, np.array([0, 100, 200, 300]), 12)
+        grow_cells(mesh, find_nearest(mesh, np.array([0, 100, 200, 300])), 12)
 
 
 def test_halving_edges_keeps_the_surface_whole() -> None:
