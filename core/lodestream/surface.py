@@ -422,7 +422,7 @@ class Surface:
         Parameters
         ----------
         vertices : array of shape (V, 2) or (V, 3)
-        faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int
+        faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int (with remesh of 3 or more)
             0-based vertices of each face, going round it.
         attributes : mapping of str to arrays of shape (V,) or (V, K), optional
         **remeshing

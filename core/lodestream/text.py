@@ -8,9 +8,12 @@ from typing import Any
 
 from .errors import OptionError
 
-__all__ = ["names_in", "printable", "remesh_words"]
+__all__ = ["is_remeshed", "names_in", "printable", "remesh_words"]
 
-#: What the metadata of a remeshed surface say in numbers, see `lodestream.remesh.surfaces`.
+#: Of the metadata of a remeshed surface: a map of what was done and measured.
+_REMESH = "remesh"
+
+#: What this map says in numbers, see `lodestream.remesh.surfaces`.
 _REMESHED = ("blocks", "quads", "folds", "rms_to_input", "rms_from_input", "largest_to_input", "largest_from_input")
 
 
@@ -58,6 +61,11 @@ def _escaped(char: str) -> str:
     return char.encode("unicode_escape").decode("ascii")
 
 
+def is_remeshed(metadata: Mapping[str, Any]) -> bool:
+    """Return whether a surface was made of another mesh: its last layer is complete, and never called exact or lossless."""
+    return metadata.get(_REMESH) is not None
+
+
 def remesh_words(metadata: Mapping[str, Any]) -> str | None:
     """Say how far a remeshed surface is from the mesh that it was made of; None if the metadata do not say so.
 
@@ -67,7 +75,7 @@ def remesh_words(metadata: Mapping[str, Any]) -> str | None:
     >>> remesh_words({"remesh": told | {"largest_to_input": 0.01, "largest_from_input": 0.02}})
     '98 blocks; RMS distance to the mesh 0.0001, from it 0.0002; largest 0.01 and 0.02; 3 of 25,088 quads folded'
     """
-    report = metadata.get("remesh")
+    report = metadata.get(_REMESH)
     if not isinstance(report, Mapping):
         return None
     numbers = [report.get(name) for name in _REMESHED]

@@ -100,6 +100,13 @@ def _hgt(path: Path) -> None:
     hills((1201, 1201)).astype(">i2").tofile(path)
 
 
+def _trimesh(path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    mesh: Any = torus().to_trimesh()
+    assert isinstance(mesh, trimesh.Trimesh)
+    mesh.export(path)
+
+
 def _off(path: Path) -> None:
     points = torus().points.reshape(-1, 3)
     r, c = np.indices((12, 16)).reshape(2, -1)
@@ -158,6 +165,8 @@ _MAKERS: dict[str, Callable[[Path], Any]] = {
     "N37W122.hgt": _hgt,
     "torus.obj": lambda path: formats.write(torus(), path),
     "torus.off": _off,
+    "torus.stl": _trimesh,
+    "torus.glb": _trimesh,
     "torus.vts": _vts,
     "scan.pcd": _pcd,
     "box.vtk": _vtk,

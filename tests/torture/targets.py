@@ -58,7 +58,7 @@ __all__ = ["EDGES", "KINDS", "TARGETS", "Edit", "Target", "edit", "mutate"]
 
 #: Read by other people's compiled code (GDAL, HDF5, VTK), which they fuzz. A server runs it in a process that may die;
 #: here such files are only recognised.
-_FOREIGN = {"cgns", "esri-ascii", "geotiff", "netcdf", "png", "srtm-hgt", "usgs-dem", "vtk", "vts"}
+_FOREIGN = {"cgns", "esri-ascii", "geotiff", "glb", "netcdf", "png", "srtm-hgt", "stl", "usgs-dem", "vtk", "vts"}
 
 _BOUNDARY = b"torture"
 _LARGEST = 1 << 16

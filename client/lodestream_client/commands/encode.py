@@ -194,10 +194,13 @@ def read_surface(
     """
     import lodestream as ls
 
-    with option_hints(names), input_files(names) as files:
+    with option_hints(names), input_files(names) as files, progress_bar(LONG) as bar:
         format_options = checked_options(options.format_options)
         given: dict[str, Any] = {"closed": options.closed, "filename": files.filename}
         given |= {"format_name": options.format_name, "nodata": options.nodata}
+        if "remesh" in format_options:  # nothing else takes long before the encoding
+            task = bar.add_task("remeshing", total=1.0, figures="")
+            given["progress"] = lambda fraction: bar.update(task, completed=fraction)
         if folder is None:
             first, *more = files.paths
             surface = ls.read(first, *more, **given, **format_options)

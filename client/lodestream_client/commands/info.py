@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lodestream.errors import StreamError, TooLargeError, TruncatedStreamError
-from lodestream.text import remesh_words
+from lodestream.text import is_remeshed, remesh_words
 
 from ..requests import addresses
 from ..terminal.output import cell, console, human_size, point_words, print_json
@@ -111,13 +111,18 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
     for kind in ("levels", "layers"):
         if details.get(kind):
             out.print()
-            exact = details.get("bytes") if kind == "layers" and details.get("exact") else None
-            last = "exact" if remesh_words(details.get("metadata") or {}) is None else "complete"
+            last = _last_state(details)
+            exact = details.get("bytes") if kind == "layers" and details.get(last) else None
             out.print(_states(kind, details[kind], details.get("channel_names") or [], out.is_terminal, exact, last))
     more = len(details.get("channel_names") or []) - _MOST_CHANNELS
     if more > 0:
         out.print()
         out.print(f"and {more} more channels, whose errors --json tells")
+
+
+def _last_state(details: Mapping[str, Any]) -> str:
+    """Return what the whole stream is called, and the key that says whether it restores every value."""
+    return "complete" if is_remeshed(details.get("metadata") or {}) else "exact"
 
 
 def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -140,13 +145,13 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
         facts.append(("type", str(details["dtype"])))
     if details.get("bytes") is not None:
         facts.append(("size", f"{human_size(details['bytes'])} ({details['bytes']} bytes)"))
-    if details.get("exact") is not None:
+    last = _last_state(details)
+    if details.get(last) is not None:
         lost = (details.get("holes") or 0) - (details.get("non_finite") or 0)
-        exact = "yes, bit for bit" + (" wherever there is a value" if lost else "")
-        name = "exact"
-        if remeshed is not None:
-            name, exact = "complete", "the remeshed surface bit for bit, which is not the mesh that it was made of"
-        facts.append((name, exact if details["exact"] else "no, within the error that was asked for"))
+        words = "yes, bit for bit" + (" wherever there is a value" if lost else "")
+        if last == "complete":
+            words = "the remeshed surface bit for bit, which is not the mesh that it was made of"
+        facts.append((last, words if details[last] else "no, within the error that was asked for"))
     if errors := _ERRORS.get(str(details.get("errors"))):
         facts.append(("errors", errors))
     if details.get("sha256"):

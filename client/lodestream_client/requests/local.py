@@ -18,13 +18,16 @@ __all__ = ["checked_options", "encoded_here"]
 #: Of `_others`: all formats, whatever the file is, for sure.
 _NO_LIMIT: tuple[frozenset[str] | None, Sequence[str], bool] = (None, ("any",), True)
 
+#: The option of meshes to be resampled, which a server lists as it does formats if it does that.
+_REMESH = "remesh"
+
 _HEAD = 4096
 _UNNAMED = "upload"
 _NAME = "surface.lode"
 
 #: Parameters of `lodestream.read` and of its callers that are no options of any format.
 _NO_OPTIONS = (
-    *("path", "closed", "max_vertices", "filename", "allowed", "format_name", "room", "nodata"),
+    *("path", "closed", "max_vertices", "filename", "allowed", "format_name", "room", "nodata", "progress"),
     *("folder", "paths", "memory", "by_bands"),
 )
 
@@ -50,7 +53,7 @@ def encoded_here(
     folder: Path,
     progress: Callable[[str, float], None] | None,
 ) -> Path | None:
-    """Encode files of one surface if the server does not read their format.
+    """Encode files of one surface, if the server does not read their format, or would have to resample and does not.
 
     Parameters
     ----------
@@ -61,7 +64,7 @@ def encoded_here(
     folder : Path
         Empty; for the container and for what does not fit into memory.
     progress : callable or None
-        Called as ``progress("encoding", fraction)``.
+        Called as ``progress("encoding", fraction)``, and before as ``progress("remeshing", fraction)`` if it is.
 
     Returns
     -------
@@ -82,7 +85,12 @@ def encoded_here(
     name = asked.filename or _name_of(sources[0])
     if is_container(_head(sources[0])):
         return None
-    allowed, candidates, sure = _NO_LIMIT if read_there is None else _others(sources[0], name, read_there, folder)
+    if read_there is None:
+        allowed, candidates, sure = _NO_LIMIT
+    elif asked.options.get(_REMESH) is not None and _REMESH not in read_there:
+        allowed, candidates, sure = None, (_REMESH,), True
+    else:
+        allowed, candidates, sure = _others(sources[0], name, read_there, folder)
     if not candidates:
         return None
     paths = [_path(source, folder / f"file-{number}") for number, source in enumerate(sources)]
@@ -96,6 +104,7 @@ def encoded_here(
             nodata=asked.nodata,
             filename=name or _UNNAMED,
             allowed=allowed,
+            progress=None if progress is None else (lambda fraction: progress("remeshing", fraction)),
             **checked_options(asked.options),
         )
     except (InputError, UnavailableError):
@@ -107,9 +116,9 @@ def encoded_here(
     elif not name:
         surface.metadata.pop("name", None)  # which the reader took from the name that stands in for the file's
     if read_there is not None:
+        there = "resample meshes" if candidates == (_REMESH,) else f"read files of format {' or '.join(candidates)}"
         warnings.warn(
-            f"the server does not read files of format {' or '.join(candidates)}: {name or 'the file'} is encoded here "
-            "and sent as a container",
+            f"the server does not {there}: {name or 'the file'} is encoded here and sent as a container",
             FormatWarning,
             stacklevel=2,
         )

@@ -16,7 +16,7 @@ from lodestream.interop.pictures import DPI, draw_surface
 from lodestream.planning.planner import plan
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target
-from lodestream.text import printable, remesh_words
+from lodestream.text import is_remeshed, printable
 
 from ..terminal.output import human_size, replacing
 from .sources import Source, read_fully
@@ -112,7 +112,7 @@ class Picture:
         blocks = [Block(block.points, block.closed, mask=block.mask) for block in surface.blocks]
         errors = f"RMS error {view.rms:.3g}, maximum {view.max_error:.3g}"
         if view.complete and view.rms == 0:
-            errors = "exact" if remesh_words(surface.metadata) is None else "complete"
+            errors = "complete" if is_remeshed(surface.metadata) else "exact"
         title = printable(" ".join(name.split()))[:_LONGEST]
         return cls(Surface(blocks=blocks, metadata=surface.metadata), f"{title}\n{human_size(view.bytes)}, {errors}")
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from ..errors import CorruptStreamError, TruncatedStreamError
+from ..text import is_remeshed
 from . import headers, sections
 from .capacity import Capacity
 from .digest import DIGEST
@@ -125,7 +126,8 @@ def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
     ``levels`` are the states that hold all levels up to one and nothing finer, ``layers`` the steps of quality
     in file order; ``bytes`` are lengths of the container's prefix (layers), of what `plan` sends (levels), and of the
     whole file. With ``channels`` each of them has RMS and maximum of every channel too, where there are several, and
-    ``channel_names`` says which.
+    ``channel_names`` says which. ``exact`` says whether the whole stream restores every value; a surface that was made
+    of another mesh has ``complete`` in its place.
     """
 
     def errors(record: LayerRecord | LevelRecord) -> dict[str, Any]:
@@ -152,7 +154,7 @@ def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
         ],
         "layers": [{"bytes": r.end, "level": r.level, **errors(r)} for r in index.layers],
         "bytes": index.size,
-        "exact": header.exact,
+        "complete" if is_remeshed(index.metadata_values) else "exact": header.exact,
         "sha256": index.digest,
         "metadata": dict(index.metadata_values),
     }

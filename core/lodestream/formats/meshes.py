@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..coordinates.seams import merge
 from ..errors import FormatError, OptionError, TooLargeError
 from ..mesh import Mesh
+from ..mesh.ears import cut_faces
 from ..remesh import RemeshOptions, remesh
 from ..remesh.remeshing import DEFAULT_ERROR
 from ..surface import Surface
@@ -19,7 +20,18 @@ from .attributes import NORMAL
 from .notes import warn
 from .source import Source, check_allowed, number
 
-__all__ = ["MOST_FACES", "REMESH_OPTIONS", "check_faces", "grids_or_blocks", "pad", "remesh_options", "surface_of"]
+__all__ = [
+    "MOST_FACES",
+    "REMESH_OPTIONS",
+    "check_corners",
+    "check_faces",
+    "cut_faces",
+    "grids_or_blocks",
+    "pad",
+    "polygons_allowed",
+    "remesh_options",
+    "surface_of",
+]
 
 #: Options of all formats for meshes.
 REMESH_OPTIONS: Mapping[str, str] = {
@@ -29,6 +41,8 @@ REMESH_OPTIONS: Mapping[str, str] = {
     "remesh_normals": "yes: normals of the file are interpolated (default: they follow from the blocks)",
 }
 _SWITCH = {"yes": True, "no": False, "true": True, "false": False, "1": True, "0": False}
+
+_ADVICE = "remesh=yes resamples any mesh of triangles into blocks"
 
 #: Corners of faces are numbered in 32 bits.
 MOST_FACES = 2**29 - 1
@@ -50,6 +64,39 @@ def check_faces(source: Source, count: int) -> None:
     most = min(2 * source.max_vertices, MOST_FACES)  # each quad may be cut in two
     if count > most:
         raise TooLargeError(f"expected at most {number(most)} faces, got {number(count)} or more")
+
+
+def polygons_allowed(options: Mapping[str, object]) -> bool:
+    """Return whether faces may have more than four corners: they are cut into triangles of meshes that are resampled.
+
+    Raises
+    ------
+    OptionError
+        If ``remesh`` among the options is neither yes nor no.
+    """
+    return _switch(options, "remesh")
+
+
+def check_corners(count: int, face: str, polygons: bool) -> None:
+    """Refuse a face of fewer than three corners, and one of more than four where there may be none.
+
+    Parameters
+    ----------
+    count : int
+        Corners of the face.
+    face : str
+        What messages say behind the count, such as "in face 7".
+    polygons : bool
+        See `polygons_allowed`.
+
+    Raises
+    ------
+    FormatError
+    """
+    if count < 3 or (count > 4 and not polygons):
+        expected = "3 corners or more" if polygons else "3 or 4 corners"
+        advice = f"; {_ADVICE}" if count > 4 else ""
+        raise FormatError(f"expected faces of {expected}, got {count} {face}{advice}")
 
 
 def _switch(options: Mapping[str, object], name: str) -> bool:
@@ -142,10 +189,10 @@ def grids_or_blocks(
         recognised = recognise(mesh)
     except FormatError as error:
         if options is None:
-            raise FormatError(f"{error}; remesh=yes resamples any mesh of triangles into blocks") from None
+            raise FormatError(f"{error}; {_ADVICE}") from None
         recognised = None
     if options is not None and (recognised is None or set(mesh.corner_attributes) - set(recognised.blocks[0].rows)):
-        surface, notes = remesh(mesh, options, known)
+        surface, notes = remesh(mesh, options, known, *([] if source is None else [source.progress]))
         for text in notes:
             warn(text)
         return surface

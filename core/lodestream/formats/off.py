@@ -15,7 +15,7 @@ from ..errors import FormatError
 from ..mesh import Mesh
 from ..surface import Surface
 from .attributes import COLOR, NORMAL, TEXTURE
-from .meshes import check_faces, surface_of
+from .meshes import check_corners, check_faces, cut_faces, polygons_allowed, surface_of
 from .source import Source, number
 
 __all__ = ["read", "sniff"]
@@ -50,12 +50,16 @@ def read(source: Source) -> Surface:
             f"{number(faces)} faces, got {number(source.size)}"
         )
     points, attributes = lines.vertices(vertices)
-    corners, coloured = lines.faces(faces, vertices)
+    counts, values, coloured = lines.faces(faces, vertices, polygons_allowed(source.options))
     lines.end()
+    check_faces(source, len(values) - 2 * faces)
+    places, face_of = cut_faces(points, counts, values)
+    corners = np.where(places >= 0, values[places], -1).astype(np.int32)
     first = lines.numbers[len(lines.numbers) - faces :]
     notes = ("colours of faces left out",) * coloured
 
-    def name(face: int) -> str:
+    def name(row: int) -> str:
+        face = int(face_of[row])
         return f"face {face + 1} (line {first[face]})"
 
     return surface_of(source, Mesh(points, corners, attributes, {}, name, notes), "off")
@@ -147,27 +151,28 @@ class _Lines:
             return FormatError(f"line {line}: expected a vertex of {wanted} numbers, got {_shown(row)}")
         raise AssertionError("one of the rows is wrong")
 
-    def faces(self, count: int, vertices: int) -> tuple[NDArray[np.int32], bool]:
-        """Return the corners of faces, and whether some faces have colours."""
+    def faces(self, count: int, vertices: int, polygons: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], bool]:
+        """Return the number of corners of each face, the vertices of all of them, and whether some faces have colours."""
         rows, numbers = self._take(count, "faces")
-        corners = np.full((count, 4), -1, np.int32)
+        counts = np.empty(count, np.int64)
+        corners: list[int] = []
         coloured = False
         for face, (row, line) in enumerate(zip(rows, numbers, strict=True)):
-            sides = 4 if row[0] == b"4" else 3
             try:
-                if row[0] not in (b"3", b"4") or len(row) <= sides:
-                    raise ValueError("no triangle or quad")
+                sides = int(row[0])
                 indices = [int(word) for word in row[1 : sides + 1]]
-                if min(indices) < 0 or max(indices) >= vertices:
+                if sides < 1 or len(indices) < sides or min(indices) < 0 or max(indices) >= vertices:
                     raise ValueError("no such vertex")
             except ValueError:
                 raise FormatError(
                     f"line {line}: expected 3 or 4 and as many vertices from 0 to {number(vertices - 1)}, got "
                     f"{_shown(row)}"
                 ) from None
-            corners[face, :sides] = indices
+            check_corners(sides, f"in line {line}", polygons)
+            counts[face] = sides
+            corners += indices
             coloured |= len(row) > sides + 1
-        return corners, coloured
+        return counts, np.array(corners, np.int64), coloured
 
     def end(self) -> None:
         """Refuse lines after the last face."""

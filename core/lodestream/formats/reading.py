@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,7 @@ def read(
     format_name: str | None = None,
     room: Room | None = None,
     nodata: float | str | None = None,
+    progress: Callable[[float], None] | None = None,
     **options: Any,
 ) -> Surface:
     """Read a surface from a file; the file's content decides its format.
@@ -101,6 +103,8 @@ def read(
         height with this value becomes a hole, and a point whose coordinates all have it, such as 0, 0, 0 of a depth
         camera; if no point of x, y, z has it in all, then those whose z has it, whose x and y stay. A `FormatWarning`
         says how many points it was.
+    progress : callable, optional
+        Is told the part that is done, from 0 to 1, while a mesh is resampled (``remesh``); reading tells none.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -149,8 +153,7 @@ def read(
             raise OptionError(f"expected max_vertices as a whole number, got {max_vertices!r}")
         hole = None if nodata is None else checked(nodata)
         format_ = _sniff(path, name.suffix.lower(), format_name)
-        if format_.read is None:
-            raise FormatError(f"expected {_readable()}, got {format_.name}, which is written but not read yet")
+        assert format_.read is not None  # or its `sniff` would have known no file
         check_allowed(format_.names, allowed)
         if more and not format_.more:
             raise OptionError(f"expected one file of format {format_.name}, got {1 + len(more)}")
@@ -162,6 +165,8 @@ def read(
             _check_regular(other)
         size = path.stat().st_size
         source = Source(path, name.stem, size, max_vertices, options, others, chosen, allowed, room or IN_MEMORY)
+        if progress is not None:
+            source = replace(source, progress=progress)
         surface = format_.read(source)
         if hole is not None:
             surface = with_nodata(surface, hole, source.room)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -42,6 +42,10 @@ _KINDS = {
 _FLOAT_SIZES = (4, 8)
 
 
+def _untold(_: float) -> None:
+    """Tell nobody."""
+
+
 @dataclass(frozen=True, slots=True)
 class Source:
     """One file to read a surface from.
@@ -68,6 +72,8 @@ class Source:
         Names of the formats that may be read; None for all.
     room : Room
         Where large arrays go.
+    progress : callable
+        Is told the part of the work that is done, from 0 to 1, by what takes long: resampling.
     """
 
     path: Path
@@ -79,6 +85,7 @@ class Source:
     closed: Closed | None = None
     allowed: Collection[str] | None = None
     room: Room = IN_MEMORY
+    progress: Callable[[float], None] = _untold
 
     def empty(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
         """Return a new array of this shape, (row, ...), not initialised.

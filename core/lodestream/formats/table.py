@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..surface import Surface
-from . import glb, npy, npz, npz_writer, off, text_arrays
+from . import glb, glb_reader, npy, npz, npz_writer, off, stl, text_arrays
 from .member import Member
 from .meshes import REMESH_OPTIONS
 from .netcdf import reader as netcdf
@@ -190,6 +190,7 @@ FORMATS = (
         memory=120,
         options=REMESH_OPTIONS,
     ),
+    Format(name="stl", suffixes=(".stl",), sniff=stl.sniff, read=stl.read, options=REMESH_OPTIONS),
     Format(name="off", suffixes=(".off",), sniff=off.sniff, read=off.read, options=REMESH_OPTIONS),
     Format(
         name="obj",
@@ -238,7 +239,9 @@ FORMATS = (
         name="glb",
         suffixes=(".glb",),
         sniff=glb.sniff,
+        read=glb_reader.read,
         write=glb.write,
+        options=REMESH_OPTIONS,
         blocks=True,
         media_type=glb.MEDIA_TYPE,
         memory=216,

@@ -7,7 +7,7 @@ import html
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..text import printable, remesh_words
+from ..text import is_remeshed, printable
 from .pictures import SMALL, small_png
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def errors(view: View, metadata: Mapping[str, Any]) -> list[tuple[str, str]]:
 
     A remeshed surface is never called exact, since its mesh is not.
     """
-    exact = view.complete and view.rms == 0 and remesh_words(metadata) is None
+    exact = view.complete and view.rms == 0 and not is_remeshed(metadata)
     return [
         ("bytes", f"{view.bytes:,}"),
         ("level", f"{view.level}"),

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..formats.meshes import grids_or_blocks, remesh_options
+from ..formats.meshes import grids_or_blocks, polygons_allowed, remesh_options
 from ..mesh import Mesh
 from ..surface import Surface
 
@@ -25,7 +25,7 @@ def from_mesh(
     Parameters
     ----------
     vertices : array of shape (V, 2) or (V, 3)
-    faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int
+    faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int (with remesh of 3 or more)
     attributes : mapping of str to arrays of shape (V,) or (V, K), or None
     remeshing : mapping of str to values
         See `surface_of_mesh`.
@@ -38,7 +38,7 @@ def from_mesh(
         If the mesh is no structured surface, and is not to be resampled.
     """
     points = np.asarray(vertices)
-    return surface_of_mesh(Mesh.of(points, faces, attributes), {}, remeshing)
+    return surface_of_mesh(Mesh.of(points, faces, attributes, polygons_allowed(remeshing)), {}, remeshing)
 
 
 def surface_of_mesh(mesh: Mesh, words: Mapping[str, str], remeshing: Mapping[str, object]) -> Surface:

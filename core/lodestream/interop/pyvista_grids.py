@@ -15,6 +15,7 @@ from ..coordinates.seams import merge
 from ..decoding.decoder import Decoder
 from ..errors import FormatError, InputError, named
 from ..formats.attributes import NORMAL, TEXTURE
+from ..formats.meshes import check_corners, cut_faces, polygons_allowed
 from ..formats.netcdf.mark import MARK
 from ..formats.notes import keep_words, listing, warn
 from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
@@ -225,17 +226,20 @@ def _words(grid: Any) -> dict[str, str]:
 
 
 def _of_polygons(data: Any, remeshing: Mapping[str, object]) -> Surface:
-    """Return the surface of a mesh whose faces have three or four corners."""
+    """Return the surface of a mesh of polygons."""
     if not data.GetPolys().GetNumberOfCells():
         raise FormatError(f"expected faces that join points to a grid, got {data.n_points:,} points and no face")
     pv, polygons = require_library("pyvista", "pyvista"), data.GetPolys()
-    offsets = np.asarray(pv.convert_array(polygons.GetOffsetsArray()))
-    counts = np.diff(offsets)
-    if not np.isin(counts, (3, 4)).all():
-        wrong = int(np.argmax(~np.isin(counts, (3, 4))))
-        raise FormatError(f"expected faces of 3 or 4 corners, got {counts[wrong]} in face {wrong + 1}")
-    corners = np.full((len(counts), 4), -1, np.int32)
-    corners[np.arange(4) < counts[:, None]] = pv.convert_array(polygons.GetConnectivityArray())
+    offsets: NDArray[np.int64] = np.array(pv.convert_array(polygons.GetOffsetsArray()), np.int64)
+    counts = offsets[1:] - offsets[:-1]
+    values = np.asarray(pv.convert_array(polygons.GetConnectivityArray()))
+    allowed = polygons_allowed(remeshing)
+    wrong = (counts < 3) | ((counts > 4) & (not allowed))
+    if wrong.any():
+        face = int(wrong.argmax())
+        check_corners(int(counts[face]), f"in face {face + 1}", allowed)
+    places, _ = cut_faces(np.array(data.points), counts, values)
+    corners = np.where(places >= 0, values[places], -1).astype(np.int32)
     attributes = {name: np.array(values) for name, values in data.point_data.items() if _kept(name, values)}
     if TEXTURE not in attributes and data.active_texture_coordinates is not None:
         attributes[TEXTURE] = np.array(data.active_texture_coordinates)

@@ -11,7 +11,7 @@ from ..coordinates.seams import restore
 from ..errors import FormatError, InputError
 from ..formats.attributes import COLOR, NORMAL, TEXTURE
 from ..formats.mesh_output import exact_float, output_of
-from ..mesh import Mesh
+from ..formats.trimesh_meshes import mesh_of
 from ..surface import Surface
 from .meshes import surface_of_mesh
 from .optional import require_library
@@ -85,19 +85,5 @@ def from_trimesh(mesh: trimesh.Trimesh, **remeshing: Any) -> Surface:
         raise InputError(f"expected a mesh of trimesh, got {type(mesh).__name__}")
     if not len(mesh.faces):
         raise FormatError(f"expected faces that join points to a grid, got {len(mesh.vertices):,} points and no face")
-    corners = np.full((len(mesh.faces), 4), -1, np.int32)
-    corners[:, :3] = mesh.faces
-    count = len(mesh.vertices)
-    attributes = {
-        str(name): np.array(values)
-        for name, values in mesh.vertex_attributes.items()
-        if len(values) == count and np.asarray(values).dtype.kind in "iuf"
-    }
-    if mesh.visual.kind == "vertex":
-        attributes.setdefault(COLOR, np.array(mesh.visual.vertex_colors))
-    elif mesh.visual.kind == "texture" and getattr(mesh.visual, "uv", None) is not None:
-        attributes.setdefault(TEXTURE, np.array(mesh.visual.uv))
-    if "vertex_normals" in mesh._cache:  # those that it came with; others follow from the points
-        attributes.setdefault(NORMAL, np.array(mesh.vertex_normals))
     words = {key: str(mesh.metadata[key]) for key in _WORDS if isinstance(mesh.metadata.get(key), str)}
-    return surface_of_mesh(Mesh(np.array(mesh.vertices), corners, attributes), words, remeshing)
+    return surface_of_mesh(mesh_of(mesh), words, remeshing)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from .ears import cut_faces
 
 __all__ = ["CornerAttribute", "Mesh", "name_faces"]
 
@@ -68,8 +69,11 @@ class Mesh:
         vertices: ArrayLike,
         faces: ArrayLike | Sequence[Sequence[int]],
         attributes: Mapping[str, ArrayLike] | None = None,
+        polygons: bool = False,
     ) -> Mesh:
         """Make a mesh of an array of quads, an array of triangles, or a list of either.
+
+        With `polygons` faces may have more corners, and are cut into triangles (`cut_faces`).
 
         Raises
         ------
@@ -78,11 +82,21 @@ class Mesh:
         """
         points = np.asarray(vertices)
         rows = [list(face) for face in faces] if isinstance(faces, list | tuple) else np.asarray(faces)
+        fitting = points.ndim == 2 and points.shape[1] in (2, 3)
         if isinstance(rows, list):
-            if any(len(row) not in (3, 4) for row in rows):
-                raise InputError("expected faces of 3 or 4 corners, got others")
-            rows = np.array([row + [-1] * (4 - len(row)) for row in rows], np.int64).reshape(-1, 4)
-        if rows.ndim != 2 or rows.shape[1] not in (3, 4) or points.ndim != 2 or points.shape[1] not in (2, 3):
+            counts = np.array([len(row) for row in rows], np.int64)
+            if counts.min(initial=3) < 3 or (counts.max(initial=3) > 4 and not polygons):
+                raise InputError(
+                    "expected faces of 3 corners or more, got others"
+                    if polygons
+                    else "expected faces of 3 or 4 corners, got others; remesh=True takes more"
+                )
+            flat = np.array([corner for row in rows for corner in row], np.int64)
+            if flat.size and fitting and not (flat.min() >= 0 and flat.max() < len(points)):
+                raise InputError(_outside(len(points)))
+            places, _ = cut_faces(points, counts, flat) if fitting else (np.empty((0, 4), np.int64), counts)
+            rows = np.where(places >= 0, flat[places], -1) if flat.size else places
+        if rows.ndim != 2 or rows.shape[1] not in (3, 4) or not fitting:
             raise InputError(
                 f"expected vertices of shape (V, 2) or (V, 3) and faces of 3 or 4 corners, got {points.shape} and "
                 f"{rows.shape}"
@@ -90,8 +104,12 @@ class Mesh:
         corners = np.full((len(rows), 4), -1, np.int32)
         corners[:, : rows.shape[1]] = rows
         if corners.size and (corners[:, :3].min() < 0 or corners.min() < -1 or corners.max() >= len(points)):
-            raise InputError(f"expected faces over {len(points)} vertices, got numbers outside 0 to {len(points) - 1}")
+            raise InputError(_outside(len(points)))
         return Mesh(points, corners, {name: np.asarray(values) for name, values in (attributes or {}).items()})
+
+
+def _outside(count: int) -> str:
+    return f"expected faces over {count} vertices, got numbers outside 0 to {count - 1}"
 
 
 def name_faces(mesh: Mesh, faces: ArrayLike) -> str:

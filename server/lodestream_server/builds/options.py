@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import FormatError, OptionError, SwitchedOffError
+from lodestream.errors import OptionError, SwitchedOffError
 from lodestream.quality import Quality
 
 from . import finished
@@ -102,22 +102,18 @@ def check(
     Raises
     ------
     FormatError
-        If the format of a file is unknown or cannot be read.
+        If the format of a file is unknown.
     SwitchedOffError
         If this server does not read the format of the first file, which decides about the others.
     OptionError
         If the format has no such option.
     """
-    from lodestream.formats import formats, sniff
+    from lodestream.formats import sniff
 
     if any(map(finished.is_container, files)):
         _check_allowed(("lode",), names[0], allowed)
         return finished.check_upload(files, options.chosen)
     sniffed = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
-    for format_ in sniffed:
-        if format_.read is None:
-            readable = ", ".join(item.name for item in formats() if item.read and not item.folder)
-            raise FormatError(f"expected a file of format {readable}, got {format_.name}, which is only written")
     _check_allowed(sniffed[0].names, names[0], allowed)
     for key in options.chosen:
         if key not in ("precision", "rms", "closed", "nodata", *sniffed[0].options) and not key.startswith(ATTRIBUTE):

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 import lodestream as ls
+from lodestream_client import sync
+from lodestream_client.viewer.pictures import Picture
 from tests.core.remesh import scenes
 
 from ..conftest import Run
@@ -37,6 +39,40 @@ def test_a_mesh_becomes_blocks(run: Run, file: Path) -> None:
     assert (code, f"remeshed {len(surface.blocks)} blocks; RMS distance" in words) == (0, True), words
     assert "complete the remeshed surface bit for bit, which is not the mesh" in words
     assert not any(word in words.lower() for word in ("exact", "lossless"))
+
+
+def test_whatever_tells_of_it_says_complete_never_exact_or_lossless(run: Run, file: Path, server: str) -> None:
+    httpx = pytest.importorskip("httpx")
+    out = file.with_suffix(".lode")
+    assert run("encode", file, out, "--remesh", "--blocks", 12, "--remesh-error", "1e-2")[0] == 0
+    code, stdout, stderr = run("push", out, server)
+    assert code == 0, stderr
+    with sync.connect(stdout.strip()) as stream:
+        *_, view = stream
+    words = {
+        "info": run("info", out)[1],
+        "info of a server": run("info", stdout.strip())[1],
+        "info --json": run("info", out, "--json")[1],
+        "the API": httpx.get(stdout.strip()).text,
+        "a notebook": view._repr_html_(),
+        "a picture": Picture.of(view, None, "ball").title,
+    }
+    for place, text in words.items():
+        assert "complete" in text.lower(), place
+        assert not any(word in text.lower() for word in ("exact", "lossless")), (place, text)
+    for place in ("info --json", "the API"):
+        facts = json.loads(words[place])
+        assert facts["complete"] is True, place
+        assert {"method", "rms_to_input", "rms_from_input", "largest_to_input", "folds"} <= set(
+            facts["metadata"]["remesh"]
+        )
+
+
+def test_with_an_error_it_is_not_complete(run: Run, file: Path) -> None:
+    out = file.with_suffix(".lode")
+    assert run("encode", file, out, "--remesh", "--blocks", 12, "--remesh-error", "1e-2", "--precision", "1e-2")[0] == 0
+    assert json.loads(run("info", out, "--json")[1])["complete"] is False
+    assert "complete no, within the error that was asked for" in " ".join(run("info", out)[1].split())
 
 
 def test_the_refusal_names_the_option(run: Run, file: Path) -> None:

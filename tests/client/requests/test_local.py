@@ -17,7 +17,8 @@ from lodestream_client import sync
 from lodestream_client.requests.api import Description
 from lodestream_client.requests.bodies import Source
 from lodestream_server import running_server
-from tests.server.routes.test_switched_off import vmec
+from tests.core.remesh import scenes
+from tests.server.routes.test_switched_off import off, vmec
 
 from ..conftest import Run
 
@@ -197,3 +198,24 @@ def test_a_confined_build_converts_units_to_those_of_the_crs(plain: str, tmp_pat
     surface = values_of(sync.upload(plain, tmp_path / "a.nc").url)
     assert surface.metadata["geotransform"] == [-1000.0, 2000.0, 0.0, -1000.0, 0.0, 2000.0]
     assert any("x and y are converted from 'km'" in note for note in surface.metadata["notes"])
+
+
+@pytest.mark.parametrize("there", [False, True], ids=["switched off there", "switched on there"])
+def test_a_mesh_is_resampled_where_that_is_switched_on(plain: str, server: str, tmp_path: Path, there: bool) -> None:
+    pytest.importorskip("igl")
+    path = tmp_path / "ball.off"
+    path.write_bytes(off(*scenes.sphere()))
+    stages: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        surface = sync.upload(
+            server if there else plain,
+            path,
+            options={"remesh": "yes", "blocks": "12", "remesh_error": "1e-2"},
+            progress=lambda stage, _: stages.append(stage),
+        )
+    assert surface.details["state"] == "ready"
+    assert surface.details["metadata"]["remesh"]["blocks"] > 1
+    words = "the server does not resample meshes"
+    assert [str(it.message).startswith(words) for it in caught if it.category is FormatWarning] == [True] * (not there)
+    assert ("remeshing" in stages) is not there

@@ -300,8 +300,8 @@ def test_a_format_is_asked_for_where_no_name_tells(tmp_path: Path) -> None:
         formats.read(tmp_path / "a.hgt", format_name="tif")
     with pytest.raises(OptionError, match=r"format to be one of npy, .*plot3d, got 'docx'"):
         formats.read(tmp_path / "a.hgt", format_name="docx")
-    with pytest.raises(OptionError, match="got 'glb'"):
-        formats.sniff(tmp_path / "a.hgt", format_name="glb")
+    with pytest.raises(OptionError, match="got 'vtm'"):
+        formats.sniff(tmp_path / "a.hgt", format_name="vtm")
     (tmp_path / "empty").touch()
     with pytest.raises(FormatError, match="expected a file of format npy, got an empty file"):
         formats.read(tmp_path / "empty", format_name="npy")

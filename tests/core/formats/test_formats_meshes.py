@@ -139,7 +139,7 @@ def test_heights_are_drawn_over_columns_and_rows_or_where_they_lie() -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4: expected a face of 3 or 4 corners, got 2: 'f 1 2'"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\n", "line 4: expected faces of 3 or 4 corners, got 2 in 'f 1 2'"),
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", r"have no partner: face 1 \(line 4\)"),
         ("v 0 0\nv 1 0 0\n", "line 1: expected a point of 3 numbers .*, got 'v 0 0'"),
         ("v 0 0 zero\n", "line 1: expected a point of 3 numbers"),

@@ -270,7 +270,8 @@ CASES: dict[str, tuple[str, Callable[[], bytes], dict[str, Any], str, str]] = {
         "FormatError",
         "expected structured grids that VTK reads",
     ),
-    "GLB": ("a.glb", lambda: b"glTF\2\0\0\0" + bytes(99), {}, "FormatError", "got glb, which is written but not read"),
+    "GLB": ("a.glb", lambda: b"glTF\2\0\0\0" + bytes(99), {}, "FormatError", "expected glTF 2 of 0 bytes, as it says"),
+    "STL": ("a.stl", lambda: bytes(80) + b"\xff" * 99, {}, "FormatError", "bytes for 4,294,967,295 triangles, got 179"),
 }
 
 

@@ -34,7 +34,6 @@ def stored(data: Path) -> list[str]:
         (b"just some text\n", "text.tif", "just some text"),
         (VRT, "raster.tif", "VRTDataset"),
         (b"\xff\xd8\xff\xe0\x00\x10JFIF" + bytes(50), "picture.png", "ff d8 ff e0"),
-        (b"glTF\x02\x00\x00\x00" + bytes(50), "mesh.glb", "written"),
         (bytes(100), "zeros", "00 00"),
     ],
 )

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from ...errors import FormatError, TooLargeError
 from ...mesh import CornerAttribute, Mesh
+from ...mesh.ears import cut_polygons
 from ..attributes import COLOR, NORMAL, TEXTURE
-from ..meshes import check_faces
+from ..meshes import check_corners, check_faces, polygons_allowed
 from ..notes import keep_words
 from ..source import Source, number
 
@@ -84,6 +85,8 @@ class ObjFile:
         self._corners: list[list[NDArray[np.int32] | None]] = [[], [], []]  # of points, textures, normals
         self._faces: list[int] = []  # faces of each run
         self._face_starts: list[tuple[int, int]] = []  # number of the first face of a run and of its line
+        self._polygons = polygons_allowed(source.options)
+        self._fans: list[tuple[int, int]] = []  # first triangle and corners of faces of more than four
         self._others: dict[bytes, set[bytes]] = {}  # what other statements say, a few of each kind
         self._foreign: dict[str, int] = {}  # statements of other programs, and how many of each
         self.words: dict[str, str] = {}  # what comments say, as the writer puts it
@@ -163,11 +166,18 @@ class ObjFile:
         if words[0] == b"l":
             self._keep_segments(line, [corner[0] for corner in corners])
             return
-        if len(corners) not in (3, 4):
-            raise FormatError(f"line {line}: expected a face of 3 or 4 corners, got {len(corners)}: {_shown(text)}")
-        rows = np.full((3, 1, 4), -1, np.int32)
-        rows[:, 0, : len(corners)] = np.array(corners, np.int32).T
-        self._keep_faces(line, 1, [row if row.max() >= 0 else None for row in rows])
+        try:
+            check_corners(len(corners), f"in {_shown(text)}", self._polygons)
+        except FormatError as error:
+            raise FormatError(f"line {line}: {error}") from None
+        faces = [corners]
+        if len(corners) > 4:
+            self._fans.append((self.face_count, len(corners)))
+            faces = [[corners[0], *pair] for pair in pairwise(corners[1:])]
+        for face in faces:
+            rows = np.full((3, 1, 4), -1, np.int32)
+            rows[:, 0, : len(face)] = np.array(face, np.int32).T
+            self._keep_faces(line, 1, [row if row.max() >= 0 else None for row in rows])
 
     def _pass_over(self, words: list[bytes]) -> None:
         """Count a statement of another program, which has no points and faces."""
@@ -273,12 +283,15 @@ class ObjFile:
         """
         points, attributes = self.points()
         corners = self._joined(0)
+        cuts = self._cuts(points, corners)
+        self._cut(corners, cuts)
         of_corners: dict[str, CornerAttribute] = {}
         for place, name in ((2, NORMAL), (1, TEXTURE)):
             values = self._values[_KINDS[place]]
             if not values or all(run is None for run in self._corners[place]):
                 continue
             rows = self._joined(place)
+            self._cut(rows, cuts)
             if rows.max() >= self._counts[_KINDS[place]]:
                 face = int((rows >= self._counts[_KINDS[place]]).any(axis=1).argmax())
                 raise FormatError(
@@ -287,6 +300,14 @@ class ObjFile:
                 )
             of_corners[name] = CornerAttribute(np.concatenate(values), rows)
         return Mesh(points, corners, attributes, of_corners, self.face_name, self.notes())
+
+    def _cuts(self, points: NDArray[np.float64], corners: NDArray[np.int32]) -> list[NDArray[np.int64]]:
+        """How each fan is to be cut, now that all points are known: (N - 2, 3) places among its N corners."""
+        return [cut_polygons(points[_around(corners, first, count)][np.newaxis])[0] for first, count in self._fans]
+
+    def _cut(self, rows: NDArray[np.int32], cuts: list[NDArray[np.int64]]) -> None:
+        for (first, count), cut in zip(self._fans, cuts, strict=True):
+            rows[first : first + count - 2, :3] = _around(rows, first, count)[cut]
 
     def _joined(self, place: int) -> NDArray[np.int32]:
         runs = [
@@ -303,6 +324,11 @@ class ObjFile:
     def face_name(self, face: int) -> str:
         """Return the name of a face for messages."""
         return f"face {face + 1} (line {self.face_line(face)})"
+
+
+def _around(rows: NDArray[np.int32], first: int, count: int) -> NDArray[np.int32]:
+    """What the corners of a fan name, in their order round the face."""
+    return np.concatenate([rows[first, :2], rows[first : first + count - 2, 2]])
 
 
 def _runs(path: Path) -> Iterator[tuple[int, list[bytes]]]:

@@ -1,7 +1,8 @@
-"""Meshes and curves in PLY: vertices joined by faces of three or four corners, or by edges."""
+"""Meshes and curves in PLY: vertices joined by faces, or by edges."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from ...mesh import CornerAttribute, Mesh
 from ...surface import Surface
 from ..attributes import TEXTURE, group
 from ..connectivity import find_curve
-from ..meshes import check_faces, surface_of
+from ..meshes import check_corners, check_faces, cut_faces, polygons_allowed, surface_of
 from ..notes import keep_words, warn
 from ..source import Source, number
 from .elements import Lists, Table, read_elements
@@ -49,18 +50,19 @@ def read(source: Source, header: PlyHeader) -> Surface:
     if lists is None:
         raise FormatError(f"expected faces with a list {_INDICES[0]}, got {', '.join(faces) or 'no property'}")
     name = _Names(header)
-    corners = _corners(lists, len(points), name.face)
+    places, face_of = _places(source, lists, points, name.face)
+    corners = np.where(places >= 0, lists.values[places], -1).astype(np.int32)
     texture = faces.get(_TEXTURE)
     of_corners = {}
     left_out = [key for key in faces if key not in _INDICES]
     if isinstance(texture, Lists) and (texture.counts == 2 * lists.counts).all():
-        of_corners[TEXTURE] = _of_corners(texture, corners)
+        of_corners[TEXTURE] = CornerAttribute(texture.values.reshape(-1, 2), places.astype(np.int32))
         left_out.remove(_TEXTURE)
     notes = [f"{' and '.join(left_out)} of faces left out"] * bool(left_out)
     others = [key for key in tables if key not in ("vertex", ELEMENT) and rows[key]]
     notes += [f"element {' and '.join(others)} left out"] * bool(others)
     notes += lists_left_out(header)
-    mesh = Mesh(points, corners, attributes, of_corners, name.face, tuple(notes))
+    mesh = Mesh(points, corners, attributes, of_corners, lambda row: name.face(int(face_of[row])), tuple(notes))
     return surface_of(source, mesh, "ply", words_of(header))
 
 
@@ -132,23 +134,20 @@ def _vertices(tables: dict[str, Table]) -> tuple[NDArray[Any], dict[str, NDArray
     return points, group(columns)
 
 
-def _corners(lists: Lists, vertices: int, name: Any) -> NDArray[np.int32]:
-    wrong = (lists.counts != 3) & (lists.counts != 4)
+def _places(
+    source: Source, lists: Lists, points: NDArray[Any], name: Callable[[int], str]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Triangles and quads, as places in the lists, (T, 4), and the face that each is a part of, (T,)."""
+    polygons = polygons_allowed(source.options)
+    wrong = (lists.counts < 3) | ((lists.counts > 4) & (not polygons))
     if wrong.any():
         face = int(wrong.argmax())
-        raise FormatError(f"expected faces of 3 or 4 corners, got {lists.counts[face]} in {name(face)}")
+        check_corners(int(lists.counts[face]), f"in {name(face)}", polygons)
     values = lists.values.astype(np.int64)
-    outside = (values < 0) | (values >= vertices)
+    outside = (values < 0) | (values >= len(points))
     if outside.any():
         place = int(outside.argmax())
         face = int(np.searchsorted(np.cumsum(lists.counts), place, "right"))
-        raise FormatError(f"expected vertices from 0 to {number(vertices - 1)}, got {values[place]} in {name(face)}")
-    corners = np.full((len(lists.counts), 4), -1, np.int32)
-    corners[np.arange(4) < lists.counts[:, None]] = values
-    return corners
-
-
-def _of_corners(texture: Lists, corners: NDArray[np.int32]) -> CornerAttribute:
-    rows = np.full(corners.shape, -1, np.int32)
-    rows[corners >= 0] = np.arange(len(texture.values) // 2)
-    return CornerAttribute(texture.values.reshape(-1, 2), rows)
+        raise FormatError(f"expected vertices from 0 to {number(len(points) - 1)}, got {values[place]} in {name(face)}")
+    check_faces(source, len(values) - 2 * len(lists.counts))
+    return cut_faces(points, lists.counts, values)
