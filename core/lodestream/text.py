@@ -62,7 +62,7 @@ def _escaped(char: str) -> str:
 
 
 def is_remeshed(metadata: Mapping[str, Any]) -> bool:
-    """Return whether a surface was made of another mesh: its last layer is complete, and never called exact or lossless."""
+    """Return whether a surface was made of another mesh: it is called complete then, never exact or lossless."""
     return metadata.get(_REMESH) is not None
 
 

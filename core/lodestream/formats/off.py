@@ -152,7 +152,7 @@ class _Lines:
         raise AssertionError("one of the rows is wrong")
 
     def faces(self, count: int, vertices: int, polygons: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], bool]:
-        """Return the number of corners of each face, the vertices of all of them, and whether some faces have colours."""
+        """Return the number of corners of each face, all their vertices, and whether some have colours."""
         rows, numbers = self._take(count, "faces")
         counts = np.empty(count, np.int64)
         corners: list[int] = []

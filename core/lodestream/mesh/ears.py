@@ -136,7 +136,7 @@ def _ears(polygon: _Floats) -> Iterator[tuple[int, int, int]]:
 
 
 def _first_ear(triangles: _Floats, candidates: _Integers, others: _Floats) -> int | None:
-    """Return the first candidate whose triangle, (3, 2), holds none of the corners that could be inside; None if all do."""
+    """Return the first candidate whose triangle, (3, 2), holds no other corner; None if all do."""
     for start in range(0, len(candidates), _TRIED):
         tried = candidates[start : start + _TRIED]
         corners = triangles[tried]
