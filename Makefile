@@ -130,8 +130,8 @@ bench-server: kernels ## 500 streams at once from one server, beside Range; ARGS
 bench-stream: kernels ## what comes after a stop, and times to the first and to good pictures, over slow and distant links
 	@$(BIN)/python -m benchmarks.stream
 
-wheels: page ## build and check dist/: wheels for Linux on x86_64 and aarch64, and the source distribution
-	@$(BIN)/python -P -c 'import auditwheel, build' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
+wheels: page ## build and check dist/: wheels for Linux, macOS and Windows, and the source distribution
+	@$(BIN)/python -P -c 'import auditwheel, build, lief' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
 	@$(BIN)/python .ci/wheels.py dist
 
 clean: ## remove the environment and everything else that can be made again

@@ -1,16 +1,19 @@
-"""Build the source distribution, and from it the wheels for every Linux, and check them.
+"""Build the source distribution, and from it the wheels for Linux, macOS and Windows, and check them.
 
-``python .ci/wheels.py FOLDER`` needs the group ``wheels`` of pyproject.toml. Each wheel is made by zig for a machine
-that need not be this one. Then what was made for this machine is installed, the source distribution twice: by the
-machine's compiler, if there is one, and by zig.
+``python .ci/wheels.py FOLDER`` needs the group ``wheels`` of pyproject.toml. Each wheel is made by zig for a platform
+that need not be this one. Its libraries are read: what they ask of others, what they offer, for which system they are.
+Then what was made for this machine is installed, the source distribution twice: by the machine's compiler, if there is
+one, and by zig.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import io
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +22,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
+import lief
 from elftools.elf.dynamic import DynamicSection
 from elftools.elf.elffile import ELFFile
 
@@ -26,7 +30,12 @@ ROOT = Path(__file__).resolve().parent.parent
 
 #: What the processors of a wheel are in ELF, and the largest pages that Linux has there.
 MACHINES = {"x86_64": ("EM_X86_64", 1 << 12), "aarch64": ("EM_AARCH64", 1 << 16)}
-PLATFORMS = ("manylinux_2_17", "musllinux_1_2")
+LINUX = ("manylinux_2_17", "musllinux_1_2")
+#: What every macOS and every Windows since 10 has, so that delocate and delvewheel would add nothing.
+SYSTEM_LIBRARIES = {
+    "darwin": re.compile("/usr/lib/libSystem.B.dylib"),
+    "win32": re.compile(r"kernel32\.dll|api-ms-win-crt-[a-z0-9-]+\.dll", re.IGNORECASE),
+}
 #: Of a wheel: what it has without the page of the browser, and the page.
 MOST_BYTES = 1_000_000 + 270_000
 
@@ -44,37 +53,93 @@ print(*sorted(path.name for path in NATIVE.iterdir()))
 """
 
 
+def _build_module() -> Any:
+    """Return `core/kernels/build.py`, which no package has."""
+    specification = importlib.util.spec_from_file_location("build_kernels", ROOT / "core/kernels/build.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+KERNELS = _build_module()
+
+
 def build(folder: Path) -> list[Path]:
-    """The source distribution, and a wheel from it for each machine."""
-    for machine in MACHINES:
-        environment = {**os.environ, "LODESTREAM_WHEEL_FOR": machine}
+    """Build the source distribution, and a wheel from it for each platform."""
+    for number, name in enumerate(KERNELS.PLATFORMS):
+        environment = {**os.environ, "LODESTREAM_WHEEL_FOR": name}
         run([sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)], environment)
+        print(f"built {number + 1} of {len(KERNELS.PLATFORMS)}: {name}", file=sys.stderr, flush=True)
     return sorted(folder.iterdir())
 
 
-def check_wheel(wheel: Path, machine: str) -> None:
-    """Its size, its library, and what auditwheel says to each platform that its name claims."""
+def check_wheel(wheel: Path, wanted: Any) -> None:
+    """Check a wheel's size and its libraries, and what auditwheel says of one for Linux."""
     expect(wheel.stat().st_size < MOST_BYTES, f"{wheel.name} below {MOST_BYTES} bytes, got {wheel.stat().st_size}")
     with ZipFile(wheel) as archive:
         names = [name for name in archive.namelist() if name.startswith("lodestream/native/")]
-        made_for = [machine, "x86_64-v3"] if machine == "x86_64" else [machine]
-        wanted = [f"lodestream/native/lodestream-linux-{name}.so" for name in made_for]
+        libraries = [f"lodestream/native/{path.name}" for path in KERNELS.libraries(Path(), wanted)]
         page = "lodestream/page/static/index.html"
         expect(page in archive.namelist(), f"{page} in {wheel.name}: it is built by make page")
-        expect(sorted(names) == sorted(wanted), f"{wanted}, got {names}")
+        expect(sorted(names) == sorted(libraries), f"{libraries}, got {names}")
         for name in names:
-            check_library(archive.read(name), machine)
+            if wanted.system == "linux":
+                check_library(archive.read(name), wanted.machine)
+            else:
+                check_other_library(archive.read(name), Path(name).name, wanted)
+    if wanted.system == "linux":
+        check_by_auditwheel(wheel, wanted.machine)
+
+
+def check_by_auditwheel(wheel: Path, machine: str) -> None:
+    """Check what auditwheel says of a wheel to each platform that its name claims."""
     with tempfile.TemporaryDirectory() as folder:
-        for tag in PLATFORMS:
+        for tag in LINUX:
             # auditwheel asks of a wheel whether it fits the platform that it is named after.
             alone = Path(folder, "-".join([*wheel.name.split("-")[:4], f"{tag}_{machine}.whl"]))
             shutil.copy(wheel, alone)
-            found = json.loads(run([sys.executable, "-m", "auditwheel", "show", "--json", str(alone)]))
-            told_by = {"pure": False, "external_libs": {}, "versioned_symbols": {}, "unsupported_isa": False}
-            told = {key: found[key] for key in told_by}
-            expect(told == told_by, f"{told_by} of auditwheel for {alone.name}, got {told}")
-            fits = found["overall_tag"].startswith(tag.split("_")[0])
-            expect(fits and version(found["overall_tag"]) <= version(tag), f"{tag}, got {found['overall_tag']}")
+            answer = json.loads(run([sys.executable, "-m", "auditwheel", "show", "--json", str(alone)]))
+            wanted = {"pure": False, "external_libs": {}, "versioned_symbols": {}, "unsupported_isa": False}
+            facts = {key: answer[key] for key in wanted}
+            expect(facts == wanted, f"{wanted} of auditwheel for {alone.name}, got {facts}")
+            fits = answer["overall_tag"].startswith(tag.split("_")[0])
+            expect(fits and version(answer["overall_tag"]) <= version(tag), f"{tag}, got {answer['overall_tag']}")
+
+
+def check_other_library(content: bytes, name: str, wanted: Any) -> None:
+    """Check that a library for macOS or Windows asks for the system's alone, and offers the kernels alone.
+
+    These are the rules by which delocate and delvewheel would add libraries to a wheel. Mach-O and PE are read by LIEF.
+    """
+    binary: Any = lief.parse(list(content))
+    expect(binary is not None, f"{name} to be a library")
+    if wanted.system == "darwin":
+        expect(isinstance(binary, lief.MachO.Binary), f"{name} to be of macOS")
+        needed = [library.name for library in binary.libraries][1:]  # the first one is the library's own name
+        own = binary.libraries[0].name
+        # Besides these two, which the linker puts into every library.
+        linkers = {"__mh_dylib_header", "___dso_handle"}
+        symbols = [symbol.name for symbol in binary.exported_symbols if symbol.name not in linkers]
+        expect(own == f"@rpath/{name}", f"{name} to tell no place where it was compiled, got {own}")
+        oldest, processor = list(binary.build_version.minos)[:2], binary.header.cpu_type.name.lower()
+        expect(oldest == [11, 0], f"{name} for macOS 11.0, got {oldest}")
+        expect(processor == wanted.machine, f"{name} for {wanted.machine}, got {processor}")
+        # Processors of Apple run no code without a signature, and that of the linker is enough.
+        expect(wanted.machine != "arm64" or binary.has_code_signature, f"{name} to be signed")
+        prefix = "_lode_"
+    else:
+        expect(isinstance(binary, lief.PE.Binary), f"{name} to be of Windows")
+        needed = [library.name for library in binary.imports]
+        symbols = [entry.name for entry in binary.get_export().entries]
+        processor = binary.header.machine.name
+        expect(processor == wanted.machine, f"{name} for {wanted.machine}, got {processor}")
+        prefix = "lode_"
+    foreign = [library for library in needed if not SYSTEM_LIBRARIES[wanted.system].fullmatch(library)]
+    expect(not foreign, f"{name} to ask for the system's libraries alone, got {foreign}")
+    others = [symbol for symbol in symbols if not symbol.startswith(prefix)]
+    expect(symbols and not others, f"{name} to offer the kernels alone, got {others or 'nothing'}")
 
 
 def version(tag: str) -> tuple[int, int]:
@@ -133,14 +198,17 @@ def main(folder: Path) -> None:
     made = build(folder)
     for path in made:
         print(f"{path.stat().st_size:>9,} {path.name}", flush=True)
-    wheels = {machine: next(path for path in made if path.name.endswith(f"_{machine}.whl")) for machine in MACHINES}
-    for machine, wheel in wheels.items():
-        check_wheel(wheel, machine)
+    wheels = {
+        name: next(path for path in made if path.name.endswith(f"-{wanted.tag}.whl"))
+        for name, wanted in KERNELS.PLATFORMS.items()
+    }
+    for name, wheel in wheels.items():
+        check_wheel(wheel, KERNELS.PLATFORMS[name])
     sdist = next(path for path in made if path.name.endswith(".tar.gz"))
     bare = str(Path(sys.executable).parent)  # an environment has no compiler
-    if sys.platform == "linux" and platform.machine() in wheels:
+    if sys.platform == "linux" and (here := f"linux-{platform.machine()}") in wheels:
         print("the wheel of this machine, installed:", flush=True)
-        check_installation(wheels[platform.machine()], bare)
+        check_installation(wheels[here], bare)
     if any(map(shutil.which, ("cc", "gcc", "clang"))):
         print("the source distribution, compiled by the machine's compiler:", flush=True)
         check_installation(sdist, os.environ["PATH"])

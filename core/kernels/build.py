@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 try:
     from hatchling.builders.hooks.plugin.interface import BuildHookInterface
@@ -44,8 +44,40 @@ _X86_64_V3 = ["-mavx2", "-mbmi", "-mbmi2", "-mf16c", "-mfma", "-mlzcnt", "-mmovb
 #: All that the second library holds: what takes 1.3 times as long without it, or longer.
 WIDE = ("library.c", "inverse.c", "lifting.c", "predictor_fit.c", "values.c")
 
-#: The machines for which one wheel serves every Linux.
-PORTABLE = ("x86_64", "aarch64")
+
+class Platform(NamedTuple):
+    """What a wheel is made for.
+
+    Attributes
+    ----------
+    system, machine : str
+        As `sys.platform` and `platform.machine` say there.
+    target : str
+        zig's name of it, with the oldest version of the system.
+    tag : str
+        The wheel's.
+    """
+
+    system: str
+    machine: str
+    target: str
+    tag: str
+
+
+def _linux(machine: str) -> Platform:
+    """Every Linux: the library needs no libc, so any that Python runs with will do."""
+    tag = f"manylinux_2_17_{machine}.manylinux2014_{machine}.musllinux_1_2_{machine}"
+    return Platform("linux", machine, f"{machine}-linux-gnu.2.17", tag)
+
+
+#: By the name that ``LODESTREAM_WHEEL_FOR`` takes.
+PLATFORMS = {
+    "linux-x86_64": _linux("x86_64"),
+    "linux-aarch64": _linux("aarch64"),
+    "macos-x86_64": Platform("darwin", "x86_64", "x86_64-macos.11.0", "macosx_11_0_x86_64"),
+    "macos-arm64": Platform("darwin", "arm64", "aarch64-macos.11.0", "macosx_11_0_arm64"),
+    "windows-x86_64": Platform("win32", "AMD64", "x86_64-windows-gnu", "win_amd64"),
+}
 
 
 def sources(v3: bool = False) -> list[Path]:
@@ -62,24 +94,26 @@ def zig() -> list[str]:
     return [sys.executable, "-m", "ziglang", "cc"]
 
 
-def machine_flags(command: list[str], machine: str | None = None, *, v3: bool = False) -> list[str]:
-    """What a compiler is told of the machine: the least processor that is served, and to leave out what none needs.
+def machine_flags(command: list[str], wanted: Platform | None = None, *, v3: bool = False) -> list[str]:
+    """Return what a compiler is told of the machine: the least processor that is served, and what to leave out.
 
     Parameters
     ----------
     command : list of str
         The compiler. zig takes the processor that it runs on and links a libc unless it is told not to.
-    machine : str or None
-        One of `PORTABLE`, for Linux; None: this one.
+    wanted : Platform or None
+        None: this one.
     v3 : bool
         For x86-64-v3.
     """
-    wide = (machine or platform.machine()) in ("x86_64", "AMD64")
-    strip = ["-s"] if machine or sys.platform == "linux" else []
+    system, machine = (wanted.system, wanted.machine) if wanted else (sys.platform, platform.machine())
+    wide = machine in ("x86_64", "AMD64")
+    strip = ["-s"] if wanted or system == "linux" else []
     if not _is_zig(command):
         return (_X86_64_V2 if wide else []) + (_X86_64_V3 if v3 else []) + strip
-    target = ["-target", f"{machine}-linux-gnu.2.17"] if machine else []
-    alone = ["-nostdlib", "-rtlib=compiler-rt"] if machine or sys.platform == "linux" else []
+    target = ["-target", wanted.target] if wanted else []
+    # macOS and Windows have their C library everywhere, and no shared library goes without it.
+    alone = ["-nostdlib", "-rtlib=compiler-rt"] if system == "linux" else []
     return [*target, f"-mcpu=x86_64_v{3 if v3 else 2}" if wide else "-mcpu=baseline", *alone, *strip]
 
 
@@ -90,7 +124,9 @@ def _run(command: list[str], flags: list[str], files: list[Path], target: Path) 
         define = f'-DLODE_SOURCES="{fingerprint()}"'
         # zig keeps what it has compiled in the home folder, which a build need not have.
         environment = {"ZIG_GLOBAL_CACHE_DIR": folder, "ZIG_LOCAL_CACHE_DIR": folder, **os.environ}
-        arguments = [*command, *FLAGS, *flags, define, *map(str, files), "-o", str(made)]
+        # A library for macOS would tell the place where it was compiled.
+        name = [f"-Wl,-install_name,@rpath/{target.name}"] if target.suffix == ".dylib" else []
+        arguments = [*command, *FLAGS, *flags, *name, define, *map(str, files), "-o", str(made)]
         try:
             done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
         except OSError as error:
@@ -134,7 +170,7 @@ def compiler() -> list[str]:
 
 
 def compile_library(
-    target: Path, command: list[str] | None = None, machine: str | None = None, *, v3: bool = False
+    target: Path, command: list[str] | None = None, wanted: Platform | None = None, *, v3: bool = False
 ) -> None:
     """Compile into ``target``.
 
@@ -143,8 +179,8 @@ def compile_library(
     target : Path
     command : list of str or None
         The compiler; None: `compiler`.
-    machine : str or None
-        One of `PORTABLE`, for Linux; None: this one.
+    wanted : Platform or None
+        None: this one.
     v3 : bool
         The second library, for x86-64-v3.
 
@@ -155,12 +191,12 @@ def compile_library(
     """
     command = command or compiler()
     target.parent.mkdir(parents=True, exist_ok=True)
-    wrong = _run(command, machine_flags(command, machine, v3=v3), sources(v3), target)
+    wrong = _run(command, machine_flags(command, wanted, v3=v3), sources(v3), target)
     if wrong:
         raise RuntimeError(f"the kernels of Lodestream could not be compiled: {wrong}")
 
 
-def compile_all(folder: Path, command: list[str] | None = None, machine: str | None = None) -> list[Path]:
+def compile_all(folder: Path, command: list[str] | None = None, wanted: Platform | None = None) -> list[Path]:
     """Compile the library into a folder, and on x86-64 the second one, for v3.
 
     Parameters
@@ -168,8 +204,8 @@ def compile_all(folder: Path, command: list[str] | None = None, machine: str | N
     folder : Path
     command : list of str or None
         The compiler; None: `compiler`.
-    machine : str or None
-        One of `PORTABLE`, for Linux; None: this one.
+    wanted : Platform or None
+        None: this one.
 
     Raises
     ------
@@ -177,17 +213,16 @@ def compile_all(folder: Path, command: list[str] | None = None, machine: str | N
         As `compile_library`.
     """
     command = command or compiler()
-    made = libraries(folder, machine)
+    made = libraries(folder, wanted)
     for number, target in enumerate(made):
-        compile_library(target, command, machine, v3=number > 0)
+        compile_library(target, command, wanted, v3=number > 0)
     return made
 
 
-def libraries(folder: Path, machine: str | None = None) -> list[Path]:
-    """Where the libraries of a machine stand in a folder: of this one, or of one of `PORTABLE`, for Linux."""
-    system = "linux" if machine else sys.platform
-    names = library_name(system, machine), wide_name(system, machine)
-    return [folder / name for name in names if name]
+def libraries(folder: Path, wanted: Platform | None = None) -> list[Path]:
+    """Return where the libraries of a platform, by default of this one, stand in a folder."""
+    where = (wanted.system, wanted.machine) if wanted else (sys.platform, None)
+    return [folder / name for name in (library_name(*where), wide_name(*where)) if name]
 
 
 def is_current(target: Path) -> bool:
@@ -199,7 +234,7 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
     """hatchling's part: the library goes into the wheel, which is then one of this platform, for every Python.
 
     A library of the tree that was made from these sources is taken as it is, unless ``CC`` names a compiler.
-    With ``LODESTREAM_WHEEL_FOR=aarch64``, or another of `PORTABLE`, the wheel is one for every Linux on that machine.
+    With ``LODESTREAM_WHEEL_FOR=linux-aarch64``, or another of `PLATFORMS`, the wheel is made for that platform, by zig.
     """
 
     PLUGIN_NAME = "custom"
@@ -220,19 +255,19 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
         """Compile: beside the sources for a package that stays among them, else aside, since those may be read-only."""
         if self.target_name != "wheel":
             return
-        machine = os.environ.get("LODESTREAM_WHEEL_FOR")
         self._folder = tempfile.TemporaryDirectory()
         try:
+            wanted = _wanted(os.environ.get("LODESTREAM_WHEEL_FOR"))
             if version == "editable":
                 compile_all(NATIVE)
             else:
-                for made in _compile_for_wheel(Path(self._folder.name), machine):
+                for made in _compile_for_wheel(Path(self._folder.name), wanted):
                     build_data["force_include"][str(made)] = f"lodestream/native/{made.name}"
         except (RuntimeError, OSError) as error:
             self._folder.cleanup()
             raise SystemExit(str(error)) from None
         build_data["pure_python"] = False
-        build_data["tag"] = f"py3-none-{_platform_tag() if machine is None else _portable_tag(machine)}"
+        build_data["tag"] = f"py3-none-{wanted.tag if wanted else _platform_tag()}"
 
     def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
         """Remove what was compiled aside."""
@@ -240,18 +275,19 @@ class Hook(BuildHookInterface):  # type: ignore[misc]  # hatchling comes without
             self._folder.cleanup()
 
 
-def _compile_for_wheel(folder: Path, machine: str | None) -> list[Path]:
-    if machine is None:
-        present = [] if os.environ.get("CC") else libraries(NATIVE)
-        return present if present and all(map(is_current, present)) else compile_all(folder)
-    if machine not in PORTABLE:
-        raise RuntimeError(f"expected LODESTREAM_WHEEL_FOR to be one of {', '.join(PORTABLE)}, got {machine}")
-    return compile_all(folder, zig(), machine)
+def _wanted(name: str | None) -> Platform | None:
+    """Return the platform that a wheel is to be made for; None: this one."""
+    if name and name not in PLATFORMS:
+        raise RuntimeError(f"expected LODESTREAM_WHEEL_FOR to be one of {', '.join(PLATFORMS)}, got {name}")
+    return PLATFORMS[name] if name else None
 
 
-def _portable_tag(machine: str) -> str:
-    """The library needs no libc, so any that Python runs with will do."""
-    return f"manylinux_2_17_{machine}.manylinux2014_{machine}.musllinux_1_2_{machine}"
+def _compile_for_wheel(folder: Path, wanted: Platform | None) -> list[Path]:
+    """Return the libraries of a wheel: compiled into a folder, or those of the tree where these are what is wanted."""
+    if wanted is not None:
+        return compile_all(folder, zig(), wanted)
+    present = [] if os.environ.get("CC") else libraries(NATIVE)
+    return present if present and all(map(is_current, present)) else compile_all(folder)
 
 
 def _platform_tag() -> str:
