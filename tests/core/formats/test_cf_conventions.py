@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -274,17 +275,51 @@ def test_a_crs_is_written_in_attributes_of_the_conventions(tmp_path: Path, kind:
     assert again.metadata["crs"] == surface.metadata["crs"]
 
 
+@cache
+def _by_pyproj(kind: str) -> pyproj.CRS:
+    return pyproj.CRS.from_cf(CONVENTIONS[kind])
+
+
 def assert_is_crs(found: Any, kind: str) -> None:
     """The numbers of a CRS are those of a convention.
 
     pyproj's own comparison takes a rotated pole for another one if it went through WKT.
     """
-    for key, value in pyproj.CRS.from_cf(CONVENTIONS[kind]).to_cf().items():
+    for key, value in _by_pyproj(kind).to_cf().items():
         if isinstance(value, str):
             assert key.endswith("_name") or key == "crs_wkt" or found[key] == value
         else:
             np.testing.assert_allclose(found[key], value, rtol=1e-12)
     assert found["grid_mapping_name"] == CONVENTIONS[kind]["grid_mapping_name"]
+
+
+@pytest.mark.parametrize("kind", CONVENTIONS)
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"horizontal_datum_name": "of a survey"},
+        {"reference_ellipsoid_name": "GRS 1980"},
+        {"prime_meridian_name": "Paris"},
+        {"longitude_of_prime_meridian": 2.5},
+    ],
+    ids=str,
+)
+def test_a_prime_meridian_that_is_not_named_is_the_one_of_pyproj(
+    tmp_path: Path, kind: str, more: dict[str, Any]
+) -> None:
+    data = mapped(kind)
+    data.crs.attrs |= more
+    surface, _ = noted(_classic, data, tmp_path)
+    assert surface.metadata["crs"] == (pyproj.CRS.from_cf(data.crs.attrs) if more else _by_pyproj(kind)).to_wkt()
+
+
+@pytest.mark.parametrize("left", [{"semi_major_axis": 6378137.0}, {"inverse_flattening": 298.25}], ids=str)
+def test_half_of_an_ellipsoid_is_what_pyproj_makes_of_it(tmp_path: Path, left: dict[str, Any]) -> None:
+    data = mapped("geographic")
+    data.crs.attrs = {"grid_mapping_name": "latitude_longitude", **left}
+    surface, _ = noted(_classic, data, tmp_path)
+    assert surface.metadata["crs"] == pyproj.CRS.from_cf(data.crs.attrs).to_wkt()
 
 
 def test_a_grid_mapping_that_nobody_understands_is_told(tmp_path: Path) -> None:

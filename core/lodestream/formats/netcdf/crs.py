@@ -16,6 +16,9 @@ from .names import associated
 
 __all__ = ["crs_of", "grid_mapping"]
 
+#: Attributes that describe an ellipsoid: any of these sets does.
+_ELLIPSOIDS = ({"earth_radius"}, {"semi_major_axis", "semi_minor_axis"}, {"semi_major_axis", "inverse_flattening"})
+
 #: The grid mapping that rioxarray and GDAL name so, where no variable names one.
 _USUAL = "spatial_ref"
 
@@ -72,11 +75,22 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
             "lodestream[formats]"
         ) from None
     try:
-        crs = pyproj.CRS.from_cf({key: _plain(value) for key, value in attributes.items()})
+        crs = pyproj.CRS.from_cf(_with_meridian({key: _plain(value) for key, value in attributes.items()}))
     except Exception as error:  # a file may say anything, and pyproj fails in several ways
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         return None, mapping, [f"left out the grid mapping {mapping}, which pyproj does not understand: {reason}"]
     return str(crs.to_wkt()), mapping, []
+
+
+def _with_meridian(attributes: dict[str, Any]) -> dict[str, Any]:
+    """Name Greenwich where an ellipsoid is described and no prime meridian is.
+
+    pyproj takes Greenwich there too, but looks for its longitude by name among all objects of PROJ: 0.4 s for a file.
+    """
+    described = any(names <= attributes.keys() for names in _ELLIPSOIDS)
+    if not described or attributes.keys() & {"prime_meridian_name", "longitude_of_prime_meridian"}:
+        return attributes
+    return {**attributes, "prime_meridian_name": "Greenwich", "longitude_of_prime_meridian": 0.0}
 
 
 def grid_mapping(metadata: Mapping[str, Any]) -> dict[str, Any]:
