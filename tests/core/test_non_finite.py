@@ -150,13 +150,13 @@ def surfaces(draw: st.DrawFn) -> ls.Surface:
     return ls.Surface(blocks=blocks)
 
 
-@examples(30)
+@examples(15)
 @given(surfaces())
 def test_every_surface_comes_back_bit_for_bit(surface: ls.Surface) -> None:
     assert_comes_back(surface)
 
 
-@examples(25)
+@examples(13)
 @given(surfaces(), st.booleans())
 def test_with_a_precision_or_an_error_infinities_come_back_and_the_rest_nearly(surface: ls.Surface, rms: bool) -> None:
     attributes = {name: "0.25" for name in ("t", "flow") if name in surface.blocks[0].attributes}

@@ -142,7 +142,7 @@ def test_a_server_that_refuses_a_second_request_is_asked_one_by_one() -> None:
     st.sampled_from([None, 500, 4096]),
     st.sampled_from([None, 5000.0]),
 )
-@examples(60)
+@examples(30)
 def test_whatever_breaks_the_surface_comes_once_and_whole(
     acts: dict[int, Act], transport: Any, window: int | None, rate: float | None
 ) -> None:
@@ -165,7 +165,7 @@ def test_whatever_breaks_the_surface_comes_once_and_whole(
     st.sampled_from(["stop", "close"]),
     st.sampled_from(["auto", "ws", "http"]),
 )
-@examples(60)
+@examples(30)
 def test_a_stop_at_any_time_is_obeyed(acts: dict[int, Act], number: int, stop: Act, transport: Any) -> None:
     world = World({**acts, number: stop}, transport=transport, window=700, close_timeout=3.0, silence=2.0, deadline=1e6)
     try:
@@ -185,7 +185,7 @@ def test_a_stop_at_any_time_is_obeyed(acts: dict[int, Act], number: int, stop: A
 
 
 @given(st.integers(0, 40), st.floats(0.5, 30.0), st.sampled_from(["ws", "http", "auto"]))
-@examples(100)
+@examples(50)
 def test_a_server_that_is_gone_is_given_up_in_time(first: int, deadline: float, transport: Any) -> None:
     acts: dict[int, Act] = dict.fromkeys(range(first, 5000), "break")
     world = World(acts, transport=transport, window=500, deadline=deadline)

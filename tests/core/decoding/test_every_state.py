@@ -311,7 +311,7 @@ def unnamed(case: Case) -> bool:
     )
 
 
-@examples(20)
+@examples(10)
 @example(case=unnamed_tile(), seed=1, level=5, bands=False)
 @example(case=unnamed_interface(), seed=1, level=3, bands=False)
 @given(case=cases(), seed=st.integers(0, 2**32), level=st.integers(0, 9), bands=st.booleans())

@@ -61,7 +61,7 @@ def states_of(decoder: PiecewiseDecoder, seed: int, count: int = 5) -> list[Stat
     return [*states, np.zeros_like(state)]
 
 
-@examples(40)
+@examples(20)
 @given(
     seed=st.integers(0, 5000),
     memory=st.sampled_from([1, 1 << 18, 1 << 30]),

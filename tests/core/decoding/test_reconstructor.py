@@ -62,7 +62,7 @@ def any_span(length: int, closed: bool, rng: np.random.Generator) -> tuple[int, 
     return start, int(rng.integers(start + 1, length + (start if closed else 0) + 1))
 
 
-@examples(100)
+@examples(50)
 @given(
     shape=st.tuples(st.integers(1, 150), st.integers(1, 130)), closed=closures, part=st.booleans(), seed=st.integers(0)
 )
@@ -139,7 +139,7 @@ def test_parents_of_coded_tiles_are_coded_where_the_level_below_needs_none_of_th
     assert not parents <= {*needed, -1}
 
 
-@examples(60)
+@examples(30)
 @given(shape=st.tuples(st.integers(1, 90), st.integers(1, 90)), closed=closures, seed=st.integers(0))
 def test_rows_above_a_level_that_is_made_already(shape: tuple[int, int], closed: Any, seed: int) -> None:
     rng = np.random.default_rng(seed)

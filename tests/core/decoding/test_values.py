@@ -30,7 +30,7 @@ def arrived(points: Any, closed: tuple[bool, bool]) -> tuple[Header, SegmentQueu
     return decoder.header, decoder._queue
 
 
-@examples(30)
+@examples(15)
 @given(
     shape=st.tuples(st.integers(2, 150), st.integers(1, 60)),
     closed=st.sampled_from(CLOSURES),

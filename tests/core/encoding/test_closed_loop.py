@@ -52,7 +52,7 @@ def check(surface: ls.Surface, base: int) -> None:
         assert distance < 8 * base + 8  # of the last patch: the two belong to each other
 
 
-@examples(30)
+@examples(15)
 @given(
     shape=st.tuples(st.integers(1, 70), st.integers(2, 70)),
     closed=CLOSED,
@@ -68,7 +68,7 @@ def test_the_loop_has_what_the_reader_has(
     check(ls.Surface(heights, closed), base)
 
 
-@examples(15)
+@examples(8)
 @given(
     down=st.lists(st.integers(1, 30), min_size=1, max_size=3),
     across=st.lists(st.integers(1, 30), min_size=1, max_size=3),

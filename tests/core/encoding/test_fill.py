@@ -108,7 +108,7 @@ def plain_fill(values: NDArray[np.float64], known: NDArray[np.bool_], closed: tu
             row[j] = (others - 0.07 * row[further_behind]) + 0.56 * row[behind]
 
 
-@examples(60)
+@examples(30)
 @given(
     shape=st.tuples(st.integers(1, 20), st.integers(1, 20)),
     closed=st.tuples(st.booleans(), st.booleans()),

@@ -78,7 +78,7 @@ def check_alike(found: Tiles, expected: Tiles | ReferenceUnits) -> None:
     budget=budgets,
     seed=st.integers(0, 2**32),
 )
-@examples(20)
+@examples(10)
 def test_what_is_written_is_read_in_any_segments_and_calls(
     shape: tuple[int, int],
     closed: tuple[bool, bool],
@@ -125,7 +125,7 @@ def test_what_is_written_is_read_in_any_segments_and_calls(
     data=st.lists(st.one_of(st.binary(max_size=300), st.integers(0, 2**32).map(noise)), min_size=1, max_size=4),
     budget=budgets,
 )
-@examples(20)
+@examples(10)
 def test_any_bytes_are_read_as_the_reference_reads_them(
     shape: tuple[int, int], tile: tuple[int, int], bits: int, data: list[bytes], budget: int
 ) -> None:
@@ -218,7 +218,7 @@ def test_calls_of_large_units_that_do_not_fit_are_refused(reading: bool, changes
     model=st.tuples(st.integers(0, 69), st.sampled_from([0, 1, 2**16 - 1, 2**31 - 1, -1, -(2**31)])),
     early=st.integers(0, 255),
 )
-@examples(30)
+@examples(15)
 def test_whatever_was_kept_a_call_ends_and_stays_in_its_arrays(
     state: tuple[int, int, int], bits: int, place: int, model: tuple[int, int], early: int
 ) -> None:

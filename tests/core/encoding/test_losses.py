@@ -148,14 +148,14 @@ def same_crs(one: str, other: str) -> bool:
 
 @pytest.mark.parametrize("suffix", ["npy", "tif", "png", "obj", "ply"])
 @given(surface=surfaces())
-@examples(60)
+@examples(30)
 def test_what_does_not_come_back_is_named_and_nothing_else_is(suffix: str, surface: Surface) -> None:
     pytest.importorskip({"tif": "rasterio", "png": "PIL"}.get(suffix, "numpy"))
     check_losses(suffix, surface)
 
 
 @given(surface=surfaces())
-@examples(10)  # each of which is read in a process of its own
+@examples(5)  # each of which is read in a process of its own
 def test_what_does_not_come_back_from_a_vts_is_named_and_nothing_else_is(surface: Surface) -> None:
     pytest.importorskip("vtkmodules")
     check_losses("vts", surface)

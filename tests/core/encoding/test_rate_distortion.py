@@ -61,7 +61,7 @@ def coefficients_of(table: TileTable, rng: np.random.Generator) -> NDArray[np.in
     return flat
 
 
-@examples(50)
+@examples(25)
 @given(layout=layouts, base=st.integers(1, 5000), at_once=st.integers(1, 500), seed=st.integers(0, 2**32))
 def test_classes_are_those_of_what_is_around(layout: Layout, base: int, at_once: int, seed: int) -> None:
     table = TileTable.of(layout)
@@ -208,7 +208,7 @@ rules = st.builds(
 )
 
 
-@examples(30)
+@examples(15)
 @given(
     sizes=st.lists(st.floats(-6, 6), min_size=1, max_size=5),
     classes=st.lists(st.integers(0, CLASSES - 1), min_size=5, max_size=5),
@@ -232,7 +232,7 @@ def test_without_feedback_the_cheapest_of_all_indices_are_found(
     assert found == pytest.approx(best, rel=1e-5, abs=1e-5)
 
 
-@examples(25)
+@examples(13)
 @given(
     shape=st.tuples(st.integers(1, 18), st.integers(1, 19)),
     scale=st.floats(-7, 6).map(lambda power: 2.0**power),
@@ -290,7 +290,7 @@ def test_no_index_is_larger_than_a_coefficient_may_be(value: float) -> None:
     assert counts[0, 3, -1] == counts.sum() == 1
 
 
-@examples(10)
+@examples(5)
 @given(layout=layouts, base=st.integers(1, 500), at_once=st.integers(1, 300), seed=st.integers(0, 2**32))
 def test_indices_do_not_depend_on_how_bands_are_cut_into_calls(
     layout: Layout, base: int, at_once: int, seed: int

@@ -41,7 +41,7 @@ layouts = st.one_of(
 )
 
 
-@examples(60)
+@examples(30)
 @given(layout=layouts, seed=st.integers(0, 2**32 - 1))
 def test_every_state_is_what_it_is_by_itself(layout: Layout, seed: int) -> None:
     rng = np.random.default_rng(seed)

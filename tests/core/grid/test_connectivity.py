@@ -19,7 +19,7 @@ from .layouts import cube, layouts, overlapping, tubes
 DATA = Path(__file__).parents[4] / "shared" / "data"
 
 
-@examples(100)
+@examples(50)
 @given(layouts())
 def test_any_layout_is_watertight_at_every_level(blocks: list[LatticeBlock]) -> None:
     arrangement = checked(blocks)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -24,6 +24,7 @@ from lodestream.entropy.part_table import part_of
 from lodestream.entropy.tiles import TileTable
 from lodestream.grid.layout import Band, Grid, Layout
 from lodestream.grid.tile_arrays import AT_ONCE
+from tests.examples import examples
 from tests.reference import tiles as reference
 from tests.reference.tiles import Share
 
@@ -153,7 +154,7 @@ def _runs(numbers: list[int]) -> list[range]:
     return [run for run in (range(*pair) for pair in ends) if run] or [range(1)]
 
 
-@settings(deadline=None)
+@examples(10)
 @given(layouts_of_several())
 def test_tiles_of_several_grids_are_those_made_one_by_one(layout: Layout) -> None:
     tiles = check_tiles(layout)

@@ -332,7 +332,7 @@ def surface_of(blocks: list[LatticeBlock], kind: str, seed: int) -> ls.Surface |
 KINDS = st.sampled_from(["none", "agree", "apart", "mixed"])
 
 
-@examples(15)
+@examples(8)
 @given(
     blocks=st.one_of(layouts(largest=6), overlapping(largest=6), tubes()),
     kind=KINDS,

@@ -137,7 +137,7 @@ def surface_of(blocks: list[LatticeBlock]) -> ls.Surface | None:
     return ls.Surface(blocks=[ls.Block(b.coordinates.astype(np.int64), b.closed, mask=b.mask) for b in usable])
 
 
-@examples(25)
+@examples(13)
 @given(layouts(largest=8))
 def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)
@@ -145,7 +145,7 @@ def test_random_layouts_stay_together(blocks: list[LatticeBlock]) -> None:
         assert_together(surface)
 
 
-@examples(20)
+@examples(10)
 @given(st.one_of(overlapping(largest=7), tubes()))
 def test_overlaps_and_tubes_stay_together(blocks: list[LatticeBlock]) -> None:
     surface = surface_of(blocks)

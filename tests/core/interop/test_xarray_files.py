@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -299,17 +301,30 @@ def written(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Any], t
     return write
 
 
+@contextmanager
+def named(case: object) -> Iterator[None]:
+    """Say of a failure which case of a loop it is of."""
+    try:
+        yield
+    except BaseException as error:
+        error.add_note(f"the case is {case}")
+        raise
+
+
+DECODINGS: list[dict[str, Any]] = [{}, {"decode_times": False}, {"mask_and_scale": False}, {"decode_coords": "all"}]
+
+
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("decoded", [{}, {"decode_times": False}, {"mask_and_scale": False}, {"decode_coords": "all"}])
-def test_a_dataset_is_the_surface_of_its_file(name: str, decoded: dict[str, Any], written: Any) -> None:
+def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
     path, opened = written(make())
     here, said = noted(lambda: ls.read(path, **options, attributes=attributes))
-    with opened(**decoded) as data:
-        there, notes = noted(lambda: ls.Surface.from_xarray(data, **options, attributes=attributes))
-        assert_same(there, here)
-        rest = [text for text in said if not text.startswith("left out variables of the same grid")]
-        assert words(notes) == words(rest)
+    rest = [text for text in said if not text.startswith("left out variables of the same grid")]
+    for decoded in DECODINGS:
+        with named(decoded), opened(**decoded) as data:
+            there, notes = noted(partial(ls.Surface.from_xarray, data, **options, attributes=attributes))
+            assert_same(there, here)
+            assert words(notes) == words(rest)
 
 
 @pytest.mark.parametrize("name", CASES)

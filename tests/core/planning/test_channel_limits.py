@@ -65,7 +65,7 @@ def error(view: ls.View, name: str, which: str) -> float:
 limits = st.dictionaries(st.sampled_from(NAMES), st.floats(-4, 2).map(lambda power: 10.0**power), max_size=3)
 
 
-@examples(25)
+@examples(13)
 @given(rms=limits, worst=limits, order=st.sampled_from(["quality", "level"]))
 def test_no_stream_stops_while_an_error_is_above_its_limit(
     rms: dict[str, float], worst: dict[str, float], order: Order

@@ -139,7 +139,7 @@ def check_end(reception: ReceiverState, kind: str, target: ls.Target) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@examples(6)
+@examples(3)
 @given(
     target=st.sampled_from(TARGETS),
     window=st.sampled_from([900, 5000, 60_000]),

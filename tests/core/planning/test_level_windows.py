@@ -94,7 +94,7 @@ def check_window(view: View, region: Region, level: int, inside: Places) -> None
                     np.testing.assert_allclose(found, wanted[np.ix_(*inside)], rtol=1e-12)
 
 
-@examples(40)
+@examples(20)
 @given(
     surface=surfaces()
     | tubes().map(
@@ -122,7 +122,7 @@ def test_the_window_of_a_level_is_cut_out_of_it_in_every_state(surface: ls.Surfa
         check_window(view, region, level, inside)
 
 
-@examples(40)
+@examples(20)
 @given(surface=surfaces(), data=st.data())
 def test_what_is_sent_for_the_window_of_a_level_is_enough(surface: ls.Surface, data: st.DataObject) -> None:
     container = encoded(surface, data.draw(st.sampled_from([None, (4, 4), (3, 5)])))
@@ -244,7 +244,7 @@ def test_no_layer_with_finer_data_is_told_as_a_state() -> None:
             assert index.layers[mark.number].level <= level
 
 
-@examples(80)
+@examples(40)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.tuples(st.booleans(), st.booleans()),

@@ -138,7 +138,7 @@ def test_several_narrow_blocks_are_read(shape: tuple[int, int]) -> None:
         np.testing.assert_array_equal(found.points, block.points)
 
 
-@examples(80)
+@examples(40)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.sampled_from(CLOSURES),

@@ -67,7 +67,7 @@ def windows(draw: st.DrawFn, shape: tuple[int, int], closed: tuple[bool, bool]) 
     return region[0], region[1]
 
 
-@examples(50)
+@examples(25)
 @given(st.data())
 def test_every_prefix_shows_the_window_as_numpy_takes_it(data: st.DataObject) -> None:
     kind, shape = data.draw(st.sampled_from(KINDS)), data.draw(st.sampled_from(SHAPES))
@@ -144,7 +144,7 @@ def test_windows_across_the_seam_are_sent_alone_and_their_errors_hold(kind: str)
     assert plan(index, first).bytes == plan(index, ls.Target()).bytes
 
 
-@examples(80)
+@examples(40)
 @given(
     st.tuples(st.integers(1, 90), st.integers(1, 90)),
     st.sampled_from([(False, True), (True, False), (True, True)]),

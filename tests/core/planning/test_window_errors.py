@@ -154,7 +154,7 @@ def test_bounds_that_are_too_small_are_refused_where_the_surface_is_exact(large:
             inspect(io.BytesIO(with_index(large, replace(index, optional=optional))), max_vertices=1_000_000)
 
 
-@examples(60)
+@examples(30)
 @given(
     st.lists(st.floats(0, 3.9), min_size=1, max_size=40), st.sampled_from([1e-110, 1.0, 1857.0, 1e110]), st.booleans()
 )
