@@ -41,7 +41,7 @@ from tests.server.programs import Server, alive, server
 pytest.importorskip("distributed")
 
 #: Of a build: half of it is too little for so many points with holes.
-MEMORY, SIDE = 160 << 20, 1480
+MEMORY, SIDE = 256 << 20, 1860
 BEYOND = {"workers": 1, "build_memory": MEMORY, "formats": "npy"}
 
 

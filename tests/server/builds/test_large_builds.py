@@ -29,7 +29,7 @@ from tests.server.helpers import push
 pytest.importorskip("distributed")
 
 #: Of a build: nothing fits into half of it in one piece that has so many points with holes.
-MEMORY, SIDE = 160 << 20, 1480
+MEMORY, SIDE = 256 << 20, 1860
 
 
 @pytest.fixture(scope="module")
