@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels clean
+.PHONY: help demo site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -98,10 +98,11 @@ LAID_OUT := $(C) $(wildcard client/web/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
 C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
 
-lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, warnings of gcc and clang; lines of code
+lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, warnings of gcc and clang, workflows; lines of code
 	@status=0; \
 	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
 	$(CLANG_FORMAT) --dry-run -Werror $(LAID_OUT) || status=1; \
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml || status=1; \
 	for compiler in gcc clang; do \
 		if command -v $$compiler > /dev/null; then \
 			for file in $(filter %.c,$(C)); do $$compiler $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \
@@ -133,6 +134,10 @@ bench-stream: kernels ## what comes after a stop, and times to the first and to 
 wheels: page ## build and check dist/: wheels for Linux, macOS and Windows, and the source distribution
 	@$(BIN)/python -P -c 'import auditwheel, build, lief' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
 	@$(BIN)/python .ci/wheels.py dist
+
+release-rehearsal: page ## build all that a release has into dist/, and try it in empty environments; publishes nothing
+	@$(BIN)/python -P -c 'import auditwheel, build, lief, twine' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
+	@PATH="$(CURDIR)/$(BIN):$$PATH" PYTHON=$(CURDIR)/$(BIN)/python $(BIN)/python .ci/rehearse.py dist
 
 clean: ## remove the environment and everything else that can be made again
 	rm -rf $(VENV) $(PEERS) build dist core/lodestream/native $(PAGE) $(WEB)/node_modules $(WEB)/dist $(WEB)/src/kernels/module.ts .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
