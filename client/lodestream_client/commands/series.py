@@ -134,6 +134,10 @@ def named_files(surface_parts: Sequence[Part]) -> Iterator[tuple[Part, str]]:
 
 
 def _file_name(part: Part) -> str:
-    """Return the label without characters that file names cannot have; a minus sign stays."""
+    """Return the label without characters that file names cannot have.
+
+    A minus sign stays, behind the name of the dimension: other programs take a name that begins with one for an option.
+    """
     name = _UNSAFE.sub("-", part.label[:_LONGEST_NAME]).strip("-.")
-    return f"-{name}" if name and part.label.startswith("-") else name or part.member.along
+    along = _UNSAFE.sub("-", part.member.along[:_LONGEST_NAME]).strip("-.") or "step"
+    return f"{along}=-{name}" if name and part.label.startswith("-") else name or along

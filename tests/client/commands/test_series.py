@@ -114,11 +114,11 @@ def test_steps_along_any_dimension_with_or_without_a_coordinate(run: Run, tmp_pa
 @pytest.mark.parametrize(
     ("places", "names"),
     [
-        ([-5.0, 5.0, 0.0], ["-5-m", "5-m", "0-m"]),
-        ([-5, 5, 0], ["-5-m", "5-m", "0-m"]),
-        ([-0.5, 0.5, -1e-7], ["-0.5-m", "0.5-m", "-1e-07-m"]),
-        ([1000000.1, 1000000.2, -1000000.1], ["1000000.1-m", "1000000.2-m", "-1000000.1-m"]),
-        (["-", "-5", "5"], ["level", "-5-m", "5-m"]),
+        ([-5.0, 5.0, 0.0], ["level=-5-m", "5-m", "0-m"]),
+        ([-5, 5, 0], ["level=-5-m", "5-m", "0-m"]),
+        ([-0.5, 0.5, -1e-7], ["level=-0.5-m", "0.5-m", "level=-1e-07-m"]),
+        ([1000000.1, 1000000.2, -1000000.1], ["1000000.1-m", "1000000.2-m", "level=-1000000.1-m"]),
+        (["-", "-5", "5"], ["level", "level=-5-m", "5-m"]),
         # Names that are the same for a file system; steps that have the same value.
         (["A b", "a-b", "c"], ["A-b-m-0", "a-b-m-1", "c-m-2"]),
         (["a", "a", "a (0)"], ["a-m-0", "a-m-1", "a-0-m"]),
