@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal clean
+.PHONY: help demo docs site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -16,8 +16,13 @@ help: ## this list
 demo: kernels ## stream a million points over a slow link, stop early, and show what came
 	@$(BIN)/lodestream demo $(ARGS)
 
-site: page kernels ## write build/site: the page and five generated surfaces, for any host of files
-	@$(BIN)/python -m lodestream_client.demo.site build/site
+docs: $(STAMP) ## build the documentation site into build/docs; a link that leads nowhere is an error
+	@$(BIN)/python -P -c 'import furo, myst_parser, sphinx' 2>/dev/null || $(BIN)/python -m pip install --quiet --group docs
+	@$(BIN)/python .ci/docs.py build/docs
+
+site: page kernels docs ## write build/site for any host of files: the documentation, and the public demo in its folder demo
+	@rm -rf build/site && cp -R build/docs build/site
+	@$(BIN)/python -m lodestream_client.demo.site build/site/demo
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Four
 # of pytest's share two processors, since some of the tests wait for a clock.
