@@ -24,7 +24,7 @@ from tests.server.helpers import eventually, settled
 from tests.server.programs import Server, server
 
 #: Of a build: nothing fits into half of it in one piece that has so many points with holes.
-MEMORY, SIDE = 256 << 20, 2280
+MEMORY, SIDE = 256 << 20, 1900
 
 Inodes = dict[str, int]
 
@@ -143,7 +143,7 @@ def test_a_build_with_other_memory_begins_anew(tmp_path: Path, upload: tuple[str
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.kill()
-    _end(data, location, container, MEMORY + (40 << 20))
+    _end(data, location, container, MEMORY + (16 << 20))
 
 
 @needs_landlock
