@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .samples import Grids, quads_of, triangles_of
-from .triangulation import Floats, Triangulation, normals_of
+from .samples import Grids, triangles_of
+from .triangulation import Floats, Integers, Triangulation, normals_of
 
 __all__ = ["Distances", "distances_of_vertices", "folded_quads", "measure"]
 
@@ -84,9 +84,20 @@ def measure(mesh: Triangulation, grids: Grids, points: Floats) -> Distances:
     )
 
 
-def folded_quads(mesh: Triangulation, grids: Grids, points: Floats) -> NDArray[np.bool_]:
-    """Quads of which a half looks the other way than the surface nearest to it, (Q,)."""
-    corners = points[triangles_of(grids.numbers)]
+def folded_quads(mesh: Triangulation, quads: Integers, points: Floats) -> NDArray[np.bool_]:
+    """Find the quads of which a half looks the other way than the surface nearest to it.
+
+    Parameters
+    ----------
+    mesh : Triangulation
+    quads : int64 array of shape (Q, 4)
+    points : float64 array of shape (N, 3)
+
+    Returns
+    -------
+    bool array of shape (Q,)
+    """
+    corners = points[np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])]
     _, triangles, _ = mesh.closest(corners.mean(axis=1))
     turned = (normals_of(corners) * mesh.normals[triangles]).sum(axis=1) < 0
-    return np.asarray(turned.reshape(2, len(quads_of(grids.numbers))).any(axis=0))
+    return np.asarray(turned.reshape(2, len(quads)).any(axis=0))

@@ -119,6 +119,39 @@ class Relaxation:
             self._move(free, offset[free], points, normals)
         return points, normals
 
+    def smooth(self, grids: Grids, points: Floats, samples: Integers, rounds: int) -> Floats:
+        """Move some samples to the means of their neighbours, and from there to the surface, so many times.
+
+        Those of the rim stay.
+
+        Parameters
+        ----------
+        grids : Grids
+        points : float64 array of shape (N, 3)
+        samples : int64 array of shape (S,)
+        rounds : int
+
+        Returns
+        -------
+        float64 array of shape (N, 3)
+        """
+        numbers, place = grids.numbers, np.full(grids.count, -1)
+        samples = np.setdiff1d(samples, rim_of(grids))
+        place[samples] = np.arange(len(samples))
+        rows = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2)
+        columns = np.stack([numbers[:, :, :-1], numbers[:, :, 1:]], axis=-1).reshape(-1, 2)
+        edges = np.sort(np.concatenate([rows, columns]), axis=1)
+        keys = np.unique(edges[:, 0] * grids.count + edges[:, 1])
+        pairs = _Neighbours.along(np.stack([keys // grids.count, keys % grids.count], axis=-1))
+        moving = place[pairs.of] >= 0
+        of, neighbour = place[pairs.of[moving]], pairs.neighbour[moving]
+        count = np.bincount(of, minlength=len(samples))[:, np.newaxis]
+        points = points.copy()
+        for _ in range(rounds):
+            sums = [np.bincount(of, points[neighbour, axis], len(samples)) for axis in range(3)]
+            _, _, points[samples] = self._mesh.closest(np.stack(sums, axis=-1) / count)
+        return points
+
     def _move(self, chosen: Integers, offset: Floats, points: Floats, normals: Floats) -> None:
         """Move samples, but not to a sheet that looks the other way nor farther than the surface bends."""
         distance, triangles, places = self._mesh.closest(points[chosen] + offset)

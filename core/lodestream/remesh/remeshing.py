@@ -38,7 +38,9 @@ _APART = 0.03
 _ROUNDS = (40, 8, 4)
 #: Cells beyond which a mesh is refused, unless as many are asked for.
 _MOST_CELLS = 1000
-_UNFOLDING = 4
+#: Times that samples of folded quads are smoothed at most, rounds of that, and how many times as far surfaces may be
+#: from each other then.
+_UNFOLDING, _SMOOTHING, _FARTHER = 4, 4, 1.15
 
 
 @dataclass(frozen=True)
@@ -136,12 +138,12 @@ def remesh_triangles(
     points, normals = relaxation.relax(grids, points, normals, _ROUNDS[0])
     used, place = np.unique(grids.numbers[:, ::2, ::2], return_inverse=True)
     halved = Grids(place.reshape(len(base.blocks), _FEWEST + 1, _FEWEST + 1), len(used))
-    result = _finished(mesh, base, halved, points[used])
+    result = _finished(mesh, relaxation, halved, points[used])
     doublings = 0
     while True:
         progress(0.6 + 0.1 * doublings)
         if result[2].rms > error:
-            result = _finished(mesh, base, grids, points)
+            result = _finished(mesh, relaxation, grids, points)
         larger = len(base.blocks) * (2 * grids.intervals + 1) ** 2
         if result[2].rms <= error or grids.intervals == _MOST or larger > most:
             break
@@ -230,22 +232,32 @@ def _worst(fine: Triangulation, mesh: Triangulation, distance: Floats, most: int
 
 
 def _finished(
-    mesh: Triangulation, base: _Base, grids: Grids, points: Floats
+    mesh: Triangulation, relaxation: Relaxation, grids: Grids, points: Floats
 ) -> tuple[Grids, Floats, Distances, int, int]:
     """Samples unfolded, and put on sharp edges where that brings the surfaces nearer; distances, folds, sharp edges."""
-    points, folded = _unfolded(mesh, base, grids, points)
+    quads = quads_of(grids.numbers)
+    folded = folded_quads(mesh, quads, points)
     distances = measure(mesh, grids, points)
+    unfolded, still = _unfolded(mesh, relaxation, grids, points, folded)
+    if still.sum() < folded.sum():
+        other = measure(mesh, grids, unfolded)
+        if other.rms <= _FARTHER * distances.rms and other.largest <= _FARTHER * distances.largest:
+            points, distances, folded = unfolded, other, still
     sharpened, sharp = sharpen(mesh, grids, points)
     if (sharpened != points).any():
-        sharpened, still = _without_new_folds(mesh, grids, points, sharpened, folded)
+        sharpened, still = _without_new_folds(mesh, quads, points, sharpened, folded)
         nearer = measure(mesh, grids, sharpened)
         if nearer.rms < distances.rms:
             points, distances, folded = sharpened, nearer, still
     return grids, points, distances, int(np.count_nonzero(folded)), sharp
 
 
-def _unfolded(mesh: Triangulation, base: _Base, grids: Grids, points: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Put the samples of quads that are folded back where the maps have them, where fewer are then.
+def _unfolded(
+    mesh: Triangulation, relaxation: Relaxation, grids: Grids, points: Floats, folded: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Smooth the samples of quads that are folded, and of those beside them, as long as fewer are then.
+
+    Relaxation holds samples that have neighbours across a bend; of folded quads that is why they stay folded.
 
     Returns
     -------
@@ -253,18 +265,13 @@ def _unfolded(mesh: Triangulation, base: _Base, grids: Grids, points: Floats) ->
     folded : bool array of shape (Q,)
         Quads that still are.
     """
-    folded = folded_quads(mesh, grids, points)
-    if not folded.any():
-        return points, folded
-    raw = base.sampled(max(grids.intervals, _FIRST))[1]
-    if grids.intervals < _FIRST:
-        raw = raw[np.unique(number_samples(base.rims, base.blocks, _FIRST).numbers[:, ::2, ::2])]
     quads = quads_of(grids.numbers)
     for _ in range(_UNFOLDING):
-        tried = points.copy()
-        samples = np.unique(quads[folded])
-        tried[samples] = raw[samples]
-        left = folded_quads(mesh, grids, tried)
+        if not folded.any():
+            break
+        samples = np.unique(quads[np.isin(quads, quads[folded]).any(axis=1)])
+        tried = relaxation.smooth(grids, points, samples, _SMOOTHING)
+        tried, left = _without_new_folds(mesh, quads, points, tried, folded)
         if left.sum() >= folded.sum():
             break
         points, folded = tried, left
@@ -272,15 +279,17 @@ def _unfolded(mesh: Triangulation, base: _Base, grids: Grids, points: Floats) ->
 
 
 def _without_new_folds(
-    mesh: Triangulation, grids: Grids, points: Floats, moved: Floats, folded: NDArray[np.bool_]
+    mesh: Triangulation, quads: Integers, points: Floats, moved: Floats, folded: NDArray[np.bool_]
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Samples as they were moved, but for those whose quads are folded only since then."""
-    quads = quads_of(grids.numbers)
+    """Samples as they were moved, but for those whose quads are folded only since then; the quads that still are."""
+    moved, still = moved.copy(), folded.copy()
+    near = np.flatnonzero((moved != points).any(axis=1)[quads].any(axis=1))
     for _ in range(_UNFOLDING):
-        still = folded_quads(mesh, grids, moved)
+        still[near] = folded_quads(mesh, quads[near], moved)
         new = still & ~folded
         if not new.any():
-            break
+            return moved, still
         back = np.unique(quads[new])
         moved[back] = points[back]
-    return moved, folded_quads(mesh, grids, moved)
+    still[near] = folded_quads(mesh, quads[near], moved)
+    return moved, still

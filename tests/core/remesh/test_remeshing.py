@@ -15,7 +15,8 @@ from lodestream.remesh.cleaning import clean, longest_edges, refine
 from lodestream.remesh.distances import folded_quads
 from lodestream.remesh.layout import Block, lay_out
 from lodestream.remesh.maps import Maps
-from lodestream.remesh.remeshing import Remeshing, remesh_triangles
+from lodestream.remesh.relaxation import Relaxation
+from lodestream.remesh.remeshing import Remeshing, _unfolded, remesh_triangles
 from lodestream.remesh.rims import trace_rims
 from lodestream.remesh.samples import quads_of
 from lodestream.remesh.triangulation import Triangulation
@@ -60,7 +61,7 @@ def test_the_surface_is_near_both_ways(remeshed: tuple[str, Remeshing]) -> None:
     assert result.distances.rms < 1e-2
     assert result.distances.largest < 6e-2
     assert result.folds <= 0.02 * len(quads_of(result.grids.numbers))
-    assert result.folds == folded_quads(result.mesh, result.grids, result.points).sum()
+    assert result.folds == folded_quads(result.mesh, quads_of(result.grids.numbers), result.points).sum()
 
 
 def test_faces_look_the_way_of_the_input(remeshed: tuple[str, Remeshing]) -> None:
@@ -165,6 +166,23 @@ def test_sharp_edges_and_corners_of_a_cube_are_kept() -> None:
     gap = np.linalg.norm(result.points[:, None] - scenes.cube()[0], axis=2).min(axis=0)
     assert gap.max() < 1e-6
     assert result.sharp_edges >= 12
+
+
+def test_quads_that_are_folded_are_unfolded() -> None:
+    result = remesh_triangles(*scenes.torus(), blocks=24, error=1e-2)
+    quads = quads_of(result.grids.numbers)
+    points = result.points.copy()
+    for block in result.grids.numbers[::3]:
+        points[block[3:5, 4]] = points[block[3:5, 4][::-1]]
+    before = folded_quads(result.mesh, quads, points)
+    assert before.sum() > 8
+    unfolded, left = _unfolded(result.mesh, Relaxation(result.mesh), result.grids, points, before)
+    assert left.sum() <= result.folds
+    np.testing.assert_array_equal(left, folded_quads(result.mesh, quads, unfolded))
+    moved = np.unique(quads[np.isin(quads, quads[before]).any(axis=1)])
+    untouched = np.setdiff1d(np.arange(len(points)), moved)
+    np.testing.assert_array_equal(unfolded[untouched], points[untouched])
+    assert result.mesh.closest(unfolded[moved])[0].max() < 1e-9
 
 
 def test_sites_are_shared_out_by_area() -> None:
