@@ -13,6 +13,7 @@ import sys
 import threading
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 
 def _within() -> dict[str, Any]:
@@ -35,19 +36,30 @@ def _answer() -> None:
         print(json.dumps(_within()), flush=True)
 
 
+def preload() -> None:
+    """Import what builds and levels need, but for what reads NetCDF: that takes longest, and few tests need it."""
+    from lodestream_server.builds import worker
+
+    with patch.object(worker, "_NETCDF", ()):
+        worker.preload()
+
+
 def main() -> None:
     """Serve until told to end."""
     gc.disable()  # what is imported stays: to look through it again and again frees nothing
     from lodestream_server import Settings
+    from lodestream_server.builds import worker
     from lodestream_server.operation.logs import configure
     from lodestream_server.running import serve_alone
+    from tests.server import alone
 
     gc.enable()
     settings = Settings(**json.loads(sys.argv[1]))
     configure(settings.log_format, settings.log_level)
     # Its own standard input: a process that it spawns must not read from it.
     threading.Thread(target=_answer, daemon=True).start()
-    serve_alone(settings, lambda address: print(address, flush=True))
+    with patch.object(worker, "preload", alone.preload):  # by the name that another process finds it by
+        serve_alone(settings, lambda address: print(address, flush=True))
 
 
 if __name__ == "__main__":
