@@ -61,8 +61,8 @@ def register(subparsers: Subparsers) -> None:
         "stream a surface from a server into a file, completely or up to a limit",
         "The suffix of OUT decides its format. Standard output is NPY. If the connection breaks, pull reconnects\n"
         "and continues where it was. After Ctrl-C, or if the server does not come back, OUT is written from the\n"
-        "data received so far, which are also kept for --resume. With --watch OUT is there after a few kilobytes, and\n"
-        "is replaced as it improves, for a program that reads it again.",
+        "data received so far, which are also kept for --resume. --watch writes OUT after the first few kilobytes\n"
+        "and rewrites it as the surface improves.",
     )
     parser.add_argument(
         "url", type=parse_source, metavar="URL", help="URL of the surface, or of a container on any web server"
