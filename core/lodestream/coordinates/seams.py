@@ -7,6 +7,7 @@ Likewise `unwrap` adds whole turns to angles so that neighbours are near each ot
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +18,7 @@ from ..errors import InputError
 from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import DTYPES, Block, Closed, Surface
 
-__all__ = ["merge", "restore", "shapes_in_files", "unwrap", "wrapped"]
+__all__ = ["angles_of", "merge", "restore", "shapes_in_files", "unwrap", "wrapped"]
 
 _WORDS: Mapping[Closed, str] = {(True, False): "rows", (False, True): "cols", (True, True): "both"}
 _AXES: Mapping[str, Closed] = {word: closed for closed, word in _WORDS.items()}
@@ -212,6 +213,25 @@ def wrapped(angles: NDArray[Any], period: float, low: float) -> NDArray[np.float
     return values
 
 
+def angles_of(metadata: Mapping[str, Any]) -> list[tuple[int, float, float]]:
+    """Return channel, full turn and least value of each of the ``angles`` that metadata say were unwrapped.
+
+    Raises
+    ------
+    InputError
+        When the metadata say something else: a hostile container may say anything.
+    """
+    angles = metadata.get("angles") or ()
+    try:
+        numbers = [(angle["channel"], angle["period"], angle["low"]) for angle in angles]
+        result = [(int(channel), float(period), float(low)) for channel, period, low in numbers]
+    except (TypeError, ValueError, LookupError, OverflowError):
+        result = [(-1, 0.0, 0.0)]
+    if not all(channel >= 0 and 0 < period < math.inf and math.isfinite(low) for channel, period, low in result):
+        raise InputError(f"expected angles of channel, period and low in the metadata, got {angles!a:.80}")
+    return result
+
+
 def restore(surface: Surface) -> Surface:
     """Restore repeated rows and columns, angles and type of a surface, and remove their entries in the metadata.
 
@@ -220,12 +240,17 @@ def restore(surface: Surface) -> Surface:
     Raises
     ------
     InputError
-        When the metadata name a type that points cannot have.
+        When the metadata name a type or angles that points cannot have, or no seam and turn.
     """
     metadata = dict(surface.metadata)
-    seam, turn, dtype = (metadata.pop(key, None) for key in ("seam", "turn", "dtype"))
     heights = surface.blocks[0].points.ndim == 2
-    angles = () if heights else metadata.pop("angles", ())
+    angles, turn = ([], None) if heights else (angles_of(metadata), _turn_of(metadata))
+    seam, _, dtype = (metadata.pop(key, None) for key in ("seam", "turn", "dtype"))
+    if not heights:
+        metadata.pop("angles", None)
+        channels = surface.blocks[0].points.shape[2]
+        if any(number >= channels for number, *_ in (*angles, *([turn] if turn else []))):
+            raise InputError(f"expected angles of {channels} channels in the metadata, got another channel")
     if not angles and seam is None and dtype is None:
         return surface
     if dtype is not None and dtype not in DTYPES:
@@ -234,11 +259,10 @@ def restore(surface: Surface) -> Surface:
     blocks, nodes = [], []
     for block, repeat in zip(surface.blocks, _repeated(surface), strict=True):
         points = block.points.copy() if angles else block.points
-        for angle in angles:
-            channel = points[..., angle["channel"]]
-            channel[:] = wrapped(channel, angle["period"], angle["low"])
+        for number, period, low in angles:
+            points[..., number] = wrapped(points[..., number], period, low)
         points = points.astype(dtype or points.dtype, copy=False)
-        points = _with_last(points, repeat, None if heights else turn)
+        points = _with_last(points, repeat, turn)
         attributes = {name: _with_last(array, repeat) for name, array in block.attributes.items()}
         mask = None if block.mask is None else _with_last(block.mask, repeat)
         closed = (block.closed[0] and not repeat[0], block.closed[1] and not repeat[1])
@@ -261,9 +285,24 @@ def shapes_in_files(surface: Surface) -> list[tuple[int, int]]:
 def _repeated(surface: Surface) -> list[Closed]:
     """Return for each block whether its first row and its first column are repeated at the end."""
     seam = surface.metadata.get("seam")
-    words = [seam] if isinstance(seam, str) else list(seam or ())
+    words = [seam] if isinstance(seam, str) else [*seam] if isinstance(seam, list | tuple) else []
     words += [""] * (len(surface.blocks) - len(words))
-    return [_AXES.get(word, (False, False)) for word in words[: len(surface.blocks)]]
+    return [_AXES.get(str(word), (False, False)) for word in words[: len(surface.blocks)]]
+
+
+def _turn_of(metadata: Mapping[str, Any]) -> tuple[int, float, int] | None:
+    """Return channel, number and axis of the turn that a seam adds, if metadata say one."""
+    turn = metadata.get("turn")
+    if turn is None:
+        return None
+    try:
+        channel, number, axis = turn
+        result = (int(channel), float(number), int(axis))
+    except (TypeError, ValueError, OverflowError):
+        result = (-1, 0.0, 0)
+    if result[0] < 0 or not math.isfinite(result[1]):
+        raise InputError(f"expected a turn of channel, number and axis in the metadata, got {turn!a:.80}")
+    return result
 
 
 def _with_last(array: NDArray[Any], repeat: Closed, turn: tuple[int, float, int] | None = None) -> NDArray[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,13 +101,11 @@ def _of_dataset(
     options: Mapping[str, str],
 ) -> Surface:
     wanted = None if attributes is None else names_in(attributes)
-    mark = Mark.of(data.attrs)
-    given = {**_names(data, mark, options, wanted), **options}
-    left_out = set() if wanted is None or "variable" not in given else {*data.data_vars} - {*given.values(), *wanted}
-    whole = _as_in_a_file(xr, data, set(map(str, left_out)), room)
+    given = {**_names(data, Mark.of(data.attrs), options, wanted), **options}
     chosen = given if wanted is None else {**given, "attributes": wanted}
     source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, chosen, (), closed, room=room)
-    surface, notes = surface_in(source, whole, "xarray", in_memory=True)
+    dataset = _as_in_a_file(xr, data)
+    surface, notes = surface_in(source, dataset, "xarray", stored=lambda variable: _as_stored(xr, variable, room))
     for text in notes:
         warn(text)
     return surface
@@ -119,38 +117,57 @@ def _places(array: Any) -> dict[str, str]:
     return {"coordinates": " ".join(names)} if names else {}
 
 
-def _as_in_a_file(xr: Any, data: Any, left_out: Collection[str], room: Room) -> Any:
-    """Return a shallow copy with values and attributes as in a file: xarray's decoding moves some to the encoding.
+def _as_in_a_file(xr: Any, data: Any) -> Any:
+    """Return a shallow copy with the attributes that a file has: decoding has moved some to the encoding.
 
-    Values that are not to be read stay as they are.
+    Nothing is read but vectors and single values.
     """
     return xr.Dataset(
-        {
-            name: _as_stored(xr, data[name].variable, room, _places(data[name]), name not in left_out)
-            for name in data.data_vars
-        },
-        {name: _as_stored(xr, variable, room) for name, variable in data.coords.variables.items()},
+        {name: _described(xr, data[name].variable, _places(data[name])) for name in data.data_vars},
+        {name: _described(xr, variable) for name, variable in data.coords.variables.items()},
         data.attrs | ({} if data.data_vars else _places(data)),
     )
 
 
-def _as_stored(xr: Any, variable: Any, room: Room, places: Mapping[str, str] | None = None, read: bool = True) -> Any:
-    """Return a variable as in its file: times as numbers, floats that were integers with a fill value as integers."""
+def _described(xr: Any, variable: Any, places: Mapping[str, str] | None = None) -> Any:
+    """Return a variable with the attributes of its file; of one dimension at most, with its values too."""
     if variable.dtype.kind in "mM" or (variable.ndim < 2 and variable.dtype.kind == "O"):
         variable = _numbered(xr, variable)
     encoding = variable.encoding
-    references = {key: encoding[key] for key in REFERENCES if key in encoding}
-    attrs = {**(places or {}), **variable.attrs, **references, **_unpacked_limits(xr, variable)}
-    missing = [number for key in _MISSING for number in np.ravel(encoding.get(key, ())).tolist()]
-    dtype = np.dtype(encoding.get("dtype") or variable.dtype)
-    if read and dtype.kind in "iu" and variable.dtype.kind == "f" and not is_packed(encoding):
-        whole = _integers(variable, _with_sign(dtype, encoding), missing, room)
-        if whole is not None:
-            kept = {"_FillValue": whole.dtype.type(missing[0])} if missing else {}
-            return xr.Variable(variable.dims, whole, {**attrs, **kept})
+    keys: tuple[str, ...] = REFERENCES
+    if np.dtype(encoding.get("dtype") or variable.dtype).kind == "f" and not is_packed(encoding):
+        keys = (*keys, *_MISSING)  # xarray passes over a missing value of another type than the values
+    moved = {key: encoding[key] for key in keys if key in encoding}
     copy = variable.to_base_variable().copy(deep=False)
-    copy.attrs = attrs
-    return copy
+    copy.encoding = {key: it for key, it in encoding.items() if key not in moved}
+    copy.attrs = {**(places or {}), **variable.attrs, **moved, **_unpacked_limits(xr, variable)}
+    return _as_stored(xr, copy, IN_MEMORY) if variable.ndim < 2 else copy
+
+
+def _as_stored(xr: Any, variable: Any, room: Room) -> Any:
+    """Return a variable with the values of its file: integers where its floats are such with NaN."""
+    encoding = variable.encoding
+    dtype = np.dtype(encoding.get("dtype") or variable.dtype)
+    if dtype.kind not in "iu" or variable.dtype.kind != "f" or is_packed(encoding):
+        return variable
+    dtype = _with_sign(dtype, encoding)
+    missing = _missing(encoding, dtype)
+    whole = _integers(variable, dtype, missing, room)
+    if whole is None:
+        return variable
+    kept = {"_FillValue": missing[0]} if missing else {}
+    return xr.Variable(variable.dims, whole, {**variable.attrs, **kept})
+
+
+def _missing(encoding: Mapping[str, Any], dtype: np.dtype[Any]) -> list[Any]:
+    """Return the missing values of a file that its integers can be; texts and other numbers say nothing."""
+    limits = np.iinfo(dtype)
+    numbers = [number for key in _MISSING for number in np.ravel(encoding.get(key, ())).tolist()]
+    return [
+        dtype.type(int(number))
+        for number in numbers
+        if isinstance(number, int | float) and limits.min <= number <= limits.max and number == int(number)
+    ]
 
 
 def _numbered(xr: Any, variable: Any) -> Any:
@@ -187,23 +204,20 @@ def _unpacked_limits(xr: Any, variable: Any) -> dict[str, Any]:
 def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room: Room) -> NDArray[Any] | None:
     """Return floats as integers, with NaN as the first of the missing values; None if they are no integers."""
     limits, result, anything = np.iinfo(dtype), room.empty(variable.shape, dtype), False
-    numbers = [dtype.type(number) for number in missing if limits.min <= number <= limits.max and number == int(number)]
-    if len(numbers) < len(missing):
-        return None
     for window, part in pieces(variable, room):
         values = part.values
         valid = ~np.isnan(values)
         known = values[valid]
-        if not numbers and not valid.all():
+        if not missing and not valid.all():
             return None
         if known.size and not (limits.min <= known.min() and known.max() <= limits.max):
             return None
         whole = known.astype(dtype)
-        if not (whole == known).all() or any((whole == number).any() for number in numbers):
+        if not (whole == known).all() or any((whole == number).any() for number in missing):
             return None
-        stored = np.full(values.shape, numbers[0] if numbers else 0, dtype)
-        stored[valid] = whole
-        result[window] = stored
+        own = np.full(values.shape, missing[0] if missing else 0, dtype)
+        own[valid] = whole
+        result[window] = own
         anything |= bool(known.size)
     return result if anything else None
 
@@ -217,4 +231,5 @@ def _names(data: Any, mark: Mark | None, options: Mapping[str, str], attributes:
     left = [str(name) for name in data.data_vars if str(name) not in (attributes or ())]
     if attributes is not None and len(left) == 1:
         return {"variable": left[0]}
-    return {"variable": "z"} if "z" in data.data_vars and data["z"].dtype.kind in "iuf" else {}
+    wide = "z" in data.data_vars and data["z"].dtype.kind in "iuf" and data["z"].ndim > 1
+    return {"variable": "z"} if wide else {}

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..coordinates.height_fields import coordinates
-from ..coordinates.seams import restore, shapes_in_files
+from ..coordinates.seams import angles_of, restore, shapes_in_files
 from ..errors import InputError
 from ..formats.closing import wraps
 from ..formats.netcdf.mark import MARK, in_json
@@ -36,7 +36,7 @@ def grid_of_block(surface: Surface, number: int) -> Grid:
     FormatError
         If integers need more bits than float64 has.
     """
-    angles = surface.metadata.get("angles", ())
+    angles = angles_of(surface.metadata)
     # Without their angles longitudes stay unwrapped.
     metadata = {key: value for key, value in surface.metadata.items() if key not in ("angles", "turn", "dtype")}
     whole = restore(Surface(blocks=surface.blocks, metadata=metadata))
@@ -55,10 +55,10 @@ def grid_of_block(surface: Surface, number: int) -> Grid:
                 line = np.moveaxis(_padded(plane, closed, axis), axis, 0)
                 ends[-1, there[-1], channel] = (line[-1] + share * (line[-1] - line[-2]))[there[-1]]
         elif block.points.ndim == 3 and (closed[axis] or seams[axis]):
-            for angle in angles:
+            for channel, period, _ in angles:
                 at = there[-1] & there[-2]
-                last, before = ends[-1, at, angle["channel"]], ends[-2, at, angle["channel"]]
-                ends[-1, at, angle["channel"]] = last + angle["period"] * np.rint((before - last) / angle["period"])
+                last, before = ends[-1, at, channel], ends[-2, at, channel]
+                ends[-1, at, channel] = last + period * np.rint((before - last) / period)
     return grid
 
 

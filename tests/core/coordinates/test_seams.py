@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from lodestream.coordinates.seams import merge, restore, unwrap, wrapped
+from lodestream.errors import InputError
 from lodestream.surface import Block, Surface
 
 from ..surfaces import torus
@@ -170,3 +171,36 @@ def test_wrapped_angles_lie_in_one_turn(angles: list[float], low: float) -> None
     assert ((found >= low - 1e-9) & (found <= low + 360 + 1e-9)).all()
     turns = (found - np.array(angles)) / 360
     np.testing.assert_allclose(turns, np.rint(turns), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"angles": 5},
+        {"angles": "abc"},
+        {"angles": [{}]},
+        {"angles": [5]},
+        {"angles": [{"channel": 9, "period": 360.0, "low": 0.0}]},
+        {"angles": [{"channel": -1, "period": 360.0, "low": 0.0}]},
+        {"angles": [{"channel": 0, "period": 0.0, "low": 0.0}]},
+        {"angles": [{"channel": 0, "period": float("nan"), "low": 0.0}]},
+        {"angles": [{"channel": float("inf"), "period": 360.0, "low": 0.0}]},
+        {"angles": [{"channel": [], "period": {}, "low": "x"}]},
+        {"seam": "cols", "turn": 5},
+        {"seam": "cols", "turn": [0, 360.0]},
+        {"seam": "cols", "turn": [9, 360.0, 1]},
+        {"seam": "cols", "turn": ["a", "b", "c"]},
+    ],
+    ids=str,
+)
+def test_angles_that_anybody_has_written_are_refused(said: dict[str, Any]) -> None:
+    points = np.stack([*np.mgrid[:5.0, :7.0], np.ones((5, 7))], axis=-1)
+    surface = Surface(points, (False, True), metadata=said)
+    with pytest.raises(InputError, match="in the metadata"):
+        restore(surface)
+
+
+@pytest.mark.parametrize("seam", [5, [[]], [{}], {"a": 1}, [5], ["cols", "rows"]], ids=str)
+def test_a_seam_that_anybody_has_written_is_none_where_it_is_no_word(seam: Any) -> None:
+    surface = Surface(np.ones((5, 7)), (False, True), metadata={"seam": seam})
+    assert restore(surface).shape == ((5, 8) if seam == ["cols", "rows"] else (5, 7))

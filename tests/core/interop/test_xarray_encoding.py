@@ -31,7 +31,7 @@ def _even() -> Any:
 
 
 def _uneven() -> Any:
-    return _even().assign_coords(x=5e5 + np.arange(SHAPE[1]) ** 1.5)
+    return _even().assign_coords(x=5e5 + np.arange(SHAPE[1]) ** 1.5).drop_vars("spatial_ref")
 
 
 def _curvilinear() -> Any:
@@ -155,3 +155,44 @@ def test_attributes_that_are_left_out_are_not_read() -> None:
     assert surface.points.dtype == whole.points.dtype == np.int32
     assert list(surface.attributes) == ["speed"]
     assert np.array_equal(surface.attributes["speed"], whole.attributes["speed"], equal_nan=True)
+
+
+class _Counted(xr.backends.BackendArray):  # type: ignore[misc, name-defined]
+    """Values of a file that count how many of them are read."""
+
+    def __init__(self, values: NDArray[Any]) -> None:
+        self._values, self.shape, self.dtype = values, values.shape, values.dtype
+        self.count = 0
+
+    def __getitem__(self, key: Any) -> Any:
+        support = xr.core.indexing.IndexingSupport.BASIC
+        return xr.core.indexing.explicit_indexing_adapter(key, self.shape, support, self._read)
+
+    def _read(self, key: Any) -> NDArray[Any]:
+        values: NDArray[Any] = self._values[key]
+        self.count += values.size
+        return values
+
+
+@pytest.mark.parametrize("dtype", ["i2", "f4"])
+def test_only_what_is_taken_is_read(dtype: str) -> None:
+    values = np.arange(9 * 24 * 32, dtype="f4").reshape(9, 24, 32) % 4000
+    values[:, 3, 4] = np.nan
+    arrays = {name: _Counted(values) for name in ("z", "other", "far")}
+
+    def lazy(name: str, dims: tuple[str, ...]) -> Any:
+        encoding = {"dtype": np.dtype(dtype), "_FillValue": np.dtype(dtype).type(-1)}
+        return xr.Variable(dims, xr.core.indexing.LazilyIndexedArray(arrays[name]), {}, encoding)
+
+    data = xr.Dataset({"z": lazy("z", ("time", "y", "x")), "far": lazy("far", ("time", "q", "r"))})
+    data["other"] = lazy("other", ("time", "y", "x"))
+    surface = ls.Surface.from_xarray(data, variable="z", time="4", attributes=[])
+    assert surface.dtype == np.dtype(dtype)
+    valid = ~np.isnan(values[4])
+    np.testing.assert_array_equal(surface.points[valid], values[4][valid])
+    assert arrays["z"].count <= 2 * values[4].size
+    assert arrays["other"].count == arrays["far"].count == 0
+    surface = ls.Surface.from_xarray(data, variable="z", time="4")
+    np.testing.assert_array_equal(surface.attributes["other"][valid], values[4][valid])
+    assert arrays["other"].count <= 2 * values[4].size
+    assert arrays["far"].count == 0

@@ -328,6 +328,24 @@ def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
+def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any) -> None:
+    make, options, attributes = CASES[name]
+    data = make()
+    path, opened = written(data)
+    surface, said = noted(lambda: ls.read(path, **options, attributes=attributes))
+    with opened() as decoded:
+        there, notes = noted(lambda: ls.Surface.from_xarray(decoded, **options, attributes=attributes))
+    grid = data[surface.metadata["variable"]].dims[-2:]
+    taken = {surface.metadata["variable"], *surface.attributes, *surface.metadata.get("scalars", ()), *grid}
+    taken |= {"lon_rho", "lat_rho", "XLONG", "XLAT", "XLONG_M", "XLAT_M", "nav_lon", "nav_lat", "geolon", "geolat"}
+    for variable in data.variables:
+        if set(data[variable].dims) & set(grid) and variable not in taken:
+            assert variable in " ".join(said).replace(",", " ").replace(";", " ").split()
+    assert_same(there, surface)
+    assert words(notes) == words([text for text in said if not text.startswith("left out variables of the same grid")])
+
+
+@pytest.mark.parametrize("name", CASES)
 def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str, written: Any) -> None:
     make, options, _ = CASES[name]
     path, opened = written(make())

@@ -23,6 +23,8 @@ __all__ = [
     "Found",
     "choose",
     "fields",
+    "fits",
+    "is_numeric",
     "main_variable",
     "offered",
     "others",
@@ -133,7 +135,7 @@ def with_attributes(dataset: Any, choice: Choice, names: Iterable[str]) -> Choic
     for name in attributes:
         if name not in variables:
             raise OptionError(f"expected attributes= among {_listing(variables)}, got {name!r}")
-        if not _fits(variables[name], choice) or not _numeric(variables[name]):
+        if not fits(variables[name], choice) or not is_numeric(variables[name]):
             rows, columns = choice.dims
             over = " and ".join(_left(variables[name].dims, choice.index)) or "none"
             raise OptionError(
@@ -150,7 +152,7 @@ def with_attributes(dataset: Any, choice: Choice, names: Iterable[str]) -> Choic
     return replace(choice, attributes=attributes, nbytes=nbytes)
 
 
-def _fits(variable: Any, choice: Choice) -> bool:
+def fits(variable: Any, choice: Choice) -> bool:
     """Whether a variable lies over the same rows and columns, with or without an axis of components behind them."""
     dims = _left(variable.dims, choice.index)
     return len(dims) <= 3 and set(dims[:2]) == set(choice.dims)
@@ -200,28 +202,29 @@ def others(dataset: Any, choice: Choice) -> list[str]:
     return [
         str(name)
         for name, variable in variables.items()
-        if str(name) not in taken and _numeric(variable) and set(choice.dims) <= set(map(str, variable.dims))
+        if str(name) not in taken and is_numeric(variable) and set(choice.dims) <= set(map(str, variable.dims))
     ]
 
 
 def offered(dataset: Any, choice: Choice) -> list[str]:
     """Give those of `others` that `with_attributes` takes."""
-    return [name for name in others(dataset, choice) if _fits(dataset.variables[name], choice)]
+    return [name for name in others(dataset, choice) if fits(dataset.variables[name], choice)]
 
 
 def _named(source: Source, variables: Mapping[Hashable, Any], key: str) -> str:
     name = str(source.options[key])
-    if name not in variables or not _numeric(variables[name]):
+    if name not in variables or not is_numeric(variables[name]):
         raise OptionError(f"expected {key}= one of {_listing(variables)}, got {name!r}")
     return name
 
 
-def _numeric(variable: Any) -> bool:
+def is_numeric(variable: Any) -> bool:
+    """Whether a variable has numbers, or flags."""
     return variable.dtype.kind in "iuf" or is_flag(variable)
 
 
 def _listing(variables: Mapping[Hashable, Any]) -> str:
-    names = [str(name) for name, variable in variables.items() if _numeric(variable) and variable.size > 1]
+    names = [str(name) for name, variable in variables.items() if is_numeric(variable) and variable.size > 1]
     return ", ".join(names[:_MOST_NAMES] + ["..."] * (len(names) > _MOST_NAMES)) or "nothing"
 
 
@@ -244,7 +247,7 @@ def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tupl
     variables = dataset.variables
     if no_grid is not None:
         on_grids = {name: it for name, it in variables.items() if not no_grid.takes(str(name), it.dims)}
-        if not any(_numeric(it) and sum(length > 1 for length in it.shape) >= 2 for it in on_grids.values()):
+        if not any(is_numeric(it) and sum(length > 1 for length in it.shape) >= 2 for it in on_grids.values()):
             raise FormatError(no_grid.refusal())
         variables = on_grids
     beside = {str(name) for name in dataset.sizes} | coordinates
@@ -253,7 +256,7 @@ def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tupl
     wide = [
         str(name)
         for name, variable in variables.items()
-        if _numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
+        if is_numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
     ]
     letters = letters_of(dataset)
     free = [name for name in wide if name not in beside and name not in letters]
@@ -354,7 +357,7 @@ def _conventional(dataset: Any, main: str, dims: tuple[str, str], index: Mapping
     vectors: dict[str, Found] = {}
     arrays: dict[str, list[Found]] = {"x": [], "y": []}
     for name in dict.fromkeys((*dims, *related["coordinates"], *others)):
-        if name not in variables or not _numeric(variables[name]) or name not in letters:
+        if name not in variables or not is_numeric(variables[name]) or name not in letters:
             continue
         left = set(_left(variables[name].dims, index))
         if left in ({dims[0]}, {dims[1]}):
@@ -365,7 +368,7 @@ def _conventional(dataset: Any, main: str, dims: tuple[str, str], index: Mapping
     places = _Places(vectors.get("x"), vectors.get("y"))
     plain = [
         _found(dataset, dim, dims, index)
-        if dim in variables and _numeric(variables[dim]) and variables[dim].dims == (dim,)
+        if dim in variables and is_numeric(variables[dim]) and variables[dim].dims == (dim,)
         else None
         for dim in dims
     ]

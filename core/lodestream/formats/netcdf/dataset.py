@@ -6,31 +6,32 @@ by pyproj. Values are those that are stored (xarray's ``decode_cf=False``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...coordinates.seams import merge
-from ...scratch import IN_MEMORY, Room, rows_at_once
+from ...scratch import IN_MEMORY, rows_at_once
 from ...surface import Closed, Surface
+from ..longitudes import close_around
 from ..notes import listing, survives
 from ..placed import Coordinate, place
 from ..source import Source, number
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, Found, offered, others
 from .crs import crs_of
-from .geotransform import by_geotransform
-from .names import REFERENCES, associated, axis_words, is_grid_mapping
+from .geotransform import by_geotransform, transform_of
+from .names import REFERENCES, associated, axis_words, is_geographic, is_grid_mapping
 from .single_numbers import SCALARS, names_of_single, number_of
 from .units import Conversion, conversions_of
-from .values import PACKING, RANGES, Values, chosen, is_packed, no_limits, raw_values, values_of
+from .values import PACKING, RANGES, UNWRITTEN, Values, chosen, is_packed, raw_values, unusable, values_of
 
 __all__ = ["attributes_with_limits", "not_taken", "surface_of"]
 
-#: Attributes that say how a file stores values; `Surface` has the values.
-_STORAGE = (*PACKING, *REFERENCES, "ancillary_variables", "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
+#: Attributes that say how a file stores values, which `Surface` has, or name coordinates, which are taken or named.
+_STORAGE = (*PACKING, "coordinates", "grid_mapping", "bounds", "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
 
 
 def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[Surface, list[str]]:
@@ -70,15 +71,23 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
     heights = None if choice.heights is None else reader.values(choice.heights, choice.dims)
     attributes = {name: reader.attribute(name, heights) for name in choice.attributes}
     extras: dict[str, Any] = {"attributes": attributes, "metadata": metadata}
+    transform = transform_of(dataset.variables[mapping].attrs) if mapping else None
     if heights is None:
         points = np.stack(np.broadcast_arrays(*(_plane(axis) for axis in (x, y))), axis=-1)
         surface = merge(Surface(points, **extras), source.closed, room=source.room)
     elif choice.x is None and choice.y is None:
         surface = Surface(heights.array, mask=heights.valid, **extras)
+        if transform is not None:
+            surface.metadata["geotransform"] = transform
+            if is_geographic(metadata.get("crs")) and transform[2] == transform[4] == 0:
+                surface = close_around(surface, (1, transform[1]), source.closed)
     else:
         said = {"closed": source.closed, "room": source.room, **extras}
         surface = place(heights.array, x, y, mask=heights.valid, **said)
-        surface = by_geotransform(surface, heights, dataset.variables[mapping].attrs if mapping else {})
+        reader.check_rounding(str(choice.heights), heights, surface.dtype)
+        if transform is not None:
+            surface, note = by_geotransform(surface, heights, transform)
+            notes += [note] if note else []
     notes += reader.notes + ([] if heights is None else _without_place(heights, x, y))
     return _closed_fields(source, dataset, choice, surface), notes
 
@@ -105,9 +114,14 @@ class _Reader:
     def values(self, name: str, dims: Sequence[str]) -> Values:
         """The values of a variable over these dimensions."""
         values = values_of(chosen(self._dataset.variables[name], self._choice.index), dims, self._source.room)
-        for key in no_limits(self._dataset.variables[name].attrs):
+        for key, words in unusable(self._dataset.variables[name].attrs).items():
             text = text_of(self._dataset.variables[name].attrs[key])[0]
-            self.notes.append(f"{key} of {name} masks nothing, since it is no number or pair of numbers: {text[:40]!r}")
+            self.notes.append(f"{key} of {name} {words}: {text[:40]!r}")
+        if count := _unwritten(values, self._dataset.variables[name].attrs):
+            self.notes.append(
+                f"{number(count)} values of {name} are what NetCDF has where nothing was written, "
+                f"{UNWRITTEN[values.array.dtype.str[1:]]!r}: nodata= makes holes of them"
+            )
         if values.outside:
             self.notes.append(f"{number(values.outside)} values of {name} are outside its valid range, and missing")
         return values
@@ -115,7 +129,7 @@ class _Reader:
     def coordinate(self, found: Found, conversion: Conversion | None = None) -> Coordinate:
         """A coordinate in the unit of the CRS, NaN where it is missing."""
         room = self._source.room
-        values = _with_nan(self.values(found.name, found.dims), room)
+        values = self._with_nan(found.name, self.values(found.name, found.dims))
         if conversion is not None:
             converted = room.empty(values.shape, np.dtype(np.float64))
             for rows in rows_at_once(values.shape):
@@ -132,20 +146,42 @@ class _Reader:
             return values.array
         valid = values.valid if values.valid.ndim == 2 else values.valid.all(axis=2)
         needed = np.ones(valid.shape, np.bool_) if heights is None or heights.valid is None else heights.valid
-        return _with_nan(values, self._source.room) if (needed & ~valid).any() else values.array
+        return self._with_nan(name, values) if (needed & ~valid).any() else values.array
+
+    def check_rounding(self, name: str, values: Values, dtype: np.dtype[Any]) -> None:
+        """Note that values become floats which do not hold all of them, if that is so."""
+        if not _survive(values, dtype):
+            self.notes.append(f"integers of {name} become {dtype}, and the largest are rounded")
+
+    def _with_nan(self, name: str, values: Values) -> NDArray[Any]:
+        """Values with NaN where they are missing: integers as floats of 32 bits, or of 64 if these do not hold them."""
+        array, valid = values.array, values.valid
+        if valid is None or array.dtype.kind == "f":
+            return array
+        dtype = np.dtype(np.float32 if _survive(values, np.dtype(np.float32)) else np.float64)
+        self.check_rounding(name, values, dtype)
+        floats = self._source.room.empty(array.shape, dtype)
+        for rows in rows_at_once(array.shape):
+            floats[rows] = np.where(valid[rows], array[rows], np.nan)
+        return floats
 
 
-def _with_nan(values: Values, room: Room) -> NDArray[Any]:
-    """Values with NaN where they are missing: integers as floats of 32 bits, or of 64 where these do not hold them."""
+def _unwritten(values: Values, attributes: Mapping[str, Any]) -> int:
+    """How many values are those that NetCDF has where nothing was written and the file does not say otherwise."""
+    array = values.array
+    default = UNWRITTEN.get(array.dtype.str[1:])
+    if default is None or {"_FillValue", "missing_value"} & set(attributes) or is_packed(attributes):
+        return 0
+    return sum(int(np.count_nonzero(array[rows] == array.dtype.type(default))) for rows in rows_at_once(array.shape))
+
+
+def _survive(values: Values, dtype: np.dtype[Any]) -> bool:
+    """Whether all values that there are keep their number in another type."""
     array, valid = values.array, values.valid
-    if valid is None or array.dtype.kind == "f":
-        return array
-    strips = list(rows_at_once(array.shape))
-    single = all(survives(array[rows][valid[rows]], np.float32) for rows in strips)
-    floats = room.empty(array.shape, np.float32 if single else np.float64)
-    for rows in strips:
-        floats[rows] = np.where(valid[rows], array[rows], np.nan)
-    return floats
+    if array.dtype.kind == "f" or dtype.kind != "f" or array.dtype.itemsize < dtype.itemsize:
+        return True
+    strips = rows_at_once(array.shape)
+    return all(survives(array[rows] if valid is None else array[rows][valid[rows]], dtype) for rows in strips)
 
 
 def _plane(axis: Coordinate) -> NDArray[Any]:
@@ -199,6 +235,8 @@ def _metadata(
         if letter in conversions:
             attributes = {key: it for key, it in attributes.items() if key not in (*RANGES, "actual_range")}
             attributes["units"] = conversions[letter].unit
+            if str(attributes.get("standard_name", "")).endswith("_angular_coordinate"):
+                del attributes["standard_name"]  # of CF 1.9, for what is an angle no longer
         said |= {f"{letter}#{key}": value for key, value in attributes.items() if not _same(value, usual.get(key))}
     single = [name for name in names_of_single(dataset, choice) if name != mapping]
     numbers = {name: number for name in single if (number := number_of(dataset, name, choice)) is not None}
@@ -244,17 +282,18 @@ def attributes_with_limits(variable: Any) -> dict[str, Any]:
 def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequence[str]) -> list[str]:
     """Variables that say something of the values or of where they lie, and are neither taken nor offered as attributes.
 
-    These are bounds, areas and others along rows or columns; those that the variable names as its coordinates; and of
-    coordinates with one value those that are no numbers, and bounds.
+    These are bounds, areas and others along rows or columns; those that the variable names as its coordinates; of
+    coordinates with one value those that are no numbers, and bounds; and a CRS that the variable does not name.
     """
     variables = dataset.variables
     known = {*others(dataset, choice), *taken, *choice.dims}
     named = associated(dataset, choice.heights)["coordinates"] if choice.heights else []
     bounds = [str(variables[name].attrs.get("bounds", "")) for name in single]
     along = [str(name) for name, it in variables.items() if set(choice.dims) & set(it.dims)]
-    left_out = [name for name in dict.fromkeys((*along, *named)) if not set(variables[name].dims) & set(choice.index)]
-    left_out += [name for name in (*single, *bounds) if name in variables]
-    return [name for name in dict.fromkeys(left_out) if name not in known and not is_grid_mapping(variables[name])]
+    mappings = {str(name) for name in variables if is_grid_mapping(variables[name])}
+    left_out = [name for name in dict.fromkeys((*along, *named, *single, *bounds)) if name in variables]
+    left_out = [name for name in left_out if name not in known | mappings]
+    return left_out + (sorted(mappings) if mappings and not mappings & taken else [])
 
 
 def _closed_fields(source: Source, dataset: Any, choice: Choice, surface: Surface) -> Surface:

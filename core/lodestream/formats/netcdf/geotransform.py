@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,22 @@ from ...scratch import rows_at_once
 from ...surface import Surface
 from .values import Values
 
-__all__ = ["by_geotransform"]
+__all__ = ["by_geotransform", "transform_of"]
+
+#: How far a geotransform may be from coordinates, in cells, until it says something else: files round both.
+_NEAR = 0.01
 
 
-def by_geotransform(surface: Surface, heights: Values, attributes: Mapping[str, Any]) -> Surface:
+def transform_of(attributes: Mapping[str, Any]) -> list[float] | None:
+    """The six numbers of the geotransform in the attributes of a grid mapping; None: it says none."""
+    try:
+        transform = [float(number) for number in str(attributes["GeoTransform"]).split()]
+    except (KeyError, ValueError):
+        return None
+    return transform if len(transform) == 6 and all(map(math.isfinite, transform)) else None
+
+
+def by_geotransform(surface: Surface, heights: Values, transform: list[float]) -> tuple[Surface, str | None]:
     """Give heights the geotransform of their grid mapping, if it says every coordinate bit for bit.
 
     Parameters
@@ -25,37 +38,62 @@ def by_geotransform(surface: Surface, heights: Values, attributes: Mapping[str, 
         Heights over the coordinates of the file, or x, y, z.
     heights : Values
         Those of the file, shape (H, W).
-    attributes : mapping
-        Of the grid mapping.
+    transform : list of float
 
     Returns
     -------
-    Surface
-        The same one where there is no such geotransform.
+    surface : Surface
+        The same one where the geotransform says other coordinates.
+    note : str or None
+        How far it is from them, if that is no rounding. GDAL writes rows from the south beside a geotransform from
+        the north, which says the same; and of a part of a Dataset it is that of the whole.
     """
-    try:
-        transform = [float(number) for number in str(attributes["GeoTransform"]).split()]
-    except (KeyError, ValueError):
-        return surface
-    if len(transform) != 6 or surface.shape != heights.array.shape or not _lies_at(surface, transform):
-        return surface
+    if surface.shape != heights.array.shape:
+        return surface, None
+    height = surface.shape[0]
+    turned = [transform[0] + height * transform[2], transform[1], -transform[2]]
+    turned += [transform[3] + height * transform[5], transform[4], -transform[5]]
+    offsets = _offsets(surface, transform)
+    if any(offsets):
+        near = [it for it in (offsets, _offsets(surface, turned)) if not _is_whole(it)]
+        away = min(max(map(abs, it)) for it in near) if len(near) == 2 else 0.0
+        words = f"left out a GeoTransform that lies elsewhere than x and y, by {away:.3g} cells"
+        return surface, words if away > _NEAR else None
     metadata = {key: value for key, value in surface.metadata.items() if key != "axes"} | {"geotransform": transform}
     points, mask = (surface.points, surface.mask) if surface.points.ndim == 2 else (heights.array, heights.valid)
-    return Surface(points, surface.closed, mask=mask, attributes=surface.attributes, metadata=metadata)
+    attributes = surface.attributes
+    return Surface(points, surface.closed, mask=mask, attributes=attributes, metadata=metadata), None
 
 
-def _lies_at(surface: Surface, transform: list[float]) -> bool:
-    """Whether a geotransform says every coordinate; some rows at a time, of which there may be many."""
+def _is_whole(offsets: Sequence[float]) -> bool:
+    """Whether all points are off by the same whole number of columns and of rows, as those of a part of a grid."""
+    left, right, top, bottom = offsets
+    even = max(right - left, bottom - top) <= _NEAR
+    return even and max(abs(left - round(left)), abs(top - round(top))) <= _NEAR
+
+
+def _offsets(surface: Surface, transform: list[float]) -> tuple[float, float, float, float]:
+    """By how many columns and rows of a geotransform points are off: least and greatest of each."""
+    (_, right_x, down_x), (_, right_y, down_y) = transform[:3], transform[3:]
+    area = right_x * down_y - down_x * right_y
+    if not area:
+        return math.inf, math.inf, math.inf, math.inf
+    ends = [math.inf, -math.inf, math.inf, -math.inf]
     for rows in rows_at_once(surface.shape):
-        told = _of_rows(surface, {"geotransform": transform}, rows)
+        x, y = _of_rows(surface, {"geotransform": transform}, rows)
         if surface.points.ndim == 2:
-            given, valid = _of_rows(surface, surface.metadata, rows), None
+            given = _of_rows(surface, surface.metadata, rows)
+            east, north = given[0] - x, given[1] - y
         else:
-            given = surface.points[rows, :, 0], surface.points[rows, :, 1]
-            valid = None if surface.mask is None else surface.mask[rows]
-        if not all(((a == b) | (False if valid is None else ~valid)).all() for a, b in zip(given, told, strict=True)):
-            return False
-    return True
+            valid = ... if surface.mask is None else surface.mask[rows]
+            points = surface.points[rows].astype(np.float64)[valid]
+            east, north = points[..., 0] - x[valid], points[..., 1] - y[valid]
+        offsets = (down_y * east - down_x * north) / area, (right_x * north - right_y * east) / area
+        for axis, steps in enumerate(offsets):
+            if steps.size:
+                ends[2 * axis] = min(ends[2 * axis], float(steps.min()))
+                ends[2 * axis + 1] = max(ends[2 * axis + 1], float(steps.max()))
+    return ends[0], ends[1], ends[2], ends[3]
 
 
 def _of_rows(surface: Surface, metadata: Mapping[str, Any], rows: slice) -> tuple[NDArray[Any], NDArray[Any]]:

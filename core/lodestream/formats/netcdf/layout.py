@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ...coordinates.coordinate_rules import VALUES
 from ...coordinates.height_fields import coordinates
-from ...coordinates.seams import wrapped
+from ...coordinates.seams import angles_of, wrapped
 from ...errors import FormatError, InputError
 from ...surface import DTYPES, Block, Closed, Surface
 from ..holes import Rows, fill_of
@@ -46,6 +46,7 @@ __all__ = [
     "packing_of",
     "parts_of",
     "said_of",
+    "scale_of",
     "values_of",
 ]
 
@@ -80,9 +81,6 @@ _UNSAFE = re.compile(r"[^\w.+@-]|^[^A-Za-z_]+", re.ASCII)
 
 _EAST = {"standard_name": "longitude", "long_name": "longitude", "units": "degrees_east", "axis": "X"}
 _NORTH = {"standard_name": "latitude", "long_name": "latitude", "units": "degrees_north", "axis": "Y"}
-
-#: What metadata say of angles that were unwrapped.
-_ANGLE = ("channel", "period", "low")
 
 
 def is_ordered(metadata: Mapping[str, Any]) -> bool:
@@ -255,7 +253,9 @@ def _data_parts(grid: Grid) -> tuple[list[Part], set[str]]:
     source = name if isinstance(name, str) and name else "z"
     heights = _free(source, taken)
     unit = grid.metadata.get("unit")
-    attrs = said_of(grid.metadata, source) | ({"units": unit} if isinstance(unit, str) else {})
+    attrs = (
+        said_of(grid.metadata, source) | ({"units": unit} if isinstance(unit, str) else {}) | scale_of(grid.metadata)
+    )
     if grid.channels != 2:
         channel = 2 if grid.channels else None
         parts.append(
@@ -268,6 +268,7 @@ def _data_parts(grid: Grid) -> tuple[list[Part], set[str]]:
         over = (*dims, _free(f"{label}_component", taken)) if components else dims
         lengths = (*shape, components) if components else shape
         said = {} if source in _RESERVED else said_of(grid.metadata, source)  # these tags are those of x and y
+        said |= scale_of(grid.metadata, source)
         parts.append(Part(label, over, lengths, kind, kind, attribute=source, attrs=said, source=source))
     return parts, taken | {"row", "column"} | {source for source, *_ in grid.attributes}
 
@@ -275,7 +276,8 @@ def _data_parts(grid: Grid) -> tuple[list[Part], set[str]]:
 def _points_as_coordinates(grid: Grid) -> list[Part]:
     """x and y of points."""
     dtype = _with_nan(grid.shown) if grid.holes else grid.shown
-    angles = _angles(grid.metadata) if grid.unwrapped else {}
+    given = angles_of(grid.metadata) if grid.unwrapped else []
+    angles = {number: (period, low) for number, period, low in given}
     letters = axis_attributes(grid)
     return [
         Part(
@@ -329,16 +331,6 @@ def _known(name: str, dims: tuple[str, ...], values: NDArray[Any], attrs: Mappin
     rows = values.__getitem__ if dims else lambda _: values
     dtype = values.dtype
     return Part(name, dims, values.shape, dtype, dtype, rows=rows, coordinate=True, attrs=dict(attrs or {}))
-
-
-def _angles(metadata: Mapping[str, Any]) -> dict[int, tuple[float, float]]:
-    """The channels of angles that were unwrapped; whoever made the container may have written anything."""
-    found = {}
-    for angle in given if isinstance(given := metadata.get("angles"), Sequence) else ():
-        if isinstance(angle, Mapping) and all(isinstance(angle.get(key), int | float) for key in _ANGLE):
-            channel, period, low = (angle[key] for key in _ANGLE)
-            found[int(channel)] = float(period), float(low)
-    return found
 
 
 def values_of(block: Block, part: Part, rows: slice = slice(None), fill: Any = None) -> NDArray[Any]:
@@ -425,6 +417,24 @@ def said_of(metadata: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {key: _plain(it) for key, it in said if key not in _NO_ATTRIBUTES and not _NO_NAME.search(key)}
 
 
+def scale_of(metadata: Mapping[str, Any], attribute: str | None = None) -> dict[str, float]:
+    """What stored numbers of a raster, of the heights or of an attribute, are to be multiplied by, and what is added.
+
+    Returns
+    -------
+    dict
+        ``scale_factor`` and ``add_offset``; empty: they are the values.
+    """
+    bands = metadata.get("bands")
+    said: Any = metadata if attribute is None else bands.get(attribute) if isinstance(bands, Mapping) else None
+    if not isinstance(said, Mapping) or not {"scale", "offset"} & set(said):
+        return {}
+    numbers = said.get("scale", 1.0), said.get("offset", 0.0)
+    if not all(isinstance(number, int | float) for number in numbers):
+        return {}
+    return {"scale_factor": float(numbers[0]), "add_offset": float(numbers[1])}
+
+
 def _plain(value: Any) -> Any:
     """A text, a list of texts or numbers, as NetCDF has them; what else JSON can say as a text of it."""
     if isinstance(value, str | int | float | np.ndarray | np.generic) and not isinstance(value, bool):
@@ -443,7 +453,7 @@ def dataset_attributes(grid: Grid) -> dict[str, Any]:
 def axis_attributes(grid: Grid) -> dict[str, dict[str, Any]]:
     """The attributes of x and y: what the conventions say of them, and what a file said (tags ``x#units``, ...)."""
     crs = grid.metadata.get("crs")
-    degrees = {angle["channel"] for angle in grid.metadata.get("angles", ()) if isinstance(angle, Mapping)}
+    degrees = {number for number, *_ in angles_of(grid.metadata)}
     x, y = (said_of(grid.metadata, letter) for letter in "xy")
     if is_rotated(crs):
         return {"x": axis_words("x", crs) | {"axis": "X"} | x, "y": axis_words("y", crs) | {"axis": "Y"} | y}

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from ...container.metadata import packed
+from ...errors import InputError
 from ...surface import Closed, Surface
 from ..notes import warn
 from .attribute_texts import TYPES, text_of
-from .choice import Choice
-from .layout import CONVENTIONS, ORDERED, Grid, Part, axis_attributes, said_of
+from .choice import Choice, is_numeric
+from .layout import CONVENTIONS, ORDERED, Grid, Part, axis_attributes, said_of, scale_of
 from .single_numbers import SCALARS
 
 __all__ = ["MARK", "NUMBERS", "Mark", "in_json", "mark_text"]
@@ -29,6 +31,9 @@ _TOLD = ("geotransform", "grid", "axes", "nodes", "crs", "unit", "tags", "angles
 
 #: Metadata that are true of a grid of the same shape only.
 _OF_THE_SHAPE = ("seam", "dtype", "angles", *ORDERED)
+
+#: Of stored numbers of a raster.
+_SCALE = ("scale", "offset")
 
 #: The owner of the attributes of a file.
 _FILE = "NC_GLOBAL"
@@ -53,6 +58,7 @@ def mark_text(grid: Grid, parts: Sequence[Part], title: str) -> str:
     if tags := _other_tags(grid, parts):
         metadata["tags"] = tags
     mark: dict[str, Any] = {"shape": list(grid.shape), "closed": list(grid.closed), "dims": list(grid.dims)}
+    mark["dtype"] = grid.shown.name
     mark["variable"] = next((part.name for part in parts if part.is_main), None)
     mark["attributes"] = {part.name: part.attribute for part in parts if part.attribute is not None}
     return json.dumps(mark | {"metadata": metadata})
@@ -81,7 +87,7 @@ def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
     texts = tags.get("")
     usual = _of_every_file(grid.metadata)
     told -= {key for key, text in usual.items() if isinstance(texts, Mapping) and texts.get(key) == text}
-    told.discard(f"{_FILE}#Conventions")
+    told -= {f"{_FILE}#Conventions", f"{_FILE}#{MARK}"}  # in whose place stand ours
     plain = {k: v for k, v in texts.items() if k not in told} if isinstance(texts, Mapping) else texts
     return {key: value for key, value in {**tags, "": plain}.items() if value}
 
@@ -101,39 +107,69 @@ class Mark:
         Rows and columns as they were.
     closed : (bool, bool)
     dims : (str, str)
+    dtype : str
+        The type of the points; empty where none is said.
     variable : str or None
         The variable of the heights, or of z.
     attributes : dict of str to str
         Variables of the attributes, with the names that these had.
     metadata : dict
+        Without what coordinates and attributes of the conventions say, which somebody may have changed.
     """
 
     shape: tuple[int, int]
     closed: Closed
     dims: tuple[str, str]
+    dtype: str
     variable: str | None
     attributes: dict[str, str]
     metadata: dict[str, Any]
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any]) -> Mark | None:
-        """That of a Dataset with these attributes; None where there is none, or somebody has changed the text."""
+        """That of a Dataset with these attributes; None where there is none, or the text is another."""
         try:
             mark = json.loads(attributes[MARK])
             (rows, columns), (high, wide), (first, second) = mark["closed"], mark["shape"], mark["dims"]
             names, metadata, variable = dict(mark["attributes"]), dict(mark["metadata"]), mark.get("variable")
-        except (KeyError, TypeError, ValueError, AttributeError, RecursionError):
+            dtype = mark.get("dtype", "")
+            packed(metadata)
+        except (KeyError, TypeError, ValueError, AttributeError, RecursionError, InputError):
             return None
-        texts = (first, second, *names, *names.values(), *([] if variable is None else [variable]))
-        if first == second or not all(isinstance(text, str) for text in texts):
+        texts = (first, second, dtype, *names, *names.values(), *([] if variable is None else [variable]))
+        if not all(isinstance(text, str) for text in texts) or first == second or len({*names.values()}) < len(names):
             return None
-        return cls((high, wide), (bool(rows), bool(columns)), (first, second), variable, names, metadata)
+        metadata = {key: value for key, value in metadata.items() if key not in _TOLD or key == "tags"}
+        return cls((high, wide), (bool(rows), bool(columns)), (first, second), dtype, variable, names, metadata)
 
     def options(self, dataset: Any) -> dict[str, str]:
         """Options that choose the surface in a Dataset which still has it."""
-        if self.variable is not None and self.variable in dataset.variables:
-            return {"variable": self.variable}
-        return {"x": "x", "y": "y"} if self.variable is None and {"x", "y"} <= set(dataset.variables) else {}
+        names = {"x": "x", "y": "y"} if self.variable is None else {"variable": self.variable}
+        return names if all(_is_wide(dataset, name) for name in names.values()) else {}
+
+    def attributes_in(self, dataset: Any) -> list[str]:
+        """The variables of attributes that a Dataset still has."""
+        return [name for name in self.attributes if _is_wide(dataset, name)]
+
+    def unscaled(self, dataset: Any) -> tuple[Any, Mark]:
+        """The Dataset with stored numbers of a raster, of which it and the mark say the same scale.
+
+        Where the Dataset has values instead, since xarray has applied the scale, the mark says it no more.
+        """
+        metadata = dict(self.metadata)
+        for name, attribute in ((self.variable, None), *self.attributes.items()):
+            scale = scale_of(metadata, attribute)
+            attrs = dataset.variables[name].attrs if name is not None and name in dataset.variables else {}
+            if scale and {key: attrs.get(key) for key in scale} == scale:
+                variable = dataset.variables[name].copy(deep=False)
+                variable.attrs = {key: it for key, it in attrs.items() if key not in scale}
+                dataset = dataset.assign({name: variable})
+            elif scale and attribute is None:
+                metadata = {key: it for key, it in metadata.items() if key not in _SCALE}
+            elif scale:
+                of_band = {key: it for key, it in metadata["bands"][attribute].items() if key not in _SCALE}
+                metadata["bands"] = {**metadata["bands"], attribute: of_band}
+        return dataset, replace(self, metadata=metadata)
 
     def is_of(self, choice: Choice) -> bool:
         """Whether the surface that is chosen is the one that the mark is of."""
@@ -200,6 +236,12 @@ class Mark:
             **told,
             **{key: text for key, text in texts.items() if key not in usual or text != text_of(usual[key])[0]},
         }
+
+
+def _is_wide(dataset: Any, name: str) -> bool:
+    """Whether a Dataset has numbers of this name over two dimensions or more."""
+    variable = dataset.variables.get(name)
+    return variable is not None and variable.ndim > 1 and is_numeric(variable)
 
 
 def _in_order(dataset: Any, choice: Choice) -> bool:

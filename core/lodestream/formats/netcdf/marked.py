@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from ...surface import Surface
+import numpy as np
+
+from ...scratch import Room, rows_at_once
+from ...surface import DTYPES, Surface
 from ...text import names_in
+from ..notes import survives
 from ..source import Source
-from .choice import choose, offered, with_attributes
+from .choice import Choice, choose, fits, offered, with_attributes
 from .dataset import not_taken, surface_of
 from .mark import MARK, NUMBERS, Mark
+from .values import chosen
 
 __all__ = ["surface_in"]
 
@@ -19,7 +25,12 @@ _OF_THE_FILE = ("name", "format")
 
 
 def surface_in(
-    source: Source, dataset: Any, format_name: str, *, deflated: bool = False, in_memory: bool = False
+    source: Source,
+    dataset: Any,
+    format_name: str,
+    *,
+    deflated: bool = False,
+    stored: Callable[[Any], Any] | None = None,
 ) -> tuple[Surface, list[str]]:
     """Make a surface of a Dataset, and restore what a mark says of it.
 
@@ -32,17 +43,22 @@ def surface_in(
     format_name : str
     deflated : bool
         Whether values are refused that the file is too small for.
-    in_memory : bool
-        Whether it is a Dataset of a user, of which every variable becomes an attribute unless options name some.
+    stored : callable, optional
+        Of a Dataset of a user, of which every variable becomes an attribute unless options name some: gives a variable
+        of two dimensions or more with the values that its file has. Only what is taken is asked for, so that nothing
+        else is read.
 
     Raises
     ------
     FormatError, OptionError, TooLargeError
         If there is no surface in it, or an option does not fit.
     """
+    in_memory = stored is not None
     mark = Mark.of(dataset.attrs)
-    dataset = dataset.copy(deep=False)
-    dataset.attrs = {key: value for key, value in dataset.attrs.items() if key != MARK}
+    if mark is not None:  # any other text of that name is an attribute like others
+        dataset = dataset.copy(deep=False)
+        dataset.attrs = {key: value for key, value in dataset.attrs.items() if key != MARK}
+        dataset, mark = mark.unscaled(dataset)
     options = {key: value for key, value in source.options.items() if key != "attributes"}
     wanted = names_in(source.options["attributes"]) if "attributes" in source.options else None
     apart: list[str] = []
@@ -52,7 +68,7 @@ def surface_in(
             options |= mark.options(dataset)
         source = replace(source, closed=source.closed or mark.closed_in(dataset))
         # Neither attributes of a surface nor numbers of rows and columns are coordinates, whatever they are called.
-        apart = [name for name in mark.attributes if name in dataset.variables and name not in options.values()]
+        apart = [name for name in mark.attributes_in(dataset) if name not in options.values()]
         numbers = [name for name in NUMBERS if name not in options.values()]
     source = replace(source, options=options)
     read = dataset.drop_vars(numbers, errors="ignore")
@@ -61,9 +77,11 @@ def surface_in(
     names = wanted
     if names is None:
         further = set(offered(read, choice)) - set(apart) if in_memory else set[str]()
-        names = apart if marked or in_memory else []
+        names = [name for name in apart if fits(read.variables[name], choice)] if marked or in_memory else []
         names = [*names, *(name for name in map(str, read.variables) if name in further)]
     choice = with_attributes(read, choice, names)
+    if stored is not None:
+        read = read.assign(_read(read, choice, stored))
     if deflated:
         source.check_expansion(choice.nbytes)
     surface, notes = surface_of(source, read, choice, format_name)
@@ -75,10 +93,39 @@ def surface_in(
     if in_memory:
         metadata = {key: value for key, value in metadata.items() if key not in _OF_THE_FILE}
     if mark is not None and marked:
-        surface.metadata, called = metadata, mark.attributes
+        surface.metadata = metadata
         metadata = mark.restored(surface, dataset, choice)
+        others = set(surface.attributes) - set(mark.attributes)
+        called = {name: text for name, text in mark.attributes.items() if text not in others}
+        surface = _typed(surface, mark.dtype, source.room)
         if not in_memory:  # the name of the surface, not that of the file, unless it had none
             metadata = source.metadata(format_name) | metadata | {"format": format_name}
     attributes = {called.get(name, name): values for name, values in surface.attributes.items()}
     closed = source.closed or surface.closed
     return Surface(surface.points, closed, mask=surface.mask, attributes=attributes, metadata=metadata), notes
+
+
+def _read(dataset: Any, choice: Choice, stored: Callable[[Any], Any]) -> dict[str, Any]:
+    """The variables of a choice, at the places that it has along other dimensions, as their file has them."""
+    places = [found.name for found in (choice.x, choice.y) if found]
+    names = {name for name in (choice.heights, *choice.attributes, *places) if name is not None}
+    wide = [name for name in names if dataset.variables[name].ndim > 1]  # others are as in the file already
+    return {name: stored(chosen(dataset.variables[name], choice.index)) for name in wide}
+
+
+def _typed(surface: Surface, name: str, room: Room) -> Surface:
+    """The points as integers of a type, where all of them are such numbers: floats only stood for what is missing."""
+    block = surface.blocks[0]
+    dtype = np.dtype(name) if name in DTYPES else surface.dtype
+    if dtype.kind not in "iu" or surface.dtype.kind != "f" or block.kept is not None:
+        return surface
+    points = room.empty(block.points.shape, dtype)
+    for rows in rows_at_once(points.shape):
+        valid = ... if block.mask is None else block.mask[rows]
+        known = block.points[rows][valid]
+        if not survives(known, dtype):
+            return surface
+        points[rows] = 0
+        points[rows][valid] = known
+    attributes, metadata = surface.attributes, surface.metadata
+    return Surface(points, surface.closed, mask=surface.mask, attributes=attributes, metadata=metadata)

@@ -45,6 +45,8 @@ _LENGTHS |= {prefix + name: power for prefix, power in _WORDS.items() for name i
 #: Radians of angles.
 _ANGLES = {
     **dict.fromkeys(("rad", "radian"), 1.0),
+    **dict.fromkeys(("mrad", "milliradian"), 1e-3),
+    **dict.fromkeys(("urad", "microradian"), 1e-6),
     **dict.fromkeys(("deg", "degree", "arc_degree", "arcdeg", "°"), math.pi / 180),
     **dict.fromkeys(("gon", "grad"), math.pi / 200),
     **dict.fromkeys(("arc_minute", "arcmin", "arcminute"), math.pi / 10800),
@@ -77,6 +79,8 @@ class Conversion:
 def conversions_of(units: Mapping[str, Any], crs: str | None) -> tuple[dict[str, Conversion], list[str]]:
     """Compare the units of x and y with those of the axes of a CRS.
 
+    Angles of a geostationary projection are as many of its lengths as the satellite is high, as PROJ has it.
+
     Parameters
     ----------
     units : mapping of {"x", "y"} to object
@@ -101,16 +105,13 @@ def conversions_of(units: Mapping[str, Any], crs: str | None) -> tuple[dict[str,
         if not isinstance(text, str) or not text.strip():
             continue
         unit, shown = _unit(text), repr(text.strip()[:40])
-        if unit is not None and unit[0] == angular:
-            factor = unit[1] / size
+        if unit is not None and (unit[0] == angular or (unit[0] and height is not None)):
+            factor = unit[1] * (height if height is not None and unit[0] != angular else 1.0) / size
             if not math.isclose(factor, 1, rel_tol=1e-9):
                 conversions[letter] = Conversion(factor, name)
                 texts.setdefault(f"converted from {shown} to the {name} of the CRS, by {factor:.10g}", []).append(
                     letter
                 )
-        elif unit == (True, 1.0) and height is not None:
-            words = f"angles in radians; metres of the CRS are {height} times as many"
-            texts.setdefault(words, []).append(letter)
         else:
             texts.setdefault(f"in {shown}, which is not converted to the {name} of the CRS", []).append(letter)
     return conversions, [
@@ -118,7 +119,7 @@ def conversions_of(units: Mapping[str, Any], crs: str | None) -> tuple[dict[str,
     ]
 
 
-def _axis_unit(crs: str | None) -> tuple[bool, float, str, Any] | None:
+def _axis_unit(crs: str | None) -> tuple[bool, float, str, float | None] | None:
     """Whether the axes of a CRS are angles, their unit in metres or radians and its name, the height of a satellite."""
     if crs is None:
         return None
@@ -130,7 +131,7 @@ def _axis_unit(crs: str | None) -> tuple[bool, float, str, Any] | None:
         size, name = float(axis.unit_conversion_factor), str(axis.unit_name)
         operation = system.coordinate_operation
         satellite = operation is not None and operation.method_name.lower().startswith("geostationary")
-        height = system.to_cf().get("perspective_point_height") if satellite else None
+        height = float(system.to_cf()["perspective_point_height"]) if satellite else None
     except Exception:  # pyproj is not installed, or does not understand what anybody may have written
         return None
     return (system.is_geographic, size, name, height) if size > 0 else None

@@ -19,14 +19,15 @@ from ...sources import windows
 __all__ = [
     "PACKING",
     "RANGES",
+    "UNWRITTEN",
     "Values",
     "chosen",
     "is_flag",
     "is_packed",
     "limits_of",
-    "no_limits",
     "pieces",
     "raw_values",
+    "unusable",
     "values_of",
 ]
 
@@ -35,6 +36,9 @@ PACKING = ("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsign
 
 #: Attributes that say which values are valid.
 RANGES = ("valid_range", "valid_min", "valid_max")
+
+#: What NetCDF has where nothing was written, in floats (NC_FILL_FLOAT and NC_FILL_DOUBLE of netcdf.h).
+UNWRITTEN = dict.fromkeys(("f4", "f8"), 9.969209968386869e36)
 
 
 @dataclass(frozen=True)
@@ -148,19 +152,29 @@ def limits_of(attributes: Mapping[str, Any]) -> tuple[Any, Any]:
     return low, high
 
 
-def no_limits(attributes: Mapping[str, Any]) -> list[str]:
-    """Find the limits of valid values that are no numbers, or not as many as they should be."""
-    counts = dict.fromkeys(RANGES, 1) | {"valid_range": 2}
-    return [
-        key
-        for key, count in counts.items()
-        if key in attributes and ((it := np.ravel(attributes[key])).dtype.kind not in "iuf" or it.size != count)
-    ]
+def unusable(attributes: Mapping[str, Any]) -> dict[str, str]:
+    """Find the attributes of missing, valid and packed values that are no numbers, or not as many as they should be.
+
+    Returns
+    -------
+    dict of str to str
+        In words, what does not happen for this reason.
+    """
+    single = {"valid_min": "masks", "valid_max": "masks", "scale_factor": "scales", "add_offset": "shifts"}
+    words = {"_FillValue": "masks", "missing_value": "masks", "valid_range": "masks", **single}
+    result = {}
+    for key, verb in words.items():
+        numbers = np.ravel(attributes.get(key, 0))
+        count = 1 if key in single else 2 if key == "valid_range" else numbers.size
+        if key in attributes and (numbers.dtype.kind not in "iuf" or numbers.size != count):
+            pair = " or pair of numbers" if key == "valid_range" else ""
+            result[key] = f"{verb} nothing, since it is no number{pair}"
+    return result
 
 
 def _number(attributes: Mapping[str, Any], key: str, default: float) -> float:
     values = np.ravel(attributes.get(key, default))
-    return float(values[0]) if values.dtype.kind in "iuf" and values.size else default
+    return float(values[0]) if values.dtype.kind in "iuf" and values.size == 1 else default
 
 
 def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]:
@@ -172,8 +186,11 @@ def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]
 
 
 def _like(number: Any, stored: np.dtype[Any], attributes: Mapping[str, Any]) -> Any:
-    """A number of an attribute, as ``_Unsigned`` says if it has the type of the stored integers."""
+    """A number of an attribute in the type of stored floats; of that of stored integers, as ``_Unsigned`` says."""
     number = np.asarray(number).ravel()
+    if stored.kind == "f" and number.dtype.kind in "iuf":
+        with np.errstate(over="ignore"):
+            return number.astype(stored)[0]
     if stored.kind in "iu" and number.dtype.kind in "iu" and number.dtype.itemsize == stored.itemsize:
         return _signed(number, attributes)[0]
     return number[0]
@@ -215,7 +232,8 @@ def _unpacked(stored: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[An
     import xarray
 
     dims = [f"axis_{number}" for number in range(stored.ndim)]
-    packing = {key: attributes[key] for key in PACKING if key in attributes}
+    unused = unusable(attributes)
+    packing = {key: attributes[key] for key in PACKING if key in attributes and key not in unused}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of several fill values
         decoded = xarray.conventions.decode_cf_variable(
