@@ -16,7 +16,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lodestream.container.capacity import memory_limit
 from lodestream.container.metadata import with_notes
@@ -357,7 +357,7 @@ def moved(container: Path, path: Path) -> str:
     return digest.hexdigest()
 
 
-def _read(job: Job, options: dict[str, str]) -> Surface:
+def _read(job: Job, options: dict[str, Any]) -> Surface:
     from lodestream.encoding.losses import at_holes
     from lodestream.formats import read
     from lodestream.scratch import FolderScratch, Room
