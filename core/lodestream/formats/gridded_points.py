@@ -21,7 +21,7 @@ from .notes import listing, warn
 from .placed import Coordinate, place
 from .source import Source, number
 
-__all__ = ["is_whole_grid", "speaks_of_places", "surface"]
+__all__ = ["are_places", "is_whole_grid", "speaks_of_places", "surface"]
 
 _DEGREES = ("lon", "long", "longitude")
 _X = ("x", "easting", "east", "e", *_DEGREES)
@@ -57,6 +57,11 @@ def speaks_of_places(names: Sequence[str]) -> bool:
     """Return whether columns of these names include x and y."""
     words = [name.lower().split("(")[0].split("[")[0].strip() for name in names]
     return any(word in _X for word in words) and any(word in _Y for word in words)
+
+
+def are_places(names: Sequence[str], columns: Sequence[int]) -> bool:
+    """Return whether x or y is among some columns, of such names."""
+    return not set(columns).isdisjoint(_roles(names)[:2])
 
 
 def is_whole_grid(x: Vector, y: Vector) -> bool:

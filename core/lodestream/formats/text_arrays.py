@@ -18,6 +18,7 @@ from ..coordinates.seams import merge
 from ..errors import FormatError, OptionError, TooLargeError
 from ..surface import Surface
 from . import gridded_points
+from .notes import listing, warn
 from .source import Source, number
 
 __all__ = ["MORE", "READ_OPTIONS", "SUFFIXES", "read", "sniff"]
@@ -33,7 +34,8 @@ READ_OPTIONS = {
 _POINTS_SUFFIX = ".xyz"
 
 #: No two ways to match the same text, of which a line of many numbers would have as many as powers of two.
-_NUMBER = rb"[-+]?(?:(?:\d++(?:\.\d*+)?|\.\d++)(?:e[-+]?\d++)?|nan|inf)"
+_MISSING = rb"(?:nan|na|n/a|null)"
+_NUMBER = rb"(?:[-+]?(?:(?:\d++(?:\.\d*+)?|\.\d++)(?:[ed][-+]?\d++)?|inf)|[-+]?" + _MISSING + rb")"
 _BETWEEN = rb"(?:[ \t]*+[,;][ \t]*+|[ \t]++)"
 _LINE = re.compile(rb"[ \t]*+" + _NUMBER + rb"(?:" + _BETWEEN + _NUMBER + rb")*+[ \t,;]*", re.IGNORECASE)
 _MARKED = rb'"[ \t]*+' + _NUMBER + rb'[ \t]*+"'
@@ -42,6 +44,10 @@ _MARKED_COMMA = rb'"[ \t]*+(?:' + _NUMBER + rb'|[-+]?\d*+,\d++)[ \t]*+"'
 _QUOTED = re.compile(_MARKED + rb"(?:" + _BETWEEN + _MARKED + rb")*+", re.IGNORECASE)
 _QUOTED_COMMAS = re.compile(_MARKED_COMMA + rb"(?:[ \t]*+;[ \t]*+" + _MARKED_COMMA + rb")*+", re.IGNORECASE)
 _NAME = re.compile(r"[^\W\d][^,;\"]{0,60}")
+
+#: What numpy does not read as it stands: missing numbers of R and of databases, and exponents of Fortran.
+_WORDS = re.compile(r"(?<![^\s,;])(?:na|n/a|null)(?![^\s,;])", re.IGNORECASE)
+_EXPONENTS = re.compile(r"(?<=[\d.])d(?=[-+]?\d)", re.IGNORECASE)
 
 _HEAD = 4096  # bytes that are looked at to know a format
 _LONGEST_LINE = 64 << 20
@@ -71,6 +77,8 @@ class _Layout:
         Names of the columns, from the line before the first numbers, or the comment before them; empty if it has none.
     heading : bool
         Whether the first line, comments aside, has the names.
+    texts : tuple of int
+        Columns that have texts in the first line below the names: they are left out.
     """
 
     delimiter: str | None
@@ -78,6 +86,12 @@ class _Layout:
     columns: int
     names: tuple[str, ...]
     heading: bool
+    texts: tuple[int, ...] = ()
+
+    @property
+    def numbers(self) -> list[int]:
+        """The columns that are read."""
+        return [column for column in range(self.columns) if column not in self.texts]
 
 
 def sniff(head: bytes, suffix: str) -> bool:
@@ -91,13 +105,15 @@ def sniff(head: bytes, suffix: str) -> bool:
     if lines and len(head) >= _HEAD and not head.endswith((b"\n", b"\r")):
         lines[-1] = re.split(rb"[ \t,;](?=[^ \t,;]*$)", lines[-1])[0]  # cut, perhaps within a number
     if lines and not _has_numbers(lines[0]) and len(lines) > 1:
-        names, numbers = (_words(line, _delimiter(lines[1])) for line in lines[:2])
+        names, words = (_words(line, _delimiter(lines[1])) for line in lines[:2])
         if (
             len(names) < 3
-            or (b'"' not in lines[1] and len(names) != len(numbers))
+            or (b'"' not in lines[1] and len(names) != len(words))
             or not all(map(_NAME.fullmatch, names))
         ):
             return False
+        if _texts(names, words):
+            return True
         lines = lines[1:]
     if not lines or not _has_numbers(lines[0]):
         return False
@@ -141,11 +157,14 @@ def read(source: Source) -> Surface:
     if len(paths) == 1:
         layout = _layout(source.path)
         points = chosen == "points" or (chosen is None and (layout.columns == 3 or bool(layout.names)))
-        shape = (layout.rows, 1, layout.columns) if points else (layout.rows, layout.columns)
+        shape = (layout.rows, 1, len(layout.numbers)) if points else (layout.rows, layout.columns)
         source.check_array(shape, np.dtype(np.float64))
         array = _array(source, source.path, layout)
+        if layout.texts:
+            warn(f"left out columns of texts: {listing(layout.names[column] for column in layout.texts)}")
         if points or (chosen is None and _are_points(layout, array)):
-            return gridded_points.surface(source, array, layout.names)
+            names = [layout.names[column] for column in layout.numbers] if layout.names else ()
+            return gridded_points.surface(source, array, names)
         return Surface(array, metadata=source.metadata("text"))
     arrays = []
     for path in paths:
@@ -167,8 +186,14 @@ def _are_points(layout: _Layout, array: NDArray[np.float64]) -> bool:
 
 
 def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
-    """Return all numbers of a file, shape (line, column); a large array goes where the source has room."""
-    rows, columns = layout.rows, layout.columns
+    """Return all numbers of a file, shape (line, column); a large array goes where the source has room.
+
+    Raises
+    ------
+    FormatError
+        If a line has others; it says which.
+    """
+    rows, columns = layout.rows, len(layout.numbers)
     array = source.empty((rows, columns), np.dtype(np.float64))
     done = 0
     try:
@@ -177,13 +202,41 @@ def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
             lines = _numbers(file, layout)
             while texts := [*islice(lines, _LINES_AT_ONCE)]:
                 # Lines and not the name: numpy would take one for an address, or for that of a compressed file.
-                part = np.loadtxt(texts, np.float64, comments=None, delimiter=layout.delimiter, ndmin=2)
+                part = np.loadtxt(
+                    texts,
+                    np.float64,
+                    comments=None,
+                    delimiter=layout.delimiter,
+                    usecols=layout.numbers if layout.texts else None,
+                    ndmin=2,
+                )
                 array[done : done + len(part)] = part
                 done += len(part)
     except (ValueError, UserWarning) as error:
-        reason = re.sub(r"\s+", " ", str(error))
-        raise FormatError(f"expected {number(rows)} lines of {number(columns)} numbers, got others: {reason}") from None
+        raise _wrong_line(path, layout, str(error)) from None
     return array
+
+
+def _wrong_line(path: Path, layout: _Layout, reason: str) -> FormatError:
+    """Return the refusal of the first line that has not a number in each column that is read."""
+    expected = f"expected {number(layout.columns)} numbers in each line, as in the first"
+    with path.open("rb") as file:
+        heading = layout.heading
+        for place, line in enumerate(_lines(file), 1):
+            text = _stripped(line)
+            if not text or heading:
+                heading = heading and not text
+                continue
+            words = _normalised(text, layout).split(layout.delimiter)
+            if len(words) != layout.columns:
+                return FormatError(f"{expected}, got {number(len(words))} in line {number(place)}")
+            for column in layout.numbers:
+                try:
+                    float(words[column])
+                except ValueError:
+                    word = words[column].strip()[:40]
+                    return FormatError(f"{expected}, got {word!r} in line {number(place)}, column {column + 1}")
+    return FormatError(f"{expected}, got others: {' '.join(reason.split())}")
 
 
 def _numbers(file: IO[bytes], layout: _Layout) -> Iterator[str]:
@@ -192,7 +245,25 @@ def _numbers(file: IO[bytes], layout: _Layout) -> Iterator[str]:
     if layout.heading:
         next(lines)
     for text in lines:
-        yield text.decode("latin-1").replace(",", ".") if layout.delimiter == ";" else text.decode("latin-1")
+        line = _normalised(text, layout)
+        if layout.texts and len(line.split(layout.delimiter)) != layout.columns:  # what numpy sees only without texts
+            raise ValueError
+        yield line
+
+
+def _normalised(line: bytes, layout: _Layout) -> str:
+    """Return a line whose numbers are as numpy reads them; one that is missing is NaN.
+
+    Nothing between delimiters is a missing number where the columns have names. Elsewhere a delimiter may end the line.
+    """
+    text = line.decode("latin-1")
+    text = text.replace(",", ".") if layout.delimiter == ";" else text
+    text = _EXPONENTS.sub("e", _WORDS.sub("nan", text))
+    if layout.delimiter and layout.names:
+        words = text.split(layout.delimiter)
+        if not all(map(str.strip, words)):
+            return layout.delimiter.join(word.strip() or "nan" for word in words)
+    return text
 
 
 def _lines(file: IO[bytes]) -> Iterator[bytes]:
@@ -223,7 +294,10 @@ def _delimiter(line: bytes) -> str | None:
 
 
 def _words(line: bytes, delimiter: str | None) -> list[str]:
-    text = line.decode("utf-8", "replace")
+    try:
+        text = line.decode("utf-8")
+    except UnicodeDecodeError:  # older programs write names so
+        text = line.decode("latin-1")
     return [word.strip().strip('"') for word in text.split(delimiter)]
 
 
@@ -232,6 +306,7 @@ def _layout(path: Path) -> _Layout:
     rows, columns, quoted = 0, 0, False
     delimiter: str | None = None
     names: tuple[str, ...] = ()
+    texts: tuple[int, ...] = ()
     heading, comment = b"", b""
     with path.open("rb") as file:
         for line in _lines(file):
@@ -247,6 +322,7 @@ def _layout(path: Path) -> _Layout:
                 delimiter = _delimiter(text)
                 columns = len(text.split(delimiter.encode() if delimiter else None))
                 names = _names(heading, comment, columns, delimiter)
+                texts = _texts(names, _words(text, delimiter))
                 quoted = b'"' in line
             # A few in quotation marks are names of rows or columns, as R writes them.
             if b'"' in text or quoted != (b'"' in line):
@@ -257,7 +333,23 @@ def _layout(path: Path) -> _Layout:
             raise _quotes(heading)
         words = heading[:60].decode("utf-8", "replace")
         raise FormatError(f"expected numbers in the first line, or a name for each column, got {words!r}")
-    return _Layout(delimiter, rows, columns, names, bool(heading))
+    return _Layout(delimiter, rows, columns, names, bool(heading), texts)
+
+
+def _texts(names: Sequence[str], words: Sequence[str]) -> tuple[int, ...]:
+    """Return the columns that have texts in the first line of points with such names; none if x or y has one, or all.
+
+    Columns with names that do not speak of places are numbers, or the file is no text of ours.
+    """
+    texts = tuple(column for column, word in enumerate(words) if word.strip() and not _is_number(word))
+    able = (
+        texts and len(names) == len(words) and len(words) - len(texts) >= 3 and gridded_points.speaks_of_places(names)
+    )
+    return texts if able and not gridded_points.are_places(names, texts) else ()
+
+
+def _is_number(word: str) -> bool:
+    return _LINE.fullmatch(word.encode()) is not None
 
 
 def _quotes(line: bytes) -> FormatError:

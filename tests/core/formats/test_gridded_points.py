@@ -274,6 +274,64 @@ def test_further_columns_without_names_are_left_out_with_a_note(tmp_path: Path) 
         assert notes == ["left out columns 4, 5: a first line with names makes attributes"]
 
 
+@pytest.mark.parametrize("separator", [",", ";", " "])
+@pytest.mark.parametrize("missing", ["", "NA", "NaN", "n/a", "NULL"])
+def test_missing_heights_in_the_words_of_other_programs(tmp_path: Path, missing: str, separator: str) -> None:
+    if not missing and separator == " ":
+        return  # nothing between spaces is no column
+    points = nodes(9, 7)
+    lines = lines_of(points, separator).splitlines()
+    for line in (0, 11, 62):
+        lines[line] = lines[line].rpartition(separator)[0] + separator + missing
+    surface, notes = read(tmp_path / "a.csv", "\n".join([separator.join("xyz"), *lines]))
+    expected = points[..., 2].copy()
+    expected.flat[[0, 11, 62]] = np.nan
+    np.testing.assert_array_equal(surface.points, expected)
+    assert notes == []
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".xyz", ".csv"])
+def test_exponents_of_fortran(tmp_path: Path, suffix: str) -> None:
+    points = nodes(9, 7)
+    text = "".join(f"{x:.1f} {y:.1f} {z:.8E}\n".replace("E", "D") for x, y, z in points.reshape(-1, 3))
+    surface, _ = read(tmp_path / f"a{suffix}", text)
+    np.testing.assert_array_equal(surface.points, points[..., 2])
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".xyz", ".csv"])
+@pytest.mark.parametrize(("names", "place"), [("x,y,z,label,q", 3), ("date,x,y,z,q", 0), ("x,y,id,z,q", 2)])
+def test_columns_of_texts_are_left_out_with_a_note(tmp_path: Path, suffix: str, names: str, place: int) -> None:
+    points = nodes(9, 7)
+    words = [f"{x:.1f} {y:.1f} {z:.8g} 7".split() for x, y, z in points.reshape(-1, 3)]
+    for number, row in enumerate(words):
+        row.insert(place, "2001-02-03" if number % 2 else "a1")
+    surface, notes = read(tmp_path / f"a{suffix}", "\n".join([names, *map(",".join, words)]))
+    np.testing.assert_array_equal(surface.points, points[..., 2])
+    assert notes == [f"left out columns of texts: {names.split(',')[place]}"]
+    assert (surface.attributes["q"] == 7).all()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_names_with_letters_beyond_ascii(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "a.csv").write_text("x,y,Höhe\n" + lines_of(nodes(9, 7), ","), encoding=encoding)
+    assert formats.read(tmp_path / "a.csv").metadata["variable"] == "Höhe"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        ("372005.5,5812000.5,high", "got 'high' in line 8, column 3"),
+        ("372005.5,5812000.5", "got 2 in line 8"),
+        ("372005.5,5812000.5,1,2", "got 4 in line 8"),
+    ],
+)
+def test_a_wrong_line_is_told_by_its_number(tmp_path: Path, wrong: str, expected: str) -> None:
+    lines = ["# heights", "x,y,z", *lines_of(nodes(9, 7), ",").splitlines()]
+    lines[7] = wrong
+    with pytest.raises(FormatError, match=f"expected 3 numbers in each line, as in the first, {expected}"):
+        read(tmp_path / "a.csv", "\n".join(lines))
+
+
 def test_decimal_commas(tmp_path: Path) -> None:
     points = nodes(9, 7)
     surface, _ = read(tmp_path / "a.txt", lines_of(points, ";").replace(".", ","))
