@@ -95,6 +95,26 @@ def test_each_variable_is_a_container_and_options_hold_for_all(
         assert surface.metadata["name"] == f"D {name}"
 
 
+def test_each_variable_has_the_places_along_the_dimensions_that_it_has(
+    run: Run, dataset: xarray.Dataset, tmp_path: Path
+) -> None:
+    file, folder = tmp_path / "day.nc", tmp_path / "variables"
+    dataset["bed"] = (("lat", "lon"), values(3)[0])
+    dataset["salt"] = (("time", "depth", "lat", "lon"), np.stack([values(4), values(5)], axis=1))
+    dataset["layer"] = (("depth", "lat", "lon"), values(6)[:2])
+    dataset.to_netcdf(file)
+    code, _, stderr = run("encode", file, "--each", f"variable={folder}", "-o", f"time={DATES[2]}", "-o", "at=depth:1")
+    assert code == 0, stderr
+    shown = {surface.metadata["series"]["value"]: heights(surface) for surface in decoded(folder)}
+    expected = {"air": values(1)[2], "wind": values(2)[2], "bed": values(3)[0], "salt": values(5)[2]}
+    expected["layer"] = values(6)[1]
+    assert shown.keys() == expected.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(shown[name], array)
+    code, _, stderr = run("encode", file, "--each", f"variable={folder}", "-o", "at=level:1")
+    assert (code, "expected -o at= with one of depth, lat, lon, time, got 'level'" in stderr) == (1, True), stderr
+
+
 def test_steps_along_any_dimension_with_or_without_a_coordinate(run: Run, tmp_path: Path) -> None:
     array = np.random.default_rng(3).normal(size=(2, 3, ROWS, COLUMNS))
     for number, coords in enumerate([{}, {"level": ("level", [1000.0, 1000.0, 500.5], {"units": "hPa"})}]):

@@ -276,11 +276,11 @@ def _left(dims: tuple[Hashable, ...], index: Mapping[str, int]) -> tuple[str, ..
 def _index(source: Source, dataset: Any, dims: tuple[Hashable, ...]) -> dict[str, int]:
     """Places along dimensions that options name."""
     index: dict[str, int] = {}
-    if "time" in source.options:
+    if moment := str(source.options.get("time", "")):
         times = [str(dim) for dim in dims if is_time(dataset, str(dim))]
         if not times:
             raise OptionError(f"expected no time=, got one: the dimensions are {', '.join(map(str, dims))}")
-        index[times[0]] = _moment(dataset, times[0], str(source.options["time"]))
+        index[times[0]] = _moment(dataset, times[0], moment)
     for part in filter(None, str(source.options.get("at", "")).split(",")):
         name, _, place = part.partition(":")
         if name not in dims:

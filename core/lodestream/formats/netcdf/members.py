@@ -72,10 +72,38 @@ def _variables(source: Source, dataset: Any) -> list[Member]:
     names = fields(dataset)
     if not names:
         raise FormatError("expected variables over two dimensions, got none")
+    places = _places(source, dataset, names)
     return [
-        Member({"variable": name}, "", VARIABLE, index, name, _unit(dataset.variables[name]), name)
+        Member({"variable": name, **places[name]}, "", VARIABLE, index, name, _unit(dataset.variables[name]), name)
         for index, name in enumerate(names)
     ]
+
+
+def _places(source: Source, dataset: Any, names: list[str]) -> dict[str, dict[str, str]]:
+    """Return, of each variable, time= and at= along those dimensions that it has; empty where it has none of them.
+
+    Raises
+    ------
+    OptionError
+        If no variable has a dimension that an option names.
+    """
+    dims = {name: [str(dim) for dim in dataset.variables[name].dims] for name in names}
+    moment = str(source.options.get("time", ""))
+    parts = [part for part in str(source.options.get("at", "")).split(",") if part]
+    timed = {name for name in names if any(is_time(dataset, dim) for dim in dims[name])}
+    if moment and not timed:
+        raise OptionError("expected no time=, got one: no variable has times")
+    every = sorted({dim for listed in dims.values() for dim in listed})
+    for part in parts:
+        if (dim := part.partition(":")[0]) not in every:
+            raise OptionError(f"expected at= with one of {', '.join(every[:_MOST_DIMENSIONS])}, got {dim!r}")
+    places: dict[str, dict[str, str]] = {name: {} for name in names}
+    for name in names:
+        if moment:
+            places[name]["time"] = moment if name in timed else ""
+        if parts:
+            places[name]["at"] = ",".join(part for part in parts if part.partition(":")[0] in dims[name])
+    return places
 
 
 def _told_apart(steps: list[_Step]) -> list[_Step]:
