@@ -147,6 +147,19 @@ describe("messages", () => {
     );
   });
 
+  it("repeat what a stranger sent in printable letters alone, and shortened", () => {
+    for (const order of ["\u007fuality", "ordn\u00fcng", "\u202egnp", "x".repeat(5000)]) {
+      const message = encodable({ type: "open", version: 1, target: { order }, credit: 65536, held: [], token: null });
+      try {
+        parse(message);
+        expect.unreachable();
+      } catch (error) {
+        if (!(error instanceof MessageError)) throw error;
+        expect(error.message).toMatch(/^expected order quality or level, got [ -~]{3,200}$/);
+      }
+    }
+  });
+
   it("are refused as such, whatever the bytes", () => {
     const bytes = fc.oneof(
       fc.uint8Array({ maxLength: 200 }),

@@ -47,7 +47,7 @@ export function makeTarget(options: TargetOptions = {}): Target {
     throw new OptionError(`expected a positive number of seconds, got ${seconds}`);
   }
   if (order !== "quality" && order !== "level") {
-    throw new OptionError(`expected order quality or level, got ${JSON.stringify(order)}`);
+    throw new OptionError(`expected order quality or level, got ${JSON.stringify(String(order).slice(0, 80))}`);
   }
   if (region !== undefined) {
     checkSpans(region);

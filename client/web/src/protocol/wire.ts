@@ -254,7 +254,7 @@ export function parse(message: Uint8Array): Event {
   try {
     return values(type as EventType, fields);
   } catch (error) {
-    if (error instanceof OptionError) throw new MessageError("bad-target", error.message);
+    if (error instanceof OptionError) throw new MessageError("bad-target", escaped(error.message));
     throw error;
   }
 }
@@ -335,6 +335,10 @@ function show(value: unknown): string {
       if (typeof item === "bigint") return String(item);
       return item instanceof Uint8Array ? `${item.length} bytes` : item;
     }) ?? "nothing";
-  const short = told.length > LONGEST ? `${told.slice(0, LONGEST)}...` : told;
-  return short.replace(/[^ -~]/g, (character) => `\\u${character.charCodeAt(0).toString(16).padStart(4, "0")}`);
+  return escaped(told.length > LONGEST ? `${told.slice(0, LONGEST)}...` : told);
+}
+
+/** A text in printable ASCII. */
+function escaped(text: string): string {
+  return text.replace(/[^ -~]/g, (character) => `\\u${character.charCodeAt(0).toString(16).padStart(4, "0")}`);
 }
