@@ -202,7 +202,7 @@ class Target:
         if self.seconds is not None and not self.seconds > 0:
             raise OptionError(f"expected a positive number of seconds, got {self.seconds}")
         if self.order not in ("quality", "level"):
-            raise OptionError(f"expected order quality or level, got {self.order!r}")
+            raise OptionError(f"expected order quality or level, got {str(self.order)[:80]!a}")
         if self.region is not None:
             check_spans(self.region)
         if self.first is not None:
@@ -211,7 +211,7 @@ class Target:
             object.__setattr__(self, "attributes", tuple(names_in(self.attributes)))
         if self.attributes is not None and len(set(self.attributes)) < len(self.attributes):
             name = next(name for name, count in Counter(self.attributes).items() if count > 1)
-            raise OptionError(f"expected each attribute once, got {name[:80]!r} twice")
+            raise OptionError(f"expected each attribute once, got {name[:80]!a} twice")
         if self.channels and self.whole != (None, None):
             raise OptionError("expected either an error of the whole surface or errors of channels, got both")
         if self.channels and self.region is not None:

@@ -208,6 +208,8 @@ def test_what_is_not_a_message_is_refused(message: bytes, expected: str) -> None
     [
         {"level": 1, "max_bytes": 5},
         {"order": "alphabetical"},
+        {"order": "\u202e\x7f" * 2000},
+        {"attributes": ["\u202eh\u00f6he" * 20] * 2},
         {"max_bytes": 0},
         {"until_rms": [-1.0, False]},
         {"channels": [["a", "rms", -1.0]]},
@@ -221,6 +223,8 @@ def test_a_target_that_contradicts_itself_has_a_code_of_its_own(target: dict[str
     with pytest.raises(MessageError) as refused:
         parse(packed(type="open", version=1, credit=1, target=target))
     assert refused.value.code == "bad-target"
+    assert str(refused.value).isascii()
+    assert len(str(refused.value)) < 1000
 
 
 def test_the_longest_list_of_what_is_held_fits_into_a_message() -> None:
