@@ -7,6 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -194,11 +195,14 @@ def read_surface(
     """
     import lodestream as ls
 
-    with option_hints(names), input_files(names) as files, progress_bar(LONG) as bar:
+    with ExitStack() as stack:
+        stack.enter_context(option_hints(names))
+        files = stack.enter_context(input_files(names))
         format_options = checked_options(options.format_options)
         given: dict[str, Any] = {"closed": options.closed, "filename": files.filename}
         given |= {"format_name": options.format_name, "nodata": options.nodata}
         if "remesh" in format_options:  # nothing else takes long before the encoding
+            bar = stack.enter_context(progress_bar(LONG))
             task = bar.add_task("remeshing", total=1.0, figures="")
             given["progress"] = lambda fraction: bar.update(task, completed=fraction)
         if folder is None:
