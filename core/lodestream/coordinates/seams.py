@@ -284,8 +284,10 @@ def shapes_in_files(surface: Surface) -> list[tuple[int, int]]:
 
 def _repeated(surface: Surface) -> list[Closed]:
     """Return for each block whether its first row and its first column are repeated at the end."""
-    seam = surface.metadata.get("seam")
-    words = [seam] if isinstance(seam, str) else [*seam] if isinstance(seam, list | tuple) else []
+    seam = surface.metadata.get("seam") or ()
+    if not isinstance(seam, str | list | tuple):
+        raise InputError(f"expected a seam of words in the metadata, got {seam!a:.80}")
+    words = [seam] if isinstance(seam, str) else [*seam]
     words += [""] * (len(surface.blocks) - len(words))
     return [_AXES.get(str(word), (False, False)) for word in words[: len(surface.blocks)]]
 

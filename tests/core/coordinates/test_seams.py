@@ -200,7 +200,14 @@ def test_angles_that_anybody_has_written_are_refused(said: dict[str, Any]) -> No
         restore(surface)
 
 
-@pytest.mark.parametrize("seam", [5, [[]], [{}], {"a": 1}, [5], ["cols", "rows"]], ids=str)
+@pytest.mark.parametrize("seam", [5, {"a": 1}, True], ids=str)
+def test_a_seam_that_is_no_text_and_no_list_is_refused(seam: Any) -> None:
+    surface = Surface(np.ones((5, 7)), (False, True), metadata={"seam": seam})
+    with pytest.raises(InputError, match="expected a seam of words in the metadata"):
+        restore(surface)
+
+
+@pytest.mark.parametrize("seam", [[[]], [{}], [5], ["cols", "rows"]], ids=str)
 def test_a_seam_that_anybody_has_written_is_none_where_it_is_no_word(seam: Any) -> None:
     surface = Surface(np.ones((5, 7)), (False, True), metadata={"seam": seam})
     assert restore(surface).shape == ((5, 8) if seam == ["cols", "rows"] else (5, 7))
