@@ -136,7 +136,7 @@ def test_what_is_known_only_to_the_reader(plain: str, tmp_path: Path) -> None:
 
 def test_what_cannot_be_read_is_refused(plain: str, text: Path, tmp_path: Path) -> None:
     text.write_text("1 2 3\n4 5\n")
-    with pytest.raises(FormatError, match=r"hill\.txt: expected 2 lines of 3 numbers"):
+    with pytest.raises(FormatError, match=r"hill\.txt: expected 3 numbers in each line, .* got 2 in line 2"):
         sync.upload(plain, text)
     (tmp_path / "a.tif").write_bytes(b"nothing")
     with pytest.raises(FormatError, match=r"a\.tif: expected a file of format"):
