@@ -1,12 +1,8 @@
-"""Draws docs/blocks.png and docs/remeshing.png: ``python -m benchmarks.pictures``.
-
-The first are surfaces of several blocks at four moments, the second triangle meshes that are resampled at three.
-"""
+"""Draws docs/blocks.png, surfaces of several blocks at four moments: ``python -m benchmarks.pictures``."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from tests.core.remesh import scenes
 
 from .arrays import ROOT
 from .render import Camera, Patch, draw
 
-PICTURE, REMESHED = ROOT / "docs" / "blocks.png", ROOT / "docs" / "remeshing.png"
+PICTURE = ROOT / "docs" / "blocks.png"
 DATA = ROOT.parent / "shared" / "data"
 
 _PAPER, _INK, _DIM, _ACCENT = "#0e1216", "#e8e6e1", "#98a2ab", "#e9b44c"
@@ -39,19 +34,18 @@ class Subject:
     Attributes
     ----------
     name, title : str
-        The name is that of a file, or of a generated mesh of the tests.
     axes : (int, int, int)
         Which coordinates run to the right, to the back and up.
     camera : (azimuth, elevation, width over the box's diagonal)
-    until : tuple of float
-        RMS errors over the diagonal of the moments between the first layer and the last.
+    until : (float, float)
+        RMS errors over the diagonal of the second and the third moment; the others are the first layer and the last.
     """
 
     name: str
     title: str
     axes: tuple[int, int, int]
     camera: tuple[float, float, float]
-    until: tuple[float, ...]
+    until: tuple[float, float]
 
 
 SUBJECTS = (
@@ -59,53 +53,32 @@ SUBJECTS = (
     Subject("bamboo_pen.obj", "Bamboo pen holder, 110 blocks", (0, 1, 2), (-62.0, 28.0, 1.02), (2e-2, 1e-3)),
 )
 
-#: Generated ones, and *Spot* by Keenan Crane (CC0).
-MESHES = (
-    Subject("meshes/spot.obj", "Spot, 5,856 triangles", (0, 2, 1), (-35.0, 18.0, 0.86), (4e-3,)),
-    Subject("capsule", "A rough capsule, 1,796 triangles", (0, 1, 2), (-62.0, 24.0, 0.9), (4e-3,)),
-    Subject("double_torus", "A surface of genus 2", (0, 1, 2), (-62.0, 42.0, 0.9), (4e-3,)),
-    Subject("gyroid", "A gyroid, open", (0, 1, 2), (-62.0, 28.0, 1.0), (4e-3,)),
-    Subject("cube", "A cube of 12 triangles", (0, 1, 2), (-62.0, 28.0, 0.9), (4e-3,)),
-    Subject("annulus", "A bent ring, open", (0, 1, 2), (-62.0, 38.0, 0.9), (4e-3,)),
-)
-
 
 def main() -> int:
     """Draw what is there; exit code 1 where a file is not."""
-    files = [subject.name for subject in (*SUBJECTS, *MESHES) if "." in subject.name]
-    missing = [name for name in files if not (DATA / name).exists()]
+    missing = [subject.name for subject in SUBJECTS if not (DATA / subject.name).exists()]
     if missing:
         print(f"expected {', '.join(missing)} in ../{DATA.relative_to(ROOT.parent)}", file=sys.stderr)
         return 1
-    _compose([(subject, *_moments(subject, ls.read(DATA / subject.name))) for subject in SUBJECTS], PICTURE)
-    _compose([(subject, *_moments(subject, _resampled(subject))) for subject in MESHES], REMESHED)
-    for path in (PICTURE, REMESHED):
-        print(f"{path.relative_to(ROOT)}: {path.stat().st_size} bytes")
+    _compose([(subject, *_moments(subject)) for subject in SUBJECTS], PICTURE)
+    print(f"{PICTURE.relative_to(ROOT)}: {PICTURE.stat().st_size} bytes")
     return 0
 
 
-def _resampled(subject: Subject) -> ls.Surface:
-    if subject.name.endswith(".obj"):
-        return ls.read(DATA / subject.name, remesh="yes")
-    points, faces = getattr(scenes, subject.name)()
-    return ls.Surface.from_mesh(points, faces, remesh=True)
-
-
-def _moments(subject: Subject, read: ls.Surface) -> tuple[list[NDArray[np.float32]], list[tuple[str, str]]]:
-    container = ls.encode(read)
+def _moments(subject: Subject) -> tuple[list[NDArray[np.float32]], list[tuple[str, str]]]:
+    container = ls.encode(ls.read(DATA / subject.name))
     decoder = ls.Decoder()
     views = decoder.feed(container)
     assert decoder.header is not None, "the container is whole"
     extent = decoder.header.extent
-    report = read.metadata.get("remesh")
     met = [next(view for view in views if view.rms <= limit * extent) for limit in subject.until]
     chosen = [views[0], *met, views[-1]]
     surfaces = [_places(view.surface(), subject.axes) for view in chosen]
     words = []
     for view in chosen:
-        error = f"RMS error {view.rms / extent:.2%} of the diagonal"
-        if view is views[-1]:
-            error = "every value, bit for bit" if report is None else _distance(report)
+        error = (
+            "every value, bit for bit" if view is views[-1] else f"RMS error {view.rms / extent:.2%} of the diagonal"
+        )
         words.append((f"{view.bytes:,} bytes", error))
     every = np.concatenate([points.reshape(-1, 3) for points in surfaces[-1]])
     low, high = every.min(axis=0), every.max(axis=0)
@@ -113,11 +86,6 @@ def _moments(subject: Subject, read: ls.Surface) -> tuple[list[NDArray[np.float3
     x, y, z = (low + high) / 2
     camera = Camera(azimuth, elevation, (x, y, z), share * float(np.linalg.norm(high - low)))
     return [draw(_patches(blocks, camera), camera, _WIDTH, _HEIGHT) for blocks in surfaces], words
-
-
-def _distance(report: Mapping[str, Any]) -> str:
-    rms = max(report["rms_to_input"], report["rms_from_input"]) / report["diagonal"]
-    return f"complete: {report['blocks']} blocks, {rms:.2%} from the mesh"
 
 
 def _places(surface: ls.Surface, axes: tuple[int, int, int]) -> list[Floats]:
@@ -168,18 +136,16 @@ def _compose(rows: list[tuple[Subject, list[NDArray[np.float32]], list[tuple[str
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.0 * len(rows[0][1]), 3.35 * len(rows)), dpi=100, facecolor=_PAPER)
+    figure = Figure(figsize=(16.0, 3.35 * len(rows)), dpi=100, facecolor=_PAPER)
     FigureCanvasAgg(figure)
-    columns = len(rows[0][1])
-    panels: Any = figure.subplots(len(rows), columns, squeeze=False)
-    margin = 0.15 / len(rows)
-    figure.subplots_adjust(left=0.008, right=0.992, top=1 - margin / 5, bottom=margin, wspace=0.02, hspace=0.2)
+    panels: Any = figure.subplots(len(rows), 4, squeeze=False)
+    figure.subplots_adjust(left=0.008, right=0.992, top=0.985, bottom=0.075, wspace=0.02, hspace=0.2)
     for line, (subject, pictures, words) in zip(panels, rows, strict=True):
         for place, (panel, picture, (size, error)) in enumerate(zip(line, pictures, words, strict=True)):
             panel.set_axis_off()
             panel.imshow(picture, interpolation="antialiased")
             for text, down, colour, points in (
-                (size, -0.015, _ACCENT if place < columns - 1 else _INK, 14.0),
+                (size, -0.015, _ACCENT if place < 3 else _INK, 14.0),
                 (error, -0.105, _DIM, 10.5),
             ):
                 panel.text(

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from ..coordinates.seams import merge
 from ..errors import FormatError, OptionError, TooLargeError
 from ..mesh import Mesh
-from ..mesh.ears import cut_faces
 from ..remesh import RemeshOptions, remesh
 from ..remesh.remeshing import DEFAULT_ERROR
 from ..surface import Surface
@@ -25,7 +24,6 @@ __all__ = [
     "REMESH_OPTIONS",
     "check_corners",
     "check_faces",
-    "cut_faces",
     "grids_or_blocks",
     "pad",
     "polygons_allowed",

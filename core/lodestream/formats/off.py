@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from ..mesh import Mesh
+from ..mesh.ears import cut_faces
 from ..surface import Surface
 from .attributes import COLOR, NORMAL, TEXTURE
-from .meshes import check_corners, check_faces, cut_faces, polygons_allowed, surface_of
+from .meshes import check_corners, check_faces, polygons_allowed, surface_of
 from .source import Source, number
 
 __all__ = ["read", "sniff"]

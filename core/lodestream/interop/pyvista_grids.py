@@ -15,12 +15,13 @@ from ..coordinates.seams import merge
 from ..decoding.decoder import Decoder
 from ..errors import FormatError, InputError, named
 from ..formats.attributes import NORMAL, TEXTURE
-from ..formats.meshes import check_corners, cut_faces, polygons_allowed
+from ..formats.meshes import check_corners, polygons_allowed
 from ..formats.netcdf.mark import MARK
 from ..formats.notes import keep_words, listing, warn
 from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
 from ..formats.vtk.grids import without_hidden
 from ..mesh import Mesh
+from ..mesh.ears import cut_faces
 from ..planning.planner import plan
 from ..surface import Block, Surface
 from ..target import Target

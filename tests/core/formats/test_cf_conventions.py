@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -20,16 +19,11 @@ import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.errors import FormatError, FormatWarning, OptionError
 
-Array = NDArray[Any]
-Opener = Callable[..., ls.Surface]
+from .openers import Opener, by_netcdf, by_xarray, by_zarr, noted
 
+Array = NDArray[Any]
 EAST = {"units": "degrees_east", "standard_name": "longitude"}
 NORTH = {"units": "degrees_north", "standard_name": "latitude"}
-
-
-def _netcdf4(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_netcdf(folder / "a.nc", engine="h5netcdf")
-    return ls.read(folder / "a.nc", **options)
 
 
 def _classic(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
@@ -37,26 +31,8 @@ def _classic(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
     return ls.read(folder / "c.nc", **options)
 
 
-def _zarr(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_zarr(folder / "a.zarr", mode="w", consolidated=False)
-    return ls.read(folder / "a.zarr", **options)
-
-
-def _decoded(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_netcdf(folder / "d.nc", engine="h5netcdf")
-    with xr.open_dataset(folder / "d.nc", engine="h5netcdf") as opened:
-        return ls.Surface.from_xarray(opened, **{"attributes": [], **options})
-
-
-OPENERS = {"netcdf4": _netcdf4, "classic": _classic, "zarr": _zarr, "from_xarray": _decoded}
+OPENERS = {"netcdf4": by_netcdf, "classic": _classic, "zarr": by_zarr, "from_xarray": by_xarray}
 every_opener = pytest.mark.parametrize("opener", OPENERS.values(), ids=OPENERS)
-
-
-def noted(opener: Opener, data: xr.Dataset, folder: Path, **options: Any) -> tuple[ls.Surface, list[str]]:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", FormatWarning)
-        surface = opener(data, folder, **options)
-    return surface, [str(note.message) for note in said]
 
 
 def positions(surface: ls.Surface) -> tuple[Array, Array]:
@@ -108,7 +84,7 @@ def sea(fill: Any, dtype: str = "f4") -> tuple[xr.Dataset, Array]:
 )
 def test_a_fill_value_masks_a_value_and_no_place(tmp_path: Path, opener: Opener, fill: Any, dtype: str) -> None:
     data, land = sea(fill, dtype)
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     assert notes == []
     assert_at(surface, data.lon_rho.values, data.lat_rho.values)
     np.testing.assert_array_equal(np.isnan(heights_of(surface)), land)
@@ -137,7 +113,7 @@ def test_a_height_without_a_place_is_kept_and_told(tmp_path: Path, opener: Opene
     lon = data.lon_rho.values.copy()
     lon[3, 4] = np.nan
     data = data.assign_coords(lon_rho=(data.zeta.dims, lon, EAST))
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     assert notes == ["1 values have no x or y: they are holes until a stream is complete"]
     back = ls.decode(ls.encode(surface))
     for found in (surface, back):
@@ -154,7 +130,7 @@ def test_a_map_can_be_drawn_where_the_source_could(tmp_path: Path, fill: float) 
     from matplotlib import pyplot
 
     data, _ = sea(np.float32(fill))
-    (tmp_path / "a.lode").write_bytes(ls.encode(_netcdf4(data, tmp_path)))
+    (tmp_path / "a.lode").write_bytes(ls.encode(by_netcdf(data, tmp_path)))
     with xr.open_dataset(tmp_path / "a.lode", engine="lode") as back:
         back.zeta.plot(x="x", y="y")
     pyplot.close("all")
@@ -234,7 +210,7 @@ def test_a_crs_comes_from_the_attributes_of_the_conventions(
     data = mapped(kind, said)
     if "other" in said:
         data["other"] = ((), np.int32(0), CONVENTIONS["mercator"])
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     assert_is_crs(pyproj.CRS.from_wkt(surface.metadata["crs"]).to_cf(), kind)
     factor = 35786023.0 if kind == "geostationary" else 1.0  # of angles to metres, as PROJ has it
     assert_at(surface, *np.meshgrid(data.x.values * factor, data.y.values * factor))
@@ -244,7 +220,7 @@ def test_a_crs_comes_from_the_attributes_of_the_conventions(
 
 @pytest.mark.parametrize("kind", ["lambert", "mercator"])
 def test_a_crs_is_the_one_that_gdal_finds(tmp_path: Path, kind: str) -> None:
-    surface = _netcdf4(mapped(kind), tmp_path)
+    surface = by_netcdf(mapped(kind), tmp_path)
     with rasterio.open(tmp_path / "a.nc") as source:
         theirs, transform = pyproj.CRS.from_wkt(source.crs.to_wkt()), source.transform
     np.testing.assert_allclose(surface.metadata["geotransform"], transform.to_gdal())
@@ -262,7 +238,7 @@ def test_a_crs_is_the_one_that_gdal_finds(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize("kind", CONVENTIONS)
 @pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 def test_a_crs_is_written_in_attributes_of_the_conventions(tmp_path: Path, kind: str, suffix: str) -> None:
-    surface, _ = noted(_netcdf4, mapped(kind), tmp_path)
+    surface, _ = noted(lambda: by_netcdf(mapped(kind), tmp_path))
     ls.write(surface, tmp_path / f"out{suffix}")
     opened = (
         xr.open_dataset(tmp_path / "out.nc")
@@ -272,7 +248,7 @@ def test_a_crs_is_written_in_attributes_of_the_conventions(tmp_path: Path, kind:
     with opened as data:
         assert_is_crs(data.spatial_ref.attrs, kind)
         assert_at(surface, *np.meshgrid(data[data.t.dims[1]].values, data[data.t.dims[0]].values))
-    again, _ = noted(lambda *_: ls.read(tmp_path / f"out{suffix}"), surface, tmp_path)  # type: ignore[arg-type]
+    again, _ = noted(lambda: ls.read(tmp_path / f"out{suffix}"))
     assert again.metadata["crs"] == surface.metadata["crs"]
 
 
@@ -311,7 +287,7 @@ def test_a_prime_meridian_that_is_not_named_is_the_one_of_pyproj(
 ) -> None:
     data = mapped(kind)
     data.crs.attrs |= more
-    surface, _ = noted(_classic, data, tmp_path)
+    surface, _ = noted(lambda: _classic(data, tmp_path))
     assert surface.metadata["crs"] == (pyproj.CRS.from_cf(data.crs.attrs) if more else _by_pyproj(kind)).to_wkt()
 
 
@@ -319,14 +295,14 @@ def test_a_prime_meridian_that_is_not_named_is_the_one_of_pyproj(
 def test_half_of_an_ellipsoid_is_what_pyproj_makes_of_it(tmp_path: Path, left: dict[str, Any]) -> None:
     data = mapped("geographic")
     data.crs.attrs = {"grid_mapping_name": "latitude_longitude", **left}
-    surface, _ = noted(_classic, data, tmp_path)
+    surface, _ = noted(lambda: _classic(data, tmp_path))
     assert surface.metadata["crs"] == pyproj.CRS.from_cf(data.crs.attrs).to_wkt()
 
 
 def test_a_grid_mapping_that_nobody_understands_is_told(tmp_path: Path) -> None:
     data = mapped("lambert")
     data.crs.attrs = {"grid_mapping_name": "of_another_planet"}
-    surface, notes = noted(_netcdf4, data, tmp_path)
+    surface, notes = noted(lambda: by_netcdf(data, tmp_path))
     assert "crs" not in surface.metadata
     assert len(notes) == 1
     assert notes[0].startswith("left out the grid mapping crs, which pyproj does not understand:")
@@ -355,7 +331,7 @@ def tripolar(bend: float) -> xr.Dataset:
 @every_opener
 def test_axes_that_lie_elsewhere_are_left_out(tmp_path: Path, opener: Opener) -> None:
     data = tripolar(40)
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     assert_at(surface, data.geolon.values, data.geolat.values, 360)
     assert notes == [
         "x and y are geolon and geolat; left out are xh and yh, which lie elsewhere by more than half a cell"
@@ -365,7 +341,7 @@ def test_axes_that_lie_elsewhere_are_left_out(tmp_path: Path, opener: Opener) ->
 @every_opener
 def test_axes_that_lie_there_are_taken_and_the_others_kept(tmp_path: Path, opener: Opener) -> None:
     data = tripolar(1)
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     east, north = np.meshgrid(data.xh.values, data.yh.values)
     assert_at(surface, east, north, 360)
     assert notes == ["x and y are xh and yh; geolon and geolat are kept as attributes"]
@@ -379,7 +355,7 @@ def test_longitudes_beside_axes_of_a_projection_are_kept(tmp_path: Path, opener:
     data = mapped(kind)
     lon, lat = curvilinear((24, 32))
     data = data.assign_coords(lon=(("y", "x"), lon, EAST), lat=(("y", "x"), lat, NORTH))
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     assert_at(surface, *np.meshgrid(data.x.values, data.y.values))
     assert notes == ["x and y are x and y; lon and lat are kept as attributes"]
     np.testing.assert_array_equal(surface.attributes["lon"], lon)
@@ -412,7 +388,7 @@ def test_the_coordinates_of_wrf_are_found(tmp_path: Path, opener: Opener, mark: 
             f"XLONG{mark}": (dims, lon[None], {"units": "degrees longitude", "stagger": "M"}),
         }
     )
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     assert notes == []
     assert surface.metadata["variable"] == f"HGT{mark}"
     assert_at(surface, lon, lat)
@@ -425,7 +401,7 @@ def test_the_pair_of_the_grid_of_a_variable_is_taken(tmp_path: Path) -> None:
     dims = ("nlat", "nlon")
     data = xr.Dataset({n: (dims, v, EAST if n.endswith("LONG") else NORTH) for n, v in reversed(said.items())})
     data["SST"] = (dims, (lon * lat).astype("f4"), {"coordinates": "ULONG ULAT"})
-    surface, notes = noted(_netcdf4, data, tmp_path, variable="SST")
+    surface, notes = noted(lambda: by_netcdf(data, tmp_path, variable="SST"))
     assert_at(surface, lon + 0.02, lat + 0.02)
     assert notes == ["left out variables of the same grid: TLAT, TLONG; take them with attributes="]
 
@@ -483,11 +459,11 @@ def attribute(data: xr.Dataset, place: str) -> Any:
     return (data[owner] if owner else data).attrs[key]
 
 
-@pytest.mark.parametrize("opener", [_netcdf4, _classic, _decoded])
+@pytest.mark.parametrize("opener", [by_netcdf, _classic, by_xarray])
 @pytest.mark.parametrize("out", ["a.nc", "a.zarr", "xarray", "lode"])
 def test_numbers_of_attributes_stay_numbers(tmp_path: Path, opener: Opener, out: str) -> None:
     data = numbered()
-    surface, notes = noted(opener, data, tmp_path, variable="z", attributes="speed")
+    surface, notes = noted(lambda: opener(data, tmp_path, variable="z", attributes="speed"))
     assert notes == []
     surface = ls.decode(ls.encode(surface))
     found: Any
@@ -524,13 +500,13 @@ def test_numbers_of_attributes_stay_numbers(tmp_path: Path, opener: Opener, out:
         ({"valid_range": [3.0, 28.0], "scale_factor": 0.5, "add_offset": 3.0}, lambda v: (v < 0) | (v > 50)),
     ],
 )
-@pytest.mark.parametrize("opener", [_netcdf4, _zarr, _decoded])
+@pytest.mark.parametrize("opener", [by_netcdf, by_zarr, by_xarray])
 def test_values_outside_the_valid_range_are_missing(
     tmp_path: Path, opener: Opener, said: dict[str, Any], missing: Callable[[Array], Array]
 ) -> None:
     stored = (np.arange(24 * 32) * 7 % 101).reshape(24, 32).astype("i2")
     data = xr.Dataset({"z": (("y", "x"), stored, said)})
-    surface, notes = noted(opener, data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     hidden = missing(stored)
     count = int(hidden.sum())
     if isinstance(said.get("valid_range"), str):
@@ -543,7 +519,7 @@ def test_values_outside_the_valid_range_are_missing(
     np.testing.assert_array_equal(surface.points[mask], expected[mask])
     (folder := tmp_path / "out").mkdir()
     ls.write(surface, folder / "a.nc")
-    again, notes = noted(lambda *_: ls.read(folder / "a.nc"), data, folder)
+    again, notes = noted(lambda: ls.read(folder / "a.nc"))
     # Limits are those of the values that are written.
     assert [note for note in notes if "masks nothing" not in note] == []
     np.testing.assert_array_equal(mask, np.ones(stored.shape, np.bool_) if again.mask is None else again.mask)
@@ -727,7 +703,7 @@ def test_longitudes_come_back_as_the_source_had_them(tmp_path: Path, dtype: str)
     lat = (60 - across * 5 + 2 * np.sin(around / 36 * 2 * np.pi)).astype(dtype)
     z = (around * across).astype("f4")
     data = xr.Dataset({"z": (("j", "i"), z)}, {"lon": (("j", "i"), lon, EAST), "lat": (("j", "i"), lat, NORTH)})
-    surface = _netcdf4(data, tmp_path)
+    surface = by_netcdf(data, tmp_path)
     assert "angles" in surface.metadata
     (tmp_path / "a.lode").write_bytes(ls.encode(surface))
     with xr.open_dataset(tmp_path / "a.lode", engine="lode") as back:

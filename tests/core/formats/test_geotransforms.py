@@ -19,6 +19,8 @@ import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.errors import FormatWarning
 
+from .openers import by_netcdf, by_xarray, by_zarr, noted
+
 pytest.importorskip("h5netcdf")
 
 SHAPE = (18, 36)
@@ -26,30 +28,7 @@ UTM = pyproj.CRS.from_epsg(32633).to_wkt()
 WGS84 = pyproj.CRS.from_epsg(4326).to_wkt()
 
 
-def _netcdf(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_netcdf(folder / "a.nc", engine="h5netcdf")
-    return ls.read(folder / "a.nc", **options)
-
-
-def _zarr(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_zarr(folder / "a.zarr", mode="w", consolidated=False)
-    return ls.read(folder / "a.zarr", **options)
-
-
-def _decoded(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_netcdf(folder / "d.nc", engine="h5netcdf")
-    with xr.open_dataset(folder / "d.nc", engine="h5netcdf") as opened:
-        return ls.Surface.from_xarray(opened, **{"attributes": [], **options})
-
-
-every_opener = pytest.mark.parametrize("opener", [_netcdf, _zarr, _decoded])
-
-
-def noted(make: Callable[[], ls.Surface]) -> tuple[ls.Surface, list[str]]:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", FormatWarning)
-        surface = make()
-    return surface, [str(note.message) for note in said]
+every_opener = pytest.mark.parametrize("opener", [by_netcdf, by_zarr, by_xarray])
 
 
 def heights() -> NDArray[Any]:

@@ -17,6 +17,8 @@ import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
 from lodestream.errors import FormatWarning, InputError
 
+from .openers import by_netcdf, by_zarr
+
 pytest.importorskip("h5netcdf")
 
 EAST = {"units": "degrees_east", "standard_name": "longitude"}
@@ -24,21 +26,11 @@ NORTH = {"units": "degrees_north", "standard_name": "latitude"}
 WGS84 = 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],UNIT["degree",0.0174532925199433]]'
 
 
-def _netcdf(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_netcdf(folder / "a.nc", engine="h5netcdf")
-    return ls.read(folder / "a.nc", **options)
-
-
-def _zarr(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
-    data.to_zarr(folder / "a.zarr", mode="w", consolidated=False)
-    return ls.read(folder / "a.zarr", **options)
-
-
 def _memory(data: xr.Dataset, folder: Path, **options: Any) -> ls.Surface:
     return ls.Surface.from_xarray(data, **options)
 
 
-every_opener = pytest.mark.parametrize("opener", [_netcdf, _zarr, _memory])
+every_opener = pytest.mark.parametrize("opener", [by_netcdf, by_zarr, _memory])
 
 
 def sea(curved: bool = False) -> xr.Dataset:
@@ -178,7 +170,7 @@ def test_attributes_that_have_become_something_else_are_no_attributes(tmp_path: 
     data = surface.to_xarray()
     assert isinstance(data, xr.Dataset)
     for changed in (data.assign(red=data.red.mean("x")), data.assign(red="text"), data.drop_vars("red")):
-        for opener in (_netcdf, _zarr, _memory):
+        for opener in (by_netcdf, by_zarr, _memory):
             with warnings.catch_warnings(record=True) as notes:
                 warnings.simplefilter("always")
                 back = opener(changed, tmp_path)

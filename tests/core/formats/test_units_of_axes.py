@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
-from lodestream.errors import FormatWarning
+
+from .openers import noted
 
 SHAPE = (24, 32)
 
@@ -72,13 +71,6 @@ def _decoded(data: xr.Dataset, folder: Path) -> ls.Surface:
     data.to_netcdf(folder / "a.nc", engine="h5netcdf")
     with xr.open_dataset(folder / "a.nc", engine="h5netcdf", decode_coords="all") as opened:
         return ls.Surface.from_xarray(opened)
-
-
-def noted(make: Callable[[], ls.Surface]) -> tuple[ls.Surface, list[str]]:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", FormatWarning)
-        surface = make()
-    return surface, [str(note.message) for note in said]
 
 
 def positions(surface: ls.Surface) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,10 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
-from lodestream.errors import FormatWarning
 
 from ..surfaces import terrain
 from ..test_non_finite import plane
+from .openers import noted
 
 Array = NDArray[Any]
 
@@ -30,13 +29,6 @@ both = pytest.mark.parametrize("suffix", [".nc", ".zarr"])
 
 def opened(path: Path) -> Any:
     return xr.open_zarr(path) if path.suffix == ".zarr" else xr.open_dataset(path, engine="h5netcdf")
-
-
-def noted(make: Any) -> tuple[Any, list[str]]:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", FormatWarning)
-        result = make()
-    return result, [str(note.message) for note in said]
 
 
 def land() -> NDArray[np.bool_]:
@@ -165,7 +157,7 @@ def test_coordinates_of_one_value_are_written(tmp_path: Path, suffix: str) -> No
 
 def test_coordinates_of_one_value_reach_xarray_and_come_back(tmp_path: Path) -> None:
     surface, _ = noted(lambda: read_single(tmp_path, "file", at="step:1"))
-    data = surface.to_xarray()
+    data: Any = surface.to_xarray()
     assert float(data.tas.time) == 15.5
     assert data.time.attrs["units"] == "days since 2001-01-01"
     assert xr.decode_cf(data).time.values == np.datetime64("2001-01-16T12")

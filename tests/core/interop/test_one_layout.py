@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import FormatWarning
 
+from ..formats.openers import noted
 from ..surfaces import terrain, torus
-from .test_xarray_files import CASES, EAST, NORTH, noted
+from .test_xarray_files import CASES, EAST, NORTH
 
 xr = pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
@@ -309,7 +310,7 @@ def test_a_file_has_the_column_again_that_its_source_repeats(kind: str, suffix: 
     data = xr.Dataset({"z": (("i", "j"), values)}, {"lon": (*places["lon"], EAST), "lat": (*places["lat"], NORTH)})
     surface, _ = noted(lambda: ls.Surface.from_xarray(data))
     assert (surface.shape, surface.closed, surface.metadata["seam"]) == ((24, 32), (False, True), "cols")
-    _, notes = noted(lambda: ls.write(surface, tmp_path / f"a{suffix}"))  # type: ignore[arg-type, return-value]
+    _, notes = noted(lambda: ls.write(surface, tmp_path / f"a{suffix}"))
     assert notes == []
     with opened(tmp_path / f"a{suffix}") as found:
         np.testing.assert_array_equal(found.z.values, values)

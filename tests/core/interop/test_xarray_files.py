@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
-from lodestream.errors import FormatWarning, OptionError
+from lodestream.errors import OptionError
+
+from ..formats.openers import noted
 
 xr = pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
@@ -250,13 +252,6 @@ CASES: dict[str, tuple[Callable[[], Any], dict[str, Any], list[str]]] = {
     "codes": (codes, {}, []),
     "hurricanes": (hurricanes, {"at": "t:1"}, []),
 }
-
-
-def noted(make: Callable[[], ls.Surface]) -> tuple[ls.Surface, list[str]]:
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", FormatWarning)
-        surface = make()
-    return surface, [str(note.message) for note in said]
 
 
 def assert_same(there: ls.Surface, here: ls.Surface) -> None:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from ...errors import FormatError
 from ...mesh import CornerAttribute, Mesh
+from ...mesh.ears import cut_faces
 from ...surface import Surface
 from ..attributes import TEXTURE, group
 from ..connectivity import find_curve
-from ..meshes import check_corners, check_faces, cut_faces, polygons_allowed, surface_of
+from ..meshes import check_corners, check_faces, polygons_allowed, surface_of
 from ..notes import keep_words, warn
 from ..source import Source, number
 from .elements import Lists, Table, read_elements
