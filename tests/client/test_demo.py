@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import subprocess
 import sys
@@ -105,3 +106,13 @@ def test_bilinear_meets_the_nodes_and_their_means() -> None:
     grid = np.array([[0.0, 2.0, 4.0], [10.0, 12.0, 14.0]])
     rows, columns = np.array([0.0, 0.5, 1.0])[:, None], np.array([0.0, 1.5, 2.0])
     assert bilinear(grid, rows, columns).tolist() == [[0.0, 3.0, 4.0], [5.0, 8.0, 9.0], [10.0, 13.0, 14.0]]
+
+
+@pytest.mark.parametrize(
+    ("path", "known"), [("env/bin/lodestream", False), ("env/bin/lodestream", True), ("-c", False)]
+)
+def test_the_program_is_named_as_a_shell_finds_it(monkeypatch: pytest.MonkeyPatch, path: str, known: bool) -> None:
+    module = importlib.import_module("lodestream_client.demo.show")  # the package has a function of this name
+    monkeypatch.setattr(sys, "argv", [path, "demo"])
+    monkeypatch.setattr(module.shutil, "which", lambda name: f"/bin/{name}" if known else None)
+    assert module._program() == ("lodestream" if known or path == "-c" else path)

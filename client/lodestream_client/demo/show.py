@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -110,7 +112,7 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
         paths.append(drawn)
     out.print(cell(f"Written: {', '.join(map(str, paths))}"))
     before = "" if assets() else "make page, and then "
-    out.print(cell(f"See it come into focus in a browser: {before}lodestream view {file}"))
+    out.print(cell(f"See it come into focus in a browser: {before}{_program()} view {file}"))
     if as_json:
         print_json(
             {
@@ -182,6 +184,12 @@ def _errors(points: NDArray[Any], heights: NDArray[np.int16]) -> tuple[float, fl
     """Return the root mean square and the maximum of the differences."""
     difference = points.astype(np.float64) - heights
     return float(np.sqrt((difference**2).mean())), float(np.abs(difference).max())
+
+
+def _program() -> str:
+    """Return what a shell runs this program by: its path, where its folder is not among those that are searched."""
+    path = sys.argv[0]
+    return path if Path(path).name == "lodestream" and shutil.which("lodestream") is None else "lodestream"
 
 
 def _table(moments: Sequence[_Moment], whole: int, shape: tuple[int, int]) -> Table:
