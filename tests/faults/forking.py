@@ -136,7 +136,10 @@ def main() -> None:
     shim: Any = fork_control
     shim._ENVIRONMENT += ("LODE_FAULT_CONTROL", "LODE_FAULT_CALLS")
     # What shim.c asks for: from which lines a call comes. The processes of builds keep this file open, and no other.
-    faulthandler.register(signal.SIGUSR2, ctypes.CDLL(None).lode_calls(), all_threads=False)
+    preloaded = ctypes.CDLL(None)
+    faulthandler.register(signal.SIGUSR2, preloaded.lode_calls(), all_threads=False)
+    if preloaded.lode_leave_signal_stack():
+        raise OSError("expected handlers of signals to leave the stack that faulthandler gave them")
     for line in sys.stdin:
         order = json.loads(line)
         answer = _run(order["run"], order["log"]) if "run" in order else _wait(order["wait"], order["seconds"])

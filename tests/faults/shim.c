@@ -106,6 +106,7 @@ extern int lode_calls(void);
 int lode_calls(void) { return calls; }
 extern const char *lode_place(int number);
 extern size_t lode_size(void);
+extern int lode_leave_signal_stack(void);
 const char *lode_call(int number) { return number < CALL_COUNT ? call_names[number] : NULL; }
 size_t lode_size(void) { return sizeof(struct control); }
 const char *lode_place(int number)
@@ -115,6 +116,15 @@ const char *lode_place(int number)
         return NULL;
     snprintf(name, sizeof name, "%s%s", top_names[number / KIND_COUNT], kind_names[number % KIND_COUNT]);
     return name;
+}
+
+/* For tests/faults/forking.py: handlers of signals then run on the stack of whoever is interrupted. faulthandler has taken
+ * 10 KB of the heap for all of them. A handler that writes (Python's, which wakes a loop) needs more than that here, with
+ * a path and with names of libc that are looked up for the first time, and would overwrite what lies beneath. */
+int lode_leave_signal_stack(void)
+{
+    stack_t none = {.ss_flags = SS_DISABLE};
+    return sigaltstack(&none, NULL);
 }
 
 static void *next(const char *name)
