@@ -28,7 +28,7 @@ _NAME = "surface.lode"
 #: Parameters of `lodestream.read` and of its callers that are no options of any format.
 _NO_OPTIONS = (
     *("path", "closed", "max_vertices", "filename", "allowed", "format_name", "room", "nodata", "progress"),
-    *("folder", "paths", "memory", "by_bands"),
+    *("folder", "paths", "memory", "by_bands", "kept"),
 )
 
 

@@ -27,6 +27,8 @@ __all__ = ["read"]
 
 _HEAD, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+#: Nodes above one another: trimesh walks up from each of them.
+_DEEPEST = 64
 #: Extensions that change nothing about the points; others that a file requires might.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "KHR_xmp")
 
@@ -58,7 +60,8 @@ def read(source: Source) -> Surface:
     check_faces(source, sum(len(part.faces) for part, _ in parts))
     mesh, left_out = _joined([_placed(mesh_of(part), matrix) for part, matrix in parts])
     notes += [f"{listing(left_out)} left out, which some of the meshes lack"] * bool(left_out)
-    extras = scene.get("asset", {}).get("extras")
+    asset = scene.get("asset")
+    extras = asset.get("extras") if isinstance(asset, dict) else None
     words: dict[str, str] = {}
     for key, value in extras.items() if isinstance(extras, dict) else ():
         keep_words(words, str(key), str(value))
@@ -119,6 +122,12 @@ def _check(source: Source, scene: dict[str, Any]) -> list[str]:
         raise FormatError(f"expected GLB without compressed or packed points, got the extension {str(foreign[0])[:60]}")
     if any("uri" in buffer for buffer in _maps(scene, "buffers")):
         raise FormatError("expected GLB that holds its buffers itself, got one that names another file")
+    views: list[Any] = [view.get("byteLength") for view in _maps(scene, "bufferViews")]
+    # trimesh copies each; views of one part of a buffer are rare.
+    if not all(isinstance(length, int) for length in views) or sum(views) > 2 * source.size:
+        raise FormatError(f"expected views of at most twice the {number(source.size)} bytes of the file, got more")
+    if _depth(list(_maps(scene, "nodes"))) > _DEEPEST:
+        raise FormatError(f"expected at most {_DEEPEST} nodes above one another in the scene, got more")
     for accessor in _maps(scene, "accessors"):
         count = accessor.get("count")
         # A value takes a byte at least.
@@ -134,7 +143,26 @@ def _check(source: Source, scene: dict[str, Any]) -> list[str]:
     if _FAN in modes:
         raise FormatError("expected triangles and strips of GLB, got fans")
     notes = ["lines and points of the scene left out"] * any(mode not in (_TRIANGLES, _STRIP) for mode in modes)
+    notes += ["further shapes (morph targets) left out"] * any(primitive.get("targets") for primitive in primitives)
     return notes + ["textures left out"] * bool(scene.get("textures"))
+
+
+def _depth(nodes: list[dict[str, Any]]) -> int:
+    """Return how many nodes stand above one another at most, each counted once; more than the deepest, in circles."""
+    children = [
+        [child for child in listed if isinstance(child, int) and 0 <= child < len(nodes)]
+        if isinstance(listed := node.get("children"), list)
+        else []
+        for node in nodes
+    ]
+    below = {child for listed in children for child in listed}
+    row, seen, depth = [number for number in range(len(nodes)) if number not in below], set[int](), 0
+    while row:
+        depth += 1
+        seen.update(row)
+        row = [child for number in row for child in children[number] if child not in seen]
+        row = list(dict.fromkeys(row))
+    return depth if len(seen) == len(nodes) else _DEEPEST + 1
 
 
 def _simplify(scene: dict[str, Any]) -> None:

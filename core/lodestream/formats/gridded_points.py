@@ -55,13 +55,20 @@ class _Axis:
 
 def speaks_of_places(names: Sequence[str]) -> bool:
     """Return whether columns of these names include x and y."""
-    words = [name.lower().split("(")[0].split("[")[0].strip() for name in names]
+    words = _words(names)
     return any(word in _X for word in words) and any(word in _Y for word in words)
 
 
+def _words(names: Sequence[str]) -> list[str]:
+    """Return names of columns without their units."""
+    return [name.lower().split("(")[0].split("[")[0].strip() for name in names]
+
+
 def are_places(names: Sequence[str], columns: Sequence[int]) -> bool:
-    """Return whether x or y is among some columns, of such names."""
-    return not set(columns).isdisjoint(_roles(names)[:2])
+    """Return whether x or y is among some columns, of such names, or what is called z."""
+    x, y, z = _roles(names)
+    words = _words(names)
+    return not set(columns).isdisjoint([x, y, z] if words[z] in _Z else [x, y])
 
 
 def is_whole_grid(x: Vector, y: Vector) -> bool:
@@ -134,7 +141,7 @@ def surface(source: Source, table: Vector, names: Sequence[str]) -> Surface:
 
 def _roles(names: Sequence[str]) -> tuple[int, int, int]:
     """Return the columns of x, y and z: by their names, else the first three."""
-    words = [name.lower().split("(")[0].split("[")[0].strip() for name in names]
+    words = _words(names)
     if not speaks_of_places(names):
         return 0, 1, 2
     x = next(column for column, word in enumerate(words) if word in _X)

@@ -72,7 +72,8 @@ class _Lines:
     def __init__(self, source: Source) -> None:
         content = source.path.read_bytes().replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         keyword = _KEYWORD.match(content)
-        assert keyword is not None  # or it would not have been taken for OFF
+        if keyword is None:  # it was taken for OFF by its first bytes alone, with other ends of lines
+            raise FormatError("expected a line with OFF at the beginning, got another")
         self.texture, self.colours, self.normals = (part is not None for part in keyword.groups()[:3])
         if keyword[4] or keyword[5]:
             raise FormatError(f"expected OFF of three dimensions, got {keyword[0].split()[-1].decode('ascii')}")

@@ -254,7 +254,7 @@ def _numbers(file: IO[bytes], layout: _Layout) -> Iterator[str]:
 def _normalised(line: bytes, layout: _Layout) -> str:
     """Return a line whose numbers are as numpy reads them; one that is missing is NaN.
 
-    Nothing between delimiters is a missing number where the columns have names. Elsewhere a delimiter may end the line.
+    Nothing between delimiters is a missing number where the columns have names.
     """
     text = line.decode("latin-1")
     text = text.replace(",", ".") if layout.delimiter == ";" else text
@@ -278,7 +278,7 @@ def _lines(file: IO[bytes]) -> Iterator[bytes]:
 def _stripped(line: bytes) -> bytes:
     """Return a line without comment, white space at its ends, and quotation marks around all of its numbers."""
     text = line.strip()
-    text = b"" if text.startswith(_COMMENT) else text.split(b"#")[0].rstrip()
+    text = b"" if text.startswith(_COMMENT) else text.partition(b"#")[0].rstrip()
     quoted = text.startswith(b'"') and (_QUOTED.fullmatch(text) or _QUOTED_COMMAS.fullmatch(text))
     return text.replace(b'"', b"") if quoted else text
 
@@ -337,7 +337,7 @@ def _layout(path: Path) -> _Layout:
 
 
 def _texts(names: Sequence[str], words: Sequence[str]) -> tuple[int, ...]:
-    """Return the columns that have texts in the first line of points with such names; none if x or y has one, or all.
+    """Return the columns that have texts in the first line of points with such names; none if x, y or z has one.
 
     Columns with names that do not speak of places are numbers, or the file is no text of ours.
     """

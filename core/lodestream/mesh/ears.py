@@ -11,8 +11,9 @@ from ..errors import FormatError
 
 __all__ = ["cut_faces", "cut_polygons"]
 
-#: Corners of a polygon that is not convex: cutting it takes time with their square, and at worst with their cube.
-_MOST_CORNERS = 1000
+#: Corners of a polygon that is not convex, and steps for all of them: cutting one takes time with the cube of its
+#: corners at worst, and as much as 10,000 steps for each of them in any case. So many steps are some 100 seconds.
+_MOST_CORNERS, _CORNER, _MOST_STEPS = 1000, 10_000, 10**10
 #: Ears that are looked at together.
 _TRIED = 16
 #: A polygon is convex if it turns to the left at each corner by more than this, as the sine of an angle.
@@ -45,8 +46,9 @@ def cut_faces(
     Raises
     ------
     FormatError
-        If a face that is not convex has more than 1,000 corners.
+        If a face that is not convex has more than 1,000 corners, or there are too many such faces.
     """
+    left = _MOST_STEPS
     starts = np.cumsum(counts) - counts
     rows: list[_Integers] = [np.empty((0, 4), np.int64)]
     parents: list[_Integers] = [np.empty(0, np.int64)]
@@ -54,8 +56,9 @@ def cut_faces(
         faces = np.flatnonzero(counts == count)
         around = starts[faces][:, np.newaxis] + np.arange(count)
         if count > 4:
-            cut = cut_polygons(points[corners[around]]).reshape(len(faces), -1)
-            around = np.take_along_axis(around, cut, axis=1).reshape(-1, 3)
+            cut, steps = _cut(points[corners[around]], left)
+            left -= steps
+            around = np.take_along_axis(around, cut.reshape(len(faces), -1), axis=1).reshape(-1, 3)
         rows.append(np.pad(around, ((0, 0), (0, 4 - around.shape[1])), constant_values=-1))
         parents.append(np.repeat(faces, len(around) // len(faces)))
     parent = np.concatenate(parents)
@@ -82,8 +85,13 @@ def cut_polygons(polygons: NDArray[np.generic]) -> _Integers:
     Raises
     ------
     FormatError
-        If a polygon that is not convex has more than 1,000 corners.
+        If a polygon that is not convex has more than 1,000 corners, or there are too many such polygons.
     """
+    return _cut(polygons, _MOST_STEPS)[0]
+
+
+def _cut(polygons: NDArray[np.generic], most: int) -> tuple[_Integers, int]:
+    """Cut polygons in at most so many steps; return the triangles, and the steps."""
     count = polygons.shape[1]
     second = np.arange(1, count - 1)
     fan = np.stack([np.zeros_like(second), second, second + 1], axis=-1)
@@ -91,13 +99,20 @@ def cut_polygons(polygons: NDArray[np.generic]) -> _Integers:
     flat = _in_plane(polygons.astype(np.float64))
     before, after = flat - np.roll(flat, 1, axis=1), np.roll(flat, -1, axis=1) - flat
     length = np.linalg.norm(before, axis=2) * np.linalg.norm(after, axis=2)
-    for number in np.flatnonzero((_cross(before, after) <= _TURN * length).any(axis=1)).tolist():
-        if count > _MOST_CORNERS:
-            raise FormatError(
-                f"expected faces that are convex or have at most {_MOST_CORNERS:,} corners, got one of {count:,}"
-            )
+    concave = np.flatnonzero((_cross(before, after) <= _TURN * length).any(axis=1)).tolist()
+    if concave and count > _MOST_CORNERS:
+        raise FormatError(
+            f"expected faces that are convex or have at most {_MOST_CORNERS:,} corners, got one of {count:,}"
+        )
+    steps = len(concave) * (count**3 + _CORNER * count)
+    if steps > most:
+        raise FormatError(
+            f"expected fewer faces that are not convex, or with fewer corners, got {len(concave):,} of {count:,}: "
+            "cut them into triangles with another program"
+        )
+    for number in concave:
         result[number] = list(_ears(flat[number]))
-    return result
+    return result, steps
 
 
 def _in_plane(polygons: _Floats) -> _Floats:

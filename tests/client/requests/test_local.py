@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,8 +13,10 @@ import pytest
 
 import lodestream as ls
 import lodestream_client as client
+from lodestream.encoding.reading import read_into
 from lodestream.errors import FormatError, FormatWarning, OptionError, RemoteError
 from lodestream_client import sync
+from lodestream_client.requests import local
 from lodestream_client.requests.api import Description
 from lodestream_client.requests.bodies import Source
 from lodestream_server import running_server
@@ -112,6 +115,13 @@ def test_all_options_are_kept(plain: str, text: Path) -> None:
         sync.upload(plain, text, options={"band": "1"})
     with pytest.raises(OptionError, match="room is not an option of any format"):
         sync.upload(plain, text, options={"room": "1"})
+
+
+def test_no_parameter_of_a_reader_is_an_option_of_a_format() -> None:
+    parameters = [it for reader in (ls.read, read_into) for it in inspect.signature(reader).parameters.values()]
+    for name in {it.name for it in parameters if it.kind is not it.VAR_KEYWORD} - {"more"}:
+        with pytest.raises(OptionError, match=f"{name} is not an option of any format"):
+            local.checked_options({name: "1"})
 
 
 def test_several_files_are_one_surface(plain: str, tmp_path: Path) -> None:

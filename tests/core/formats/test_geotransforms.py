@@ -114,6 +114,19 @@ def test_a_geotransform_of_other_cells_is_named(tmp_path: Path, opener: Callable
     assert notes == ["left out a GeoTransform that lies elsewhere than x and y, by 17.8 cells"]
 
 
+@every_opener
+@pytest.mark.parametrize("transform", [[0, 1e200, 0, 0, 0, 1e200], [0.0] * 6, [1e308, 1e308, 0, 1e308, 0, -1e308]])
+def test_a_geotransform_that_no_raster_has_is_left_out(
+    tmp_path: Path, opener: Callable[..., ls.Surface], transform: list[float]
+) -> None:
+    x, y = centres([500000.0, 32.0, 0.0, 4100000.0, 0.0, -32.0])
+    data = mapped(transform).assign_coords(x=x[0], y=y[:, 0])
+    surface, notes = noted(lambda: opener(data, tmp_path))
+    np.testing.assert_array_equal(coordinates(surface)[0], x)
+    assert len(notes) == 1
+    assert "left out a GeoTransform" in notes[0]
+
+
 @pytest.mark.parametrize("bottom_up", ["YES", "NO"])
 def test_rows_from_the_south_as_gdal_writes_them_need_no_note(tmp_path: Path, bottom_up: str) -> None:
     transform = rasterio.transform.Affine(30, 0, 500000, 0, -30, 4100000)

@@ -157,7 +157,23 @@ REFUSED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     ),
     "a view beyond the end": (
         lambda content: changed(content, lambda scene: scene["bufferViews"][0].update(byteLength=10**12)),
-        "expected GLB that trimesh reads, got one where it says AssertionError",
+        "expected views of at most twice",
+    ),
+    "views of the same bytes": (
+        lambda content: changed(content, lambda scene: scene["bufferViews"].extend(scene["bufferViews"] * 99)),
+        "expected views of at most twice the [0-9,]+ bytes of the file",
+    ),
+    "a view of no length": (
+        lambda content: changed(content, lambda scene: scene["bufferViews"][0].pop("byteLength")),
+        "expected views of at most",
+    ),
+    "a tall scene": (
+        lambda content: changed(content, _set("nodes", [{"mesh": 0, "children": [k + 1]} for k in range(99)])),
+        "expected at most 64 nodes above one another",
+    ),
+    "nodes in a circle": (
+        lambda content: changed(content, _set("nodes", [{"mesh": 0, "children": [1]}, {"children": [0]}])),
+        "expected at most 64 nodes above one another",
     ),
     "fans": (
         lambda content: changed(content, lambda scene: scene["meshes"][0]["primitives"][0].update(mode=6)),
@@ -187,6 +203,22 @@ def test_what_would_be_read_wrongly_or_without_limit_is_refused(case: str, tmp_p
     with pytest.raises(ls.FormatError, match=words) as caught:
         ls.read(tmp_path / "a.glb")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("asset", [[], "x", None, 5, {"extras": 5}])
+def test_an_asset_that_is_no_map_says_nothing(tmp_path: Path, asset: object) -> None:
+    (tmp_path / "a.glb").write_bytes(changed(glb(torus()), _set("asset", asset)))
+    assert sorted(ls.read(tmp_path / "a.glb").shape) == [12, 16]
+
+
+def test_further_shapes_are_left_out_with_a_note(tmp_path: Path) -> None:
+    def add(scene: dict[str, Any]) -> None:
+        primitive = scene["meshes"][0]["primitives"][0]
+        primitive["targets"] = [{"POSITION": primitive["attributes"]["POSITION"]}]
+
+    (tmp_path / "a.glb").write_bytes(changed(glb(torus()), add))
+    with pytest.warns(ls.FormatWarning, match=r"further shapes \(morph targets\) left out"):
+        ls.read(tmp_path / "a.glb")
 
 
 def test_a_mesh_at_many_places_counts_as_often(tmp_path: Path) -> None:

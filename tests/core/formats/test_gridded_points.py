@@ -317,6 +317,18 @@ def test_names_with_letters_beyond_ascii(tmp_path: Path, encoding: str) -> None:
     assert formats.read(tmp_path / "a.csv").metadata["variable"] == "Höhe"
 
 
+def test_heights_of_which_the_first_is_a_text_are_not_left_out(tmp_path: Path) -> None:
+    lines = lines_of(nodes(9, 7), ",").splitlines()
+    rows = [f"{line},7" for line in lines]
+    rows[0] = rows[0].replace(lines[0].split(",")[2], "*")
+    with pytest.raises(FormatError):
+        read(tmp_path / "a.csv", "\n".join(["x,y,height,count", *rows]))
+    # Without a column that is called so, the first numbers behind x and y are what there is.
+    words = [",".join([*line.split(",")[:2], "a", line.split(",")[2]]) for line in lines]
+    surface, notes = read(tmp_path / "a.csv", "\n".join(["x,y,label,level", *words]))
+    assert (surface.metadata["variable"], notes) == ("level", ["left out columns of texts: label"])
+
+
 @pytest.mark.parametrize(
     ("wrong", "expected"),
     [

@@ -108,6 +108,10 @@ def test_what_would_take_long_is_refused() -> None:
     assert cut_polygons(disc[np.newaxis]).shape == (1, 4998, 3)
     with pytest.raises(FormatError, match="at most 1,000 corners, got one of 5,000"):
         cut_polygons(star(5000, 0)[np.newaxis])
+    stars = np.concatenate([star(900, 0), star(800, 0)])
+    counts = np.array([900, 800] * 9)
+    with pytest.raises(FormatError, match="expected fewer faces that are not convex, or with fewer corners"):
+        cut_faces(stars, counts, np.tile(np.arange(1700), 9))
 
 
 def test_a_list_of_faces_is_refused_by_what_is_wrong_with_it() -> None:

@@ -237,6 +237,7 @@ def test_off_colours(tmp_path: Path) -> None:
         ("OFF\n2 1 0\n0 0 0\n1 0 0\n5 0 1 0 1 0\n", r"expected faces of 3 or 4 corners, got 5 in line 5; remesh=yes"),
         ("OFF\n2 2 0\n0 0 0\n1 0 0\n3 0 1 1\n", r"expected 2 lines of faces, got 1"),
         ("OFF\n2 1 0\n0 0 0\n1 0 0\n3 0 1 1\n7\n", r"line 6: expected the end of the file after its faces, got '7'"),
+        ("#\rXYZ\nOFF\n1 1 0\n0 0 0\n3 0 0 0\n", "expected a line with OFF at the beginning, got another"),
         ("COFF\n1 1 0\n0 0 0 1 1\n3 0 0 0\n", r"line 3: expected a vertex with a colour of 3 or 4 numbers"),
         ("OFF\n0 0 0\n# nothing at all\n", "expected at least one vertex, got none"),
     ],

@@ -68,15 +68,19 @@ def by_geotransform(surface: Surface, heights: Values, transform: list[float]) -
 def _is_whole(offsets: Sequence[float]) -> bool:
     """Whether all points are off by the same whole number of columns and of rows, as those of a part of a grid."""
     left, right, top, bottom = offsets
-    even = max(right - left, bottom - top) <= _NEAR
+    even = all(map(math.isfinite, offsets)) and max(right - left, bottom - top) <= _NEAR
     return even and max(abs(left - round(left)), abs(top - round(top))) <= _NEAR
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _offsets(surface: Surface, transform: list[float]) -> tuple[float, float, float, float]:
-    """By how many columns and rows of a geotransform points are off: least and greatest of each."""
+    """By how many columns and rows of a geotransform points are off: least and greatest of each.
+
+    A geotransform of absurd numbers overflows, and is off by an infinite number.
+    """
     (_, right_x, down_x), (_, right_y, down_y) = transform[:3], transform[3:]
     area = right_x * down_y - down_x * right_y
-    if not area:
+    if not area or not math.isfinite(area):
         return math.inf, math.inf, math.inf, math.inf
     ends = [math.inf, -math.inf, math.inf, -math.inf]
     for rows in rows_at_once(surface.shape):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...errors import FormatError, TooLargeError
 from ...mesh import CornerAttribute, Mesh
-from ...mesh.ears import cut_polygons
+from ...mesh.ears import cut_faces
 from ..attributes import COLOR, NORMAL, TEXTURE
 from ..meshes import check_corners, check_faces, polygons_allowed
 from ..notes import keep_words
@@ -303,7 +303,13 @@ class ObjFile:
 
     def _cuts(self, points: NDArray[np.float64], corners: NDArray[np.int32]) -> list[NDArray[np.int64]]:
         """How each fan is to be cut, now that all points are known: (N - 2, 3) places among its N corners."""
-        return [cut_polygons(points[_around(corners, first, count)][np.newaxis])[0] for first, count in self._fans]
+        if not self._fans:
+            return []
+        counts = np.array([count for _, count in self._fans], np.int64)
+        around = np.concatenate([_around(corners, first, count) for first, count in self._fans])
+        places, fan = cut_faces(points, counts, around)
+        starts = np.cumsum(counts) - counts
+        return np.split(places[:, :3] - starts[fan][:, np.newaxis], np.cumsum(counts - 2)[:-1])
 
     def _cut(self, rows: NDArray[np.int32], cuts: list[NDArray[np.int64]]) -> None:
         for (first, count), cut in zip(self._fans, cuts, strict=True):
