@@ -167,32 +167,32 @@ static enum outcome read_large(const struct run *run, const struct tiles *tiles,
     return done ? DONE : PAUSED;
 }
 
-int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
-                    int64_t runs_count, int32_t *known, int64_t known_count, int8_t *sign, int64_t sign_count,
-                    uint8_t *flags, int64_t flags_count, uint8_t *early, int64_t early_count, const int32_t *truth,
-                    int64_t truth_count, int32_t *models, int64_t models_count, uint8_t *data, int64_t data_count,
-                    double *costs, int64_t costs_count, uint16_t *symbols, int64_t symbols_count, int64_t *state,
-                    int64_t state_count, int64_t budget) {
-    int64_t model = trellis ? LODE_TRELLIS_MODEL : LODE_MODEL, all = runs_count / LODE_RUN_FIELDS;
-    if (bands_count % BAND_FIELDS || runs_count % LODE_RUN_FIELDS || sign_count != known_count ||
-        early_count != known_count || (!reads && truth_count != known_count) || models_count % model ||
-        state_count != LODE_PASSES_STATE || state[AT_RUN] < 0 || state[AT_RUN] > all || budget < 1)
+int64_t lode_passes(int64_t reads, int64_t trellis, const struct lode_passes *arguments) {
+    const struct lode_passes call = *arguments;
+    int64_t budget = call.budget;
+    int64_t model = trellis ? LODE_TRELLIS_MODEL : LODE_MODEL, all = call.runs_count / LODE_RUN_FIELDS;
+    if (call.bands_count % BAND_FIELDS || call.runs_count % LODE_RUN_FIELDS || call.sign_count != call.known_count ||
+        call.early_count != call.known_count || (!reads && call.truth_count != call.known_count) ||
+        call.models_count % model || call.state_count != LODE_PASSES_STATE || call.state[AT_RUN] < 0 ||
+        call.state[AT_RUN] > all || budget < 1)
         return LODE_REFUSED;
-    struct position at = {state[AT_RUN], state[AT_PASSES], state[AT_BAND], state[AT_BLOCK],
-                          (int)(state[AT_TRELLIS] & (TRELLIS_STATES - 1))};
+    struct position at = {call.state[AT_RUN], call.state[AT_PASSES], call.state[AT_BAND], call.state[AT_BLOCK],
+                          (int)(call.state[AT_TRELLIS] & (TRELLIS_STATES - 1))};
     for (; at.run < all && budget > 0; at = (struct position){at.run + 1, 0, 0, 0, 0}) {
-        int64_t *fields = runs + at.run * LODE_RUN_FIELDS;
+        int64_t *fields = call.runs + at.run * LODE_RUN_FIELDS;
         struct run run = run_of(fields);
-        if (!run_fits(&run, bands_count / BAND_FIELDS, models_count / model, data_count, costs_count))
+        if (!run_fits(&run, call.bands_count / BAND_FIELDS, call.models_count / model, call.data_count,
+                      call.costs_count))
             return LODE_REFUSED;
         for (int64_t band = run.band; band < run.band + run.bands; band++)
-            if (!band_fits(bands + band * BAND_FIELDS, known_count, flags_count))
+            if (!band_fits(call.bands + band * BAND_FIELDS, call.known_count, call.flags_count))
                 return LODE_REFUSED;
-        struct tiles tiles = {(uint32_t *)known, sign, flags, early, truth, models + run.model * model};
+        struct tiles tiles = {(uint32_t *)call.known,         call.sign, call.flags, call.early, call.truth,
+                              call.models + run.model * model};
         if (run.large && trellis)
             return LODE_REFUSED;
         if (run.large && reads) {
-            enum outcome outcome = read_large(&run, &tiles, bands, data, &at, state, &budget);
+            enum outcome outcome = read_large(&run, &tiles, call.bands, call.data, &at, call.state, &budget);
             if (outcome == REFUSED)
                 return LODE_REFUSED;
             if (outcome == PAUSED)
@@ -200,22 +200,24 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_
             continue;
         }
         if (run.large) {
-            struct class_output output = {symbols, symbols_count, data + run.start, run.length, costs};
+            struct class_output output = {call.symbols, call.symbols_count, call.data + run.start, run.length,
+                                          call.costs};
             fields[LODE_RUN_LENGTH] = -1;
-            if (run.first >= 0 && run.last == 0 && run.first < costs_count)
-                fields[LODE_RUN_LENGTH] =
-                    lode_class_write(&tiles, bands + run.band * BAND_FIELDS, run.bands, run.first, &output, &budget);
+            if (run.first >= 0 && run.last == 0 && run.first < call.costs_count)
+                fields[LODE_RUN_LENGTH] = lode_class_write(&tiles, call.bands + run.band * BAND_FIELDS, run.bands,
+                                                           run.first, &output, &budget);
             if (fields[LODE_RUN_LENGTH] < 0)
                 return LODE_REFUSED;
             continue;
         }
         struct coder coder;
-        if (!go_on(reads, &run, &at, state, data, &coder))
+        if (!go_on(reads, &run, &at, call.state, call.data, &coder))
             return LODE_REFUSED;
-        if (!code_run(reads, trellis, &coder, &tiles, bands, &run, &at, costs_count ? costs : 0, &budget)) {
-            state[AT_LOW] = (int64_t)coder.low;
-            state[AT_WIDTH] = coder.width;
-            state[AT_PLACE] = coder.place;
+        if (!code_run(reads, trellis, &coder, &tiles, call.bands, &run, &at, call.costs_count ? call.costs : 0,
+                      &budget)) {
+            call.state[AT_LOW] = (int64_t)coder.low;
+            call.state[AT_WIDTH] = coder.width;
+            call.state[AT_PLACE] = coder.place;
             break;
         }
         if (!reads)
@@ -223,10 +225,10 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_
         if (fields[LODE_RUN_LENGTH] < 0)
             return LODE_REFUSED;
     }
-    state[AT_RUN] = at.run;
-    state[AT_PASSES] = at.passes;
-    state[AT_BAND] = at.band;
-    state[AT_BLOCK] = at.block;
-    state[AT_TRELLIS] = at.trellis;
+    call.state[AT_RUN] = at.run;
+    call.state[AT_PASSES] = at.passes;
+    call.state[AT_BAND] = at.band;
+    call.state[AT_BLOCK] = at.block;
+    call.state[AT_TRELLIS] = at.trellis;
     return at.run;
 }

@@ -68,7 +68,7 @@ static int32_t from_sixteenths(int64_t sixteenths, int64_t step) {
 
 /* Bits that are unknown are replaced so that a magnitude lies below the middle of what is possible; `step` 0 is that of
  * no quantiser. */
-static struct rule rule_of(int remaining, int64_t step, bool finer) {
+LODE_INLINE struct rule rule_of(int remaining, int64_t step, bool finer) {
     int begun = remaining >> 1, plane = begun + (remaining & 1);
     int64_t unknown = INT64_C(1) << plane, unit = INT64_C(1) << begun;
     struct rule rule = {
@@ -103,7 +103,7 @@ LODE_INLINE void spread_row(const int32_t *restrict magnitudes, const int8_t *re
     }
 }
 
-static void spread_band(struct places at, struct rule rule) {
+LODE_INLINE void spread_band(struct places at, struct rule rule) {
     for (int64_t i = at.first; i < at.last; i++, at.out += at.pitch) {
         int64_t place = i * at.stride + at.begin, count = at.end - at.begin;
         const int32_t *magnitudes = at.magnitudes + place;
@@ -129,7 +129,7 @@ static bool part_of(int64_t length, int64_t start, int64_t count, int64_t *first
 }
 
 /* A band of indices that are known: the trellis follows them in raster order of blocks, as they were coded. */
-static void spread_trellis(struct places at, int64_t rows, int64_t columns, struct rule rule) {
+LODE_INLINE void spread_trellis(struct places at, int64_t rows, int64_t columns, struct rule rule) {
     int32_t less = (rule.step + 1) / 2;
     for (int64_t top = at.first / BLOCK * BLOCK; top < at.last; top += BLOCK) {
         unsigned state = 0;
@@ -153,48 +153,47 @@ static void clear(struct places at) {
             at.out[j] = 0;
 }
 
-int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
-                    const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,
-                    const int64_t *origins, int64_t origins_count, const int64_t *steps, int64_t steps_count,
-                    const int64_t *numbers, int64_t numbers_count, const int8_t *state, int64_t state_count,
-                    int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch, int64_t first_row,
-                    int64_t first_column) {
-    if (sign_count != known_count || early_count != known_count || bands_count != steps_count * BAND_FIELDS ||
-        origins_count != steps_count * ORIGIN_FIELDS || (rows > 1 && pitch < columns) || first_row < 0 ||
-        first_row > INT32_MAX || first_column < 0 || first_column > INT32_MAX)
+int64_t lode_spread(const struct lode_spread *arguments) {
+    const struct lode_spread call = *arguments;
+    if (call.sign_count != call.known_count || call.early_count != call.known_count ||
+        call.bands_count != call.steps_count * BAND_FIELDS || call.origins_count != call.steps_count * ORIGIN_FIELDS ||
+        (call.rows > 1 && call.pitch < call.columns) || call.first_row < 0 || call.first_row > INT32_MAX ||
+        call.first_column < 0 || call.first_column > INT32_MAX)
         return LODE_REFUSED;
-    for (int64_t i = 0; i < numbers_count; i++) {
-        if (numbers[i] < 0 || numbers[i] >= steps_count)
+    for (int64_t i = 0; i < call.numbers_count; i++) {
+        if (call.numbers[i] < 0 || call.numbers[i] >= call.steps_count)
             return LODE_REFUSED;
-        const int64_t *band = bands + numbers[i] * BAND_FIELDS, *origin = origins + numbers[i] * ORIGIN_FIELDS;
-        int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = steps[numbers[i]], tile = origin[0];
+        const int64_t *band = call.bands + call.numbers[i] * BAND_FIELDS,
+                      *origin = call.origins + call.numbers[i] * ORIGIN_FIELDS;
+        int64_t offset = band[BAND_OFFSET], stride = band[BAND_STRIDE], step = call.steps[call.numbers[i]],
+                tile = origin[0];
         int64_t height = band[BAND_ROWS], width = band[BAND_COLUMNS];
         if (origin[1] < 0 || origin[1] > INT32_MAX || origin[2] < 0 || origin[2] > INT32_MAX || height < 0 ||
             width < 0 || height > INT32_MAX || stride < width || stride < 1 || stride > INT32_MAX || offset < 0 ||
-            offset > known_count - width || (height - 1) * stride > known_count - width - offset || tile < 0 ||
-            tile >= state_count || state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
+            offset > call.known_count - width || (height - 1) * stride > call.known_count - width - offset ||
+            tile < 0 || tile >= call.state_count || call.state[tile] < 0 || step < 0 || step >= WIDEST_STEP)
             return LODE_REFUSED;
-        int64_t top = origin[1] - first_row, left = origin[2] - first_column, first, last, begin, end;
-        if (!part_of(height, top, rows, &first, &last) || !part_of(width, left, columns, &begin, &end))
+        int64_t top = origin[1] - call.first_row, left = origin[2] - call.first_column, first, last, begin, end;
+        if (!part_of(height, top, call.rows, &first, &last) || !part_of(width, left, call.columns, &begin, &end))
             continue;
         struct places at = {
-            .magnitudes = known + offset,
-            .signs = sign + offset,
-            .early = early + offset,
+            .magnitudes = call.known + offset,
+            .signs = call.sign + offset,
+            .early = call.early + offset,
             .stride = stride,
-            .out = out + (top + first) * pitch + left + begin,
-            .pitch = pitch,
+            .out = call.out + (top + first) * call.pitch + left + begin,
+            .pitch = call.pitch,
             .first = first,
             .last = last,
             .begin = begin,
             .end = end,
         };
-        if (state[tile] >= LODE_UNANNOUNCED)
+        if (call.state[tile] >= LODE_UNANNOUNCED)
             clear(at);
-        else if (step > 0 && state[tile] == 0)
-            spread_trellis(at, height, width, rule_of(0, step, tile >= finer));
+        else if (step > 0 && call.state[tile] == 0)
+            spread_trellis(at, height, width, rule_of(0, step, tile >= call.finer));
         else
-            spread_band(at, rule_of(state[tile], step, tile >= finer));
+            spread_band(at, rule_of(call.state[tile], step, tile >= call.finer));
     }
     return 0;
 }

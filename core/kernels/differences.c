@@ -143,35 +143,33 @@ LODE_INLINE void code_all(bool reads, struct coder *coder, struct store *store, 
     }
 }
 
-int64_t lode_differences(int64_t reads, const int64_t *line, int64_t line_count, int64_t *differences,
-                         int64_t differences_count, const int32_t *exponents, int64_t exponents_count, uint8_t *marks,
-                         int64_t marks_count, int64_t most, int64_t specials, int32_t *model, int64_t model_count,
-                         int64_t *memory, int64_t memory_count, uint8_t *data, int64_t data_count, uint8_t *stored,
-                         int64_t stored_count, int64_t *used, int64_t used_count) {
-    if (differences_count != line_count || exponents_count != line_count || marks_count != line_count || most < 0 ||
-        most > 4095 || specials < 0 || specials > LODE_MOST_SPECIALS || model_count != LODE_DIFFERENCES_MODEL ||
-        memory_count != 3 * LODE_DIFFERENCES_MEMORY || used_count != 2)
+int64_t lode_differences(int64_t reads, const struct lode_differences *arguments) {
+    const struct lode_differences call = *arguments;
+    if (call.differences_count != call.line_count || call.exponents_count != call.line_count ||
+        call.marks_count != call.line_count || call.most < 0 || call.most > 4095 || call.specials < 0 ||
+        call.specials > LODE_MOST_SPECIALS || call.model_count != LODE_DIFFERENCES_MODEL ||
+        call.memory_count != 3 * LODE_DIFFERENCES_MEMORY || call.used_count != 2)
         return LODE_REFUSED;
     for (int i = 0; i < LODE_DIFFERENCES_MODEL; i++)
-        model[i] = LODE_NEW_CONTEXT;
-    memset(memory, 0, (size_t)memory_count * sizeof *memory);
-    struct coder coder = coder_start(reads, data, data_count);
-    struct store store = {0, 0, 0, stored, stored_count};
+        call.model[i] = LODE_NEW_CONTEXT;
+    memset(call.memory, 0, (size_t)call.memory_count * sizeof *call.memory);
+    struct coder coder = coder_start(reads, call.data, call.data_count);
+    struct store store = {0, 0, 0, call.stored, call.stored_count};
     if (reads)
-        code_all(true, &coder, &store, line, differences, exponents, marks, line_count, most, (int)specials, model,
-                 memory);
+        code_all(true, &coder, &store, call.line, call.differences, call.exponents, call.marks, call.line_count,
+                 call.most, (int)call.specials, call.model, call.memory);
     else
-        code_all(false, &coder, &store, line, differences, exponents, marks, line_count, most, (int)specials, model,
-                 memory);
-    used[0] = coder.place;
+        code_all(false, &coder, &store, call.line, call.differences, call.exponents, call.marks, call.line_count,
+                 call.most, (int)call.specials, call.model, call.memory);
+    call.used[0] = coder.place;
     if (!reads) {
         if (store.queued)
             store_bits(false, &store, 0, 8 - store.queued);
-        used[0] = coder_finish(&coder);
-        if (used[0] < 0 || store.at > stored_count)
+        call.used[0] = coder_finish(&coder);
+        if (call.used[0] < 0 || store.at > call.stored_count)
             return LODE_REFUSED;
     }
-    used[1] = store.at;
+    call.used[1] = store.at;
     return 0;
 }
 

@@ -111,27 +111,26 @@ static double along(const double *row, int64_t j, int64_t width, bool wraps) {
     return 0.75 * row[here] + 0.25 * row[beside(here, 2 * (j & 1) - 1, width, wraps)];
 }
 
-int64_t lode_push(double *values, int64_t values_count, const uint8_t *known, int64_t known_count, int64_t rows,
-                  int64_t columns, int64_t first, int64_t last, int64_t rows_wrap, int64_t columns_wrap,
-                  const double *coarser, int64_t coarser_count) {
-    if (!is_grid(values_count, known_count, rows, columns))
+int64_t lode_push(const struct lode_push *arguments) {
+    const struct lode_push call = *arguments;
+    if (!is_grid(call.values_count, call.known_count, call.rows, call.columns))
         return LODE_REFUSED;
-    int64_t height = (rows + 1) / 2, width = (columns + 1) / 2;
-    if (coarser_count != height * width || !is_run(first, last, values_count))
+    int64_t height = (call.rows + 1) / 2, width = (call.columns + 1) / 2;
+    if (call.coarser_count != height * width || !is_run(call.first, call.last, call.values_count))
         return LODE_REFUSED;
-    for (int64_t at = first; at < last;) {
-        int64_t i = at / columns, start = at % columns, stop = least(columns, start + (last - at));
-        const double *near = coarser + (i >> 1) * width;
-        const double *far = coarser + beside(i >> 1, 2 * (i & 1) - 1, height, rows_wrap != 0) * width;
-        const uint8_t *own = known + i * columns;
+    for (int64_t at = call.first; at < call.last;) {
+        int64_t i = at / call.columns, start = at % call.columns, stop = least(call.columns, start + (call.last - at));
+        const double *near = call.coarser + (i >> 1) * width;
+        const double *far = call.coarser + beside(i >> 1, 2 * (i & 1) - 1, height, call.rows_wrap != 0) * width;
+        const uint8_t *own = call.known + i * call.columns;
         for (int64_t k = start; k < stop; k += GROUP) {
             int64_t end = least(k + GROUP, stop);
             if (end == k + GROUP && all_known(own + k, 1))
                 continue;
             for (int64_t j = k; j < end; j++)
                 if (!own[j])
-                    values[i * columns + j] = 0.75 * along(near, j, width, columns_wrap != 0) +
-                                              0.25 * along(far, j, width, columns_wrap != 0);
+                    call.values[i * call.columns + j] = 0.75 * along(near, j, width, call.columns_wrap != 0) +
+                                                        0.25 * along(far, j, width, call.columns_wrap != 0);
         }
         at += stop - start;
     }

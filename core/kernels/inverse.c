@@ -64,10 +64,23 @@ static void refine(int32_t *x, int64_t rows, int64_t columns, int64_t pitch) {
 /* Lift the first rows and columns of a plane, all of it or of a line. */
 static bool lift(int64_t kind, const int64_t *step, int64_t axis, int32_t *x, int64_t rows, int64_t columns,
                  int64_t pitch, int32_t *work, int64_t work_count) {
-    for (int64_t from = 0; from < step[RUN];) {
-        from = lode_lift(kind, axis, x, rows, columns, pitch, step[MIDPOINTS], step[RUN], step + TABLE, TABLE_COUNT,
-                         step[A], step[B], from, work, work_count);
-        if (from == LODE_REFUSED)
+    struct lode_lift call = {
+        .x = x,
+        .rows = rows,
+        .columns = columns,
+        .pitch = pitch,
+        .midpoints = step[MIDPOINTS],
+        .run = step[RUN],
+        .table = step + TABLE,
+        .table_count = TABLE_COUNT,
+        .a = step[A],
+        .b = step[B],
+        .work = work,
+        .work_count = work_count,
+    };
+    while (call.from < step[RUN]) {
+        call.from = lode_lift(kind, axis, &call);
+        if (call.from == LODE_REFUSED)
             return false;
     }
     return true;

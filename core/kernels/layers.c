@@ -69,19 +69,18 @@ static void slopes_of(const double *bits, const double *gains, int64_t count, co
     }
 }
 
-int64_t lode_pass_slopes(const double *bits, int64_t bits_count, const double *gains, int64_t gains_count,
-                         const int64_t *ends, int64_t ends_count, int64_t first, int64_t last, const double *falling,
-                         int64_t falling_count, const double *known, int64_t known_count, double share_of_tile,
-                         double share_of_stream, double segment, double *slopes, int64_t slopes_count) {
-    if (gains_count != bits_count || slopes_count != bits_count || known_count != falling_count || first < 0 ||
-        last > ends_count)
+int64_t lode_pass_slopes(const struct lode_pass_slopes *arguments) {
+    const struct lode_pass_slopes call = *arguments;
+    if (call.gains_count != call.bits_count || call.slopes_count != call.bits_count ||
+        call.known_count != call.falling_count || call.first < 0 || call.last > call.ends_count)
         return LODE_REFUSED;
-    struct worth worth = {falling, known, falling_count, share_of_stream, segment};
-    for (int64_t number = first; number < last; number++) {
-        if (!fits(ends, number, bits_count))
+    struct worth worth = {call.falling, call.known, call.falling_count, call.share_of_stream, call.segment};
+    for (int64_t number = call.first; number < call.last; number++) {
+        if (!fits(call.ends, number, call.bits_count))
             return LODE_REFUSED;
-        int64_t start = number ? ends[number - 1] : 0;
-        slopes_of(bits + start, gains + start, ends[number] - start, &worth, share_of_tile, slopes + start);
+        int64_t start = number ? call.ends[number - 1] : 0;
+        slopes_of(call.bits + start, call.gains + start, call.ends[number] - start, &worth, call.share_of_tile,
+                  call.slopes + start);
     }
     return 0;
 }

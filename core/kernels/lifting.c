@@ -590,35 +590,36 @@ static bool nothing(const int32_t *row, int64_t columns) {
     return found == 0;
 }
 
-int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64_t columns, int64_t pitch,
-                  int64_t midpoints, int64_t run, const int64_t *table, int64_t table_count, int64_t a, int64_t b,
-                  int64_t from, int32_t *work, int64_t work_count) {
+int64_t lode_lift(int64_t inverse, int64_t axis, const struct lode_lift *arguments) {
+    const struct lode_lift call = *arguments;
     bool along_rows = axis == 1;
-    int64_t length = along_rows ? columns : rows, across = along_rows ? rows : columns;
+    int64_t length = along_rows ? call.columns : call.rows, across = along_rows ? call.rows : call.columns;
     int64_t gap = along_rows || across < NARROW ? 1 : STRIP;
-    if (rows < 1 || columns < 1 || length > INT32_MAX || (rows > 1 && pitch < columns) || midpoints < 1 ||
-        midpoints > length || run < midpoints || run > midpoints + 1)
+    if (call.rows < 1 || call.columns < 1 || length > INT32_MAX || (call.rows > 1 && call.pitch < call.columns) ||
+        call.midpoints < 1 || call.midpoints > length || call.run < call.midpoints || call.run > call.midpoints + 1)
         return LODE_REFUSED;
-    int64_t places = run + BEFORE + AFTER + midpoints + 2 * REACH, coarse = length - midpoints;
-    if (run > coarse || coarse > run + 1 || (run == midpoints && run != coarse) || table_count != 4 * REACH ||
-        a < -127 || a > 127 || b < -127 || b > 127 || from < 0 || from >= run || from % (CHUNK / gap) ||
-        (from > 0 && across > gap) || work_count < places * gap + ALIGNED)
+    int64_t places = call.run + BEFORE + AFTER + call.midpoints + 2 * REACH, coarse = length - call.midpoints;
+    if (call.run > coarse || coarse > call.run + 1 || (call.run == call.midpoints && call.run != coarse) ||
+        call.table_count != 4 * REACH || call.a < -127 || call.a > 127 || call.b < -127 || call.b > 127 ||
+        call.from < 0 || call.from >= call.run || call.from % (CHUNK / gap) || (call.from > 0 && across > gap) ||
+        call.work_count < places * gap + ALIGNED)
         return LODE_REFUSED;
     for (int64_t i = 0; i < 4 * REACH; i += 2)
-        if (table[i] < 0 || table[i] >= midpoints || table[i + 1] < -1 || table[i + 1] > 1)
+        if (call.table[i] < 0 || call.table[i] >= call.midpoints || call.table[i + 1] < -1 || call.table[i + 1] > 1)
             return LODE_REFUSED;
-    int64_t shift = (int64_t)(-(uintptr_t)work / sizeof *work % ALIGNED);
-    int32_t *nodes = work + shift + BEFORE * gap;
-    struct bundle w = {.along = along_rows ? 1 : pitch, .length = length, .midpoints = midpoints, .run = run};
-    w.bare = inverse == LODE_LIFT_BARE, w.table = table, w.a = (int32_t)a, w.b = (int32_t)b;
-    w.nodes = nodes, w.details = nodes + (run + AFTER + REACH) * gap;
-    int64_t end = across > gap ? run : from + AT_ONCE / gap, reached = run;
+    int64_t shift = (int64_t)(-(uintptr_t)call.work / sizeof *call.work % ALIGNED);
+    int32_t *nodes = call.work + shift + BEFORE * gap;
+    struct bundle w = {
+        .along = along_rows ? 1 : call.pitch, .length = length, .midpoints = call.midpoints, .run = call.run};
+    w.bare = inverse == LODE_LIFT_BARE, w.table = call.table, w.a = (int32_t)call.a, w.b = (int32_t)call.b;
+    w.nodes = nodes, w.details = nodes + (call.run + AFTER + REACH) * gap;
+    int64_t end = across > gap ? call.run : call.from + AT_ONCE / gap, reached = call.run;
     for (int64_t i = 0; i < across; i += w.width) {
-        w.x = x + (along_rows ? i * pitch : i);
+        w.x = call.x + (along_rows ? i * call.pitch : i);
         w.gap = across - i < NARROW ? 1 : gap;
         w.width = least(w.gap, across - i);
-        if (!along_rows || from > 0 || !nothing(w.x, columns))
-            reached = lift(&w, inverse, from, end);
+        if (!along_rows || call.from > 0 || !nothing(w.x, call.columns))
+            reached = lift(&w, inverse, call.from, end);
     }
     return reached;
 }

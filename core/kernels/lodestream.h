@@ -3,7 +3,8 @@
  * An array is a pointer and, behind it, its number of elements. Arrays of arrays are in C order; `rows` of a plane that
  * need not lie side by side come as pointer, rows, columns, and `pitch`, the elements from one row to the next. The
  * caller owns all memory and has checked types; nothing here allocates, keeps anything between calls, or calls a
- * library. `reads` chooses between the two directions of a coder: 1 reads `data` and fills what it describes, 0 writes.
+ * library. A kernel with more than eight arguments takes those after its first integers in a struct, which it does not
+ * change. `reads` chooses between the two directions of a coder: 1 reads `data` and fills what it describes, 0 writes.
  *
  * What comes from a stream may hold anything: results are then wrong numbers, but no access leaves an array.
  * Where lengths and places that the caller gives do not fit each other, the answer is LODE_REFUSED and arrays that
@@ -54,9 +55,16 @@ LODE_API int lode_runs_v3(void);
  * LODE_LIFT_STRIP columns and at least a quarter of them. The first call of an inverse copies all nodes of a line,
  * which alone takes longer than a tenth of a second where they are more than 2^25.
  */
-LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, int32_t *x, int64_t rows, int64_t columns, int64_t pitch,
-                           int64_t midpoints, int64_t run, const int64_t *table, int64_t table_count, int64_t a,
-                           int64_t b, int64_t from, int32_t *work, int64_t work_count);
+struct lode_lift {
+    int32_t *x;
+    int64_t rows, columns, pitch, midpoints, run;
+    const int64_t *table;
+    int64_t table_count, a, b, from;
+    int32_t *work;
+    int64_t work_count;
+};
+
+LODE_API int64_t lode_lift(int64_t inverse, int64_t axis, const struct lode_lift *arguments);
 
 /* inverse.c ------------------------------------------------------------------------------------------------------ */
 
@@ -98,9 +106,18 @@ LODE_API int64_t lode_inverse(const int64_t *steps, int64_t steps_count, const i
  * state:  four numbers that are handed on from call to call, as the model is; others are refused.
  * Returns the bytes written or looked at so far, all of them once the last group is coded.
  */
-LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last, uint8_t *field,
-                           int64_t field_count, int32_t *model, int64_t model_count, uint8_t *data, int64_t data_count,
-                           int64_t *state, int64_t state_count);
+struct lode_mask {
+    uint8_t *field;
+    int64_t field_count;
+    int32_t *model;
+    int64_t model_count;
+    uint8_t *data;
+    int64_t data_count;
+    int64_t *state, state_count;
+};
+
+LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last,
+                           const struct lode_mask *arguments);
 
 #define LODE_MASK_GROUP 16
 #define LODE_MASK_MODEL ((1 << 10) + 4)
@@ -120,10 +137,15 @@ LODE_API int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t
  * points:      (rows, columns, channels).
  * Returns 0.
  */
-LODE_API int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int64_t columns, int64_t pitch,
-                                   void *points, int64_t points_count, int64_t points_type, int64_t channels,
-                                   int64_t channel, int64_t first, int64_t last, int64_t decimal, double origin,
-                                   double step, double scale);
+struct lode_store_values {
+    const int32_t *coordinates;
+    int64_t rows, columns, pitch;
+    void *points;
+    int64_t points_count, points_type, channels, channel, first, last, decimal;
+    double origin, step, scale;
+};
+
+LODE_API int64_t lode_store_values(const struct lode_store_values *arguments);
 
 /* Squared distances between points and the values of lattice coordinates in the type of the points, by parts of
  * LODE_PART_ROWS x LODE_PART_COLUMNS points, fewer at the ends: those from `first` to `last` - 1 in raster order.
@@ -139,12 +161,20 @@ LODE_API int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int
  *
  * Returns 0.
  */
-LODE_API int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type,
-                                       const int32_t *coordinates, int64_t coordinates_count, const double *rules,
-                                       int64_t rules_count, const uint8_t *counted, int64_t counted_count,
-                                       double *figures, int64_t figures_count, int64_t rows, int64_t columns,
-                                       int64_t channels, int64_t channel, int64_t height, int64_t pitch, int64_t first,
-                                       int64_t last);
+struct lode_square_distances {
+    const void *points;
+    int64_t points_count, points_type;
+    const int32_t *coordinates;
+    int64_t coordinates_count;
+    const double *rules;
+    int64_t rules_count;
+    const uint8_t *counted;
+    int64_t counted_count;
+    double *figures;
+    int64_t figures_count, rows, columns, channels, channel, height, pitch, first, last;
+};
+
+LODE_API int64_t lode_square_distances(const struct lode_square_distances *arguments);
 
 #define LODE_PART_ROWS 128
 #define LODE_PART_COLUMNS 256
@@ -169,9 +199,16 @@ LODE_API int64_t lode_pull(const double *values, int64_t values_count, const uin
 /* Give holes, of points `first` to `last` - 1, what the coarser grid has at their place, by bilinear interpolation.
  * Returns 0.
  */
-LODE_API int64_t lode_push(double *values, int64_t values_count, const uint8_t *known, int64_t known_count,
-                           int64_t rows, int64_t columns, int64_t first, int64_t last, int64_t rows_wrap,
-                           int64_t columns_wrap, const double *coarser, int64_t coarser_count);
+struct lode_push {
+    double *values;
+    int64_t values_count;
+    const uint8_t *known;
+    int64_t known_count, rows, columns, first, last, rows_wrap, columns_wrap;
+    const double *coarser;
+    int64_t coarser_count;
+};
+
+LODE_API int64_t lode_push(const struct lode_push *arguments);
 
 /* Bring holes nearer to where a thin plate would lie through what is around them: steps `first` to `last` - 1 of a walk
  * that goes over all points in raster order, then back, and so on, at most 2^20 in a call; rows x columns are a sweep.
@@ -218,11 +255,28 @@ LODE_API int64_t lode_classify(const int64_t *bands, int64_t bands_count, const 
  *
  * Returns 0.
  */
-LODE_API int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rules, int64_t rules_count,
-                             const double *relative, int64_t relative_count, const int8_t *classes,
-                             int64_t classes_count, const float *rates, int64_t rates_count, int32_t *chosen,
-                             int64_t chosen_count, double *counts, int64_t counts_count, int16_t *ways,
-                             int64_t ways_count, float *above, int64_t above_count);
+struct lode_choose {
+    const int64_t *bands;
+    int64_t bands_count;
+    const float *rules;
+    int64_t rules_count;
+    const double *relative;
+    int64_t relative_count;
+    const int8_t *classes;
+    int64_t classes_count;
+    const float *rates;
+    int64_t rates_count;
+    int32_t *chosen;
+    int64_t chosen_count;
+    double *counts;
+    int64_t counts_count;
+    int16_t *ways;
+    int64_t ways_count;
+    float *above;
+    int64_t above_count;
+};
+
+LODE_API int64_t lode_choose(const struct lode_choose *arguments);
 
 /* lzf.c ---------------------------------------------------------------------------------------------------------- */
 
@@ -248,12 +302,25 @@ LODE_API int64_t lode_lzf(const uint8_t *source, int64_t source_count, uint8_t *
  * used:            bytes of `data` and of `stored`, written or looked at.
  * A call takes about 50 ns a value. Returns 0.
  */
-LODE_API int64_t lode_differences(int64_t reads, const int64_t *line, int64_t line_count, int64_t *differences,
-                                  int64_t differences_count, const int32_t *exponents, int64_t exponents_count,
-                                  uint8_t *marks, int64_t marks_count, int64_t most, int64_t specials, int32_t *model,
-                                  int64_t model_count, int64_t *memory, int64_t memory_count, uint8_t *data,
-                                  int64_t data_count, uint8_t *stored, int64_t stored_count, int64_t *used,
-                                  int64_t used_count);
+struct lode_differences {
+    const int64_t *line;
+    int64_t line_count;
+    int64_t *differences, differences_count;
+    const int32_t *exponents;
+    int64_t exponents_count;
+    uint8_t *marks;
+    int64_t marks_count, most, specials;
+    int32_t *model;
+    int64_t model_count;
+    int64_t *memory, memory_count;
+    uint8_t *data;
+    int64_t data_count;
+    uint8_t *stored;
+    int64_t stored_count;
+    int64_t *used, used_count;
+};
+
+LODE_API int64_t lode_differences(int64_t reads, const struct lode_differences *arguments);
 
 #define LODE_MOST_SPECIALS 15
 #define LODE_DIFFERENCES_MODEL (256 + 4 + 16 + 1 + 1 + 16)
@@ -322,12 +389,28 @@ LODE_API int64_t lode_predictor_bits(const int32_t *first, int64_t first_count, 
  * finer:   coefficients of the tiles from this one on are multiplied by 8.
  * out:     begins at `first_row` and `first_column` of all coefficients. What bands have outside of it is left out.
  */
-LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const int8_t *sign, int64_t sign_count,
-                             const uint8_t *early, int64_t early_count, const int64_t *bands, int64_t bands_count,
-                             const int64_t *origins, int64_t origins_count, const int64_t *steps, int64_t steps_count,
-                             const int64_t *numbers, int64_t numbers_count, const int8_t *state, int64_t state_count,
-                             int64_t finer, int32_t *out, int64_t rows, int64_t columns, int64_t pitch,
-                             int64_t first_row, int64_t first_column);
+struct lode_spread {
+    const int32_t *known;
+    int64_t known_count;
+    const int8_t *sign;
+    int64_t sign_count;
+    const uint8_t *early;
+    int64_t early_count;
+    const int64_t *bands;
+    int64_t bands_count;
+    const int64_t *origins;
+    int64_t origins_count;
+    const int64_t *steps;
+    int64_t steps_count;
+    const int64_t *numbers;
+    int64_t numbers_count;
+    const int8_t *state;
+    int64_t state_count, finer;
+    int32_t *out;
+    int64_t rows, columns, pitch, first_row, first_column;
+};
+
+LODE_API int64_t lode_spread(const struct lode_spread *arguments);
 
 /* bitplanes.c ---------------------------------------------------------------------------------------------------- */
 
@@ -360,12 +443,32 @@ LODE_API int64_t lode_spread(const int32_t *known, int64_t known_count, const in
  *
  * Returns how many runs are done.
  */
-LODE_API int64_t lode_passes(int64_t reads, int64_t trellis, const int64_t *bands, int64_t bands_count, int64_t *runs,
-                             int64_t runs_count, int32_t *known, int64_t known_count, int8_t *sign, int64_t sign_count,
-                             uint8_t *flags, int64_t flags_count, uint8_t *early, int64_t early_count,
-                             const int32_t *truth, int64_t truth_count, int32_t *models, int64_t models_count,
-                             uint8_t *data, int64_t data_count, double *costs, int64_t costs_count, uint16_t *symbols,
-                             int64_t symbols_count, int64_t *state, int64_t state_count, int64_t budget);
+struct lode_passes {
+    const int64_t *bands;
+    int64_t bands_count;
+    int64_t *runs, runs_count;
+    int32_t *known;
+    int64_t known_count;
+    int8_t *sign;
+    int64_t sign_count;
+    uint8_t *flags;
+    int64_t flags_count;
+    uint8_t *early;
+    int64_t early_count;
+    const int32_t *truth;
+    int64_t truth_count;
+    int32_t *models;
+    int64_t models_count;
+    uint8_t *data;
+    int64_t data_count;
+    double *costs;
+    int64_t costs_count;
+    uint16_t *symbols;
+    int64_t symbols_count;
+    int64_t *state, state_count, budget;
+};
+
+LODE_API int64_t lode_passes(int64_t reads, int64_t trellis, const struct lode_passes *arguments);
 
 #define LODE_RUN_FIELDS 8
 #define LODE_RUN_LARGE 7
@@ -408,11 +511,23 @@ LODE_API int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, cons
  * share_of_stream, segment: this share of the stream's bits at the first run's slope, but not more than `segment` bits.
  * Returns 0.
  */
-LODE_API int64_t lode_pass_slopes(const double *bits, int64_t bits_count, const double *gains, int64_t gains_count,
-                                  const int64_t *ends, int64_t ends_count, int64_t first, int64_t last,
-                                  const double *falling, int64_t falling_count, const double *known,
-                                  int64_t known_count, double share_of_tile, double share_of_stream, double segment,
-                                  double *slopes, int64_t slopes_count);
+struct lode_pass_slopes {
+    const double *bits;
+    int64_t bits_count;
+    const double *gains;
+    int64_t gains_count;
+    const int64_t *ends;
+    int64_t ends_count, first, last;
+    const double *falling;
+    int64_t falling_count;
+    const double *known;
+    int64_t known_count;
+    double share_of_tile, share_of_stream, segment;
+    double *slopes;
+    int64_t slopes_count;
+};
+
+LODE_API int64_t lode_pass_slopes(const struct lode_pass_slopes *arguments);
 
 /* Gives a parent's passes of a plane at least the slope of its children's, for the curves from `last` - 1 down to
  * `first`.
@@ -524,11 +639,25 @@ LODE_API int64_t lode_mesh_umbrellas(const int32_t *corners, int64_t corners_cou
  * cut:    one for each half-edge, 0 at first; 1 along the lines.
  * state:  three numbers, at first 0, 0 and the lines.
  */
-LODE_API int64_t lode_mesh_trace(const int32_t *corners, int64_t corners_count, const int32_t *twins,
-                                 int64_t twins_count, const int32_t *umbrella, int64_t umbrella_count,
-                                 const int32_t *valence, int64_t valence_count, int64_t whole, uint8_t *passed,
-                                 int64_t passed_count, int32_t *riders, int64_t riders_count, uint8_t *cut,
-                                 int64_t cut_count, int64_t *state, int64_t state_count, int64_t steps);
+struct lode_mesh_trace {
+    const int32_t *corners;
+    int64_t corners_count;
+    const int32_t *twins;
+    int64_t twins_count;
+    const int32_t *umbrella;
+    int64_t umbrella_count;
+    const int32_t *valence;
+    int64_t valence_count, whole;
+    uint8_t *passed;
+    int64_t passed_count;
+    int32_t *riders;
+    int64_t riders_count;
+    uint8_t *cut;
+    int64_t cut_count;
+    int64_t *state, state_count, steps;
+};
+
+LODE_API int64_t lode_mesh_trace(const struct lode_mesh_trace *arguments);
 
 /* Find the poles of triangles that go round alike: vertices without which they are the halves of a grid's quads.
  *
@@ -539,12 +668,27 @@ LODE_API int64_t lode_mesh_trace(const int32_t *corners, int64_t corners_count, 
  * missing:  for each closed umbrella the triangles by which it is short of six; fewer once poles beside it are taken.
  * state:    four numbers.
  */
-LODE_API int64_t lode_mesh_poles(const int32_t *corners, int64_t corners_count, const int32_t *twins,
-                                 int64_t twins_count, const int32_t *umbrella, int64_t umbrella_count,
-                                 const int32_t *valence, int64_t valence_count, const int32_t *leaving,
-                                 int64_t leaving_count, const int32_t *order, int64_t order_count, int64_t together,
-                                 uint8_t *pole, int64_t pole_count, int32_t *missing, int64_t missing_count,
-                                 int64_t *state, int64_t state_count, int64_t steps);
+struct lode_mesh_poles {
+    const int32_t *corners;
+    int64_t corners_count;
+    const int32_t *twins;
+    int64_t twins_count;
+    const int32_t *umbrella;
+    int64_t umbrella_count;
+    const int32_t *valence;
+    int64_t valence_count;
+    const int32_t *leaving;
+    int64_t leaving_count;
+    const int32_t *order;
+    int64_t order_count, together;
+    uint8_t *pole;
+    int64_t pole_count;
+    int32_t *missing;
+    int64_t missing_count;
+    int64_t *state, state_count, steps;
+};
+
+LODE_API int64_t lode_mesh_poles(const struct lode_mesh_poles *arguments);
 
 /* Make each triangle of the fans round poles a quad whose side at the pole has two new vertices.
  *
@@ -559,13 +703,27 @@ LODE_API int64_t lode_mesh_poles(const int32_t *corners, int64_t corners_count, 
  *                 each open fan.
  * state:          four numbers, the last of which is that of new vertices.
  */
-LODE_API int64_t lode_mesh_unfold(const int32_t *corners, int64_t corners_count, const int32_t *twins,
-                                  int64_t twins_count, const int32_t *starts, int64_t starts_count,
-                                  const uint8_t *folded, int64_t folded_count, const int32_t *attributes,
-                                  int64_t attributes_count, int64_t vertices, int32_t *new_corners,
-                                  int64_t new_corners_count, int32_t *new_attributes, int64_t new_attributes_count,
-                                  int32_t *pole_of, int64_t pole_of_count, int64_t *state, int64_t state_count,
-                                  int64_t steps);
+struct lode_mesh_unfold {
+    const int32_t *corners;
+    int64_t corners_count;
+    const int32_t *twins;
+    int64_t twins_count;
+    const int32_t *starts;
+    int64_t starts_count;
+    const uint8_t *folded;
+    int64_t folded_count;
+    const int32_t *attributes;
+    int64_t attributes_count, vertices;
+    int32_t *new_corners;
+    int64_t new_corners_count;
+    int32_t *new_attributes;
+    int64_t new_attributes_count;
+    int32_t *pole_of;
+    int64_t pole_of_count;
+    int64_t *state, state_count, steps;
+};
+
+LODE_API int64_t lode_mesh_unfold(const struct lode_mesh_unfold *arguments);
 
 /* mesh_lattice.c ------------------------------------------------------------------------------------------------- */
 
@@ -581,11 +739,24 @@ LODE_API int64_t lode_mesh_unfold(const int32_t *corners, int64_t corners_count,
  * state:   three numbers, the last of which is that of pieces.
  * Returns 2 when there are more pieces than `turns` and `periods` have room for: to be called again with larger ones.
  */
-LODE_API int64_t lode_mesh_develop(int64_t sides, const int32_t *twins, int64_t twins_count, int32_t *piece,
-                                   int64_t piece_count, int32_t *first, int64_t first_count, int8_t *heading,
-                                   int64_t heading_count, uint8_t *turns, int64_t turns_count, int64_t *periods,
-                                   int64_t periods_count, int32_t *stack, int64_t stack_count, int64_t *state,
-                                   int64_t state_count, int64_t steps);
+struct lode_mesh_develop {
+    const int32_t *twins;
+    int64_t twins_count;
+    int32_t *piece;
+    int64_t piece_count;
+    int32_t *first;
+    int64_t first_count;
+    int8_t *heading;
+    int64_t heading_count;
+    uint8_t *turns;
+    int64_t turns_count;
+    int64_t *periods, periods_count;
+    int32_t *stack;
+    int64_t stack_count;
+    int64_t *state, state_count, steps;
+};
+
+LODE_API int64_t lode_mesh_develop(int64_t sides, const struct lode_mesh_develop *arguments);
 
 /* What there is along each of the three directions of triangles that were laid out, for any part of a mesh's faces.
  *
@@ -595,13 +766,28 @@ LODE_API int64_t lode_mesh_develop(int64_t sides, const int32_t *twins, int64_t 
  * single:    three for each piece: 1 where a half-edge of direction 0, 1 or 2, or the opposite, has no twin.
  * length:    three for each piece: the lengths of all these half-edges are added.
  */
-LODE_API int64_t lode_mesh_survey(const int32_t *corners, int64_t corners_count, const int32_t *twins,
-                                  int64_t twins_count, const double *points, int64_t points_rows,
-                                  int64_t points_columns, int64_t points_pitch, const int32_t *piece,
-                                  int64_t piece_count, const int32_t *first, int64_t first_count, const int8_t *heading,
-                                  int64_t heading_count, int64_t *low, int64_t low_count, int64_t *high,
-                                  int64_t high_count, uint8_t *single, int64_t single_count, double *length,
-                                  int64_t length_count);
+struct lode_mesh_survey {
+    const int32_t *corners;
+    int64_t corners_count;
+    const int32_t *twins;
+    int64_t twins_count;
+    const double *points;
+    int64_t points_rows, points_columns, points_pitch;
+    const int32_t *piece;
+    int64_t piece_count;
+    const int32_t *first;
+    int64_t first_count;
+    const int8_t *heading;
+    int64_t heading_count;
+    int64_t *low, low_count;
+    int64_t *high, high_count;
+    uint8_t *single;
+    int64_t single_count;
+    double *length;
+    int64_t length_count;
+};
+
+LODE_API int64_t lode_mesh_survey(const struct lode_mesh_survey *arguments);
 
 /* The bounds of quads that were laid out, for any part of `faces`: the least and the largest row, the least and the
  * largest column of a quad, if they are less or larger than what `bounds` holds. */
@@ -617,11 +803,21 @@ LODE_API int64_t lode_mesh_bounds(const int64_t *faces, int64_t faces_count, con
  * cells:     the face, or -1; as many rows and columns as nodes, but for one less where they are not closed.
  * Returns how many faces were put before one that lies on another or does not join it; all, where there is none.
  */
-LODE_API int64_t lode_mesh_fill(const int64_t *faces, int64_t faces_count, const int32_t *first, int64_t first_count,
-                                const int8_t *heading, int64_t heading_count, const int32_t *identity,
-                                int64_t identity_count, int64_t top, int64_t left, int64_t closed_rows,
-                                int64_t closed_columns, int32_t *nodes, int64_t height, int64_t width,
-                                int64_t nodes_pitch, int32_t *cells, int64_t cells_height, int64_t cells_width,
-                                int64_t cells_pitch);
+struct lode_mesh_fill {
+    const int64_t *faces;
+    int64_t faces_count;
+    const int32_t *first;
+    int64_t first_count;
+    const int8_t *heading;
+    int64_t heading_count;
+    const int32_t *identity;
+    int64_t identity_count, top, left, closed_rows, closed_columns;
+    int32_t *nodes;
+    int64_t height, width, nodes_pitch;
+    int32_t *cells;
+    int64_t cells_height, cells_width, cells_pitch;
+};
+
+LODE_API int64_t lode_mesh_fill(const struct lode_mesh_fill *arguments);
 
 #endif

@@ -71,28 +71,28 @@ LODE_INLINE int code_groups(bool reads, struct coder *coder, int64_t columns, in
     return answer;
 }
 
-int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last, uint8_t *field,
-                  int64_t field_count, int32_t *model, int64_t model_count, uint8_t *data, int64_t data_count,
-                  int64_t *state, int64_t state_count) {
+int64_t lode_mask(int64_t reads, int64_t rows, int64_t columns, int64_t first, int64_t last,
+                  const struct lode_mask *arguments) {
+    const struct lode_mask call = *arguments;
     if (rows < 1 || columns < 1 || rows > INT32_MAX || columns > INT32_MAX || first < 0 || last < first ||
-        last > rows * groups_across(columns) || field_count != (rows + ABOVE) * (columns + 2 * BESIDE) ||
-        model_count != LODE_MASK_MODEL || state_count != 4)
+        last > rows * groups_across(columns) || call.field_count != (rows + ABOVE) * (columns + 2 * BESIDE) ||
+        call.model_count != LODE_MASK_MODEL || call.state_count != 4)
         return LODE_REFUSED;
-    struct coder coder = {(uint64_t)state[0], (uint32_t)state[1], state[2], data, data_count};
-    int answer = state[3] & 1;
-    if (first > 0 && ((uint64_t)state[1] > WIDEST || !coder_can_go_on(reads, &coder)))
+    struct coder coder = {(uint64_t)call.state[0], (uint32_t)call.state[1], call.state[2], call.data, call.data_count};
+    int answer = call.state[3] & 1;
+    if (first > 0 && ((uint64_t)call.state[1] > WIDEST || !coder_can_go_on(reads, &coder)))
         return LODE_REFUSED;
     if (first == 0) {
-        coder = coder_start(reads, data, data_count);
+        coder = coder_start(reads, call.data, call.data_count);
         answer = 0;
         for (int i = 0; i < LODE_MASK_MODEL; i++)
-            model[i] = LODE_NEW_CONTEXT;
+            call.model[i] = LODE_NEW_CONTEXT;
     }
-    answer = reads ? code_groups(true, &coder, columns, first, last, field, model, answer)
-                   : code_groups(false, &coder, columns, first, last, field, model, answer);
-    state[0] = (int64_t)coder.low;
-    state[1] = coder.width;
-    state[2] = coder.place;
-    state[3] = answer;
+    answer = reads ? code_groups(true, &coder, columns, first, last, call.field, call.model, answer)
+                   : code_groups(false, &coder, columns, first, last, call.field, call.model, answer);
+    call.state[0] = (int64_t)coder.low;
+    call.state[1] = coder.width;
+    call.state[2] = coder.place;
+    call.state[3] = answer;
     return reads || last < rows * groups_across(columns) ? coder.place : coder_finish(&coder);
 }

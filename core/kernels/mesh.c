@@ -293,15 +293,14 @@ int64_t lode_mesh_umbrellas(const int32_t *corners, int64_t corners_count, const
     return steps > 0;
 }
 
-int64_t lode_mesh_trace(const int32_t *corners, int64_t corners_count, const int32_t *twins, int64_t twins_count,
-                        const int32_t *umbrella, int64_t umbrella_count, const int32_t *valence, int64_t valence_count,
-                        int64_t whole, uint8_t *passed, int64_t passed_count, int32_t *riders, int64_t riders_count,
-                        uint8_t *cut, int64_t cut_count, int64_t *state, int64_t state_count, int64_t steps) {
-    if (!is_mesh(corners_count, twins_count) || umbrella_count != twins_count || passed_count != valence_count ||
-        cut_count != twins_count || state_count != 3)
+int64_t lode_mesh_trace(const struct lode_mesh_trace *arguments) {
+    const struct lode_mesh_trace call = *arguments;
+    int64_t steps = call.steps;
+    if (!is_mesh(call.corners_count, call.twins_count) || call.umbrella_count != call.twins_count ||
+        call.passed_count != call.valence_count || call.cut_count != call.twins_count || call.state_count != 3)
         return LODE_REFUSED;
-    int64_t place = state[0], kept = state[1], count = state[2];
-    if (kept < 0 || place < kept || count < place || riders_count < count)
+    int64_t place = call.state[0], kept = call.state[1], count = call.state[2];
+    if (kept < 0 || place < kept || count < place || call.riders_count < count)
         return LODE_REFUSED;
     for (; steps > 0; steps--) {
         if (place == count) {
@@ -310,25 +309,25 @@ int64_t lode_mesh_trace(const int32_t *corners, int64_t corners_count, const int
             count = kept;
             place = kept = 0;
         }
-        int64_t half = riders[place++];
-        if (!within(half, twins_count) || !within(twins[half], twins_count))
+        int64_t half = call.riders[place++];
+        if (!within(half, call.twins_count) || !within(call.twins[half], call.twins_count))
             return LODE_REFUSED;
-        if (cut[half])
+        if (call.cut[half])
             continue;
-        cut[half] = cut[twins[half]] = 1;
-        int64_t ahead = next_half_edge(corners, half), vertex = umbrella[ahead];
-        if (!within(vertex, valence_count))
+        call.cut[half] = call.cut[call.twins[half]] = 1;
+        int64_t ahead = next_half_edge(call.corners, half), vertex = call.umbrella[ahead];
+        if (!within(vertex, call.valence_count))
             return LODE_REFUSED;
-        if (valence[vertex] != 4 || (passed[vertex] && !whole))
+        if (call.valence[vertex] != 4 || (call.passed[vertex] && !call.whole))
             continue;
-        passed[vertex] = 1;
-        if (!within(twins[ahead], twins_count))
+        call.passed[vertex] = 1;
+        if (!within(call.twins[ahead], call.twins_count))
             return LODE_REFUSED;
-        riders[kept++] = (int32_t)next_half_edge(corners, twins[ahead]);
+        call.riders[kept++] = (int32_t)next_half_edge(call.corners, call.twins[ahead]);
     }
-    state[0] = place;
-    state[1] = kept;
-    state[2] = count;
+    call.state[0] = place;
+    call.state[1] = kept;
+    call.state[2] = count;
     return steps > 0;
 }
 
@@ -367,55 +366,55 @@ static inline int take_triangle(const struct fan *fan, int64_t half) {
     return 1;
 }
 
-int64_t lode_mesh_poles(const int32_t *corners, int64_t corners_count, const int32_t *twins, int64_t twins_count,
-                        const int32_t *umbrella, int64_t umbrella_count, const int32_t *valence, int64_t valence_count,
-                        const int32_t *leaving, int64_t leaving_count, const int32_t *order, int64_t order_count,
-                        int64_t together, uint8_t *pole, int64_t pole_count, int32_t *missing, int64_t missing_count,
-                        int64_t *state, int64_t state_count, int64_t steps) {
-    struct fan fan = {corners, umbrella, valence, valence_count, pole, missing, together};
-    if (!is_mesh(corners_count, twins_count) || umbrella_count != twins_count || leaving_count != valence_count ||
-        pole_count != valence_count || missing_count != valence_count || state_count != 4)
+int64_t lode_mesh_poles(const struct lode_mesh_poles *arguments) {
+    const struct lode_mesh_poles call = *arguments;
+    int64_t steps = call.steps;
+    struct fan fan = {call.corners, call.umbrella, call.valence, call.valence_count,
+                      call.pole,    call.missing,  call.together};
+    if (!is_mesh(call.corners_count, call.twins_count) || call.umbrella_count != call.twins_count ||
+        call.leaving_count != call.valence_count || call.pole_count != call.valence_count ||
+        call.missing_count != call.valence_count || call.state_count != 4)
         return LODE_REFUSED;
     /* Round each fan once to see whether all fits, and once more to take it. */
-    int64_t place = state[0], turn = state[1], half = state[2], taking = state[3];
+    int64_t place = call.state[0], turn = call.state[1], half = call.state[2], taking = call.state[3];
     if (place < 0 || turn < 0)
         return LODE_REFUSED;
-    for (; steps > 0 && place < order_count; steps--) {
-        int64_t vertex = order[place];
-        if (!within(vertex, valence_count))
+    for (; steps > 0 && place < call.order_count; steps--) {
+        int64_t vertex = call.order[place];
+        if (!within(vertex, call.valence_count))
             return LODE_REFUSED;
-        bool open = valence[vertex] < 0;
-        int64_t faces = open ? -(int64_t)valence[vertex] : valence[vertex];
+        bool open = call.valence[vertex] < 0;
+        int64_t faces = open ? -(int64_t)call.valence[vertex] : call.valence[vertex];
         if (faces < (open ? 2 : FEWEST_ROUND)) {
             place++;
             continue;
         }
         if (turn == 0)
-            half = leaving[vertex];
-        if (!is_half_edge(corners, twins_count, half) || turn >= faces || faces > twins_count)
+            half = call.leaving[vertex];
+        if (!is_half_edge(call.corners, call.twins_count, half) || turn >= faces || faces > call.twins_count)
             return LODE_REFUSED;
         bool first = open && turn == 0, last = open && turn == faces - 1;
         int fits = taking ? take_triangle(&fan, half) : look_at_triangle(&fan, half, first, last);
         if (fits < 0)
             return LODE_REFUSED;
-        half = twin_before(corners, twins, half);
+        half = twin_before(call.corners, call.twins, half);
         turn++;
         if (fits && turn < faces)
             continue;
         if (fits && !taking)
-            pole[vertex] = 1;
-        taking = fits && !taking && together;
+            call.pole[vertex] = 1;
+        taking = fits && !taking && call.together;
         if (taking)
-            missing[vertex] = 0;
+            call.missing[vertex] = 0;
         else
             place++;
         turn = 0;
     }
-    state[0] = place;
-    state[1] = turn;
-    state[2] = half;
-    state[3] = taking;
-    return place >= order_count;
+    call.state[0] = place;
+    call.state[1] = turn;
+    call.state[2] = half;
+    call.state[3] = taking;
+    return place >= call.order_count;
 }
 
 /* What the corners of a quad have beside their vertices, which was a triangle with its tip at a pole. */
@@ -429,55 +428,54 @@ static inline void unfold_row(const int32_t *row, const int32_t *beside, int64_t
         unfolded[3] = beside[tip_beside];
 }
 
-int64_t lode_mesh_unfold(const int32_t *corners, int64_t corners_count, const int32_t *twins, int64_t twins_count,
-                         const int32_t *starts, int64_t starts_count, const uint8_t *folded, int64_t folded_count,
-                         const int32_t *attributes, int64_t attributes_count, int64_t vertices, int32_t *new_corners,
-                         int64_t new_corners_count, int32_t *new_attributes, int64_t new_attributes_count,
-                         int32_t *pole_of, int64_t pole_of_count, int64_t *state, int64_t state_count, int64_t steps) {
-    if (!is_mesh(corners_count, twins_count) || folded_count != twins_count / 4 || new_corners_count != corners_count ||
-        new_attributes_count != attributes_count || (attributes_count && !corners_count) ||
-        (corners_count && attributes_count % corners_count) || vertices < 0 || pole_of_count > INT32_MAX ||
-        vertices > INT32_MAX - pole_of_count || state_count != 4)
+int64_t lode_mesh_unfold(const struct lode_mesh_unfold *arguments) {
+    const struct lode_mesh_unfold call = *arguments;
+    int64_t steps = call.steps;
+    if (!is_mesh(call.corners_count, call.twins_count) || call.folded_count != call.twins_count / 4 ||
+        call.new_corners_count != call.corners_count || call.new_attributes_count != call.attributes_count ||
+        (call.attributes_count && !call.corners_count) ||
+        (call.corners_count && call.attributes_count % call.corners_count) || call.vertices < 0 ||
+        call.pole_of_count > INT32_MAX || call.vertices > INT32_MAX - call.pole_of_count || call.state_count != 4)
         return LODE_REFUSED;
-    int64_t place = state[0], half = state[1], first_new = state[2], count = state[3];
-    if (place < 0 || first_new < 0 || count < first_new || count > pole_of_count)
+    int64_t place = call.state[0], half = call.state[1], first_new = call.state[2], count = call.state[3];
+    if (place < 0 || first_new < 0 || count < first_new || count > call.pole_of_count)
         return LODE_REFUSED;
-    for (; steps > 0 && place < starts_count; steps--) {
-        int64_t start = starts[place];
+    for (; steps > 0 && place < call.starts_count; steps--) {
+        int64_t start = call.starts[place];
         if (count == first_new)
             half = start;
-        if (!within(start, twins_count) || !is_half_edge(corners, twins_count, half) || !is_triangle(corners, half) ||
-            count == pole_of_count)
+        if (!within(start, call.twins_count) || !is_half_edge(call.corners, call.twins_count, half) ||
+            !is_triangle(call.corners, half) || count == call.pole_of_count)
             return LODE_REFUSED;
-        int64_t face = half >> 2, tip = half & 3, following = twin_before(corners, twins, half);
-        bool closed = twins[start] >= 0, last = following < 0 || following == start;
-        if (following >= twins_count || (following < 0 && closed) || (following >= 0 && (following & 3) == 3))
+        int64_t face = half >> 2, tip = half & 3, following = twin_before(call.corners, call.twins, half);
+        bool closed = call.twins[start] >= 0, last = following < 0 || following == start;
+        if (following >= call.twins_count || (following < 0 && closed) || (following >= 0 && (following & 3) == 3))
             return LODE_REFUSED;
-        const int32_t *old = corners + 4 * face;
-        int32_t *quad = new_corners + 4 * face;
-        quad[0] = (int32_t)(vertices + count);
+        const int32_t *old = call.corners + 4 * face;
+        int32_t *quad = call.new_corners + 4 * face;
+        quad[0] = (int32_t)(call.vertices + count);
         quad[1] = old[(tip + 1) % 3];
         quad[2] = old[(tip + 2) % 3];
-        quad[3] = (int32_t)(vertices + (last && closed ? first_new : count + 1));
-        for (int64_t row = 4 * face; row < attributes_count; row += corners_count) {
-            const int32_t *beside = following < 0 ? 0 : attributes + row - 4 * face + (following & ~INT64_C(3));
-            unfold_row(attributes + row, beside, tip, following & 3, folded[face], new_attributes + row);
+        quad[3] = (int32_t)(call.vertices + (last && closed ? first_new : count + 1));
+        for (int64_t row = 4 * face; row < call.attributes_count; row += call.corners_count) {
+            const int32_t *beside = following < 0 ? 0 : call.attributes + row - 4 * face + (following & ~INT64_C(3));
+            unfold_row(call.attributes + row, beside, tip, following & 3, call.folded[face], call.new_attributes + row);
         }
-        pole_of[count++] = old[tip];
+        call.pole_of[count++] = old[tip];
         half = following;
         if (!last)
             continue;
         if (!closed) {
-            if (count == pole_of_count)
+            if (count == call.pole_of_count)
                 return LODE_REFUSED;
-            pole_of[count++] = old[tip];
+            call.pole_of[count++] = old[tip];
         }
         first_new = count;
         place++;
     }
-    state[0] = place;
-    state[1] = half;
-    state[2] = first_new;
-    state[3] = count;
-    return place >= starts_count;
+    call.state[0] = place;
+    call.state[1] = half;
+    call.state[2] = first_new;
+    call.state[3] = count;
+    return place >= call.starts_count;
 }

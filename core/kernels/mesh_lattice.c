@@ -110,39 +110,39 @@ static inline __attribute__((always_inline)) bool place_beside(struct developmen
     return true;
 }
 
-int64_t lode_mesh_develop(int64_t sides, const int32_t *twins, int64_t twins_count, int32_t *piece, int64_t piece_count,
-                          int32_t *first, int64_t first_count, int8_t *heading, int64_t heading_count, uint8_t *turns,
-                          int64_t turns_count, int64_t *periods, int64_t periods_count, int32_t *stack,
-                          int64_t stack_count, int64_t *state, int64_t state_count, int64_t steps) {
-    int64_t faces = heading_count;
-    if ((sides != 3 && sides != 4) || !is_faces(twins_count) || faces != twins_count / 4 || piece_count != faces ||
-        first_count != 2 * faces || stack_count != faces || periods_count % 3 || periods_count / 3 != turns_count ||
-        state_count != 3)
+int64_t lode_mesh_develop(int64_t sides, const struct lode_mesh_develop *arguments) {
+    const struct lode_mesh_develop call = *arguments;
+    int64_t steps = call.steps;
+    int64_t faces = call.heading_count;
+    if ((sides != 3 && sides != 4) || !is_faces(call.twins_count) || faces != call.twins_count / 4 ||
+        call.piece_count != faces || call.first_count != 2 * faces || call.stack_count != faces ||
+        call.periods_count % 3 || call.periods_count / 3 != call.turns_count || call.state_count != 3)
         return LODE_REFUSED;
-    struct development laid = {twins, faces, piece, first, heading, turns, periods, stack, state[1]};
-    int64_t seed = state[0], count = state[2];
-    if (seed < 0 || !within(laid.top, faces + 1) || !within(count, turns_count + 1) || (laid.top && !count))
+    struct development laid = {call.twins, faces,        call.piece, call.first,   call.heading,
+                               call.turns, call.periods, call.stack, call.state[1]};
+    int64_t seed = call.state[0], count = call.state[2];
+    if (seed < 0 || !within(laid.top, faces + 1) || !within(count, call.turns_count + 1) || (laid.top && !count))
         return LODE_REFUSED;
     bool room = true;
     for (; steps > 0; steps--) {
         if (laid.top == 0) {
-            while (seed < faces && heading[seed] >= 0)
+            while (seed < faces && call.heading[seed] >= 0)
                 seed++;
-            room = seed >= faces || count < turns_count;
+            room = seed >= faces || count < call.turns_count;
             if (seed >= faces || !room)
                 break;
             place_face(&laid, seed, count++, 0, 0, 0);
         }
-        int64_t face = stack[--laid.top];
+        int64_t face = call.stack[--laid.top];
         if (!within(face, faces))
             return LODE_REFUSED;
         if (!(sides == 4 ? place_beside(&laid, face, count - 1, 4, SQUARE_STEPS)
                          : place_beside(&laid, face, count - 1, 3, TRIANGLE_STEPS)))
             return LODE_REFUSED;
     }
-    state[0] = seed;
-    state[1] = laid.top;
-    state[2] = count;
+    call.state[0] = seed;
+    call.state[1] = laid.top;
+    call.state[2] = count;
     return steps > 0 && room ? 1 : room ? 0 : 2;
 }
 
@@ -160,31 +160,28 @@ static inline void stretch(int64_t *low, int64_t *high, int64_t value) {
         *high = value;
 }
 
-int64_t lode_mesh_survey(const int32_t *corners, int64_t corners_count, const int32_t *twins, int64_t twins_count,
-                         const double *points, int64_t points_rows, int64_t points_columns, int64_t points_pitch,
-                         const int32_t *piece, int64_t piece_count, const int32_t *first, int64_t first_count,
-                         const int8_t *heading, int64_t heading_count, int64_t *low, int64_t low_count, int64_t *high,
-                         int64_t high_count, uint8_t *single, int64_t single_count, double *length,
-                         int64_t length_count) {
-    int64_t faces = heading_count;
-    if (!is_mesh(corners_count, twins_count) || faces != corners_count / 4 || piece_count != faces ||
-        first_count != 2 * faces || low_count % 3 || high_count != low_count || single_count != low_count ||
-        length_count != low_count)
+int64_t lode_mesh_survey(const struct lode_mesh_survey *arguments) {
+    const struct lode_mesh_survey call = *arguments;
+    int64_t faces = call.heading_count;
+    if (!is_mesh(call.corners_count, call.twins_count) || faces != call.corners_count / 4 ||
+        call.piece_count != faces || call.first_count != 2 * faces || call.low_count % 3 ||
+        call.high_count != call.low_count || call.single_count != call.low_count || call.length_count != call.low_count)
         return LODE_REFUSED;
     for (int64_t face = 0; face < faces; face++) {
-        int64_t x = first[2 * face], y = first[2 * face + 1], base = 3 * (int64_t)piece[face];
-        int way = heading[face];
-        if (way < 0 || way >= 6 || !within(base, low_count))
+        int64_t x = call.first[2 * face], y = call.first[2 * face + 1], base = 3 * (int64_t)call.piece[face];
+        int way = call.heading[face];
+        if (way < 0 || way >= 6 || !within(base, call.low_count))
             return LODE_REFUSED;
         for (int k = 0; k < 3; k++, way = (way + 2) % 6) {
-            int64_t family = base + way % 3, a = corners[4 * face + k], b = corners[4 * face + (k + 1) % 3];
-            if (!within(a, points_rows) || !within(b, points_rows))
+            int64_t family = base + way % 3, a = call.corners[4 * face + k], b = call.corners[4 * face + (k + 1) % 3];
+            if (!within(a, call.points_rows) || !within(b, call.points_rows))
                 return LODE_REFUSED;
-            single[family] |= twins[4 * face + k] < 0;
-            length[family] += distance(points + a * points_pitch, points + b * points_pitch, points_columns);
-            stretch(&low[base], &high[base], x);
-            stretch(&low[base + 1], &high[base + 1], y);
-            stretch(&low[base + 2], &high[base + 2], x + y);
+            call.single[family] |= call.twins[4 * face + k] < 0;
+            call.length[family] +=
+                distance(call.points + a * call.points_pitch, call.points + b * call.points_pitch, call.points_columns);
+            stretch(&call.low[base], &call.high[base], x);
+            stretch(&call.low[base + 1], &call.high[base + 1], y);
+            stretch(&call.low[base + 2], &call.high[base + 2], x + y);
             x += TRIANGLE_STEPS[way][0];
             y += TRIANGLE_STEPS[way][1];
         }
@@ -233,37 +230,37 @@ static inline int put_corner(int32_t *node, int32_t corner, const int32_t *ident
     return identity[*node] == identity[corner];
 }
 
-int64_t lode_mesh_fill(const int64_t *faces, int64_t faces_count, const int32_t *first, int64_t first_count,
-                       const int8_t *heading, int64_t heading_count, const int32_t *identity, int64_t identity_count,
-                       int64_t top, int64_t left, int64_t closed_rows, int64_t closed_columns, int32_t *nodes,
-                       int64_t height, int64_t width, int64_t nodes_pitch, int32_t *cells, int64_t cells_height,
-                       int64_t cells_width, int64_t cells_pitch) {
+int64_t lode_mesh_fill(const struct lode_mesh_fill *arguments) {
+    const struct lode_mesh_fill call = *arguments;
     const int64_t far = INT64_C(1) << 32;
-    if (first_count != 2 * heading_count || !is_faces(identity_count) || identity_count != 4 * heading_count ||
-        cells_height != height - !closed_rows || cells_width != width - !closed_columns || top < -far || top > far ||
-        left < -far || left > far)
+    if (call.first_count != 2 * call.heading_count || !is_faces(call.identity_count) ||
+        call.identity_count != 4 * call.heading_count || call.cells_height != call.height - !call.closed_rows ||
+        call.cells_width != call.width - !call.closed_columns || call.top < -far || call.top > far ||
+        call.left < -far || call.left > far)
         return LODE_REFUSED;
-    for (int64_t j = 0; j < faces_count; j++) {
-        int64_t face = faces[j], row, column;
-        if (!cell_of(first, heading, heading_count, face, &row, &column))
+    for (int64_t j = 0; j < call.faces_count; j++) {
+        int64_t face = call.faces[j], row, column;
+        if (!cell_of(call.first, call.heading, call.heading_count, face, &row, &column))
             return LODE_REFUSED;
-        row = closed_rows && height > 0 ? modulo(row - top, height) : row - top;
-        column = closed_columns && width > 0 ? modulo(column - left, width) : column - left;
-        if (!within(row, cells_height) || !within(column, cells_width))
+        row = call.closed_rows && call.height > 0 ? modulo(row - call.top, call.height) : row - call.top;
+        column = call.closed_columns && call.width > 0 ? modulo(column - call.left, call.width) : column - call.left;
+        if (!within(row, call.cells_height) || !within(column, call.cells_width))
             return LODE_REFUSED;
-        if (cells[row * cells_pitch + column] >= 0)
+        if (call.cells[row * call.cells_pitch + column] >= 0)
             return j;
-        cells[row * cells_pitch + column] = (int32_t)face;
-        int64_t below = row + 1 == height ? 0 : row + 1, right = column + 1 == width ? 0 : column + 1;
-        int32_t *around[4] = {&nodes[row * nodes_pitch + column], &nodes[row * nodes_pitch + right],
-                              &nodes[below * nodes_pitch + right], &nodes[below * nodes_pitch + column]};
+        call.cells[row * call.cells_pitch + column] = (int32_t)face;
+        int64_t below = row + 1 == call.height ? 0 : row + 1, right = column + 1 == call.width ? 0 : column + 1;
+        int32_t *around[4] = {&call.nodes[row * call.nodes_pitch + column], &call.nodes[row * call.nodes_pitch + right],
+                              &call.nodes[below * call.nodes_pitch + right],
+                              &call.nodes[below * call.nodes_pitch + column]};
         for (int k = 0; k < 4; k++) {
-            int fits = put_corner(around[(heading[face] + k) & 3], (int32_t)(4 * face + k), identity, identity_count);
+            int fits = put_corner(around[(call.heading[face] + k) & 3], (int32_t)(4 * face + k), call.identity,
+                                  call.identity_count);
             if (fits < 0)
                 return LODE_REFUSED;
             if (!fits)
                 return j;
         }
     }
-    return faces_count;
+    return call.faces_count;
 }

@@ -316,29 +316,27 @@ static void choose(const struct choice *c, int64_t top) {
     filter_rows(c);
 }
 
-int64_t lode_choose(const int64_t *bands, int64_t bands_count, const float *rules, int64_t rules_count,
-                    const double *relative, int64_t relative_count, const int8_t *classes, int64_t classes_count,
-                    const float *rates, int64_t rates_count, int32_t *chosen, int64_t chosen_count, double *counts,
-                    int64_t counts_count, int16_t *ways, int64_t ways_count, float *above, int64_t above_count) {
-    if (classes_count != relative_count || chosen_count != relative_count || bands_count % BAND_FIELDS ||
-        rules_count != bands_count / BAND_FIELDS * RULE || rates_count != 2 * LODE_CLASSES * LODE_RATES ||
-        counts_count != 2 * LODE_CLASSES * LODE_INDICES)
+int64_t lode_choose(const struct lode_choose *arguments) {
+    const struct lode_choose call = *arguments;
+    if (call.classes_count != call.relative_count || call.chosen_count != call.relative_count ||
+        call.bands_count % BAND_FIELDS || call.rules_count != call.bands_count / BAND_FIELDS * RULE ||
+        call.rates_count != 2 * LODE_CLASSES * LODE_RATES || call.counts_count != 2 * LODE_CLASSES * LODE_INDICES)
         return LODE_REFUSED;
-    for (int64_t number = 0; number < bands_count / BAND_FIELDS; number++) {
-        const int64_t *band = bands + number * BAND_FIELDS;
-        const float *rule = rules + number * RULE;
+    for (int64_t number = 0; number < call.bands_count / BAND_FIELDS; number++) {
+        const int64_t *band = call.bands + number * BAND_FIELDS;
+        const float *rule = call.rules + number * RULE;
         int64_t columns = band[BAND_COLUMNS];
-        if (!is_band(band, relative_count) || !(rule[0] >= 0.0f && rule[0] <= 1.0f) ||
-            columns > ways_count / (BLOCK * LANES) || columns > above_count / 2)
+        if (!is_band(band, call.relative_count) || !(rule[0] >= 0.0f && rule[0] <= 1.0f) ||
+            columns > call.ways_count / (BLOCK * LANES) || columns > call.above_count / 2)
             return LODE_REFUSED;
-        struct choice choice = {.band = band, .relative = relative, .classes = classes, .rates = rates};
+        struct choice choice = {.band = band, .relative = call.relative, .classes = call.classes, .rates = call.rates};
         choice.weight = rule[1];
         for (int k = 0; k < 2; k++)
             choice.up[k] = rule[2 + k], choice.left[k] = rule[4 + k];
         choice.half = (floats_t){0.0f, 0.0f, rule[0], rule[0]};
-        choice.above = above, choice.chosen = chosen, choice.counts = counts, choice.ways = ways;
+        choice.above = call.above, choice.chosen = call.chosen, choice.counts = call.counts, choice.ways = call.ways;
         for (int64_t j = 0; j < 2 * columns; j++)
-            above[j] = 0.0f;
+            call.above[j] = 0.0f;
         for (int64_t top = 0; top < band[BAND_ROWS]; top += BLOCK)
             choose(&choice, top);
     }

@@ -248,28 +248,29 @@ static bool is_shape(int64_t count, int64_t rows, int64_t columns, int64_t chann
            count % channels == 0 && count / channels == rows * columns;
 }
 
-int64_t lode_store_values(const int32_t *coordinates, int64_t rows, int64_t columns, int64_t pitch, void *points,
-                          int64_t points_count, int64_t points_type, int64_t channels, int64_t channel, int64_t first,
-                          int64_t last, int64_t decimal, double origin, double step, double scale) {
-    if (!is_shape(points_count, rows, columns, channels) || (rows > 1 && pitch < 0) || points_type < 0 ||
-        points_type >= TYPES || channel < 0 || channel >= channels || first < 0 || last < first ||
-        last > rows * columns || !is_rule(origin, step, scale))
+int64_t lode_store_values(const struct lode_store_values *arguments) {
+    const struct lode_store_values call = *arguments;
+    if (!is_shape(call.points_count, call.rows, call.columns, call.channels) || (call.rows > 1 && call.pitch < 0) ||
+        call.points_type < 0 || call.points_type >= TYPES || call.channel < 0 || call.channel >= call.channels ||
+        call.first < 0 || call.last < call.first || call.last > call.rows * call.columns ||
+        !is_rule(call.origin, call.step, call.scale))
         return LODE_REFUSED;
-    struct rule rule = {decimal != 0, origin, step, scale, TYPE[points_type].low, TYPE[points_type].high};
-    int64_t size = TYPE[points_type].size;
-    bool as_it_is = points_type == NUMBER_float64, beside = channels == 1;
+    struct rule rule = {call.decimal != 0,          call.origin, call.step, call.scale, TYPE[call.points_type].low,
+                        TYPE[call.points_type].high};
+    int64_t size = TYPE[call.points_type].size;
+    bool as_it_is = call.points_type == NUMBER_float64, beside = call.channels == 1;
     double values[TOGETHER], own[TOGETHER];
-    for (int64_t at = first; at < last;) {
-        int64_t row = at / columns, column = at % columns;
-        int64_t count = least(least(columns - column, last - at), TOGETHER);
-        void *place = (char *)points + (at * channels + channel) * size;
+    for (int64_t at = call.first; at < call.last;) {
+        int64_t row = at / call.columns, column = at % call.columns;
+        int64_t count = least(least(call.columns - column, call.last - at), TOGETHER);
+        void *place = (char *)call.points + (at * call.channels + call.channel) * size;
         double *evaluated = as_it_is && beside ? place : values;
         void *made = as_it_is ? evaluated : beside ? place : own;
-        evaluate(coordinates + row * pitch + column, count, &rule, evaluated);
+        evaluate(call.coordinates + row * call.pitch + column, count, &rule, evaluated);
         if (!as_it_is)
-            convert(evaluated, count, points_type, made);
+            convert(evaluated, count, call.points_type, made);
         if (!beside)
-            copy(size, made, 1, place, channels, count);
+            copy(size, made, 1, place, call.channels, count);
         at += count;
     }
     return 0;
@@ -388,38 +389,39 @@ static bool compares_whole(const struct comparison *c, struct whole_rule *rule) 
            whole_rule_of(numbers[1], numbers[2], numbers[3], TYPE[c->type].low, TYPE[c->type].high, rule);
 }
 
-int64_t lode_square_distances(const void *points, int64_t points_count, int64_t points_type, const int32_t *coordinates,
-                              int64_t coordinates_count, const double *rules, int64_t rules_count,
-                              const uint8_t *counted, int64_t counted_count, double *figures, int64_t figures_count,
-                              int64_t rows, int64_t columns, int64_t channels, int64_t channel, int64_t height,
-                              int64_t pitch, int64_t first, int64_t last) {
-    int64_t compared = rules_count / RULE_NUMBERS, kinds = kinds_of(compared);
-    if (!is_shape(points_count, rows, columns, channels) || rules_count % RULE_NUMBERS || compared < 1 ||
-        kinds > MOST_KINDS || channel < 0 || channel > channels - compared ||
-        !is_shape(coordinates_count, height, pitch, compared) || height < rows || pitch < columns ||
-        (counted_count && counted_count != rows * columns) || points_type < 0 || points_type >= TYPES)
+int64_t lode_square_distances(const struct lode_square_distances *arguments) {
+    const struct lode_square_distances call = *arguments;
+    int64_t compared = call.rules_count / RULE_NUMBERS, kinds = kinds_of(compared);
+    if (!is_shape(call.points_count, call.rows, call.columns, call.channels) || call.rules_count % RULE_NUMBERS ||
+        compared < 1 || kinds > MOST_KINDS || call.channel < 0 || call.channel > call.channels - compared ||
+        !is_shape(call.coordinates_count, call.height, call.pitch, compared) || call.height < call.rows ||
+        call.pitch < call.columns || (call.counted_count && call.counted_count != call.rows * call.columns) ||
+        call.points_type < 0 || call.points_type >= TYPES)
         return LODE_REFUSED;
-    int64_t across = (columns + LODE_PART_COLUMNS - 1) / LODE_PART_COLUMNS;
-    int64_t down = (rows + LODE_PART_ROWS - 1) / LODE_PART_ROWS;
-    if (first < 0 || last < first || last > down * across || figures_count != 2 * kinds * down * across)
+    int64_t across = (call.columns + LODE_PART_COLUMNS - 1) / LODE_PART_COLUMNS;
+    int64_t down = (call.rows + LODE_PART_ROWS - 1) / LODE_PART_ROWS;
+    if (call.first < 0 || call.last < call.first || call.last > down * across ||
+        call.figures_count != 2 * kinds * down * across)
         return LODE_REFUSED;
-    for (int64_t at = 0; at < rules_count; at += RULE_NUMBERS)
-        if (!is_rule(rules[at + 1], rules[at + 2], rules[at + 3]))
+    for (int64_t at = 0; at < call.rules_count; at += RULE_NUMBERS)
+        if (!is_rule(call.rules[at + 1], call.rules[at + 2], call.rules[at + 3]))
             return LODE_REFUSED;
-    struct comparison comparison = {points,      coordinates, rules,    counted_count ? counted : 0,
-                                    points_type, columns,     channels, channel,
-                                    compared,    height,      pitch};
+    struct comparison comparison = {
+        call.points,      call.coordinates, call.rules,    call.counted_count ? call.counted : 0,
+        call.points_type, call.columns,     call.channels, call.channel,
+        compared,         call.height,      call.pitch};
     struct whole_rule whole = {0};
     bool is_whole = compares_whole(&comparison, &whole);
-    for (int64_t part = first; part < last;) {
+    for (int64_t part = call.first; part < call.last;) {
         int64_t top = part / across * LODE_PART_ROWS, left = part % across * LODE_PART_COLUMNS;
-        int64_t parts =
-            least(least(across - part % across, last - part), kinds > 1 ? SIDE_BY_SIDE / MOST_KINDS : SIDE_BY_SIDE);
-        int64_t bottom = least(top + LODE_PART_ROWS, rows), width = least(columns - left, parts * LODE_PART_COLUMNS);
+        int64_t parts = least(least(across - part % across, call.last - part),
+                              kinds > 1 ? SIDE_BY_SIDE / MOST_KINDS : SIDE_BY_SIDE);
+        int64_t bottom = least(top + LODE_PART_ROWS, call.rows),
+                width = least(call.columns - left, parts * LODE_PART_COLUMNS);
         if (is_whole)
-            whole_part_figures(&comparison, &whole, top, bottom, left, width, figures + 2 * part);
+            whole_part_figures(&comparison, &whole, top, bottom, left, width, call.figures + 2 * part);
         else
-            part_figures(&comparison, top, bottom, left, width, figures + 2 * kinds * part);
+            part_figures(&comparison, top, bottom, left, width, call.figures + 2 * kinds * part);
         part += parts;
     }
     return 0;

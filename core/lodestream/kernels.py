@@ -8,6 +8,7 @@ not fit each other are an error of the caller, never of a stream.
 from __future__ import annotations
 
 import ctypes
+import struct
 from collections.abc import Callable
 from operator import index
 from typing import Any
@@ -87,8 +88,15 @@ _IN_ONE_PIECE, _ALIGNED, _WRITEABLE = 0x1, 0x100, 0x400
 #: The types that values of a surface may have; kernels identify them by their index.
 VALUE_TYPES = [np.dtype(name) for name in ("i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8")]
 
-#: A ctypes type whose instances pass the address of a buffer; `numpy.ndarray.ctypes` takes four times as long.
+#: A ctypes type whose instances give the address of a buffer; `numpy.ndarray.ctypes` takes four times as long.
 _Start: Any = ctypes.c_char * 0
+
+#: A kernel with more arguments takes those after its first integers in a struct. These integers stay arguments, so that
+#: a compiler sees the direction of a coder as a constant.
+MOST_ARGUMENTS = 8
+
+#: The formats of `struct` for the types of C arguments.
+_FORMATS = {ctypes.c_void_p: "P", ctypes.c_int64: "q", ctypes.c_double: "d"}
 
 
 class Array:
@@ -229,7 +237,8 @@ class Kernel:
     name : str
         Without ``lode_``.
     arguments : declarations of the arguments
-        Each is passed as one or more C arguments, see its class. The function returns int64.
+        Each is passed as one or more C arguments, see its class. Where there are more than `MOST_ARGUMENTS`, those
+        after the first integers are fields of a struct. The function returns int64.
 
     Raises
     ------
@@ -241,13 +250,22 @@ class Kernel:
         self.name, self.arguments = name, arguments
         self.types = [kind for argument in arguments for kind in argument.types]
         self._passed: list[Callable[[Any], tuple[Any, ...]]] = [argument.passed for argument in arguments]
+        self._fields: struct.Struct | None = None
+        #: Arguments that are no fields of a struct, ``struct lode_<name>``.
+        self.plain = len(arguments)
+        if len(arguments) > MOST_ARGUMENTS:
+            self.plain = next(place for place, argument in enumerate(arguments) if argument is not INTEGER)
+            self._fields = struct.Struct("@" + "".join(_FORMATS[kind] for kind in self.types[self.plain :]))
         self._function: Any = None
 
     def __call__(self, *values: Any) -> int:
         """Call the kernel; raise ValueError or TypeError if the values are not as declared."""
         if self._function is None:
             function = library()[f"lode_{self.name}"]
-            function.argtypes, function.restype = self.types, ctypes.c_int64
+            function.argtypes = self.types
+            if self._fields is not None:
+                function.argtypes = [*self.types[: self.plain], ctypes.c_char_p]
+            function.restype = ctypes.c_int64
             self._function = function  # only now: another thread may be calling, and would pass numbers of 32 bits
         arguments: list[Any] = []
         try:
@@ -255,6 +273,10 @@ class Kernel:
                 arguments += passed(value)
         except (AttributeError, TypeError, ValueError) as error:
             raise self._refusal(values, error) from None
+        if self._fields is not None:
+            addressof = ctypes.addressof
+            fields = [addressof(value) if type(value) is _Start else value for value in arguments[self.plain :]]
+            arguments[self.plain :] = [self._fields.pack(*fields)]
         result: int = self._function(*arguments)
         if result == _REFUSED:
             raise ValueError(f"{self.name}: lengths or places do not fit each other: {_described(values)}")

@@ -20,8 +20,7 @@ __all__ = ["declarations", "digest", "dispatch"]
 
 def declarations() -> dict[str, tuple[Any, ...]]:
     """The arguments of every kernel, by its name, in the order of ``kernels.py``."""
-    found = (value for value in vars(kernels).values() if isinstance(value, Kernel))
-    return {kernel.name: kernel.arguments for kernel in found}
+    return {kernel.name: kernel.arguments for kernel in vars(kernels).values() if isinstance(kernel, Kernel)}
 
 
 def _ctype(dtype: np.dtype[Any]) -> str:
@@ -56,7 +55,11 @@ def dispatch(names: Collection[str] | None = None) -> str:
     lines = ['#include "calls.h"', '#include "lodestream.h"', ""]
     table = {name: arguments for name, arguments in declarations().items() if names is None or name in names}
     for name, arguments in table.items():
-        passed = ", ".join(_passed(place, argument) for place, argument in enumerate(arguments))
+        values = [_passed(place, argument) for place, argument in enumerate(arguments)]
+        plain = Kernel(name, *arguments).plain
+        if plain < len(values):
+            values[plain:] = [f"&(struct lode_{name}){{{', '.join(values[plain:])}}}"]
+        passed = ", ".join(values)
         lines += [
             f"static int64_t call_{name}(const struct value *v) {{ return lode_{name}({passed}); }}",
             f"static const struct declared {name}[] = {{{', '.join(map(_declared, arguments))}}};",

@@ -39,13 +39,36 @@ class Parameter(NamedTuple):
     name: str
 
 
+def parameter_of(text: str) -> Parameter:
+    before, _, after = text.strip().rpartition(" ")
+    return Parameter(before + " *" * after.count("*"), after.strip("*"))
+
+
+def fields_of(text: str) -> list[Parameter]:
+    """The fields of a struct: a declaration may have several names of one type."""
+    fields = []
+    for declaration in filter(None, map(str.strip, text.split(";"))):
+        first, *others = map(str.strip, declaration.split(","))
+        kind = first.rpartition(" ")[0]
+        fields += [parameter_of(word) for word in (first, *(f"{kind} {other}" for other in others))]
+    return fields
+
+
+STRUCTS = {
+    name: fields_of(text)
+    for name, text in re.findall(r"^struct lode_(\w+) \{(.*?)^\};", CODE, flags=re.DOTALL | re.MULTILINE)
+}
+
+
 def prototypes() -> dict[str, list[Parameter]]:
-    """The functions of the header that are kernels."""
-    found = {}
+    """The functions of the header that are kernels; the fields of a struct are in place of its pointer."""
+    functions = {}
     for name, text in re.findall(r"LODE_API int64_t lode_(\w+)\((.*?)\);", CODE, flags=re.DOTALL):
-        words = [parameter.strip().rpartition(" ") for parameter in text.split(",")]
-        found[name] = [Parameter(before + " *" * after.count("*"), after.strip("*")) for before, _, after in words]
-    return found
+        parameters = [parameter_of(word) for word in text.split(",")]
+        if parameters[-1].ctype == f"const struct lode_{name} *":
+            parameters = [*parameters[:-1], *STRUCTS[name]]
+        functions[name] = parameters
+    return functions
 
 
 DECLARED = {kernel.name: kernel for kernel in vars(kernels).values() if isinstance(kernel, Kernel)}
@@ -56,6 +79,8 @@ ELEMENTS = {"float": "float32", "double": "float64", "uint8_t": "uint8", "bool":
 def test_each_function_of_the_header_is_declared_and_no_other() -> None:
     assert len(re.findall(r"\blode_\w+\(", CODE)) == len(prototypes()) + 2  # lode_sources, lode_runs_v3
     assert sorted(DECLARED) == sorted(prototypes())
+    taken = {name for name, kernel in DECLARED.items() if kernel.plain < len(kernel.arguments)}
+    assert taken == set(STRUCTS)
 
 
 @pytest.mark.parametrize("name", sorted(prototypes()))
