@@ -25,7 +25,8 @@ __all__ = ["dump", "file_state", "load", "root_of"]
 #: Attribute of a map: whether the files that had its name had its values.
 _KNOWN = "_lodestream_files"
 
-_HEAD = f"lodestream {__version__}\n".encode()
+#: What builds and workers share: pickled arrays and sums of floats may differ between versions of numpy, too.
+_HEAD = f"lodestream {__version__} with numpy {np.__version__}\n".encode()
 
 
 def dump(value: object, path: Path, flush: bool = False) -> None:
@@ -53,7 +54,7 @@ def load(path: Path) -> Any:
     with path.open("rb") as file:
         if (head := file.readline()) != _HEAD:
             version, expected = (line.decode("ascii", "replace").strip()[:80] for line in (head, _HEAD))
-            raise UnavailableError(f"expected workers of the same version: {version} builds, a worker has {expected}")
+            raise UnavailableError(f"expected workers of the same versions: {version} builds, a worker has {expected}")
         return pickle.load(file)
 
 

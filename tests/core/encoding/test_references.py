@@ -62,7 +62,7 @@ def test_another_version_is_refused_before_anything_is_unpickled(tmp_path: Path)
     path = tmp_path / "a.pickle"
     dump(np.arange(3), path)
     path.write_bytes(b"lodestream 0.0.1\nno pickle")
-    with pytest.raises(UnavailableError, match=r"workers of the same version: lodestream 0\.0\.1 builds"):
+    with pytest.raises(UnavailableError, match=r"workers of the same versions: lodestream 0\.0\.1 builds"):
         load(path)
 
 
