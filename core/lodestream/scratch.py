@@ -81,7 +81,7 @@ class Scratch(ABC):
 
     @abstractmethod
     def read(self, name: str) -> NDArray[Any]:
-        """The array of this name, of the shape that it was written with, not to be changed.
+        """Return the array of this name, of the shape that it was written with, not to be changed.
 
         Raises
         ------
@@ -91,7 +91,7 @@ class Scratch(ABC):
 
     @abstractmethod
     def those_of(self, names: Iterable[str]) -> set[str]:
-        """Those of these names that arrays have."""
+        """Return those of these names that arrays have."""
 
     @abstractmethod
     def remove(self, name: str) -> None:
@@ -99,10 +99,10 @@ class Scratch(ABC):
 
     @abstractmethod
     def temporary(self, least: int) -> AbstractContextManager[Room]:
-        """Where one task alone puts arrays while it is at work; a file is worth it for ``least`` bytes."""
+        """Return where one task alone puts arrays while it is at work; a file is worth it for ``least`` bytes."""
 
     def has(self, name: str) -> bool:
-        """Whether an array has this name."""
+        """Return whether an array has this name."""
         return bool(self.those_of([name]))
 
 
@@ -121,14 +121,14 @@ class MemoryScratch(Scratch):
         self._arrays[name] = kept
 
     def read(self, name: str) -> NDArray[Any]:
-        """The array of this name, of the shape that was kept."""
+        """Return the array of this name, of the shape that was kept."""
         try:
             return self._arrays[name]
         except KeyError:
             raise FileNotFoundError(f"expected an array {name}, there is none") from None
 
     def those_of(self, names: Iterable[str]) -> set[str]:
-        """Those of these names that arrays have."""
+        """Return those of these names that arrays have."""
         return {name for name in names if name in self._arrays}
 
     def remove(self, name: str) -> None:
@@ -137,7 +137,7 @@ class MemoryScratch(Scratch):
             del self._arrays[kept]
 
     def temporary(self, least: int) -> AbstractContextManager[Room]:
-        """Memory, whatever ``least`` is."""
+        """Return memory, whatever ``least`` is."""
         return nullcontext(IN_MEMORY)
 
 
@@ -215,7 +215,7 @@ class FolderScratch(Scratch):
             unfinished.unlink(missing_ok=True)
 
     def read(self, name: str) -> NDArray[Any]:
-        """The array of this name, of the shape (row, ...) that it was written with, memory-mapped, not to be changed.
+        """Return the array of this name, memory-mapped, of the shape (row, ...) that it was written with, not to be changed.
 
         An empty one is in memory.
 
@@ -252,7 +252,7 @@ class FolderScratch(Scratch):
         return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
 
     def empty(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array of this shape, (row, ...), in a file of its own, memory-mapped, of zeros; it is there at once.
+        """Return a new array of zeros of this shape, (row, ...), memory-mapped, in a file of its own that is there at once.
 
         One under the name of another replaces it: maps of the former stay as they are.
 
@@ -286,7 +286,7 @@ class FolderScratch(Scratch):
             yield Room(files, least)
 
     def those_of(self, names: Iterable[str]) -> set[str]:
-        """Those of these names that arrays have.
+        """Return those of these names that arrays have.
 
         Folders are listed, and no file is asked for that may not be there: a file system of a network remembers for a
         while that it was not, though another machine has written it meanwhile.
@@ -308,7 +308,7 @@ class FolderScratch(Scratch):
         shutil.rmtree(self.folder / name, ignore_errors=True)
 
     def size(self) -> int:
-        """Bytes of all files, but for those that vanish meanwhile."""
+        """Return the bytes of all files, but for those that vanish meanwhile."""
         return sum(map(_size, _files(self.folder)))
 
     def clear(self) -> None:
@@ -316,7 +316,7 @@ class FolderScratch(Scratch):
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _made(self, name: str) -> Path:
-        """The path of a name, in a folder that is there."""
+        """Return the path of a name, in a folder that is there."""
         path = self._path(name)
         for parent in [*path.relative_to(self.folder).parents][-2::-1]:
             (self.folder / parent).mkdir(exist_ok=True)
@@ -403,11 +403,11 @@ class Room:
         self._common: tuple[NDArray[np.uint8], int] = np.zeros(0, np.uint8), 0  # a file, and how much of it is taken
 
     def takes(self, size: int) -> bool:
-        """Whether an array of so many bytes goes into a file: it is large, or there are many small ones already."""
+        """Return whether an array of so many bytes goes into a file: it is large, or there are many small ones already."""
         return self._scratch is not None and self._small + size >= self._least
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """A new array of this shape, (row, ...), whatever it holds."""
+        """Return a new array of this shape, (row, ...), whatever it holds."""
         size = math.prod(shape) * np.dtype(dtype).itemsize
         if self._scratch is None or not self.takes(size):
             self._small += size
@@ -432,7 +432,7 @@ class Room:
 
 
 def is_made(array: NDArray[Any]) -> bool:
-    """Whether an array, of any shape, is one that a `Room` has put into a file: that file says nothing about it."""
+    """Return whether an array, of any shape, is one that a `Room` has put into a file: that file says nothing about it."""
     return bool(getattr(array, _MADE, False))
 
 
@@ -444,6 +444,6 @@ _AT_ONCE = 1 << 22
 
 
 def rows_at_once(shape: tuple[int, ...]) -> Iterator[slice]:
-    """All rows of an array of this shape, as many at a time as have a few million values, but at least one."""
+    """Return all rows of an array of this shape, as many at a time as have a few million values, but at least one."""
     each = max(1, _AT_ONCE // max(math.prod(shape[1:]), 1))
     return (slice(start, min(start + each, shape[0])) for start in range(0, shape[0], each))

@@ -33,7 +33,7 @@ _WIND = (257, 321)
 
 
 def mountains() -> ls.Surface:
-    """Heights of whole metres on an even grid."""
+    """Return heights of whole metres on an even grid."""
     rows, _ = _TERRAIN
     place = [500_000.0, CELL, 0.0, 4_200_000.0 + rows * CELL, 0.0, -CELL]
     metadata = {"name": "Mountains: heights, 30 m apart", "unit": "m", "geotransform": place}
@@ -41,7 +41,7 @@ def mountains() -> ls.Surface:
 
 
 def ocean() -> ls.Surface:
-    """Depths around the whole Earth: columns closed, land as holes, and a temperature."""
+    """Return depths around the whole Earth: columns closed, land as holes, and a temperature."""
     latitude = np.radians(90.0 - np.arange(_OCEAN[0]))[:, None]
     longitude = np.radians(np.arange(_OCEAN[1]) - 180.0)[None, :]
     depth = _waves(_unit(latitude, longitude), seed=11, octaves=6)
@@ -56,7 +56,7 @@ def ocean() -> ls.Surface:
 
 
 def knot() -> ls.Surface:
-    """A tube around a torus knot: x, y, z, closed along both axes."""
+    """Return a tube around a torus knot: x, y, z, closed along both axes."""
     along = 2 * np.pi * np.arange(_KNOT[0])[:, None] / _KNOT[0]
     around = 2 * np.pi * np.arange(_KNOT[1])[None, :] / _KNOT[1]
 
@@ -76,7 +76,7 @@ def knot() -> ls.Surface:
 
 
 def moon() -> ls.Surface:
-    """A sphere with craters as the six sides of a cube: blocks that share the points of their sides."""
+    """Return a sphere with craters as the six sides of a cube: blocks that share the points of their sides."""
     steps = np.arange(1 - _FACE, _FACE, 2) / (_FACE - 1)  # symmetric about 0, so that two sides agree bit for bit
     v, u = np.meshgrid(steps, steps, indexing="ij")
     blocks = []
@@ -91,7 +91,7 @@ def moon() -> ls.Surface:
 
 
 def wind() -> ls.Surface:
-    """Hills with a vector at each point: the wind over them, as an attribute."""
+    """Return hills with a vector at each point: the wind over them, as an attribute."""
     y, x = np.mgrid[0 : _WIND[0], 0 : _WIND[1]] / 40.0
     heights = 240.0 * np.sin(x) * np.cos(0.8 * y) + 90.0 * np.sin(2.3 * x + 1.9 * y) + 25.0 * np.cos(6.1 * y - 5.3 * x)
     down, across = np.gradient(heights, 100.0)
@@ -147,13 +147,13 @@ def write_site(folder: Path) -> None:
 
 
 def _unit(latitude: Floats, longitude: Floats) -> Floats:
-    """Points (H, W, 3) of the unit sphere at latitudes (H, 1) and longitudes (1, W), in radians."""
+    """Return points (H, W, 3) of the unit sphere at latitudes (H, 1) and longitudes (1, W), in radians."""
     x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
     return np.stack([x, y, np.broadcast_to(np.sin(latitude), x.shape)], axis=2)
 
 
 def _waves(places: Floats, seed: int, octaves: int) -> Floats:
-    """Sums of plane waves in space, (H, W), at places (H, W, 3): smooth over a sphere, from about -1 to 1."""
+    """Return sums of plane waves in space, (H, W), at places (H, W, 3): smooth over a sphere, from about -1 to 1."""
     rng = np.random.default_rng(seed)
     total = np.zeros(places.shape[:2])
     for octave in range(octaves):
@@ -164,7 +164,7 @@ def _waves(places: Floats, seed: int, octaves: int) -> Floats:
 
 
 def _craters(places: Floats) -> Floats:
-    """Depths of craters, (H, W), at places (H, W, 3) of the unit sphere."""
+    """Return depths of craters, (H, W), at places (H, W, 3) of the unit sphere."""
     rng = np.random.default_rng(8)
     total = np.zeros(places.shape[:2])
     for _ in range(60):

@@ -71,7 +71,7 @@ def _write_config(folder: Path, sources: Mapping[str, Source]) -> None:
 
 
 def _ours(folder: Path) -> bool:
-    """Whether this module has written the list of the folder."""
+    """Return whether this module has written the list of the folder."""
     try:
         config = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
     except (OSError, ValueError):

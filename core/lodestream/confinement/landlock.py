@@ -39,7 +39,7 @@ _ALL_SCOPES = 0b11  # abstract sockets and signals to processes outside
 
 
 def version(libc: ctypes.CDLL) -> int:
-    """Version of the kernel's interface; 0 where there is none, or it is switched off."""
+    """Return the version of the kernel's interface; 0 where there is none, or it is switched off."""
     return max(0, int(libc.syscall(_CREATE_RULESET, None, ctypes.c_size_t(0), _VERSION)))
 
 

@@ -24,7 +24,7 @@ _VARIABLES = ("GDAL_DATA", "GDAL_DRIVER_PATH", "HDF5_PLUGIN_PATH", "LD_LIBRARY_P
 
 
 def library_places(*, processes: bool = False) -> tuple[Path, ...]:
-    """Files and folders that any program in Python may need to read; not all of them exist.
+    """Return files and folders that any program in Python may need to read; not all of them exist.
 
     Parameters
     ----------

@@ -120,7 +120,7 @@ def memory_limit() -> int:
 
 
 def default_memory() -> int:
-    """A quarter of the memory that this process may have, in bytes: what encoding or a check may take."""
+    """Return a quarter of the memory that this process may have, in bytes: what encoding or a check may take."""
     return memory_limit() // 4
 
 

@@ -74,7 +74,7 @@ class Asset:
 
 @functools.lru_cache(maxsize=8)
 def assets(folder: Path = FOLDER) -> dict[str, Asset]:
-    """The files of the page by name; none where it is not built.
+    """Return the files of the page by name; none where it is not built.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def assets(folder: Path = FOLDER) -> dict[str, Asset]:
 
 
 def widget_modules(folder: Path = FOLDER) -> tuple[Path, Path] | None:
-    """The module of a widget in notebooks, and that of the viewer's element, which it loads; None: not built.
+    """Return the module of a widget in notebooks, and that of the viewer's element, which it loads; None: not built.
 
     Parameters
     ----------
