@@ -215,7 +215,7 @@ class FolderScratch(Scratch):
             unfinished.unlink(missing_ok=True)
 
     def read(self, name: str) -> NDArray[Any]:
-        """Return the array of this name, memory-mapped, of the shape (row, ...) that it was written with, not to be changed.
+        """Return the array of this name, memory-mapped and read-only, of the shape (row, ...) that it was written with.
 
         An empty one is in memory.
 
@@ -252,7 +252,7 @@ class FolderScratch(Scratch):
         return np.memmap(path, dtype, "r", start, shape, "F" if fortran else "C")
 
     def empty(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Return a new array of zeros of this shape, (row, ...), memory-mapped, in a file of its own that is there at once.
+        """Return a new array of zeros of this shape, (row, ...), mapped from a file of its own that is there at once.
 
         One under the name of another replaces it: maps of the former stay as they are.
 
@@ -403,7 +403,7 @@ class Room:
         self._common: tuple[NDArray[np.uint8], int] = np.zeros(0, np.uint8), 0  # a file, and how much of it is taken
 
     def takes(self, size: int) -> bool:
-        """Return whether an array of so many bytes goes into a file: it is large, or there are many small ones already."""
+        """Return whether so many bytes go into a file: they are many, or there are many small arrays already."""
         return self._scratch is not None and self._small + size >= self._least
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
@@ -432,7 +432,7 @@ class Room:
 
 
 def is_made(array: NDArray[Any]) -> bool:
-    """Return whether an array, of any shape, is one that a `Room` has put into a file: that file says nothing about it."""
+    """Return whether a `Room` has put this array, of any shape, into a file: that file says nothing about it."""
     return bool(getattr(array, _MADE, False))
 
 
