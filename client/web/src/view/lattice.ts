@@ -62,7 +62,8 @@ export interface Between {
 /**
  * Places along an axis between the lines of a grid.
  *
- * @param places - In indices of the full resolution; beyond the end of a closed axis it begins again.
+ * @param places - In indices of the full resolution; beyond the end of a closed axis it begins again. NaN, a line
+ * outside the grid, has no share.
  * @param at - Where the grid's lines stand, rising.
  * @param full - Samples of the axis at full resolution.
  */
@@ -93,7 +94,7 @@ export function between(places: readonly number[], at: Float64Array, full: numbe
     }
     below[k] = start;
     above[k] = end;
-    share[k] = b > a ? (place - a) / (b - a) : 0;
+    share[k] = Number.isNaN(place) ? Number.NaN : b > a ? (place - a) / (b - a) : 0;
   });
   return { below, above, share };
 }
@@ -105,7 +106,8 @@ type Reader = (node: number) => number;
  * Bilinear interpolation in a grid.
  *
  * @param reader - The value at a node; NaN where there is none.
- * @returns [row, column]; of the corners that have a value the mean by their shares, NaN where none has one.
+ * @returns [row, column]; of the corners that have a value the mean by their shares, NaN where none has one and outside
+ * the grid.
  */
 export function interpolated(rows: Between, columns: Between, width: number, reader: Reader): Float64Array {
   const [height, across] = [rows.share.length, columns.share.length];
@@ -132,7 +134,11 @@ export function interpolated(rows: Between, columns: Between, width: number, rea
   return values;
 }
 
-/** Nodes as `latticeOf`, at places between those of an earlier grid of the same block. */
+/**
+ * Nodes as `latticeOf`, at places between those of an earlier grid of the same block.
+ *
+ * @param rows - Places, see `placesOf`.
+ */
 export function latticeBetween(
   grid: Grid,
   rows: readonly number[],
@@ -159,7 +165,7 @@ export function latticeBetween(
 /** Where lines of nodes stand, in indices of the full resolution; NaN outside the grid. */
 export function placesOf(lines: readonly number[], at: Float64Array, full: number, closed: boolean): number[] {
   return lines.map((line) => {
-    if (!closed) return at[line]!;
+    if (!closed) return at[line] ?? Number.NaN;
     const turns = Math.floor(line / at.length);
     return at[line - turns * at.length]! + turns * full;
   });

@@ -228,6 +228,12 @@ describe("blending", () => {
     }
   });
 
+  it("of the same picture shows it as it is, to its ends", () => {
+    const bowl = (): Grid => plane(9, 12, (i, j) => (i - 3) ** 2 / 9 + j / 5);
+    const drawn = new Drawn().picture([bowl()]).picture([bowl()]);
+    for (const { normals, fromNormals } of drawn.patches.values()) expect(fromNormals).toEqual(normals);
+  });
+
   it("reports the last change along the normal, in the surface's unit", () => {
     const drawn = new Drawn().picture([plane(9, 9, () => 1)]).picture([plane(9, 9, () => 3.5)]);
     drawn.take(drawn.geometry.setField({ kind: "change" }).patches);
