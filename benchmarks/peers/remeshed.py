@@ -20,7 +20,7 @@ from ..arrays import ROOT
 from .curves import bytes_at
 from .tables import bold, table
 
-__all__ = ["MESHES", "distance", "measure", "page"]
+__all__ = ["MESHES", "distance", "error_of", "measure", "page"]
 
 FOLDER = ROOT.parent / "shared" / "data" / "meshes"
 #: Scans, and a CAD model, for which Draco is the better choice.
@@ -53,7 +53,7 @@ def _measured(path: Path) -> dict[str, Any]:
     for error in _RMS:
         container = ls.encode(surface, rms=error * report["diagonal"])
         decoded = ls.decode(container)
-        rows.append({"setting": f"rms {error:g}", "bytes": len(container), "rms": _error(points, triangles, decoded)})
+        rows.append({"setting": f"rms {error:g}", "bytes": len(container), "rms": error_of(points, triangles, decoded)})
         print(f"{path.name}: {rows[-1]}", flush=True)
     return {
         "vertices": len(points),
@@ -74,13 +74,14 @@ def _layers(points: Floats, triangles: Integers, surface: ls.Surface) -> Iterato
     for layer in reader.index.layers:
         prefix = ls.Decoder()
         prefix.feed(container[: layer.end])
-        yield {"setting": "layer", "bytes": layer.end, "rms": _error(points, triangles, prefix.surface())}
+        yield {"setting": "layer", "bytes": layer.end, "rms": error_of(points, triangles, prefix.surface())}
 
 
-def _error(points: Floats, triangles: Integers, surface: ls.Surface) -> float:
+def error_of(points: Floats, triangles: Integers, surface: ls.Surface) -> float:
+    """Root mean square distance of a surface from a mesh, see `distance`."""
     mesh = weld(surface)
     quads = np.asarray(mesh.quads, np.int64)
-    places = np.concatenate([block.points.reshape(-1, 3) for block in surface.blocks]).astype(np.float64)
+    places = np.concatenate([block.points.reshape(-1, 3) for block in surface.blocks])[mesh.source].astype(np.float64)
     halves = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     return distance(points, triangles, places, halves)
 

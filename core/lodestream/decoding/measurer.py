@@ -290,6 +290,8 @@ def _stacked(frames: Sequence[Grid]) -> NDArray[np.int32]:
 
 def _one_cell(squares: NDArray[np.float64]) -> list[tuple[float, float]]:
     """Return the sum and the largest of each kind over all cells of a patch."""
+    if squares.shape[:2] == (1, 1):
+        return [(total, largest) for total, largest in squares[0, 0].tolist()]
     return [
         (math.fsum(kind_squares[..., 0].flat), float(kind_squares[..., 1].max()))
         for kind_squares in np.moveaxis(squares, 2, 0)

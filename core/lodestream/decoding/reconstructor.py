@@ -7,6 +7,7 @@ shares with the one before it is not made again.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from itertools import accumulate, pairwise, product
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..entropy.band_fields import COLUMNS, ROWS
+from ..entropy.stacks import Stacks
 from ..entropy.tiles import Tiles, TileTable
 from ..transform.all_levels import LevelInverse
 from ..transform.lifting import FRACTION_BITS
@@ -94,9 +96,10 @@ class Reconstructor:
         arrays = _arrays([*(shapes if below is None else ()), *(step.shape for step in region.steps)], memory)
         self._core, arrays = ([below[0]], arrays) if below else (arrays[: len(shapes)], arrays[len(shapes) :])
         #: Of each grid of the surface its array at the core; None if it is not made.
-        self._places: list[Grid | None] = [None] * len(region.layout.grids)
+        places: list[Grid | None] = [None] * len(region.layout.grids)
         for number, array in zip(region.grids, self._core, strict=True):
-            self._places[number] = array
+            places[number] = array
+        self._stacks = tiles.stacks(places) if below is None else None
         self._levels, self._shown = [], self._core
         if region.core_spans is not None:
             wanted = [span_pieces(*of) for of in zip(region.core_spans, shapes[0], strict=True)]
@@ -127,8 +130,8 @@ class Reconstructor:
         """
         shared = self._shared_with(state)
         self._before = state
-        if not shared and self._below_fraction is None:
-            self._make_core(state)
+        if not shared and self._stacks is not None:
+            self._make_core(state, self._stacks)
         for level in self._levels[max(shared - 1, 0) :]:
             level.make(self._tiles, state)
         fraction = FRACTION_BITS if state.whole < self._region.level else 0
@@ -137,7 +140,7 @@ class Reconstructor:
         cells = [self._shown[k : k + self._columns] for k in range(0, len(self._shown), self._columns)]
         return [np.block(cells)], fraction
 
-    @property
+    @cached_property
     def frames(self) -> list[Grid]:
         """The grids of the last call in one piece; further columns, whose values mean nothing, follow.
 
@@ -166,10 +169,10 @@ class Reconstructor:
                 return number
         return len(self._used)
 
-    def _make_core(self, state: KnownState) -> None:
+    def _make_core(self, state: KnownState, stacks: Stacks) -> None:
         region, core = self._region, self._region.core
         bare = [level for level in state.bare if level <= core]
-        self._tiles.spread_levels(core, state.passes, self._places, state.whole, bare=bare)
+        self._tiles.spread_levels(core, state.passes, stacks, state.whole, bare=bare)
         inverse(self._core, region.part, self._predictors, core, state.whole, self._coordinate, bare=bare)
 
 

@@ -17,6 +17,7 @@ from ..quantization.band_steps import Quantiser, band_step
 from .band_fields import COLUMNS, OFFSET, ROWS, STRIDE
 from .bitplanes import PADDING, code_passes, new_models
 from .dequantize import spread_bands
+from .stacks import Stacks
 
 __all__ = ["BandClass", "Reading", "Run", "TileTable", "Tiles", "gather"]
 
@@ -303,11 +304,18 @@ class Tiles:
         for array, numbers in zip(coefficients, self.table.of_grid, strict=True):
             self._spread(numbers[(numbers >= first) & (numbers < last)], state, array, len(state))
 
+    def stacks(self, arrays: Sequence[NDArray[np.int32] | None]) -> Stacks:
+        """Return the stacks of arrays of coefficients for `spread_levels`, shape (row, column), one for each grid.
+
+        None stands for a grid that is passed over.
+        """
+        return Stacks(self.table.origins, self.table.of_grid, arrays)
+
     def spread_levels(
         self,
         level: int,
         state: NDArray[np.int8],
-        coefficients: Sequence[NDArray[np.int32] | None],
+        stacks: Stacks,
         whole: int,
         bare: Collection[int] = (),
     ) -> None:
@@ -318,8 +326,8 @@ class Tiles:
         level : int
         state : int8, shape (tile,)
             Passes that remain of each tile.
-        coefficients : int32 arrays, shape (row, column), one for each grid; None of grids that are passed over
-            Their values at the places of these tiles are overwritten.
+        stacks : Stacks
+            Those of `stacks`. Values of their arrays at the places of these tiles are overwritten.
         whole : int
             Coefficients of levels above this one are multiplied by 2**`FRACTION_BITS`.
         bare : collection of int
@@ -329,11 +337,9 @@ class Tiles:
         finer = table.tiles_from(whole + 1)
         for lowest, highest in _runs(0, level, bare):
             span = table.first[[table.tiles_from(lowest) if lowest else 0, table.tiles_from(highest + 1)]]
-            for array, numbers in zip(coefficients, table.of_grid, strict=True):
-                if array is None:
-                    continue
-                bands = np.arange(*span) if len(coefficients) == 1 else numbers[slice(*np.searchsorted(numbers, span))]
-                self._spread(bands, state, array, finer)
+            for plane, numbers in stacks.planes:
+                bands = numbers[slice(*np.searchsorted(numbers, span))]
+                self._spread(bands, state, plane, finer, origins=stacks.origins)
 
     def spread_part(
         self,
@@ -375,9 +381,14 @@ class Tiles:
         array: NDArray[np.int32],
         finer: int,
         origin: tuple[int, int] = (0, 0),
+        origins: NDArray[np.int64] | None = None,
     ) -> None:
-        """Write the estimated coefficients of some bands into an array whose first element is at ``origin``."""
-        arrays = self.known, self.sign, self.early, self.table.bands, self.table.origins, self.steps
+        """Write the estimated coefficients of some bands into an array whose first element is at ``origin``.
+
+        ``origins`` are those of the table, unless the array has other rows.
+        """
+        origins = self.table.origins if origins is None else origins
+        arrays = self.known, self.sign, self.early, self.table.bands, origins, self.steps
         spread_bands(*arrays, numbers, np.ascontiguousarray(state), finer, array, origin)
 
 

@@ -20,10 +20,12 @@ from .samples import Grids, number_samples, place_samples, quads_of, upsample
 from .sharp_edges import sharpen
 from .triangulation import Floats, Integers, Triangulation
 
-__all__ = ["DEFAULT_ERROR", "Remeshing", "remesh_triangles"]
+__all__ = ["DEFAULT_ERROR", "MOST_BLOCKS", "Remeshing", "remesh_triangles"]
 
 #: Root mean square distance that is aimed at, in parts of the diagonal.
 DEFAULT_ERROR = 2e-4
+#: Blocks that may be asked for: these take some minutes, and the time to place sites grows with the square.
+MOST_BLOCKS = 4000
 #: Quads along a side of a block: of those that are tried first, and of the largest.
 _FEWEST, _FIRST, _MOST = 8, 16, 128
 #: Edges of triangles before they are cut into cells, in parts of the side of a cell.
@@ -127,12 +129,10 @@ def remesh_triangles(
     mesh, rows, turned = clean(vertices, faces)
     progress(0.05)
     wanted = min(100, max(24, len(mesh.vertices) // 40)) if blocks is None else blocks
-    base = _adapted(mesh, wanted, progress)
     most = np.inf if most_points is None else most_points
-    if len(base.blocks) * (_FIRST + 1) ** 2 > most:
-        raise TooLargeError(
-            f"expected at most {most_points:,} points, got {len(base.blocks):,} blocks of {_FIRST + 1}^2"
-        )
+    _check_size(int(_EVEN * wanted), most)
+    base = _adapted(mesh, wanted, progress)
+    _check_size(len(base.blocks), most)
     relaxation = Relaxation(mesh)
     grids, points, normals = base.sampled(_FIRST)
     points, normals = relaxation.relax(grids, points, normals, _ROUNDS[0])
@@ -159,6 +159,14 @@ def remesh_triangles(
     return Remeshing(mesh, rows, turned, kept, places, distances, folds, base.cells.count, sharp)
 
 
+def _check_size(blocks: int, most: float) -> None:
+    """Refuse more blocks than there may be points for."""
+    if blocks * (_FIRST + 1) ** 2 > most:
+        raise TooLargeError(
+            f"expected at most {most:,} points, got {blocks:,} blocks of {_FIRST + 1}^2: ask for fewer blocks"
+        )
+
+
 def _shares(mesh: Triangulation, wanted: float) -> Integers:
     """Cells of each component, by area, for so many blocks in all.
 
@@ -177,9 +185,11 @@ def _adapted(mesh: Triangulation, wanted: int, progress: Callable[[float], None]
     shares = _shares(mesh, _EVEN * wanted)
     most = max(_MOST_CELLS, 4 * wanted)
     if shares.sum() > most:
+        enough = -(-int(shares.sum()) // 4)
+        more = f", or ask for {enough:,} blocks" if enough <= MOST_BLOCKS else ""
         raise FormatError(
             f"expected a surface that at most {most:,} cells cover, got {len(shares):,} components of {LEAST_CELLS} "
-            f"cells or more each: leave out the small ones, or ask for {-(-int(shares.sum()) // 4):,} blocks"
+            f"cells or more each: leave out the small ones{more}"
         )
     fine, parents = refine(mesh, longest_edges(mesh, np.sqrt(areas / shares) / _FINENESS, shares))
     # Components of the finer mesh may be numbered otherwise.

@@ -14,7 +14,7 @@ from ..mesh import Mesh
 from ..mesh.places import equal_places
 from ..surface import Block, Surface
 from .attributes import find_places, sample_attributes
-from .remeshing import DEFAULT_ERROR, Remeshing, remesh_triangles
+from .remeshing import DEFAULT_ERROR, MOST_BLOCKS, Remeshing, remesh_triangles
 from .samples import Grids
 from .triangulation import Floats, Integers
 
@@ -25,7 +25,6 @@ KEY = "remesh"
 _METHOD = "geodesic cells, pairs of their dual triangles"
 #: The points are float32 if that moves none farther than this part of the diagonal.
 _ROUNDING = 1e-6
-_MOST_BLOCKS = 100_000
 #: Rounds in which samples at the same place are moved apart.
 _ROUNDS = 8
 
@@ -37,7 +36,7 @@ class RemeshOptions:
     Attributes
     ----------
     blocks : int or None
-        About how many blocks. None: 100, and fewer for a mesh of less than 4,000 vertices.
+        About how many blocks, at most `MOST_BLOCKS`. None: 100, and fewer for a mesh of less than 4,000 vertices.
     error : float
         Root mean square distance to be reached both ways, in parts of the diagonal of the bounding box.
     normals : str
@@ -60,8 +59,11 @@ class RemeshOptions:
     most_points: int | None = None
 
     def __post_init__(self) -> None:
-        if self.blocks is not None and not 1 <= self.blocks <= _MOST_BLOCKS:
-            raise OptionError(f"expected blocks= from 1 to {_MOST_BLOCKS:,}, got {self.blocks}")
+        if self.blocks is not None and not 1 <= self.blocks <= MOST_BLOCKS:
+            raise OptionError(
+                f"expected blocks= from 1 to {MOST_BLOCKS:,}, got {self.blocks:,}: a smaller remesh_error= puts more "
+                "points into each"
+            )
         if not 0 < self.error < 1:
             raise OptionError(f"expected remesh_error= above 0 and below 1, such as 2e-4, got {self.error}")
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..grid.axis import AxisStep
-from ..grid.layout import Layout, Source
+from ..grid.layout import REMEMBERED, Layout, Source
 from .all_levels import inverse_levels, memory_of
 from .fitting import fitted_predictor
 from .lifting import CLAMP, FRACTION_BITS, REACH, TAPS, forward_step, inverse_step
@@ -287,14 +287,25 @@ def synthesis_norms(layout: Layout, predictors: NDArray[np.int8], number: int = 
     """
     lines = _line_norms(layout, predictors, number)
     norms: NDArray[np.float64] = lines[0][:, :, None] * lines[1][:, None, :]
-    if layout.grids[number].interface:
-        for patch, grid in enumerate(layout.grids):
-            for side, source in enumerate(grid.sources):
-                if source is not None and source.grid == number and not grid.interface:
-                    # Across the side its points count as nodes of the patch; a pole's only point does so all along it.
-                    across, points = side // 2, grid.shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
-                    return norms * points * _line_norms(layout, predictors, patch)[across, :, 0][:, None, None]
+    beside = _patches_beside(layout).get(number)
+    if beside is not None:
+        patch, side = beside
+        # Across the side its points count as nodes of the patch; a pole's only point does so all along it.
+        points = layout.grids[patch].shape[1 - side // 2] if layout.grids[number].shape[0] == 1 else 1
+        return norms * points * _line_norms(layout, predictors, patch)[side // 2, :, 0][:, None, None]
     return norms
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _patches_beside(layout: Layout) -> dict[int, tuple[int, int]]:
+    """Return for each interface that a patch takes points from the first such patch, and its side."""
+    sides = {
+        source.grid: (patch, side)
+        for patch, grid in reversed(list(enumerate(layout.grids)))
+        for side, source in reversed(list(enumerate(grid.sources)))
+        if source is not None and not grid.interface
+    }
+    return {number: beside for number, beside in sides.items() if layout.grids[number].interface}
 
 
 def _line_norms(layout: Layout, predictors: NDArray[np.int8], number: int) -> NDArray[np.float64]:

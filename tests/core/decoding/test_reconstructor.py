@@ -52,7 +52,7 @@ def whole(
     unknown = [k for k in range(1, level + 1) if state[layout.tiles_of(k).start : layout.tiles_of(k).stop].any()]
     known = unknown[0] - 1 if unknown else level
     arrays = [allocate(layout.shape(0, level))]
-    tiles.spread_levels(level, state, arrays, known)
+    tiles.spread_levels(level, state, tiles.stacks(arrays), known)
     inverse(arrays, layout, predictors, level, known)
     return arrays[0], FRACTION_BITS if known < level else 0
 

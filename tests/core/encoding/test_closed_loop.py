@@ -44,7 +44,8 @@ def check(surface: ls.Surface, base: int) -> None:
         tiles = Tiles(table, quantiser)
         tiles.known[:], tiles.sign[:] = np.abs(indices), np.sign(indices)
         grids = [allocate(grid.shape) for grid in layout.grids]
-        tiles.spread_levels(layout.levels, np.zeros(len(layout.tiles), np.int8), grids, layout.levels)
+        state = np.zeros(len(layout.tiles), np.int8)
+        tiles.spread_levels(layout.levels, state, tiles.stacks(grids), layout.levels)
         inverse(grids, layout, predictors, layout.levels, layout.levels)
         for reconstruction, grid in zip(reconstructions, grids, strict=True):
             assert np.array_equal(reconstruction, grid)

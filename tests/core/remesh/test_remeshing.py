@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lodestream as ls
-from lodestream.errors import FormatError, OptionError
+from lodestream.errors import FormatError, OptionError, TooLargeError
 from lodestream.mesh import weld
+from lodestream.remesh import remeshing
 from lodestream.remesh.cells import Cells, find_nearest, grow_cells, place_sites
 from lodestream.remesh.cleaning import clean, longest_edges, refine
 from lodestream.remesh.distances import folded_quads
@@ -273,6 +274,20 @@ def test_more_components_than_cells_are_refused_at_once() -> None:
         remesh_triangles(places.reshape(-1, 3), every)
 
 
+def test_more_blocks_than_points_are_refused_before_the_work_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remeshing, "_adapted", None)
+    with pytest.raises(TooLargeError, match=r"at most 100,000 points, got 3,000 blocks of 17\^2: ask for fewer"):
+        remesh_triangles(*scenes.sphere(), blocks=4000, most_points=100_000)
+
+
+def test_a_remedy_that_would_be_refused_is_not_named() -> None:
+    points, faces = scenes.cube()
+    places = np.arange(4100)[:, None, None] * [3, 0, 0] + points
+    every = (np.arange(4100)[:, None, None] * 8 + faces).reshape(-1, 3)
+    with pytest.raises(FormatError, match=r"leave out the small ones$"):
+        remesh_triangles(places.reshape(-1, 3), every, blocks=100)
+
+
 @pytest.mark.parametrize("size", [1e-100, 1e100, 1e300])
 def test_sizes_beyond_all_measure_are_refused(size: float) -> None:
     points, faces = scenes.cube()
@@ -391,6 +406,7 @@ class TestSurfaces:
             ({"remesh": "perhaps"}, "yes or no"),
             ({"remesh": True, "blocks": "many"}, "a number"),
             ({"remesh": True, "blocks": 0}, "from 1"),
+            ({"remesh": True, "blocks": 4001}, "from 1 to 4,000, got 4,001: a smaller remesh_error="),
             ({"remesh": True, "remesh_error": 2}, "below 1"),
         ],
     )
