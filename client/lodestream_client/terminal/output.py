@@ -150,7 +150,7 @@ def _points(details: Mapping[str, Any]) -> int:
 def note_holes(holes: int, total: int, of: str = "") -> None:
     """Note how many points are holes, if any are; `of` stands before it."""
     if holes:
-        note(f"{of}{holes} of {total} points are holes")
+        note(f"{of}{holes} of {total} points {'is a hole' if holes == 1 else 'are holes'}")
 
 
 def note_details(details: Mapping[str, Any], of: str = "", words: Callable[[str], str] = str) -> None:

@@ -130,11 +130,13 @@ def plain(number: Any) -> Any:
 def _nearly_even(index: NDArray[np.int64], values: NDArray[Any]) -> bool:
     """Return whether values at different places lie on a line, except for rounding."""
     exact = values.astype(np.float64)
+    if float(np.abs(exact).max()) >= 2**53:
+        return False
     step = (exact[-1] - exact[0]) / float(index[-1] - index[0])
     rounding = np.finfo(values.dtype).eps if values.dtype.kind == "f" else 0.0
     allowed = 4 * rounding * float(np.abs(exact).max()) + (0.0 if rounding else 0.5) + 1e-9 * abs(step)
     away = np.abs(exact[0] + step * (index - index[0]) - exact).max()
-    return bool(step) and bool(away <= min(allowed, abs(step) / 4)) and float(np.abs(exact).max()) < 2**53
+    return bool(step) and bool(away <= min(allowed, abs(step) / 4))
 
 
 def _candidates(index: NDArray[np.int64], values: NDArray[Any]) -> Iterator[Rule]:

@@ -238,11 +238,13 @@ def _fit_plane(plane: NDArray[Any], mask: NDArray[np.bool_] | None, down: bool) 
     origin, right, below = (float(plane[i, j]) for i, j in ((0, 0), (0, -1), (-1, 0)))
     rows, width = plane.shape
     across, by_row = (right - origin) / (width - 1), (below - origin) / (rows - 1)
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
-        values = plane.astype(np.float64)
-    near = values - (origin + across * np.arange(width) + by_row * np.arange(rows)[:, None])
     spread = abs(across) + abs(by_row)
-    if not 0 < spread < np.inf or not np.isfinite(origin) or np.nanmax(np.abs(near)) > spread:
+    if not 0 < spread < np.inf or not np.isfinite(origin):
+        return None
+    with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN becomes a quiet one
+        values = plane.astype(np.float64)
+        near = values - (origin + across * np.arange(width) + by_row * np.arange(rows)[:, None])
+    if np.nanmax(np.abs(near)) > spread:
         return None
     for step_across in neighbours(across)[:7]:
         for step_down in neighbours(by_row)[:7]:

@@ -190,8 +190,13 @@ def _placed(mesh: Mesh, matrix: NDArray[np.float64]) -> Mesh:
     if np.array_equal(matrix, np.eye(4)):
         return Mesh(mesh.vertices.astype(np.float32), mesh.corners, attributes)
     turn = matrix[:3, :3]
-    determinant = np.linalg.det(turn)
-    if not np.isfinite(matrix).all() or determinant == 0:
+    with np.errstate(over="ignore", invalid="ignore"):
+        determinant = np.linalg.det(turn)
+    if not np.isfinite(matrix).all() or not np.isfinite(determinant):
+        raise FormatError(
+            "expected meshes of GLB at finite places, got one with a matrix that is not finite, or beyond"
+        )
+    if determinant == 0:
         raise FormatError("expected meshes of GLB at places in space, got one that its matrix makes flat")
     if NORMAL in attributes:
         normals = attributes[NORMAL] @ np.linalg.inv(turn)

@@ -18,7 +18,7 @@ from ..scratch import rows_at_once
 from ..surface import Surface
 from .attributes import group
 from .notes import listing, warn
-from .placed import Coordinate, place
+from .placed import FURTHEST, Coordinate, place
 from .source import Source, number
 
 __all__ = ["are_places", "is_whole_grid", "speaks_of_places", "surface"]
@@ -103,12 +103,15 @@ def surface(source: Source, table: Vector, names: Sequence[str]) -> Surface:
         raise FormatError(f"expected at least three columns, x, y and z, got {table.shape[1]}")
     roles = _roles(names)
     x, y = table[:, roles[0]], table[:, roles[1]]
-    columns, rows = _axes(x, y)
+    with np.errstate(over="ignore"):  # a step that is infinite is one all the same
+        columns, rows = _axes(x, y)
     shape = len(rows.values), len(columns.values)
     source.check_array(shape, np.dtype(np.float64))
+    names = _told_apart(names)
     others = [column for column in range(table.shape[1]) if column not in roles]
     if others and not names:
-        warn(f"left out columns {listing(column + 1 for column in others)}: a first line with names makes attributes")
+        words = "column" if len(others) == 1 else "columns"
+        warn(f"left out {words} {listing(column + 1 for column in others)}: a first line with names makes attributes")
         others = []
     grids = {column: source.empty(shape, np.dtype(np.float64)) for column in (roles[2], *others)}
     for grid in grids.values():
@@ -148,6 +151,20 @@ def _roles(names: Sequence[str]) -> tuple[int, int, int]:
     y = next(column for column, word in enumerate(words) if word in _Y)
     left = [column for column in range(len(words)) if column not in (x, y)]
     return x, y, next((column for column in left if words[column] in _Z), left[0])
+
+
+def _told_apart(names: Sequence[str]) -> list[str]:
+    """Return names of columns of which no two are equal: a later one gets the number of its column, with a note."""
+    taken = set(names)
+    result: list[str] = []
+    for column, name in enumerate(names, 1):
+        other = name
+        while other in result or (other != name and other in taken):
+            other = f"{other}_{column}"
+        if other != name:
+            warn(f"column {column} has the name of another, {name!r}, and is read as {other!r}")
+        result.append(other)
+    return result
 
 
 def _different(values: Vector) -> Vector | None:
@@ -234,6 +251,8 @@ def _without_gaps(values: Vector, name: str, whole: bool) -> Vector:
         Each node of the grid has a point: then most steps must be the smallest one, since uneven axes too are often
         whole numbers.
     """
+    if np.abs(values).max() > FURTHEST:
+        return values
     steps = np.diff(values)
     # Their mean, since coordinates are rounded: 0.333 and 0.334 in turn are one step.
     step = float(steps[steps < 1.5 * steps.min()].mean())

@@ -75,7 +75,8 @@ def with_nodata(surface: Surface, nodata: int | float, room: Room) -> Surface:
     if count:
         warn(f"nodata={nodata} masks {number(count)} of {total} points")
     elif known:
-        warn(f"nodata={nodata} masks nothing more: {number(known)} of {total} points have this value and are holes")
+        words = "has this value and is a hole" if known == 1 else "have this value and are holes"
+        warn(f"nodata={nodata} masks nothing more: {number(known)} of {total} points {words}")
     else:
         warn(f"nodata={nodata} masks nothing: none of {total} points has this value")
     if not count:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError
 from ..surface import Surface
 from .notes import metadata_left_out, warn, warn_left_out
-from .source import Source, number
+from .source import Source, counted, number
 
 __all__ = [
     "MAGIC",
@@ -151,7 +151,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
     closure = ["closure"] * any(surface.closed)
     warn_left_out("NPY", [*surface.attributes, *closure, *metadata_left_out(surface, ())])
     if surface.mask is not None and surface.points.dtype.kind != "f":
-        warn(f"NPY has integers at all points, including the {number(surface.blocks[0].holes)} holes")
+        warn(f"NPY has integers at all points, also at {counted(surface.blocks[0].holes, 'hole', 'holes')}")
     write_array(file, with_holes(surface))
 
 

@@ -17,10 +17,13 @@ from ..scratch import IN_MEMORY, Room, rows_at_once
 from ..surface import DTYPES, Closed, Surface
 from .longitudes import TURN, close_around, close_uneven, encircles, next_around
 
-__all__ = ["Coordinate", "place"]
+__all__ = ["FURTHEST", "Coordinate", "place"]
 
 #: How far a coordinate may be from even spacing, in steps, for the heights to count as a regular lattice.
 _EVEN = 0.01
+
+#: Beyond this, sums of coordinates may be infinite.
+FURTHEST = np.finfo(np.float64).max / 8
 
 
 @dataclass(frozen=True)
@@ -126,11 +129,12 @@ class _Line:
 def _line(coordinate: Coordinate) -> _Line | None:
     """Return a coordinate as a line; None for an array over both axes, and if no rule can replace x and y.
 
-    These are values that are not finite or are all the same, and uneven ones of a type that points cannot have.
+    These are values that are not finite, so large that sums of them are not, or all the same, and uneven ones of a type
+    that points cannot have.
     Longitudes that jump stay as they are where unwrapping would round them.
     """
     given = coordinate.values
-    if coordinate.axis is None or len(given) < 2 or not np.isfinite(given).all():
+    if coordinate.axis is None or len(given) < 2 or not (np.abs(given.astype(np.float64)) <= FURTHEST).all():
         return None
     values, low = given, None
     if coordinate.degrees:

@@ -194,6 +194,11 @@ def number(value: int) -> str:
     return f"{value:,}"
 
 
+def counted(count: int, singular: str, plural: str) -> str:
+    """Return a count with the words for it, for messages: "1 value is", "2 values are"."""
+    return f"{number(count)} {singular if count == 1 else plural}"
+
+
 def with_name(error: InputError, label: str) -> InputError:
     """Return an error with the file's name before its message, which stays one line whatever either holds."""
     message = f"{label}: {error}"

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import islice
 from math import prod
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,9 +196,9 @@ def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
     array = source.empty((rows, columns), np.dtype(np.float64))
     done = 0
     try:
-        with warnings.catch_warnings(), path.open("rb") as file:
+        with warnings.catch_warnings():
             warnings.simplefilter("error")
-            lines = _numbers(file, layout)
+            lines = _numbers(path, layout)
             while texts := [*islice(lines, _LINES_AT_ONCE)]:
                 # Lines and not the name: numpy would take one for an address, or for that of a compressed file.
                 part = np.loadtxt(
@@ -220,28 +219,27 @@ def _array(source: Source, path: Path, layout: _Layout) -> NDArray[np.float64]:
 def _wrong_line(path: Path, layout: _Layout, reason: str) -> FormatError:
     """Return the refusal of the first line that has not a number in each column that is read."""
     expected = f"expected {number(layout.columns)} numbers in each line, as in the first"
-    with path.open("rb") as file:
-        heading = layout.heading
-        for place, line in enumerate(_lines(file), 1):
-            text = _stripped(line)
-            if not text or heading:
-                heading = heading and not text
-                continue
-            words = _normalised(text, layout).split(layout.delimiter)
-            if len(words) != layout.columns:
-                return FormatError(f"{expected}, got {number(len(words))} in line {number(place)}")
-            for column in layout.numbers:
-                try:
-                    float(words[column])
-                except ValueError:
-                    word = words[column].strip()[:40]
-                    return FormatError(f"{expected}, got {word!r} in line {number(place)}, column {column + 1}")
+    heading = layout.heading
+    for place, line in enumerate(_lines(path), 1):
+        text = _stripped(line)
+        if not text or heading:
+            heading = heading and not text
+            continue
+        words = _normalised(text, layout).split(layout.delimiter)
+        if len(words) != layout.columns:
+            return FormatError(f"{expected}, got {number(len(words))} in line {number(place)}")
+        for column in layout.numbers:
+            try:
+                float(words[column])
+            except ValueError:
+                word = words[column].strip()[:40]
+                return FormatError(f"{expected}, got {word!r} in line {number(place)}, column {column + 1}")
     return FormatError(f"{expected}, got others: {' '.join(reason.split())}")
 
 
-def _numbers(file: IO[bytes], layout: _Layout) -> Iterator[str]:
+def _numbers(path: Path, layout: _Layout) -> Iterator[str]:
     """Yield the lines of numbers of a file, without comments and the line of names."""
-    lines = (text for text in map(_stripped, _lines(file)) if text)
+    lines = (text for text in map(_stripped, _lines(path)) if text)
     if layout.heading:
         next(lines)
     for text in lines:
@@ -266,13 +264,15 @@ def _normalised(line: bytes, layout: _Layout) -> str:
     return text
 
 
-def _lines(file: IO[bytes]) -> Iterator[bytes]:
-    if file.read(len(_MARK)) != _MARK:
-        file.seek(0)
-    while line := file.readline(_LONGEST_LINE):
-        if len(line) == _LONGEST_LINE:
-            raise TooLargeError(f"expected lines of fewer than {number(_LONGEST_LINE)} bytes, got a longer one")
-        yield line
+def _lines(path: Path) -> Iterator[bytes]:
+    """Yield the lines of a file, which end in LF, CR LF or CR."""
+    before = _MARK
+    with path.open(encoding="latin-1", newline=None) as file:  # every byte is a letter of this encoding
+        while text := file.readline(_LONGEST_LINE):
+            if len(text) == _LONGEST_LINE:
+                raise TooLargeError(f"expected lines of fewer than {number(_LONGEST_LINE)} bytes, got a longer one")
+            yield text.encode("latin-1").removeprefix(before)
+            before = b""
 
 
 def _stripped(line: bytes) -> bytes:
@@ -308,26 +308,25 @@ def _layout(path: Path) -> _Layout:
     names: tuple[str, ...] = ()
     texts: tuple[int, ...] = ()
     heading, comment = b"", b""
-    with path.open("rb") as file:
-        for line in _lines(file):
-            text = _stripped(line)
-            if not rows and not text and line.strip():
-                comment = line.strip().lstrip(b"#%!/").strip()
-            if not text:
+    for line in _lines(path):
+        text = _stripped(line)
+        if not rows and not text and line.strip():
+            comment = line.strip().lstrip(b"#%!/").strip()
+        if not text:
+            continue
+        if not rows:
+            if not heading and _LINE.fullmatch(text) is None:
+                heading = text
                 continue
-            if not rows:
-                if not heading and _LINE.fullmatch(text) is None:
-                    heading = text
-                    continue
-                delimiter = _delimiter(text)
-                columns = len(text.split(delimiter.encode() if delimiter else None))
-                names = _names(heading, comment, columns, delimiter)
-                texts = _texts(names, _words(text, delimiter))
-                quoted = b'"' in line
-            # A few in quotation marks are names of rows or columns, as R writes them.
-            if b'"' in text or quoted != (b'"' in line):
-                raise _quotes(line)
-            rows += 1
+            delimiter = _delimiter(text)
+            columns = len(text.split(delimiter.encode() if delimiter else None))
+            names = _names(heading, comment, columns, delimiter)
+            texts = _texts(names, _words(text, delimiter))
+            quoted = b'"' in line
+        # A few in quotation marks are names of rows or columns, as R writes them.
+        if b'"' in text or quoted != (b'"' in line):
+            raise _quotes(line)
+        rows += 1
     if heading and not names:
         if _has_numbers(heading):
             raise _quotes(heading)

@@ -15,7 +15,7 @@ from ..formats.netcdf.layout import ORDERED
 from ..formats.netcdf.mark import MARK, Mark
 from ..formats.netcdf.marked import surface_in
 from ..formats.netcdf.names import REFERENCES
-from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces
+from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces, stored_number
 from ..formats.nodata import checked, with_nodata
 from ..formats.notes import warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
@@ -140,33 +140,34 @@ def _described(xr: Any, variable: Any, places: Mapping[str, str] | None = None) 
     moved = {key: encoding[key] for key in keys if key in encoding}
     copy = variable.to_base_variable().copy(deep=False)
     copy.encoding = {key: it for key, it in encoding.items() if key not in moved}
-    copy.attrs = {**(places or {}), **variable.attrs, **moved, **_unpacked_limits(xr, variable)}
+    copy.attrs = {**(places or {}), **variable.attrs, **moved, **_limits(xr, variable)}
     return _as_stored(xr, copy, IN_MEMORY) if variable.ndim < 2 else copy
 
 
 def _as_stored(xr: Any, variable: Any, room: Room) -> Any:
     """Return a variable with the values of its file: integers where its floats are such with NaN."""
     encoding = variable.encoding
-    dtype = np.dtype(encoding.get("dtype") or variable.dtype)
-    if dtype.kind not in "iu" or variable.dtype.kind != "f" or is_packed(encoding):
+    stored = np.dtype(encoding.get("dtype") or variable.dtype)
+    if stored.kind not in "iu" or variable.dtype.kind not in "iuf" or is_packed(encoding):
         return variable
-    dtype = _with_sign(dtype, encoding)
-    missing = _missing(encoding, dtype)
-    whole = _integers(variable, dtype, missing, room)
-    if whole is None:
-        return variable
-    kept = {"_FillValue": missing[0]} if missing else {}
-    return xr.Variable(variable.dims, whole, {**variable.attrs, **kept})
+    dtype = _with_sign(stored, encoding)
+    missing = _missing(encoding, stored, dtype)
+    # Of unsigned integers xarray masks only what is the first fill value.
+    unsigned = "_Unsigned" in encoding
+    kept = {"_FillValue": np.array(missing, dtype)} if missing else {}
+    if variable.dtype.kind != "f":  # xarray has not masked all that the file does
+        return variable._replace(attrs={**variable.attrs, **kept})
+    whole = _integers(variable, dtype, missing, room, values_may_be_missing=unsigned)
+    return variable if whole is None else xr.Variable(variable.dims, whole, {**variable.attrs, **kept})
 
 
-def _missing(encoding: Mapping[str, Any], dtype: np.dtype[Any]) -> list[Any]:
+def _missing(encoding: Mapping[str, Any], stored: np.dtype[Any], dtype: np.dtype[Any]) -> list[Any]:
     """Return the missing values of a file that its integers can be; texts and other numbers say nothing."""
+    numbers = [number for key in _MISSING for number in np.ravel(encoding.get(key, ()))]
+    numbers = [stored_number(number, stored, encoding) for number in numbers if np.asarray(number).dtype.kind in "iuf"]
     limits = np.iinfo(dtype)
-    numbers = [number for key in _MISSING for number in np.ravel(encoding.get(key, ())).tolist()]
     return [
-        dtype.type(int(number))
-        for number in numbers
-        if isinstance(number, int | float) and limits.min <= number <= limits.max and number == int(number)
+        dtype.type(int(number)) for number in numbers if limits.min <= number <= limits.max and number == int(number)
     ]
 
 
@@ -190,9 +191,17 @@ def _with_sign(dtype: np.dtype[Any], encoding: Mapping[str, Any]) -> np.dtype[An
     return np.dtype(f"{kind}{dtype.itemsize}")
 
 
-def _unpacked_limits(xr: Any, variable: Any) -> dict[str, Any]:
-    """Return the limits of packed values: integers among them are in packed units."""
+def _limits(xr: Any, variable: Any) -> dict[str, Any]:
+    """Return the limits of values that a file stores as others: integers among them are stored ones."""
     encoding = variable.encoding
+    if "_Unsigned" in encoding and not is_packed(encoding):
+        dtype = np.dtype(encoding.get("dtype") or variable.dtype)
+        limits = {key: np.ravel(variable.attrs[key]) for key in RANGES if key in variable.attrs}
+        return {
+            key: np.array([stored_number(limit, dtype, encoding) for limit in numbers])
+            for key, numbers in limits.items()
+            if dtype.kind in "iu" and numbers.size and numbers.dtype.kind in "iuf"
+        }
     if not is_packed(encoding) or is_packed(variable.attrs):
         return {}
     packing = {key: encoding[key] for key in PACKING if key in encoding and key not in ("_FillValue", "missing_value")}
@@ -201,8 +210,13 @@ def _unpacked_limits(xr: Any, variable: Any) -> dict[str, Any]:
     return {key: value for key, value in attributes_with_limits(stored).items() if key in RANGES}
 
 
-def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room: Room) -> NDArray[Any] | None:
-    """Return floats as integers, with NaN as the first of the missing values; None if they are no integers."""
+def _integers(
+    variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room: Room, *, values_may_be_missing: bool
+) -> NDArray[Any] | None:
+    """Return floats as integers, with NaN as the first of the missing values.
+
+    None if they are no integers, or one of them is a missing value and may not be.
+    """
     limits, result, anything = np.iinfo(dtype), room.empty(variable.shape, dtype), False
     for window, part in pieces(variable, room):
         values = part.values
@@ -213,7 +227,9 @@ def _integers(variable: Any, dtype: np.dtype[Any], missing: Sequence[Any], room:
         if known.size and not (limits.min <= known.min() and known.max() <= limits.max):
             return None
         whole = known.astype(dtype)
-        if not (whole == known).all() or any((whole == number).any() for number in missing):
+        if not (whole == known).all():
+            return None
+        if not values_may_be_missing and any((whole == number).any() for number in missing):
             return None
         own = np.full(values.shape, missing[0] if missing else 0, dtype)
         own[valid] = whole

@@ -22,6 +22,7 @@ from ..formats.vtk.ghosts import HIDDEN_CELL, HIDDEN_POINT
 from ..formats.vtk.grids import without_hidden
 from ..mesh import Mesh
 from ..mesh.ears import cut_faces
+from ..mesh.model import names_of_parts
 from ..planning.planner import plan
 from ..surface import Block, Surface
 from ..target import Target
@@ -239,7 +240,7 @@ def _of_polygons(data: Any, remeshing: Mapping[str, object]) -> Surface:
     if wrong.any():
         face = int(wrong.argmax())
         check_corners(int(counts[face]), f"in face {face + 1}", allowed)
-    places, _ = cut_faces(np.array(data.points), counts, values)
+    places, parts = cut_faces(np.array(data.points), counts, values)
     corners = np.where(places >= 0, values[places], -1).astype(np.int32)
     attributes = {name: np.array(values) for name, values in data.point_data.items() if _kept(name, values)}
     if TEXTURE not in attributes and data.active_texture_coordinates is not None:
@@ -248,4 +249,5 @@ def _of_polygons(data: Any, remeshing: Mapping[str, object]) -> Surface:
     if left_out:
         warn(f"left out data that do not belong to points: {listing(left_out)}")
     _warn_no_numbers(_no_numbers(data))
-    return surface_of_mesh(Mesh(np.array(data.points), corners, attributes), _words(data), remeshing)
+    mesh = Mesh(np.array(data.points), corners, attributes, face_name=names_of_parts(parts))
+    return surface_of_mesh(mesh, _words(data), remeshing)

@@ -96,10 +96,12 @@ def _cut(polygons: NDArray[np.generic], most: int) -> tuple[_Integers, int]:
     second = np.arange(1, count - 1)
     fan = np.stack([np.zeros_like(second), second, second + 1], axis=-1)
     result = np.tile(fan, (len(polygons), 1, 1))
-    flat = _in_plane(polygons.astype(np.float64))
-    before, after = flat - np.roll(flat, 1, axis=1), np.roll(flat, -1, axis=1) - flat
-    length = np.linalg.norm(before, axis=2) * np.linalg.norm(after, axis=2)
-    concave = np.flatnonzero((_cross(before, after) <= _TURN * length).any(axis=1)).tolist()
+    with np.errstate(over="ignore", invalid="ignore"):  # a polygon with an infinite vertex, or far ones, is a fan
+        flat = _in_plane(polygons.astype(np.float64))
+        before, after = flat - np.roll(flat, 1, axis=1), np.roll(flat, -1, axis=1) - flat
+        length = np.linalg.norm(before, axis=2) * np.linalg.norm(after, axis=2)
+        turns_right = (_cross(before, after) <= _TURN * length).any(axis=1)
+    concave = np.flatnonzero(turns_right & np.isfinite(length).all(axis=1)).tolist()
     if concave and count > _MOST_CORNERS:
         raise FormatError(
             f"expected faces that are convex or have at most {_MOST_CORNERS:,} corners, got one of {count:,}"

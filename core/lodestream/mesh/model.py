@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import InputError
 from .ears import cut_faces
 
-__all__ = ["CornerAttribute", "Mesh", "name_faces"]
+__all__ = ["CornerAttribute", "Mesh", "name_faces", "names_of_parts"]
 
 #: Faces that an error message names, at most.
 _MAX_NAMED_FACES = 4
@@ -36,6 +36,11 @@ class CornerAttribute:
 def _number(face: int) -> str:
     """Name a face by its 1-based number."""
     return f"face {face + 1}"
+
+
+def names_of_parts(faces: NDArray[np.int64]) -> Callable[[int], str]:
+    """Return the `face_name` of a mesh whose faces, shape (T,), are parts of those with these 0-based numbers."""
+    return lambda part: _number(int(faces[part]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +87,7 @@ class Mesh:
         """
         points = np.asarray(vertices)
         rows = [list(face) for face in faces] if isinstance(faces, list | tuple) else np.asarray(faces)
+        name: Callable[[int], str] = _number
         fitting = points.ndim == 2 and points.shape[1] in (2, 3)
         if isinstance(rows, list):
             counts = np.array([len(row) for row in rows], np.int64)
@@ -94,7 +100,8 @@ class Mesh:
             flat = np.array([corner for row in rows for corner in row], np.int64)
             if flat.size and fitting and not (flat.min() >= 0 and flat.max() < len(points)):
                 raise InputError(_outside(len(points)))
-            places, _ = cut_faces(points, counts, flat) if fitting else (np.empty((0, 4), np.int64), counts)
+            places, parts = cut_faces(points, counts, flat) if fitting else (np.empty((0, 4), np.int64), counts)
+            name = names_of_parts(parts)
             rows = np.where(places >= 0, flat[places], -1) if flat.size else places
         if rows.ndim != 2 or rows.shape[1] not in (3, 4) or not fitting:
             raise InputError(
@@ -105,7 +112,8 @@ class Mesh:
         corners[:, : rows.shape[1]] = rows
         if corners.size and (corners[:, :3].min() < 0 or corners.min() < -1 or corners.max() >= len(points)):
             raise InputError(_outside(len(points)))
-        return Mesh(points, corners, {name: np.asarray(values) for name, values in (attributes or {}).items()})
+        of_vertices = {key: np.asarray(values) for key, values in (attributes or {}).items()}
+        return Mesh(points, corners, of_vertices, face_name=name)
 
 
 def _outside(count: int) -> str:
@@ -115,7 +123,8 @@ def _outside(count: int) -> str:
 def name_faces(mesh: Mesh, faces: ArrayLike) -> str:
     """Name the first few of some faces, whose numbers have any shape."""
     numbers = np.unique(np.asarray(faces)).tolist()
-    words = [mesh.face_name(number) for number in numbers[:_MAX_NAMED_FACES]]
+    # Several triangles may be parts of one face.
+    words = list(dict.fromkeys(mesh.face_name(number) for number in numbers[:_MAX_NAMED_FACES]))
     if len(numbers) > _MAX_NAMED_FACES:
         return f"{', '.join(words)} and {len(numbers) - _MAX_NAMED_FACES:,} more"
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

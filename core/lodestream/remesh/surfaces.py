@@ -132,7 +132,8 @@ def _triangulated(mesh: Mesh, vertices: Floats) -> tuple[Integers, Integers]:
     """Triangles, and quads cut along their shorter diagonal: the face of each, (T,), and its corners there, (T, 3)."""
     quads = mesh.corners[:, 3] >= 0
     a, b, c, d = (vertices[mesh.corners[:, corner]] for corner in range(4))
-    first = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)
+    with np.errstate(over="ignore", invalid="ignore"):  # coordinates beyond all measure are refused later
+        first = np.linalg.norm(a - c, axis=1) <= np.linalg.norm(b - d, axis=1)
     cuts = [
         (~quads, (0, 1, 2)),
         (quads & first, (0, 1, 2)),

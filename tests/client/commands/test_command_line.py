@@ -359,7 +359,7 @@ def test_push_of_many_files_says_whose_notes_they_are(run: Run, server: str, tmp
     np.save(tmp_path / "holes.npy", heights)
     code, stdout, stderr = run("push", "--each", tmp_path / "whole.npy", tmp_path / "holes.npy", server)
     assert (code, len(stdout.splitlines())) == (0, 2)
-    assert stderr == f"lodestream: {tmp_path / 'holes.npy'}: 1 of 600 points are holes\n"
+    assert stderr == f"lodestream: {tmp_path / 'holes.npy'}: 1 of 600 points is a hole\n"
 
 
 def test_list_finds_and_sorts(run: Run, tmp_path: Path) -> None:

@@ -291,3 +291,16 @@ def test_each_file_is_a_surface_wherever_the_option_stands(run: Run, tmp_path: P
         assert pushed == [name for name in names if name in args]
     code, _, stderr = run("push", "--each", names[0], "no url")
     assert (code, "argument URL" in stderr) == (2, True)
+
+
+def test_a_dimension_that_a_small_file_claims_to_be_long_is_refused(run: Run, tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "long.nc", "w") as file:
+        air = file.create_dataset("air", (5_000_000, ROWS, COLUMNS), "f4", chunks=(1, ROWS, COLUMNS))
+        for axis, (name, length) in enumerate({"step": 5_000_000, "lat": ROWS, "lon": COLUMNS}.items()):
+            file.create_dataset(name, (length,), "f4", chunks=(min(length, 1 << 20),)).make_scale(name)
+            air.dims[axis].attach_scale(file[name])
+    assert (tmp_path / "long.nc").stat().st_size < 100_000
+    code, stdout, stderr = run("encode", tmp_path / "long.nc", "--each", f"step={tmp_path / 'out'}")
+    assert (code, stdout) == (1, "")
+    assert "expected at most 100,000 surfaces of a file, got 5,000,000 along step" in stderr

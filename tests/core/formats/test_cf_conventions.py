@@ -114,7 +114,7 @@ def test_a_height_without_a_place_is_kept_and_told(tmp_path: Path, opener: Opene
     lon[3, 4] = np.nan
     data = data.assign_coords(lon_rho=(data.zeta.dims, lon, EAST))
     surface, notes = noted(lambda: opener(data, tmp_path))
-    assert notes == ["1 values have no x or y: they are holes until a stream is complete"]
+    assert notes == ["1 value without x or y: holes until a stream is complete"]
     back = ls.decode(ls.encode(surface))
     for found in (surface, back):
         assert heights_of(found)[3, 4] == data.zeta.values[3, 4]
@@ -512,7 +512,7 @@ def test_values_outside_the_valid_range_are_missing(
     if isinstance(said.get("valid_range"), str):
         assert notes == ["valid_range of z masks nothing, since it is no number or pair of numbers: '0 50'"]
     else:
-        assert notes == ([f"{count} values of z are outside its valid range, and missing"] if count else [])
+        assert notes == ([f"{count} value{'s' * (count > 1)} of z outside its valid range: missing"] if count else [])
     mask = np.ones(stored.shape, np.bool_) if surface.mask is None else surface.mask
     np.testing.assert_array_equal(mask, ~hidden)
     expected = stored * said.get("scale_factor", 1) + said.get("add_offset", 0)
@@ -604,6 +604,12 @@ def boozmn() -> xr.Dataset:
     return xr.Dataset({"ixm_b": ("mn_modes", np.arange(40)), "ixn_b": ("mn_modes", np.arange(40)), **modes})
 
 
+def old_gmt() -> xr.Dataset:
+    ranges = {f"{letter}_range": ("side", np.array([0.0, 9.0])) for letter in "xyz"}
+    size = {"spacing": ("side", np.ones(2)), "dimension": ("side", np.array([10, 10], "i4"))}
+    return xr.Dataset({**ranges, **size, "z": ("xysize", np.arange(100, dtype="f4"))})
+
+
 @every_opener
 @pytest.mark.parametrize(
     ("made", "variables", "words"),
@@ -611,6 +617,7 @@ def boozmn() -> xr.Dataset:
         (ugrid, ("face_nodes", "edge_nodes", "salt"), r"an unstructured mesh \(UGRID\)"),
         (mpas, ("verticesOnCell", "temperature"), "an unstructured mesh"),
         (boozmn, ("rmnc_b",), "Fourier coefficients in Boozer coordinates"),
+        (old_gmt, ("z",), "a grid of GMT before version 4"),
     ],
 )
 def test_what_holds_no_grid_is_refused_as_what_it_is(

@@ -189,6 +189,18 @@ REFUSED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
         lambda content: changed(content, lambda scene: scene["nodes"][0].update(scale=[1, 1, 0])),
         "that its matrix makes flat",
     ),
+    "a place that is no number": (
+        lambda content: changed(content, lambda scene: scene["nodes"][0].update(matrix=[float("nan")] * 16)),
+        "with a matrix that is not finite, or beyond",
+    ),
+    "an infinite place": (
+        lambda content: changed(content, lambda scene: scene["nodes"][0].update(translation=[float("inf"), 0, 0])),
+        "with a matrix that is not finite, or beyond|trimesh reads",
+    ),
+    "a place beyond all numbers": (
+        lambda content: changed(content, lambda scene: scene["nodes"][0].update(scale=[1e308] * 3)),
+        "with a matrix that is not finite, or beyond|trimesh reads",
+    ),
     "a corner that is not there": (
         lambda content: changed(content, lambda scene: scene["accessors"][0].update(count=2)),
         "trimesh reads|expected faces over",

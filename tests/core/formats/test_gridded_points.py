@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream import formats
-from lodestream.errors import FormatError, FormatWarning, OptionError, TooLargeError
+from lodestream.errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
 from lodestream.formats import text_arrays
 
 Array = NDArray[Any]
@@ -481,3 +481,67 @@ def test_any_order_of_any_grid(
     surface, _ = read(tmp_path_factory.mktemp("points") / "a.txt", text)
     assert surface.shape == (rows, columns)
     np.testing.assert_array_equal(places_of(surface), sorted_points(points))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("names", ["", "x y z\n", "# x y z\n"])
+@pytest.mark.parametrize("suffix", [".txt", ".csv", ".xyz"])
+def test_every_end_of_lines(tmp_path: Path, end: str, names: str, suffix: str) -> None:
+    text = (names + lines_of(nodes())).replace("\n", end)
+    (tmp_path / f"grid{suffix}").write_bytes(text.encode())
+    surface = ls.read(tmp_path / f"grid{suffix}")
+    np.testing.assert_array_equal(surface.points, nodes()[..., 2])
+
+
+def test_the_line_of_a_wrong_number_is_told_whatever_ends_it(tmp_path: Path) -> None:
+    lines = lines_of(nodes()).splitlines()
+    lines[7] = "1 2 here"
+    (tmp_path / "grid.txt").write_bytes("\r".join(lines).encode())
+    with pytest.raises(FormatError, match="got 'here' in line 8, column 3"):
+        ls.read(tmp_path / "grid.txt")
+
+
+def test_lines_of_any_end_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(text_arrays, "_LONGEST_LINE", 64)
+    (tmp_path / "grid.txt").write_bytes(lines_of(nodes()).replace("\n", "\r").encode())
+    assert ls.read(tmp_path / "grid.txt").shape == (ROWS, COLUMNS)
+    (tmp_path / "grid.txt").write_bytes(b"1 " * 40 + b"\r1 2\r")
+    with pytest.raises(TooLargeError, match="lines of fewer than 64 bytes"):
+        ls.read(tmp_path / "grid.txt")
+
+
+def test_columns_of_one_name_are_all_kept(tmp_path: Path) -> None:
+    points = np.concatenate([nodes(), nodes()[..., 2:] + [1, 2, 3]], axis=-1)
+    surface, notes = read(tmp_path / "grid.csv", "x,y,z,q,z,q\n" + lines_of(points, ","))
+    np.testing.assert_array_equal(surface.points, points[..., 2])
+    assert list(surface.attributes) == ["q", "z_5", "q_6"]
+    for name, column in zip(surface.attributes, (3, 4, 5), strict=True):
+        np.testing.assert_allclose(surface.attributes[name], points[..., column], atol=1e-9)
+    assert notes == [
+        "column 5 has the name of another, 'z', and is read as 'z_5'",
+        "column 6 has the name of another, 'q', and is read as 'q_6'",
+    ]
+
+
+@pytest.mark.parametrize(
+    "places",
+    [
+        ("-1.7e308", "0", "1.7e308"),
+        ("-1.7e308", "1.7e308"),
+        ("-1.7e308", "-1e308", "0", "1.7e308"),
+        ("-1e308", "-5e307", "0", "1e308"),
+        ("0", "1", "2", "1.7e308"),
+    ],
+)
+@pytest.mark.parametrize("swapped", [False, True])
+def test_axes_whose_steps_are_beyond_all_numbers(tmp_path: Path, places: tuple[str, ...], swapped: bool) -> None:
+    lines = [(x, str(y), str(number)) for number, (y, x) in enumerate((y, x) for y in range(3) for x in places)]
+    text = "".join(" ".join((y, x, z) if swapped else (x, y, z)) + "\n" for x, y, z in lines)
+    surface, notes = read(tmp_path / "grid.txt", text)
+    assert notes == []
+    with pytest.raises(InputError, match=r"expected values of at most 1e\+300 in magnitude"):
+        ls.encode(surface)
+    points = surface.points.reshape(-1, 3)
+    points = points[:, [1, 0, 2]] if swapped else points
+    expected = np.array(lines, np.float64)
+    np.testing.assert_array_equal(points[np.argsort(points[:, 2])], expected)

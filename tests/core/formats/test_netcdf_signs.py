@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -44,3 +45,46 @@ def test_fill_values_are_stored_like_values(
     own: Any = xarray.open_dataset(path, engine="h5netcdf").c.values
     assert np.array_equal(np.isnan(own), ~surface.mask)
     assert np.array_equal(own[surface.mask], surface.points[surface.mask])
+
+
+#: Attributes beside int16 that are unsigned, and which of 65533, 65534, 65535 and 0 are missing.
+MISSING: dict[str, tuple[dict[str, Any], list[bool]]] = {
+    "another type that holds the stored number": ({"_FillValue": np.int32(-1)}, [False, False, True, False]),
+    "another type that holds the value": ({"_FillValue": np.int32(65535)}, [False, False, True, False]),
+    "a float": ({"_FillValue": np.float64(-1)}, [False, False, True, False]),
+    "a float of the value": ({"_FillValue": np.float64(65535)}, [False, False, True, False]),
+    "no integer": ({"_FillValue": np.float64(0.5)}, [False] * 4),
+    "beyond all integers": ({"_FillValue": np.float64(1e20)}, [False] * 4),
+    "a missing value": ({"missing_value": np.int16(-2)}, [False, True, False, False]),
+    "missing values": ({"missing_value": np.array([-2, -1], "i2")}, [False, True, True, False]),
+    "both": ({"_FillValue": np.int16(-1), "missing_value": np.int16(-2)}, [False, True, True, False]),
+    "several": ({"_FillValue": np.array([-1, -2], "i2")}, [False, True, True, False]),
+    "a limit": ({"valid_max": np.int16(-2)}, [False, False, True, False]),
+}
+
+#: Those that xarray itself decodes otherwise, or not at all.
+NOT_DECODED = ("no integer", "beyond all integers", "several")
+
+
+@pytest.mark.parametrize("scaled", [False, True])
+@pytest.mark.parametrize("case", MISSING)
+def test_fill_values_of_any_number_and_type(tmp_path: Path, case: str, scaled: bool) -> None:
+    said, missing = MISSING[case]
+    path = tmp_path / "goes.nc"
+    scale = {"scale_factor": np.float64(0.5)} if scaled else {}
+    with h5netcdf.File(path, "w") as file:
+        file.dimensions = {"y": 2, "x": 2}
+        variable = file.create_variable("c", ("y", "x"), "i2", data=np.array([[-3, -2], [-1, 0]], "i2"))
+        variable.attrs.update({"_Unsigned": "true", **said, **scale})
+    values = np.array([65533, 65534, 65535, 0]) * (0.5 if scaled else 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of xarray about several fill values, of ours about what is outside limits
+        surfaces = {"file": ls.read(path)}
+        surfaces["raw"] = ls.Surface.from_xarray(xarray.open_dataset(path, engine="h5netcdf", decode_cf=False))
+        if case not in NOT_DECODED and not scaled:  # what was not masked before unpacking is no stored number any more
+            surfaces["decoded"] = ls.Surface.from_xarray(xarray.open_dataset(path, engine="h5netcdf"))
+    for surface in surfaces.values():
+        mask = np.ones(4, np.bool_) if surface.mask is None else surface.mask.ravel()
+        assert mask.tolist() == [not hole for hole in missing]
+        assert np.array_equal(surface.points.ravel()[mask], values[mask])
+        assert surface.dtype == (np.float64 if scaled else np.uint16)

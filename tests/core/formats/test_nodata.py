@@ -126,7 +126,7 @@ def test_holes_that_the_file_declares_stay(tmp_path: Path) -> None:
     np.testing.assert_array_equal(surface.mask, valid)
     assert surface.metadata["nodata"] == -32768
     _, notes = notes_of(lambda: ls.read(tmp_path / "a.tif", nodata=-32768))
-    assert notes == ["nodata=-32768 masks nothing more: 1 of 204 points have this value and are holes"]
+    assert notes == ["nodata=-32768 masks nothing more: 1 of 204 points has this value and is a hole"]
 
 
 @pytest.mark.parametrize(
@@ -160,9 +160,9 @@ def test_nan_and_infinity_are_values_too(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[np.nan, 1], [-np.inf, 3]]))
     surface, notes = notes_of(lambda: ls.read(tmp_path / "a.npy", nodata="nan"))
     np.testing.assert_array_equal(surface.mask, [[False, True], [False, True]])
-    assert notes == ["nodata=nan masks nothing more: 1 of 4 points have this value and are holes"]
+    assert notes == ["nodata=nan masks nothing more: 1 of 4 points has this value and is a hole"]
     _, notes = notes_of(lambda: ls.read(tmp_path / "a.npy", nodata=-np.inf))
-    assert notes == ["nodata=-inf masks nothing more: 1 of 4 points have this value and are holes"]
+    assert notes == ["nodata=-inf masks nothing more: 1 of 4 points has this value and is a hole"]
 
 
 @pytest.mark.parametrize("value", ["high", "", "1,5", True, "0x10"])

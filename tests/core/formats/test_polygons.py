@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.mesh import weld
+from lodestream.mesh import Mesh, weld
+from lodestream.mesh.model import name_faces
 
 Floats = NDArray[np.float64]
 OPTIONS: dict[str, Any] = {"remesh": True, "blocks": 12, "remesh_error": 1e-2}
@@ -139,4 +140,59 @@ def test_what_is_no_face_is_refused_all_the_same(text: str, words: str, tmp_path
     path = tmp_path / "a.obj"
     path.write_text(text)
     with pytest.raises(ls.FormatError, match=words):
+        ls.read(path, remesh="yes")
+
+
+#: Faces of three, five, four, six and three corners.
+COUNTS = (3, 5, 4, 6, 3)
+
+
+def circles() -> tuple[Floats, list[list[int]]]:
+    corners = [np.arange(count) * 2 * np.pi / count for count in COUNTS]
+    points = np.concatenate([np.stack([np.cos(a) + 3 * k, np.sin(a), 0 * a], axis=1) for k, a in enumerate(corners)])
+    starts = np.cumsum([0, *COUNTS[:-1]])
+    return points, [list(range(start, start + count)) for start, count in zip(starts, COUNTS, strict=True)]
+
+
+@pytest.mark.parametrize("kind", ["obj", "off", "ply"])
+def test_parts_of_a_face_have_its_name(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vertices, faces = circles()
+    points = "".join(f"{x} {y} {z}\n" for x, y, z in vertices)
+    lists = "".join(" ".join(map(str, [len(face), *face])) + "\n" for face in faces)
+    text = {
+        "obj": points.replace("\n", "\nv ").join(["v ", ""])[:-2]
+        + "".join("f " + " ".join(str(k + 1) for k in face) + "\n" for face in faces),
+        "off": f"OFF\n{len(vertices)} {len(faces)} 0\n{points}{lists}",
+        "ply": f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty double x\nproperty double y\n"
+        f"property double z\nelement face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"{points}{lists}",
+    }[kind]
+    (tmp_path / f"a.{kind}").write_text(text)
+    first = text.splitlines().index((lists if kind != "obj" else text[text.index("f ") :]).splitlines()[0]) + 1
+    module = {"obj": "obj.reader", "off": "off", "ply": "ply.mesh"}[kind]
+    meshes = []
+
+    def keep(_: object, mesh: Mesh, *more: object) -> ls.Surface:
+        meshes.append(mesh)
+        return ls.Surface(np.zeros((2, 2)))
+
+    monkeypatch.setattr(f"lodestream.formats.{module}.surface_of", keep)
+    ls.read(tmp_path / f"a.{kind}", remesh="yes")
+    (mesh,) = meshes
+    parents = np.repeat(np.arange(5), [1, 3, 1, 4, 1])
+    assert [mesh.face_name(part) for part in range(10)] == [f"face {k + 1} (line {first + k})" for k in parents]
+    assert name_faces(mesh, [1, 2, 3]) == f"face 2 (line {first + 1})"
+
+
+def test_parts_of_a_face_in_a_list_have_its_number() -> None:
+    mesh = Mesh.of(*circles(), polygons=True)
+    assert [mesh.face_name(part) for part in range(10)] == [f"face {k}" for k in (1, 2, 2, 2, 3, 4, 4, 4, 4, 5)]
+
+
+@pytest.mark.parametrize("far", ["inf", "nan", "1e308", "-1.7e308"])
+def test_polygons_with_vertices_beyond_all_measure_are_refused(far: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.obj"
+    FILES["obj"](path)
+    path.write_text(path.read_text().replace("v ", f"v {far} ", 1).replace(" -1.0\n", "\n", 1))
+    with pytest.raises(ls.FormatError, match=r"expected finite coordinates of vertices|with a diagonal from"):
         ls.read(path, remesh="yes")

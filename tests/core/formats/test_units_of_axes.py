@@ -116,6 +116,14 @@ def test_arrays_are_converted(tmp_path: Path, opener: Any) -> None:
     assert len(notes) == 1
 
 
+@pytest.mark.parametrize("units", ["ms", "mn", "m_east", "kms", "degrees_east", "m2", "fts", "ins", "es", "mtrue"])
+def test_other_units_are_no_lengths(tmp_path: Path, units: str) -> None:
+    data = mapped(units)
+    surface, notes = noted(lambda: _file(data, tmp_path))
+    np.testing.assert_array_equal(positions(surface)[0][0], data.x.values)
+    assert notes == [f"x and y are in {units!r}, which is not converted to the metre of the CRS"]
+
+
 @pytest.mark.parametrize(
     ("code", "units", "factor"),
     [

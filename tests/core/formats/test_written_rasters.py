@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -406,3 +407,29 @@ def test_bands_of_several_types_are_joined_strip_by_strip(tmp_path: Path, monkey
     far[699, 3] += 1
     with pytest.warns(FormatWarning, match="one type for all bands: far are rounded to float64"):
         formats.write(surface, tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("crs", "notes"),
+    [
+        (4326, []),
+        (32611, []),
+        # Longitudes first, which GDAL turns round for all rasters.
+        ("OGC:CRS84", ["GeoTIFF has the CRS as GDAL spells it, with other names or axes, and the same parameters"]),
+        ("+proj=stere +lat_0=90 +lat_ts=70 +lon_0=-45 +a=6378273 +rf=298.28 +units=m", None),
+    ],
+)
+def test_a_crs_that_gdal_spells_otherwise_is_written_with_a_note_that_says_so(
+    tmp_path: Path, crs: int | str, notes: list[str] | None
+) -> None:
+    pyproj = pytest.importorskip("pyproj")
+    system = pyproj.CRS.from_user_input(crs)
+    wkt = system.to_wkt().replace("WGS 84 (CRS84)", "undefined").replace('ID["OGC","CRS84"]', 'ID["X","1"]')
+    surface = Surface(hills(np.float32), metadata={"crs": wkt, "geotransform": [10.0, 0.5, 0.0, 45.0, 0.0, -0.5]})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        formats.write(surface, tmp_path / "a.tif")
+    words = [str(note.message) for note in caught]
+    assert words == notes if notes is not None else all("as GDAL spells it" in text for text in words)
+    with rasterio.open(tmp_path / "a.tif") as raster:
+        assert raster.crs.to_dict() == rasterio.crs.CRS.from_wkt(wkt).to_dict()

@@ -18,7 +18,7 @@ from ...surface import Closed, Surface
 from ..longitudes import close_around
 from ..notes import listing, survives
 from ..placed import Coordinate, place
-from ..source import Source, number
+from ..source import Source, counted
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, Found, offered, others
 from .crs import crs_of
@@ -119,11 +119,12 @@ class _Reader:
             self.notes.append(f"{key} of {name} {words}: {text[:40]!r}")
         if count := _unwritten(values, self._dataset.variables[name].attrs):
             self.notes.append(
-                f"{number(count)} values of {name} are what NetCDF has where nothing was written, "
+                f"{counted(count, 'value', 'values')} of {name} as NetCDF has where nothing was written, "
                 f"{UNWRITTEN[values.array.dtype.str[1:]]!r}: nodata= makes holes of them"
             )
         if values.outside:
-            self.notes.append(f"{number(values.outside)} values of {name} are outside its valid range, and missing")
+            count_outside = counted(values.outside, "value", "values")
+            self.notes.append(f"{count_outside} of {name} outside its valid range: missing")
         return values
 
     def coordinate(self, found: Found, conversion: Conversion | None = None) -> Coordinate:
@@ -196,7 +197,7 @@ def _without_place(heights: Values, x: Coordinate, y: Coordinate) -> list[str]:
         known = [np.isfinite(plane[rows] if plane.shape[0] > 1 else plane) for plane in planes]
         valid = True if heights.valid is None else heights.valid[rows]
         count += int(np.count_nonzero(~(known[0] & known[1]) & valid))
-    return [f"{number(count)} values have no x or y: they are holes until a stream is complete"] if count else []
+    return [f"{counted(count, 'value', 'values')} without x or y: holes until a stream is complete"] if count else []
 
 
 def _metadata(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import FormatError, OptionError
 from ..member import Member
-from ..source import Source
+from ..source import Source, number
 from .choice import fields, main_variable
 from .names import is_time, time_of
 
@@ -21,6 +21,9 @@ _Step = tuple[float | int | str, str, str]
 
 #: What is said for variables, in place of a dimension.
 VARIABLE = "variable"
+
+#: Surfaces of one file: a file of a few bytes can claim a dimension of any length.
+_MOST_MEMBERS = 100_000
 
 #: Dimensions in a refusal.
 _MOST_DIMENSIONS = 50
@@ -47,6 +50,10 @@ def members_of(source: Source, dataset: Any, along: str) -> list[Member]:
         raise OptionError(f"expected {main} over two more dimensions for each {along}, got {', '.join(dims)}")
     if dim in chosen:
         raise OptionError(f"expected no place along {dim} for each {along}, got one by time= or at=")
+    if (count := int(dataset.sizes[dim])) > _MOST_MEMBERS:
+        raise OptionError(
+            f"expected at most {number(_MOST_MEMBERS)} surfaces of a file, got {number(count)} along {dim}"
+        )
     before = str(source.options.get("at", ""))
     at = f"{before}," if before else ""
     return [

@@ -27,10 +27,14 @@ _MOST_CORNERS = 16
 _MESH = "an unstructured mesh"
 _ADVICE = "only grids of rows and columns can be read, to which other programs can interpolate"
 
+_OLD_GMT = "a grid of GMT before version 4"
+_CONVERSION = "gmt grdconvert writes it as the CF conventions have it"
+
 #: Files that are told by variables that they have together.
 _BY_VARIABLES = {
     ("ixm_b", "ixn_b"): "Fourier coefficients in Boozer coordinates (BOOZ_XFORM)",
     ("grid_center_lat", "grid_corner_lat", "grid_dims"): "a list of cells (SCRIP)",
+    ("x_range", "y_range", "spacing", "dimension", "z"): _OLD_GMT,
 }
 
 #: Texts of attributes of a file.
@@ -51,12 +55,15 @@ class NoGrid:
         Variables that describe it.
     whole : bool
         Whether the Dataset is nothing else.
+    advice : str
+        What to do with it.
     """
 
     words: str
     dims: frozenset[str] = frozenset()
     names: frozenset[str] = frozenset()
     whole: bool = False
+    advice: str = _ADVICE
 
     def takes(self, name: str, dims: Any) -> bool:
         """Whether a variable of this name, over these dimensions, belongs to it."""
@@ -65,7 +72,7 @@ class NoGrid:
     def refusal(self, name: str = "") -> str:
         """Words of an error about the whole, or about a variable of it."""
         belongs = f", to which {name} belongs" if name else ""
-        return f"expected a variable over a grid, got {self.words}{belongs}: {_ADVICE}"
+        return f"expected a variable over a grid, got {self.words}{belongs}: {self.advice}"
 
 
 def no_grid_of(dataset: Any) -> NoGrid | None:
@@ -73,7 +80,7 @@ def no_grid_of(dataset: Any) -> NoGrid | None:
     variables = {str(name): variable for name, variable in dataset.variables.items()}
     for names, words in _BY_VARIABLES.items():
         if set(names) <= set(variables):
-            return NoGrid(words, whole=True)
+            return NoGrid(words, whole=True, advice=_CONVERSION if words == _OLD_GMT else _ADVICE)
     for (key, text), words in _BY_ATTRIBUTES.items():
         if text in str(dataset.attrs.get(key, "")).lower():
             return NoGrid(words, whole=True)

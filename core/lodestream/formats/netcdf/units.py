@@ -56,8 +56,11 @@ _ANGLES = {
 #: A unit is a multiple of a named one, such as "km", "1000 m" or "1e3*metre".
 _UNIT = re.compile(r"(?P<times>[0-9.]+(?:[eE][-+]?[0-9]+)?)?[\s*]*(?P<name>[^\W\d].*|°)", re.DOTALL)
 
-#: What directions are added to degrees.
-_DIRECTION = re.compile(r"_?(east|north|e|n|true)$")
+#: Degrees with a direction.
+_DIRECTION = re.compile(r"(deg(?:ree)?s?|°)_?(?:east|north|e|n|true)")
+
+#: Letters that a name in the plural has at least; symbols have no plural ("ms" are milliseconds).
+_SHORTEST_PLURAL = 5
 
 
 @dataclass(frozen=True)
@@ -152,8 +155,10 @@ def _unit(text: str) -> tuple[bool, float] | None:
     if symbol == "Mm":  # no millimetre
         return False, times * 1e6
     name = re.sub(r"[\s_.-]+", "_", symbol.lower()).strip("_")
-    angle = _DIRECTION.sub("", name)
-    for spelling in (name, name.removesuffix("s"), name.removesuffix("es"), angle, angle.removesuffix("s")):
+    if direction := _DIRECTION.fullmatch(name):
+        name = direction[1]
+    plural = len(name) >= _SHORTEST_PLURAL or name == "degs"
+    for spelling in (name, *((name.removesuffix("s"), name.removesuffix("es")) if plural else ())):
         for table, angular in ((_LENGTHS, False), (_ANGLES, True)):
             if spelling in table:
                 return angular, times * table[spelling]

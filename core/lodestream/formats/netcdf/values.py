@@ -27,12 +27,16 @@ __all__ = [
     "limits_of",
     "pieces",
     "raw_values",
+    "stored_number",
     "unusable",
     "values_of",
 ]
 
+#: Attributes that say which values are missing.
+_MISSING = ("_FillValue", "missing_value")
+
 #: Attributes that say how values are stored.
-PACKING = ("_FillValue", "missing_value", "scale_factor", "add_offset", "_Unsigned")
+PACKING = (*_MISSING, "scale_factor", "add_offset", "_Unsigned")
 
 #: Attributes that say which values are valid.
 RANGES = ("valid_range", "valid_min", "valid_max")
@@ -185,14 +189,19 @@ def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]
     return values.view(values.dtype.str.replace(values.dtype.kind, kind))
 
 
-def _like(number: Any, stored: np.dtype[Any], attributes: Mapping[str, Any]) -> Any:
-    """A number of an attribute in the type of stored floats; of that of stored integers, as ``_Unsigned`` says."""
+def stored_number(number: Any, stored: np.dtype[Any], attributes: Mapping[str, Any]) -> Any:
+    """A number of an attribute in the type of stored floats; one that stored integers hold as ``_Unsigned`` says.
+
+    The number may be of any type: -1 in float64 beside unsigned int16 is 65535.
+    """
     number = np.asarray(number).ravel()
     if stored.kind == "f" and number.dtype.kind in "iuf":
         with np.errstate(over="ignore"):
             return number.astype(stored)[0]
-    if stored.kind in "iu" and number.dtype.kind in "iu" and number.dtype.itemsize == stored.itemsize:
-        return _signed(number, attributes)[0]
+    if stored.kind in "iu" and number.dtype.kind in "iuf":
+        limits = np.iinfo(stored)
+        if limits.min <= number[0] <= limits.max and number[0] == int(number[0]):
+            return _signed(number.astype(stored), attributes)[0]
     return number[0]
 
 
@@ -204,18 +213,21 @@ def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArr
     packed = is_packed(attributes)
     raw = _signed(stored, attributes)
     valid = np.ones(raw.shape, np.bool_)
-    for key in ("_FillValue", "missing_value"):
+    for key in _MISSING:
         for missing in np.ravel(attributes.get(key, ())):
             if isinstance(missing, np.number):
-                valid &= raw != _like(missing, stored.dtype, attributes)
+                valid &= raw != stored_number(missing, stored.dtype, attributes)
     values = _unpacked(stored, attributes) if packed else raw
     if values.dtype.kind == "f":
         valid &= ~np.isnan(values)
     inside = np.ones((), np.bool_)
     for limit, is_within in zip(limits_of(attributes), (np.greater_equal, np.less_equal), strict=True):
         if limit is not None and not np.isnan(limit):
-            of_stored = packed and stored.dtype.kind in "iu" and limit.dtype.kind in "iu"
-            inside = inside & is_within(raw if of_stored else values, _like(limit, stored.dtype, attributes))
+            of_unpacked = packed and stored.dtype.kind in "iu" and limit.dtype.kind == "f"
+            if not of_unpacked:
+                limit = stored_number(limit, stored.dtype, attributes)
+            of_stored = packed and stored.dtype.kind in "iu" and not of_unpacked
+            inside = inside & is_within(raw if of_stored else values, limit)
     outside = 0
     if inside.ndim and not inside.all():
         outside = int(np.count_nonzero(valid & ~inside))
@@ -234,6 +246,11 @@ def _unpacked(stored: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[An
     dims = [f"axis_{number}" for number in range(stored.ndim)]
     unused = unusable(attributes)
     packing = {key: attributes[key] for key in PACKING if key in attributes and key not in unused}
+    if stored.dtype.kind in "iu":  # xarray takes one fill value of unsigned integers, and of their type
+        numbers = [number for key in _MISSING for number in np.ravel(packing.pop(key, ()))]
+        known = [stored_number(number, stored.dtype, attributes) for number in numbers]
+        fills = [number for number in known if number.dtype == _signed(stored[:0], attributes).dtype]
+        packing |= {"_FillValue": fills[0].astype(stored.dtype)} if fills else {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of several fill values
         decoded = xarray.conventions.decode_cf_variable(

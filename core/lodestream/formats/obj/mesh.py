@@ -328,8 +328,9 @@ class ObjFile:
         return line + face - first
 
     def face_name(self, face: int) -> str:
-        """Return the name of a face for messages."""
-        return f"face {face + 1} (line {self.face_line(face)})"
+        """Return the name in messages of a face, from the number that it has once polygons are cut into triangles."""
+        further = sum(min(face - first, count - 3) for first, count in self._fans if first < face)
+        return f"face {face - further + 1} (line {self.face_line(face)})"
 
 
 def _around(rows: NDArray[np.int32], first: int, count: int) -> NDArray[np.int32]:

@@ -102,11 +102,15 @@ def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], P
         path = finish(path, profile["predictor"])
         with rasterio.Env(**gdal.ALONE), rasterio.open(path, driver="GTiff") as dataset:
             lost = missing(dataset, surface.metadata, names)
-            lost += ["all of the CRS"] * (crs is not None and dataset.crs != crs)
+            same = crs is None or dataset.crs == crs
+            spelled = not same and dataset.crs is not None and dataset.crs.to_dict() == crs.to_dict()
+            lost += ["a part of the CRS"] * (not same and not spelled)
             _check(dataset, surface, bands, dtype, nodata)
         with path.open("rb") as written:
             shutil.copyfileobj(written, file)
     warn_left_out(_TITLE, lost, "which GDAL does not write")
+    if spelled:
+        warn(f"{_TITLE} has the CRS as GDAL spells it, with other names or axes, and the same parameters")
 
 
 @contextmanager
