@@ -1,4 +1,4 @@
-"""``python -m tests.server.alone SETTINGS`` is a server that `programs` starts: it imports nothing that tests need.
+"""``python -m tests.server.alone SETTINGS PRELOAD`` is a server that `programs` starts: it imports nothing of the tests.
 
 It prints its address, then answers each line of its standard input with a line that says what is in it.
 """
@@ -11,9 +11,15 @@ import gc
 import json
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
+
+#: How many times what a value takes is counted, where small surfaces are to be large.
+_TIMES = 10
+#: Seconds that a build waits for somebody who ends it: longer than any test waits.
+_PATIENCE = 3600.0
 
 
 def _within() -> dict[str, Any]:
@@ -44,6 +50,34 @@ def preload() -> None:
         worker.preload()
 
 
+def preload_large() -> None:
+    """The same; then builds count what a value takes ten times: so small surfaces do not fit into memory in one piece."""
+    from lodestream.encoding import folder_build, memory
+    from lodestream_server.builds import worker
+
+    preload()
+    memory._WHOLE_WITH_HOLES *= _TIMES
+    folder_build.OF_BAND *= _TIMES
+    folder_build._FEWEST //= _TIMES
+    worker._PART *= _TIMES
+
+
+def preload_waiting() -> None:
+    """The same; then builds by pieces have measured one when they wait: whoever ends them then does so in the middle."""
+    from lodestream.encoding import tasks
+    from lodestream.encoding.build import Build
+
+    preload_large()
+    measure = tasks.measure
+
+    def measure_first(build: Build, number: int) -> None:
+        if number:
+            time.sleep(_PATIENCE)
+        measure(build, number)
+
+    tasks.measure = measure_first
+
+
 def main() -> None:
     """Serve until told to end."""
     gc.disable()  # what is imported stays: to look through it again and again frees nothing
@@ -58,7 +92,7 @@ def main() -> None:
     configure(settings.log_format, settings.log_level)
     # Its own standard input: a process that it spawns must not read from it.
     threading.Thread(target=_answer, daemon=True).start()
-    with patch.object(worker, "preload", alone.preload):  # by the name that another process finds it by
+    with patch.object(worker, "preload", getattr(alone, sys.argv[2])):  # by the name that another process finds it by
         serve_alone(settings, lambda address: print(address, flush=True))
 
 

@@ -54,14 +54,16 @@ class Server:
         Its folder; what it says goes into a file beside it.
     wrapper : sequence of str
         A command that runs the one that follows it.
+    preload : str
+        The function of `alone` that builds and levels begin with.
     **settings
         Fields of `Settings`.
     """
 
-    def __init__(self, data: Path, wrapper: Sequence[str] = (), **settings: Any) -> None:
+    def __init__(self, data: Path, wrapper: Sequence[str] = (), preload: str = "preload", **settings: Any) -> None:
         self.log = data.with_name(f"{data.name}.log")
         chosen = {"host": "127.0.0.1", "port": 0, "workers": 1, "data": str(data), **settings}
-        command = [*wrapper, sys.executable, "-m", "tests.server.alone", json.dumps(chosen)]
+        command = [*wrapper, sys.executable, "-m", "tests.server.alone", json.dumps(chosen), preload]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         with self.log.open("ab") as log:
             self._process = subprocess.Popen(
@@ -113,9 +115,11 @@ class Server:
 
 
 @contextlib.contextmanager
-def server(data: Path, wrapper: Sequence[str] = (), **settings: Any) -> Iterator[Server]:
+def server(
+    data: Path, wrapper: Sequence[str] = (), preload: str = "preload", **settings: Any
+) -> Iterator[Server]:
     """A server, which has ended when the ``with`` block does."""
-    running = Server(data, wrapper, **settings)
+    running = Server(data, wrapper, preload, **settings)
     try:
         yield running
         assert running.stop() in (0, -signal.SIGTERM)

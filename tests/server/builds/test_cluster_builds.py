@@ -40,14 +40,14 @@ from tests.server.programs import Server, alive, server
 
 pytest.importorskip("distributed")
 
-#: Of a build: half of it is too little for so many points with holes.
-MEMORY, SIDE = 256 << 20, 1860
-BEYOND = {"workers": 1, "build_memory": MEMORY, "formats": "npy"}
+#: Of a build: half of it is too little for so many points with holes; for so few by `alone.preload_large`.
+MEMORY, SIDE, SMALL_SIDE = 256 << 20, 1860, 620
+BEYOND: dict[str, Any] = {"workers": 1, "build_memory": MEMORY, "formats": "npy"}
 
 
-def large() -> bytes:
+def large(side: int = SIDE) -> bytes:
     """A file that is built by bands within that memory."""
-    heights = np.rint(terrain((SIDE, SIDE)) * 40).astype(np.float32)
+    heights = np.rint(terrain((side, side)) * 40).astype(np.float32)
     heights[3:9, 5:60] = np.nan
     return npy(heights)
 
@@ -297,9 +297,9 @@ def test_a_server_starts_where_no_scheduler_is_and_says_so_of_what_it_cannot_bui
 def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_killed_builds_again(
     tmp_path: Path,
 ) -> None:
-    data = large()
+    data = large(SMALL_SIDE)
     with local_cluster(0) as cluster:
-        settings = {**BEYOND, "dask": cluster.scheduler_address}
+        settings: dict[str, Any] = {**BEYOND, "preload": "preload_large", "dask": cluster.scheduler_address}
         clients = cluster.scheduler.clients  # those of the processes that hand out tasks, and one of its own
 
         def handing_out() -> bool:

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
@@ -17,19 +16,19 @@ import lodestream as ls
 from lodestream.encoding import cluster as clusters
 from lodestream.formats import write_stream
 from lodestream_client.__main__ import main
-from lodestream_server import create_app, running_server
+from lodestream_server import create_app
 from lodestream_server.builds import cluster_build, worker
 from lodestream_server.operation.settings import Settings
 from tests.clusters import local_cluster
 from tests.core.encoding.block_surfaces import block_surface
 from tests.core.surfaces import terrain
-from tests.patience import PATIENCE
 from tests.server.helpers import push
+from tests.server.programs import server
 
 pytest.importorskip("distributed")
 
-#: Of a build: nothing fits into half of it in one piece that has so many points with holes.
-MEMORY, SIDE = 256 << 20, 1860
+#: Of a build: nothing fits into half of it in one piece that has so many points with holes, by `alone.preload_large`.
+MEMORY, SIDE = 256 << 20, 620
 
 
 @pytest.fixture(scope="module")
@@ -116,12 +115,8 @@ def _new(folder: Path, name: str) -> Path:
 
 def test_a_cluster_builds_what_is_large(cluster: Any, tmp_path: Path) -> None:
     data = _npy(SIDE)
-    with (
-        running_server(
-            tmp_path / "data", workers=1, build_memory=MEMORY, dask=cluster.scheduler_address, formats="npy"
-        ) as url,
-        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
-    ):
+    settings = {"build_memory": MEMORY, "dask": cluster.scheduler_address, "formats": "npy"}
+    with server(tmp_path / "data", preload="preload_large", **settings) as running, running.client() as http:
         large = push(http, data)
         assert large["state"] == "ready", large
         container = http.get(f"{large['url']}/container", follow_redirects=True).raise_for_status().content
