@@ -30,7 +30,10 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.ge
 
 #: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
 LONGEST = (
+    "tests/server/builds/test_interrupted_builds.py",
+    "tests/core/formats/test_cf_conventions.py",
     "tests/history/test_runs.py",
+    "tests/server/builds/test_cluster_builds.py",
     "tests/core/decoding/test_reference_decoder.py",
     "tests/core/grid/test_many_patches.py",
     "tests/core/grid/test_watertight.py",

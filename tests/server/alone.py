@@ -1,4 +1,4 @@
-"""``python -m tests.server.alone SETTINGS PRELOAD`` is a server that `programs` starts: it imports nothing of the tests.
+"""``python -m tests.server.alone SETTINGS PRELOAD`` is a server that `programs` starts: it imports little of the tests.
 
 It prints its address, then answers each line of its standard input with a line that says what is in it.
 """
@@ -51,19 +51,19 @@ def preload() -> None:
 
 
 def preload_large() -> None:
-    """The same; then builds count what a value takes ten times: so small surfaces do not fit into memory in one piece."""
+    """The same; then builds count what a value takes ten times: small surfaces do not fit into memory in one piece."""
     from lodestream.encoding import folder_build, memory
     from lodestream_server.builds import worker
 
     preload()
     memory._WHOLE_WITH_HOLES *= _TIMES
-    folder_build.OF_BAND *= _TIMES
+    vars(folder_build)["OF_BAND"] *= _TIMES
     folder_build._FEWEST //= _TIMES
     worker._PART *= _TIMES
 
 
 def preload_waiting() -> None:
-    """The same; then builds by pieces have measured one when they wait: whoever ends them then does so in the middle."""
+    """The same; then builds by pieces wait once they have measured one: whoever ends them does so in the middle."""
     from lodestream.encoding import tasks
     from lodestream.encoding.build import Build
 

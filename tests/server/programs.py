@@ -115,9 +115,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def server(
-    data: Path, wrapper: Sequence[str] = (), preload: str = "preload", **settings: Any
-) -> Iterator[Server]:
+def server(data: Path, wrapper: Sequence[str] = (), preload: str = "preload", **settings: Any) -> Iterator[Server]:
     """A server, which has ended when the ``with`` block does."""
     running = Server(data, wrapper, preload, **settings)
     try:

@@ -68,7 +68,7 @@ def at_nodes(decoder: ls.Decoder, planes: tuple[NDArray[Any], ...], level: int) 
     return [plane[np.ix_(rows, columns)] for plane in planes]
 
 
-@examples(100)
+@examples(20)
 @given(placements())
 def test_nodes_of_heights_lie_at_their_places_in_the_finest_grid(surface: ls.Surface) -> None:
     decoder = decoder_of(surface)
@@ -84,7 +84,7 @@ def test_nodes_of_heights_lie_at_their_places_in_the_finest_grid(surface: ls.Sur
                 assert plane.tobytes() == wanted.tobytes()
 
 
-@examples(30)
+@examples(15)
 @given(placements())
 def test_levels_of_levels_lie_there_as_well(surface: ls.Surface) -> None:
     first = decoder_of(surface)
@@ -101,7 +101,7 @@ def test_levels_of_levels_lie_there_as_well(surface: ls.Surface) -> None:
             np.testing.assert_allclose(plane, own, rtol=0, atol=1e-14 * size)
 
 
-@examples(30)
+@examples(20)
 @given(
     st.tuples(st.integers(2, 60), st.integers(2, 60)),
     st.sampled_from(CLOSURES),
@@ -248,7 +248,7 @@ def longitudes(draw: st.DrawFn) -> tuple[NDArray[Any], bool]:
     return (line[::-1] if draw(st.booleans()) else line).astype(draw(st.sampled_from(["f4", "f8"]))), around
 
 
-@examples(100)
+@examples(20)
 @given(longitudes(), st.integers(2, 40), st.integers(0, 2**32), st.booleans())
 def test_nodes_over_uneven_longitudes_lie_at_places_of_the_source(
     line: tuple[NDArray[Any], bool], rows: int, seed: int, turned: bool

@@ -11,7 +11,9 @@ import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -134,6 +136,13 @@ def cases(draw: st.DrawFn) -> Case:
     return Case(data, original, firsts)
 
 
+@lru_cache(maxsize=1)
+def reference_of(data: bytes) -> tuple[reference.Container, reference.Decoder]:
+    """A container as `tests.reference` reads and decodes it: slowly, so once for all states."""
+    container = reference.read_container(data)
+    return container, reference.decode(container)
+
+
 def errors_of(
     original: ls.Surface, shown: ls.Surface, firsts: Sequence[NDArray[np.bool_]]
 ) -> list[tuple[float, float]]:
@@ -178,8 +187,7 @@ def cut(blocks: list[reference.Shown], region: Region) -> list[reference.Shown]:
 
 def check_states(case: Case, region: Region | None, level: int) -> None:
     """In the order of the file: after each layer and at the end, values, a coarser level, a window, and errors."""
-    container = reference.read_container(case.data)
-    other = reference.decode(container)
+    container, other = reference_of(case.data)
     decoder = ls.Decoder()
     views = decoder.feed(case.data)
     last = len(container.layers)
@@ -199,10 +207,10 @@ def check_states(case: Case, region: Region | None, level: int) -> None:
 
 def remaining(case: Case, view: View, selection: Selection) -> list[int]:
     """What `reference.Decoder` knows in the state of a view that came by the index: whole layers, or whole levels."""
-    index, container = index_of(case.data), reference.read_container(case.data)
+    index, (container, whole) = index_of(case.data), reference_of(case.data)
     header = index.header
     if view.complete:
-        return reference.decode(container).states[-1]
+        return whole.states[-1]
     segments = select(index, selection).segments
     level_of = [header.layout.level_of(segment.tile) for segment in segments]
     layers = [segment.layer for segment in segments]
@@ -215,9 +223,9 @@ def remaining(case: Case, view: View, selection: Selection) -> list[int]:
         found.append([most for most in range(count) if sizes[most] == view.bytes])
     whole_layers, whole_levels = found
     if view.bytes == index.layers[min(view.number, header.layer_count - 1)].end:  # read as it is written
-        return reference.decode(container).states[view.number]
+        return whole.states[view.number]
     if whole_layers and view.number == whole_layers[-1]:
-        return reference.decode(container).states[whole_layers[-1]]
+        return whole.states[whole_layers[-1]]
     assert view.number == whole_levels[-1]
     other = reference.Decoder(container.header, container.masks)
     entries = [entry for layer in reference.read_index(case.data, container).segments for entry in layer]
@@ -229,11 +237,11 @@ def remaining(case: Case, view: View, selection: Selection) -> list[int]:
 def check_planned(case: Case, target: ls.Target) -> None:
     """By the index: whole layers or whole levels, of all or of a window, which is as within the whole."""
     index, selection = index_of(case.data), Selection(region=target.region)
-    container = reference.read_container(case.data)
+    container, whole = reference_of(case.data)
     views = follow(case.data, plan(index, target), selection=selection)[1]
     assert views[-1].complete
     for view in views:
-        other = reference.decode(container)
+        other = copy(whole)
         other.remaining = remaining(case, view, selection)
         blocks = other.shown(residual=container.residual if view.complete else None)
         surface = view.surface()

@@ -202,8 +202,10 @@ def mapped(kind: str, said: str = "crs") -> xr.Dataset:
 
 
 @every_opener
-@pytest.mark.parametrize("kind", CONVENTIONS)
-@pytest.mark.parametrize("said", ["crs", "crs: x y", "other: a b crs: x y"])
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [*((kind, "crs") for kind in CONVENTIONS), ("lambert", "crs: x y"), ("geographic", "other: a b crs: x y")],
+)
 def test_a_crs_comes_from_the_attributes_of_the_conventions(
     tmp_path: Path, opener: Opener, kind: str, said: str
 ) -> None:
@@ -270,15 +272,18 @@ def assert_is_crs(found: Any, kind: str) -> None:
     assert found["grid_mapping_name"] == CONVENTIONS[kind]["grid_mapping_name"]
 
 
-@pytest.mark.parametrize("kind", CONVENTIONS)
 @pytest.mark.parametrize(
-    "more",
+    ("kind", "more"),
     [
-        {},
-        {"horizontal_datum_name": "of a survey"},
-        {"reference_ellipsoid_name": "GRS 1980"},
-        {"prime_meridian_name": "Paris"},
-        {"longitude_of_prime_meridian": 2.5},
+        *((kind, {}) for kind in CONVENTIONS),
+        ("lambert", {"horizontal_datum_name": "of a survey"}),
+        ("geographic", {"horizontal_datum_name": "of a survey"}),
+        ("rotated", {"reference_ellipsoid_name": "GRS 1980"}),
+        ("mercator", {"reference_ellipsoid_name": "GRS 1980"}),
+        ("geographic", {"prime_meridian_name": "Paris"}),
+        ("geostationary", {"prime_meridian_name": "Paris"}),
+        ("lambert", {"longitude_of_prime_meridian": 2.5}),
+        ("rotated", {"longitude_of_prime_meridian": 2.5}),
     ],
     ids=str,
 )
