@@ -64,7 +64,7 @@ def views_of(container: bytes, index: Index, target: ls.Target, windows: WindowE
     return views
 
 
-@examples(75)
+@examples(20)
 @given(
     st.tuples(st.sampled_from(KINDS), st.integers(0, 3), st.booleans()),
     st.tuples(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1)),
