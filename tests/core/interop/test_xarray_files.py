@@ -278,19 +278,29 @@ def words(notes: list[str]) -> list[str]:
     return sorted(" ".join(notes).replace(",", "").split())
 
 
-@pytest.fixture(params=["netcdf", "zarr"])
-def written(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Any], tuple[Path, Callable[..., Any]]]:
-    """Write a Dataset, and give the path and what opens it in xarray."""
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where each Dataset is written once."""
+    return tmp_path_factory.mktemp("written")
 
-    def write(data: Any) -> tuple[Path, Callable[..., Any]]:
-        path = tmp_path / f"a.{'nc' if request.param == 'netcdf' else 'zarr'}"
+
+@pytest.fixture(params=["netcdf", "zarr"])
+def written(
+    request: pytest.FixtureRequest, folder: Path
+) -> Callable[[Callable[[], Any]], tuple[Path, Callable[..., Any]]]:
+    """Write the Dataset that a function makes, and give the path and what opens it in xarray."""
+
+    def write(make: Callable[[], Any]) -> tuple[Path, Callable[..., Any]]:
+        path = folder / f"{make.__name__}.{'nc' if request.param == 'netcdf' else 'zarr'}"
         if request.param == "netcdf":
-            data.to_netcdf(path, engine="h5netcdf")
+            if not path.exists():
+                make().to_netcdf(path, engine="h5netcdf")
             return path, lambda **how: xr.open_dataset(path, engine="h5netcdf", **how)
         pytest.importorskip("zarr")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of texts of fixed length
-            data.to_zarr(path, consolidated=False)
+        if not path.exists():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of texts of fixed length
+                make().to_zarr(path, consolidated=False)
         return path, lambda **how: xr.open_dataset(path, engine="zarr", consolidated=False, **how)
 
     return write
@@ -312,7 +322,7 @@ DECODINGS: list[dict[str, Any]] = [{}, {"decode_times": False}, {"mask_and_scale
 @pytest.mark.parametrize("name", CASES)
 def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
-    path, opened = written(make())
+    path, opened = written(make)
     here, said = noted(lambda: ls.read(path, **options, attributes=attributes))
     rest = [text for text in said if not text.startswith("left out variables of the same grid")]
     for decoded in DECODINGS:
@@ -326,7 +336,7 @@ def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
 def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
     data = make()
-    path, opened = written(data)
+    path, opened = written(make)
     surface, said = noted(lambda: ls.read(path, **options, attributes=attributes))
     with opened() as decoded:
         there, notes = noted(lambda: ls.Surface.from_xarray(decoded, **options, attributes=attributes))
@@ -343,7 +353,7 @@ def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any
 @pytest.mark.parametrize("name", CASES)
 def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str, written: Any) -> None:
     make, options, _ = CASES[name]
-    path, opened = written(make())
+    path, opened = written(make)
     _, said = noted(lambda: ls.read(path, **options))
     offered = [text for text in said if text.startswith("left out variables of the same grid: ")]
     names = offered[0].split(": ")[1].split(";")[0].split(", ") if offered else []
@@ -356,7 +366,7 @@ def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str,
 @pytest.mark.parametrize("name", CASES)
 def test_containers_are_the_same(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
-    path, opened = written(make())
+    path, opened = written(make)
     here, _ = noted(lambda: ls.decode(ls.encode(ls.read(path, **options, attributes=attributes))))
     with opened() as data:
         there, _ = noted(lambda: ls.decode(ls.encode(ls.Surface.from_xarray(data, **options, attributes=attributes))))
@@ -373,8 +383,10 @@ def test_an_option_that_is_none_is_refused() -> None:
 
 @pytest.mark.parametrize("nodata", [0, "0", 7.0])
 def test_nodata_masks_as_in_a_file(nodata: Any, written: Any) -> None:
-    data = xr.Dataset({"z": (("y", "x"), field())})
-    path, opened = written(data)
+    def plain() -> Any:
+        return xr.Dataset({"z": (("y", "x"), field())})
+
+    path, opened = written(plain)
     here, said = noted(lambda: ls.read(path, nodata=nodata))
     assert here.mask is not None
     with opened() as data:
