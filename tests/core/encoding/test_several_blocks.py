@@ -138,9 +138,9 @@ def test_many_blocks_take_few_files(tmp_path: Path) -> None:
     assert resource is not None
     rng = np.random.default_rng(1)
     blocks = []
-    for _ in range(80):
-        mask = rng.random((12, 12)) < 0.9
-        blocks.append(Block(rng.normal(size=(12, 12)), mask=mask, attributes={"a": rng.normal(size=(12, 12))}))
+    for _ in range(70):
+        mask = rng.random((5, 6)) < 0.9
+        blocks.append(Block(rng.normal(size=(5, 6)), mask=mask, attributes={"a": rng.normal(size=(5, 6))}))
     surface = Surface(blocks=blocks)
     expected = encode(surface)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)

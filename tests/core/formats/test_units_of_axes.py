@@ -77,8 +77,10 @@ def positions(surface: ls.Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     return coordinates(surface) if surface.points.ndim == 2 else (surface.points[..., 0], surface.points[..., 1])
 
 
-@pytest.mark.parametrize("opener", [_file, _decoded])
-@pytest.mark.parametrize("units", METRES)
+@pytest.mark.parametrize(
+    ("opener", "units"),
+    [*((_file, units) for units in METRES), (_decoded, "km"), (_decoded, "1000 m"), (_decoded, "ft")],
+)
 def test_lengths_become_those_of_the_crs(tmp_path: Path, opener: Any, units: str) -> None:
     data = mapped(units)
     surface, notes = noted(lambda: opener(data, tmp_path))
