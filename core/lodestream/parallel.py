@@ -12,6 +12,7 @@ from typing import Any, Generic, TypeVar
 from weakref import ref
 
 from .errors import OptionError
+from .operating_system import processors, run_in_forks
 
 __all__ = ["VARIABLE", "spread", "threads"]
 
@@ -34,17 +35,10 @@ def threads() -> int:
     """
     setting = os.environ.get(VARIABLE, "").strip()
     if not setting:
-        return min(_processors(), _MAX_THREADS)
+        return min(processors(), _MAX_THREADS)
     if setting.isascii() and setting.isdigit() and 1 <= int(setting) <= _MAX_THREADS:
         return int(setting)
     raise OptionError(f"expected {VARIABLE} to be a whole number from 1 to {_MAX_THREADS}, got {setting[:40]!r}")
-
-
-def _processors() -> int:
-    """Return the number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, len(os.sched_getaffinity(0)))
-    return os.cpu_count() or 1
 
 
 def spread(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
@@ -188,5 +182,4 @@ def _pool() -> _Pool:
     return _pools.get(most) or _pools.setdefault(most, _Pool(most))
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pools.clear)  # threads do not survive a fork
+run_in_forks(_pools.clear)  # threads do not survive a fork

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import math
 import os
@@ -21,6 +20,8 @@ from uuid import uuid4
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+
+from .operating_system import allocate, remove_folder, run_in_forks
 
 __all__ = [
     "IN_MEMORY",
@@ -57,7 +58,7 @@ def _parse_anew() -> None:
     _parsing = Lock()
 
 
-os.register_at_fork(after_in_child=_parse_anew)  # another thread may have been parsing when the process forked
+run_in_forks(_parse_anew)  # another thread may have been parsing when the process forked
 
 
 def checksum(path: Path) -> tuple[int, int]:
@@ -267,7 +268,7 @@ class FolderScratch(Scratch):
             return np.zeros(shape, dtype)
         array = np.lib.format.open_memmap(path, "w+", np.dtype(dtype), shape)
         try:
-            _take(path)
+            allocate(path)
         except BaseException:
             path.unlink(missing_ok=True)
             raise
@@ -305,7 +306,7 @@ class FolderScratch(Scratch):
     def remove(self, name: str) -> None:
         """Forget an array, if it is there, or all whose names begin with this and a slash."""
         self._path(name).unlink(missing_ok=True)
-        shutil.rmtree(self.folder / name, ignore_errors=True)
+        remove_folder(self.folder / name)
 
     def size(self) -> int:
         """Return the bytes of all files, but for those that vanish meanwhile."""
@@ -313,7 +314,7 @@ class FolderScratch(Scratch):
 
     def clear(self) -> None:
         """Remove the folder with everything in it."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+        remove_folder(self.folder)
 
     def _made(self, name: str) -> Path:
         """Return the path of a name, in a folder that is there."""
@@ -356,25 +357,6 @@ def _size(path: Path) -> int:
         return path.lstat().st_size
     except FileNotFoundError:
         return 0
-
-
-def _take(path: Path) -> None:
-    """Take the room on the disk that a file has promised: a full disk ends a process that writes to a map of it.
-
-    Raises
-    ------
-    OSError
-        If there is none.
-    """
-    if not hasattr(os, "posix_fallocate"):  # not on macOS and Windows
-        return
-    with path.open("r+b") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-                raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from None
-            # Some file systems cannot.
 
 
 #: Arrays of a `Room` that have a file each. Those that come after share files, unless they are large: each file is one

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import signal
 import socket
 import subprocess
 import sys
@@ -17,6 +15,7 @@ from pathlib import Path
 import httpx
 
 from lodestream.errors import LodestreamError
+from lodestream.operating_system import kill_session, new_session
 
 from ..terminal.interrupts import raising
 
@@ -44,9 +43,7 @@ def own_server() -> Iterator[str]:
         command += ["--host", "127.0.0.1", "--port", str(port), "--data", str(Path(folder) / "data")]
         with log.open("wb") as output:
             # A session of its own: a Ctrl-C is ours to handle, and then ours to pass on.
-            process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
-            )
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, **new_session())
         try:
             url = f"http://127.0.0.1:{port}"
             _await(process, url, log)
@@ -82,5 +79,5 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.wait(_END_SECONDS)
     except subprocess.TimeoutExpired:
         # Its workers too: they are in its session, which is its own.
-        os.killpg(process.pid, signal.SIGKILL)
+        kill_session(process)
         process.wait()

@@ -11,7 +11,6 @@ followed, and no file is written or removed that does not begin like a file of t
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import re
 import stat
@@ -22,6 +21,16 @@ from bisect import bisect_right, insort
 from pathlib import Path
 
 from lodestream.errors import InputError, LodestreamError
+from lodestream.operating_system import (
+    cache_home,
+    close_and_remove,
+    is_of_another_user,
+    lock,
+    open_own,
+    read_at,
+    touch,
+    write_at,
+)
 from lodestream.planning.byte_ranges import RangeSet
 
 __all__ = ["CacheFile", "cache_folder", "forget_old", "is_name"]
@@ -34,8 +43,6 @@ _RECORD = struct.Struct("<QII")  # offset, length, CRC-32 of both and of the dat
 _DAYS_KEPT = 30
 
 _NAME = re.compile(r"[0-9a-f]{64}")
-# Not a link, and not a wait for whoever is at the other end of what is no file.
-_OPENING = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class _TakenError(Exception):
@@ -45,8 +52,7 @@ class _TakenError(Exception):
 def cache_folder() -> Path:
     """Return the folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
     chosen = os.environ.get("LODESTREAM_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME", "").strip() or os.path.expanduser("~/.cache")
-    return Path(chosen) if chosen else Path(base, "lodestream")
+    return Path(chosen) if chosen else cache_home() / "lodestream"
 
 
 def is_name(name: object) -> bool:
@@ -95,15 +101,16 @@ class CacheFile:
         self.discarded = False
         self._records: list[tuple[int, int, int]] = []  # offset, length, place in the file
         try:
-            self._handle = _locked(self._path, os.O_CREAT)
+            self._handle = _locked(self._path, create=True)
         except _TakenError:
             raise LodestreamError(f"another program is receiving the same surface into {folder}") from None
         try:
             self._end = self._recover(size)
         except BaseException:
-            if not os.fstat(self._handle).st_size:
-                self._path.unlink(missing_ok=True)  # the disk took not even its head
-            os.close(self._handle)
+            if os.fstat(self._handle).st_size:
+                os.close(self._handle)
+            else:  # the disk took not even its head
+                close_and_remove(self._handle, self._path)
             raise
 
     def read(self, offset: int, length: int) -> bytes:
@@ -113,7 +120,7 @@ class CacheFile:
         while len(data) < length:
             start, size, place = self._records[number]
             skipped = offset + len(data) - start
-            data += os.pread(self._handle, min(size - skipped, length - len(data)), place + skipped)
+            data += read_at(self._handle, min(size - skipped, length - len(data)), place + skipped)
             number += 1
         return bytes(data)
 
@@ -126,7 +133,7 @@ class CacheFile:
             If the disk is full, or does not take them for another reason.
         """
         record = _RECORD.pack(offset, len(data), _checksum(offset, data)) + data
-        written = os.pwrite(self._handle, record, self._end)
+        written = write_at(self._handle, record, self._end)
         if written != len(record):
             raise OSError(f"expected to write {len(record)} bytes to {self._path}, got {written}")
         self._add(offset, len(data), self._end + _RECORD.size)
@@ -138,9 +145,10 @@ class CacheFile:
     def close(self) -> None:
         """Release the file, or remove it."""
         if self.discarded or not self.ranges.total:
-            # Whoever opens it just now finds that it has no name any more, and makes another.
-            self._path.unlink(missing_ok=True)
-        os.close(self._handle)
+            # A program that is just opening it finds that it has no name any more, and creates another.
+            close_and_remove(self._handle, self._path)
+        else:
+            os.close(self._handle)
 
     def _add(self, offset: int, length: int, place: int) -> None:
         insort(self._records, (offset, length, place))
@@ -153,7 +161,7 @@ class CacheFile:
         with open(self._handle, "rb", closefd=False) as file:
             if file.read(end) != head:
                 os.ftruncate(self._handle, 0)
-                os.pwrite(self._handle, head, 0)
+                write_at(self._handle, head, 0)
                 return end
             while len(fields := file.read(_RECORD.size)) == _RECORD.size:
                 offset, length, checksum = _RECORD.unpack(fields)
@@ -165,7 +173,7 @@ class CacheFile:
                 self._add(offset, length, end + _RECORD.size)
                 end += _RECORD.size + length
         os.ftruncate(self._handle, end)
-        os.utime(self._handle)
+        touch(self._handle, self._path)
         return end
 
     def _is_new(self, offset: int, length: int) -> bool:
@@ -189,13 +197,10 @@ def forget_old(folder: Path) -> None:
             handle = _locked(path)
         except (OSError, _TakenError):
             continue
-        try:
-            path.unlink(missing_ok=True)
-        finally:
-            os.close(handle)
+        close_and_remove(handle, path)
 
 
-def _locked(path: Path, create: int = 0) -> int:
+def _locked(path: Path, create: bool = False) -> int:
     """Open a cache file, locked until it is closed.
 
     Raises
@@ -204,16 +209,14 @@ def _locked(path: Path, create: int = 0) -> int:
         When it cannot be opened, or is not ours.
     """
     while True:
-        handle = os.open(path, _OPENING | create, 0o600)
+        handle = open_own(path, create)
         try:
             _check_ours(handle, path)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise _TakenError from None
+            if not lock(handle):
+                raise _TakenError
             if _is_at(handle, path):
                 return handle
-            # It was removed by whoever had it locked. Without O_CREAT the next attempt finds none.
+            # It was removed by whoever had it locked. Without `create` the next attempt finds none.
         except BaseException:
             os.close(handle)
             raise
@@ -223,9 +226,9 @@ def _locked(path: Path, create: int = 0) -> int:
 def _check_ours(handle: int, path: Path) -> None:
     """Refuse a file that this program did not make, before anything is done to it."""
     status = os.fstat(handle)
-    is_ours = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid() and status.st_nlink <= 1
+    is_ours = stat.S_ISREG(status.st_mode) and not is_of_another_user(status) and status.st_nlink <= 1
     # A program that was killed may have left less than a head.
-    if not is_ours or not _MAGIC.startswith(os.pread(handle, len(_MAGIC), 0)):
+    if not is_ours or not _MAGIC.startswith(read_at(handle, len(_MAGIC), 0)):
         raise FileExistsError(errno.EEXIST, "not a file of an earlier pull; it is not changed", str(path))
 
 

@@ -19,6 +19,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lodestream.errors import LodestreamError, UnavailableError
+from lodestream.operating_system import new_session
 
 from .pictures import Picture, write_png
 
@@ -64,7 +65,7 @@ class Drawing:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,
+            **new_session(),
         )
         # The thread waits for the process, so that nothing else does.
         self._thread = ThreadPoolExecutor(1, "lodestream-drawing")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lodestream.errors import LodestreamError, RemoteProtocolError
+from lodestream.operating_system import read_at
 
 from .. import sync
 from ..requests import api, calls
@@ -101,7 +102,7 @@ class FileSource:
             If it is another file than it was, or was written since.
         """
         with self._path.open("rb") as file:
-            data = os.pread(file.fileno(), min(length, _AT_ONCE), offset)
+            data = read_at(file.fileno(), min(length, _AT_ONCE), offset)
             # Asked afterwards: what was read before a change is of the old file.
             same = _tag(os.fstat(file.fileno())) == self.tag
         if not same or not data:

@@ -11,9 +11,12 @@ import sys
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from . import landlock, seccomp
 from .places import library_places
+
+if TYPE_CHECKING or sys.platform == "linux":
+    from . import landlock, seccomp
 
 __all__ = ["Rights", "confine", "missing"]
 
@@ -86,6 +89,8 @@ def missing(held: Collection[str]) -> tuple[str, ...]:
     tuple of str
         Each begins with "landlock" or "seccomp"; empty if both hold.
     """
+    if sys.platform != "linux":
+        return ("landlock and seccomp: only Linux has them, so a build may do what the server may do",)
     sentences = []
     known = landlock.version(ctypes.CDLL(None, use_errno=True)) if "landlock" in held else 0
     if "landlock" not in held:

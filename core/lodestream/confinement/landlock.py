@@ -7,8 +7,11 @@ import errno
 import os
 import stat
 import struct
+import sys
 from collections.abc import Iterable
 from pathlib import Path
+
+assert sys.platform == "linux"  # no other system has what follows
 
 __all__ = ["NETWORK", "SCOPES", "restrict", "version"]
 

@@ -14,6 +14,8 @@ import struct
 import sys
 from collections.abc import Iterable, Mapping
 
+assert sys.platform == "linux"  # no other system has what follows
+
 __all__ = ["restrict"]
 
 _SET_FILTER = 1  # SECCOMP_SET_MODE_FILTER

@@ -14,12 +14,12 @@ Surfaces and views that the caller keeps are not counted, nor is memory for writ
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from pathlib import Path
 
 from ..errors import TooLargeError
+from ..operating_system import memory_of_machine, memory_of_process
 
 __all__ = ["BYTES_PER_VERTEX", "Capacity", "Extent", "default_memory", "memory_limit"]
 
@@ -116,32 +116,12 @@ class Capacity:
 
 def memory_limit() -> int:
     """Return the memory available to this process in bytes: the least limit of machine, control group and process."""
-    return min(filter(None, (_physical(), *_group_limits(), *_own_limits())), default=1 << 32)
+    return min(filter(None, (memory_of_machine(), *_group_limits(), *memory_of_process())), default=1 << 32)
 
 
 def default_memory() -> int:
     """Return a quarter of the memory that this process may have, in bytes: what encoding or a check may take."""
     return memory_limit() // 4
-
-
-def _physical() -> int:
-    """Return the machine's memory in bytes, 0 where it is unknown."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (OSError, ValueError):
-        return 0
-
-
-def _own_limits() -> Iterator[int]:
-    """Yield the limits of this process in bytes."""
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return
-    for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA):
-        limit = resource.getrlimit(kind)[0]
-        if limit != resource.RLIM_INFINITY:
-            yield limit
 
 
 def _group_limits(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:

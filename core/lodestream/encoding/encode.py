@@ -17,13 +17,14 @@ from numpy.typing import ArrayLike
 from ..container.capacity import default_memory
 from ..errors import FormatError, FormatWarning, InputError, OptionError, TooLargeError
 from ..library import require
+from ..operating_system import synchronise_folder
 from ..quality import Limit, Quality
 from ..scratch import Room
 from ..sources import Source, is_source, read_source
 from ..surface import Surface
 from . import request
 from .folder_build import FolderBuild
-from .folders import BuildFolders, check_out, replacing, synchronise
+from .folders import BuildFolders, check_out, replacing
 from .losses import at_holes
 from .memory import WHOLE, checked_memory, whole_memory
 from .room import CopyRoom
@@ -229,7 +230,7 @@ def _given(container: Path, out: str | os.PathLike[str] | None) -> bytes | None:
             shutil.copyfile(container, unfinished)
         with unfinished.open("rb+") as file:
             os.fsync(file.fileno())
-    synchronise(Path(out).resolve().parent)
+    synchronise_folder(Path(out).resolve().parent)
     return None
 
 

@@ -11,16 +11,22 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ..errors import InputError
+from ..operating_system import (
+    NO_LOCKS,
+    is_of_another_user,
+    is_writable_by_others,
+    lock,
+    open_own,
+    remove_closed,
+    remove_folder,
+    run_in_forks,
+    unlock,
+)
 from ..scratch import FolderScratch, checksum
-
-try:
-    import fcntl
-except ImportError:  # not on Windows
-    fcntl = None  # type: ignore[assignment]
 
 __all__ = [
     "BuildFolders",
@@ -31,7 +37,6 @@ __all__ = [
     "remove_leftovers",
     "replacing",
     "seal",
-    "synchronise",
     "temporary_folder",
 ]
 
@@ -45,8 +50,6 @@ _REMOVED = ".lodestream-removed-"
 _SHORT = 50
 #: Descriptors of the locks that this process has.
 _HELD: set[int] = set()
-#: What file systems without locks say.
-_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 #: How often a folder may vanish, or its lock be another file than the one that was opened, while it is taken.
 _ATTEMPTS = 100
 
@@ -131,18 +134,6 @@ def replacing(path: Path) -> Iterator[Path]:
         unfinished.unlink(missing_ok=True)
 
 
-def synchronise(folder: Path) -> None:
-    """Put the names in a folder on disk, on systems that can; others do so by themselves."""
-    if not hasattr(os, "O_DIRECTORY"):  # not on Windows
-        return
-    with suppress(OSError):  # a process that is confined, or file systems without it
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
 @contextmanager
 def temporary_folder(above: Path | None, name: str = "") -> Iterator[Path]:
     """Make a folder in another one that only this user can read, and remove it afterwards, whatever happens.
@@ -188,17 +179,21 @@ def kept_folder(scratch: Path, key: str) -> Iterator[Path]:
     scratch.mkdir(parents=True, exist_ok=True)
     remove_leftovers(scratch)
     folder = scratch.absolute() / hashlib.sha256(key.encode("utf-8", "surrogateescape")).hexdigest()[:24]
-    lock = _locked(folder)
+    descriptor = _locked(folder)
+    has_ended_well = False
     try:
         yield folder
-        if fcntl is None or lock in _HELD:  # else this is a fork of the process that builds
+        has_ended_well = descriptor in _HELD  # else this is a fork of the process that builds
+        if has_ended_well:
             remove(folder)
     finally:
-        _let_go(lock)
+        _let_go(descriptor)
+        if has_ended_well:
+            remove_closed(folder / _LOCK)
 
 
 def _locked(folder: Path) -> int:
-    """Lock a folder, which is made if it is missing; return a file descriptor, -1 on systems without locks."""
+    """Lock a folder, which is made if it is missing; return a file descriptor."""
     for _ in range(_ATTEMPTS):
         try:
             folder.mkdir(0o700)
@@ -209,9 +204,7 @@ def _locked(folder: Path) -> int:
         try:
             if was_there:
                 _check(folder)
-            if fcntl is None:
-                return -1
-            handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            handle = open_own(folder / _LOCK, create=True)
         except FileNotFoundError:  # the build that had it has just removed the folder
             continue
         _HELD.add(handle)
@@ -233,32 +226,32 @@ def _check(folder: Path) -> None:
     state = folder.lstat()
     if not stat.S_ISDIR(state.st_mode):
         raise InputError(f"expected a folder of a build at {folder}, got something else")
-    if hasattr(os, "geteuid") and state.st_uid != os.geteuid():
+    if is_of_another_user(state):
         raise InputError(
             f"expected {folder} to be a folder of this user, got one of another; choose another scratch folder"
         )
-    if hasattr(os, "geteuid") and state.st_mode & 0o022:
+    if is_writable_by_others(state):
         raise InputError(f"expected {folder} to be writable by this user alone, others may write there; remove it")
 
 
 def _lock(handle: int, folder: Path) -> None:
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        is_free = lock(handle)
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        return
+    if not is_free:
         raise InputError(
             f"expected {folder} to be free for this build, the same build is at work there; choose another scratch "
             "folder"
-        ) from None
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            raise
+        )
 
 
 def _let_go(handle: int) -> None:
     if handle in _HELD:
         _HELD.remove(handle)
-        with suppress(OSError):
-            fcntl.flock(handle, fcntl.LOCK_UN)  # a process that is being forked may have it open too
+        unlock(handle)
         os.close(handle)
 
 
@@ -268,8 +261,7 @@ def _forked() -> None:
         os.close(_HELD.pop())
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_forked)
+run_in_forks(_forked)
 
 
 def remove(path: Path) -> None:
@@ -284,13 +276,13 @@ def remove(path: Path) -> None:
         return
     except OSError:  # a folder whose files are open, on Windows
         away = path
-    shutil.rmtree(away, ignore_errors=True)
+    remove_folder(away)
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove folders that a killed process had begun to remove."""
     for path in folder.glob(f"{_REMOVED}*"):
-        shutil.rmtree(path, ignore_errors=True)
+        remove_folder(path)
 
 
 def seal(folder: Path) -> None:
@@ -307,7 +299,7 @@ def seal(folder: Path) -> None:
             os.fsync(file.fileno())
         sums[path.relative_to(folder).as_posix()] = checksum(path)
     unfinished = folder / f"{_SEAL}.part"
-    with unfinished.open("w") as file_:
+    with unfinished.open("w", encoding="utf-8") as file_:
         json.dump(sums, file_)
         file_.flush()
         os.fsync(file_.fileno())

@@ -18,6 +18,7 @@ from lodestream.container import capacity, headers, read_index, sections
 from lodestream.container.capacity import Capacity, memory_limit
 from lodestream.errors import TooLargeError
 from lodestream.grid.layout import Layout
+from lodestream.operating_system import memory_of_machine
 from lodestream.planning.selection import Selection
 from lodestream.target import Target
 from lodestream.transfer.range_download import RangeDownload
@@ -211,7 +212,7 @@ def test_chunks_that_nobody_can_use_are_bounded() -> None:
 
 
 def test_limits_of_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert 0 < memory_limit() <= capacity._physical()
+    assert 0 < memory_limit() <= memory_of_machine()
     proc, root = tmp_path / "cgroup", tmp_path / "fs"
     (root / "a" / "b").mkdir(parents=True)
     (root / "a" / "memory.max").write_text("3000000\n")

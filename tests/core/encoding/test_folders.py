@@ -18,6 +18,7 @@ import pytest
 from lodestream.encoding import folders
 from lodestream.encoding.folders import kept_folder, remove, replacing, temporary_folder
 from lodestream.errors import InputError
+from lodestream.operating_system import NO_LOCKS
 from lodestream.scratch import FolderScratch
 
 
@@ -181,7 +182,7 @@ def test_a_folder_that_goes_while_it_is_opened_is_made_again(tmp_path: Path, mon
 
 def test_file_systems_without_locks_will_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_locks(*_: Any) -> None:
-        raise OSError(next(iter(folders._NO_LOCKS)), "no locks available")
+        raise OSError(next(iter(NO_LOCKS)), "no locks available")
 
     monkeypatch.setattr("fcntl.flock", no_locks)
     with kept_folder(tmp_path, "key") as folder:

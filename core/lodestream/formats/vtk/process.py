@@ -10,12 +10,9 @@ Output: a line of JSON, {"grids": [{"dims", "arrays"}]} or {"error"}, and then t
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import re
-import resource
-import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +28,7 @@ from vtkmodules.vtkIOXML import vtkXMLStructuredGridReader
 
 sys.path.append(os.fspath(Path(__file__).parents[3]))  # of which the package itself loads nothing else
 from lodestream.confinement import Rights, confine
+from lodestream.operating_system import limit_files, limit_memory, limit_processor
 
 _READERS: dict[str, Any] = {
     "structured": vtkStructuredGridReader,
@@ -45,7 +43,6 @@ _WORDS = ("name", "unit", "crs")
 #: Field data that are of no use here: VTK adds the first to what it reads from CGNS, `Surface.to_pyvista` the second.
 _PASSED_OVER = ("Base/Zone", "lodestream")
 
-_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _MAX_SECONDS = 600
 
 
@@ -95,24 +92,10 @@ def main(kind: str, path: str, budget: int, seconds: int) -> None:
 
 def _limit(budget: int, seconds: int, path: Path) -> None:
     """Limit memory and processor time, allow one open file more, only this one, and end with the parent."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
-        with open("/proc/self/status") as status:
-            used = next(int(line.split()[1]) << 10 for line in status if line.startswith("VmData"))
-        _lower(resource.RLIMIT_DATA, used + budget)
-    _lower(resource.RLIMIT_CPU, min(seconds, _MAX_SECONDS))
-    _lower(resource.RLIMIT_CORE, 0)
-    _lower(resource.RLIMIT_FSIZE, 0)
+    limit_memory(budget)
+    limit_processor(min(seconds, _MAX_SECONDS))
     confine(Rights(read=(path,)))
-    free = os.open(os.devnull, os.O_RDONLY)
-    os.close(free)
-    _lower(resource.RLIMIT_NOFILE, free + 1)
-
-
-def _lower(kind: int, limit: int) -> None:
-    before = resource.getrlimit(kind)[1]
-    limit = limit if before == resource.RLIM_INFINITY else min(limit, before)
-    resource.setrlimit(kind, (limit, limit))
+    limit_files(1)
 
 
 def _leaves(data: Any) -> Iterator[Any]:

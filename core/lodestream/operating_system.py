@@ -1,0 +1,342 @@
+"""What differs between operating systems, for all other modules of the library and the clients.
+
+Linux and macOS have the interface of POSIX, Windows does not. Where a system lacks something, a function here does it
+another way or does nothing, as its docstring says. No other module asks which system this is, except the confinement
+(`lodestream.confinement`), which needs Linux, and `lodestream.library`, which names the kernels of each system.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import gc
+import os
+import shutil
+import signal
+import stat
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import subprocess
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+    import resource
+
+__all__ = [
+    "NO_LOCKS",
+    "allocate",
+    "cache_home",
+    "close_and_remove",
+    "is_of_another_user",
+    "is_writable_by_others",
+    "kill_session",
+    "limit_files",
+    "limit_memory",
+    "limit_processor",
+    "lock",
+    "memory_of_machine",
+    "memory_of_process",
+    "new_session",
+    "open_own",
+    "processors",
+    "read_at",
+    "remove_closed",
+    "remove_folder",
+    "run_in_forks",
+    "synchronise_folder",
+    "touch",
+    "unlock",
+    "write_at",
+]
+
+#: Numbers of the errors of file systems without locks.
+NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
+
+#: The byte that a lock covers on Windows, where others cannot read locked bytes: the last one of `msvcrt.locking`.
+_LOCKED_BYTE = (1 << 31) - 2
+
+_DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
+_NEW_PROCESS_GROUP = 0x200  # CREATE_NEW_PROCESS_GROUP of Windows
+
+
+def open_own(path: Path, create: bool = False) -> int:
+    """Open a file of this program to read and write; return its descriptor.
+
+    Symbolic links are not followed, pipes are not waited for, and child processes do not inherit the file.
+
+    Parameters
+    ----------
+    path : Path
+    create : bool
+        Create the file, for this user only, if it does not exist.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened, or is a symbolic link.
+    """
+    flags = os.O_RDWR | (os.O_CREAT if create else 0)
+    if sys.platform == "win32":
+        if path.is_symlink():
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+        return os.open(path, flags | os.O_BINARY | os.O_NOINHERIT, 0o600)
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
+
+
+def lock(handle: int) -> bool:
+    """Lock an open file against other programs until it is closed; return whether it was free.
+
+    Raises
+    ------
+    OSError
+        If the file system has no locks (`NO_LOCKS`), or fails.
+    """
+    try:
+        if sys.platform == "win32":
+            _at_locked_byte(handle, msvcrt.LK_NBLCK)
+        else:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    return True
+
+
+def unlock(handle: int) -> None:
+    """Release a lock; a process that was forked meanwhile may have the file open too."""
+    with suppress(OSError):
+        if sys.platform == "win32":
+            _at_locked_byte(handle, msvcrt.LK_UNLCK)
+        else:
+            fcntl.flock(handle, fcntl.LOCK_UN)
+
+
+def _at_locked_byte(handle: int, mode: int) -> None:
+    if sys.platform == "win32":
+        with _at(handle, _LOCKED_BYTE):
+            msvcrt.locking(handle, mode, 1)
+
+
+@contextmanager
+def _at(handle: int, offset: int) -> Iterator[None]:
+    """Move the position of a file for the length of a block."""
+    position = os.lseek(handle, 0, os.SEEK_CUR)
+    os.lseek(handle, offset, os.SEEK_SET)
+    try:
+        yield
+    finally:
+        os.lseek(handle, position, os.SEEK_SET)
+
+
+def read_at(handle: int, length: int, offset: int) -> bytes:
+    """Read up to ``length`` bytes at an offset; the position of the file stays. On Windows one thread at a time may."""
+    if sys.platform == "win32":
+        with _at(handle, offset):
+            return os.read(handle, length)
+    return os.pread(handle, length, offset)
+
+
+def write_at(handle: int, data: bytes, offset: int) -> int:
+    """Write bytes at an offset and return how many were written; as `read_at`."""
+    if sys.platform == "win32":
+        with _at(handle, offset):
+            return os.write(handle, data)
+    return os.pwrite(handle, data, offset)
+
+
+def touch(handle: int, path: Path) -> None:
+    """Set the modification time of an open file, of this path, to now."""
+    os.utime(handle if os.utime in os.supports_fd else path)
+
+
+def close_and_remove(handle: int, path: Path) -> None:
+    """Remove an open file and close it.
+
+    Programs that wait for it see that it has no name any more. On Windows open files cannot be removed: it is closed
+    first, and stays if another program opens it in between.
+
+    Raises
+    ------
+    OSError
+        If it cannot be removed; it is closed nevertheless.
+    """
+    if sys.platform == "win32":
+        os.close(handle)
+        with suppress(PermissionError):
+            path.unlink(missing_ok=True)
+        return
+    try:
+        path.unlink(missing_ok=True)
+    finally:
+        os.close(handle)
+
+
+def remove_closed(path: Path) -> None:
+    """Remove a file that could not be removed with its folder because it was open, and the folder; only on Windows.
+
+    Both stay if another program has opened the file, or created another one, in between.
+    """
+    if sys.platform == "win32":
+        with suppress(OSError):
+            path.unlink()
+            path.parent.rmdir()
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder with its contents, as far as possible.
+
+    On Windows files that are mapped or open cannot be removed: maps that nothing refers to any more are closed first.
+    """
+    if sys.platform == "win32":
+        gc.collect()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def is_of_another_user(status: os.stat_result) -> bool:
+    """Return whether a file belongs to another user than that of this process; False on Windows."""
+    return sys.platform != "win32" and status.st_uid != os.geteuid()
+
+
+def is_writable_by_others(status: os.stat_result) -> bool:
+    """Return whether other users may write to a file by its mode; False on Windows, where modes do not say it."""
+    return sys.platform != "win32" and bool(status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+
+
+def synchronise_folder(folder: Path) -> None:
+    """Put the names in a folder on disk, where folders can be opened; Windows does so by itself."""
+    if sys.platform == "win32":
+        return
+    with suppress(OSError):  # a process that is confined, or a file system that cannot
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def allocate(path: Path) -> None:
+    """Preallocate a file of its present length: writing to a map of it on a full disk would kill the process (SIGBUS).
+
+    Nothing on macOS, which has no such call, and on Windows, where files have their space when they have their length.
+
+    Raises
+    ------
+    OSError
+        If the disk has no space for it.
+    """
+    if sys.platform == "win32" or sys.platform == "darwin":
+        return
+    with path.open("r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, os.fstat(file.fileno()).st_size)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise OSError(error.errno, os.strerror(error.errno), os.fspath(path)) from None
+            # Some file systems cannot.
+
+
+def cache_home() -> Path:
+    """Return the folder in which programs of this user keep what they can do without."""
+    if chosen := os.environ.get("XDG_CACHE_HOME", "").strip():
+        return Path(chosen)
+    if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
+        return Path(local)
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+
+
+def processors() -> int:
+    """Return how many processors this process may use; of macOS and Windows, how many there are."""
+    if sys.platform == "win32" or sys.platform == "darwin":
+        return os.cpu_count() or 1
+    return max(1, len(os.sched_getaffinity(0)))
+
+
+def memory_of_machine() -> int:
+    """Return the memory of the machine in bytes, 0 where it is unknown."""
+    if sys.platform == "win32":
+        status = _MemoryStatus(length=ctypes.sizeof(_MemoryStatus))
+        known = ctypes.windll.kernel32.GlobalMemoryStatusEx(ctypes.byref(status))
+        return int(status.total_physical) if known else 0
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (OSError, ValueError):
+        return 0
+
+
+class _MemoryStatus(ctypes.Structure):
+    """MEMORYSTATUSEX of Windows."""
+
+    _fields_ = [
+        ("length", ctypes.c_uint32),
+        ("load", ctypes.c_uint32),
+        ("total_physical", ctypes.c_uint64),
+        ("others", ctypes.c_uint64 * 6),
+    ]
+
+
+def memory_of_process() -> list[int]:
+    """Return the limits of the memory of this process in bytes; none on Windows."""
+    limits: list[int] = []
+    if sys.platform != "win32":
+        limits = [resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_AS, resource.RLIMIT_DATA)]
+        limits = [limit for limit in limits if limit != resource.RLIM_INFINITY]
+    return limits
+
+
+def limit_memory(budget: int) -> None:
+    """Let this process take so many bytes more, and end it with its parent; only on Linux."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+        with open("/proc/self/status", encoding="utf-8") as status:
+            used = next(int(line.split()[1]) << 10 for line in status if line.startswith("VmData"))
+        _lower(resource.RLIMIT_DATA, used + budget)
+
+
+def limit_processor(seconds: int) -> None:
+    """Let this process take so many seconds of a processor, and write no file; not on Windows."""
+    if sys.platform != "win32":
+        _lower(resource.RLIMIT_CPU, seconds)
+        _lower(resource.RLIMIT_CORE, 0)
+        _lower(resource.RLIMIT_FSIZE, 0)
+
+
+def limit_files(count: int) -> None:
+    """Let this process open so many files beside those that are open; not on Windows."""
+    if sys.platform != "win32":
+        free = os.open(os.devnull, os.O_RDONLY)
+        os.close(free)
+        _lower(resource.RLIMIT_NOFILE, free + count)
+
+
+def _lower(kind: int, limit: int) -> None:
+    if sys.platform != "win32":
+        before = resource.getrlimit(kind)[1]
+        limit = limit if before == resource.RLIM_INFINITY else min(limit, before)
+        resource.setrlimit(kind, (limit, limit))
+
+
+def run_in_forks(function: Callable[[], Any]) -> None:
+    """Have a function called in each process that is forked from this one; Windows has no forks."""
+    if sys.platform != "win32":
+        os.register_at_fork(after_in_child=function)
+
+
+def new_session() -> dict[str, Any]:
+    """Return arguments of `subprocess.Popen` for a process that Ctrl-C in this terminal does not reach."""
+    if sys.platform == "win32":
+        return {"creationflags": _NEW_PROCESS_GROUP}
+    return {"start_new_session": True}
+
+
+def kill_session(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process that was started in a session of its own, with all processes of that; on Windows, it alone."""
+    if sys.platform == "win32":
+        process.kill()
+    else:
+        os.killpg(process.pid, signal.SIGKILL)

@@ -1,0 +1,1 @@
+"""Tests on imitations of macOS and Windows."""
