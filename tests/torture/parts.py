@@ -275,6 +275,17 @@ def _decoders(folder: Path, count: int, seconds: float | None) -> tuple[int, tup
     )
 
 
+def _layouts(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from . import layouts
+
+    done = layouts.run(count, seconds)
+    return done.layouts, (
+        f"{done.layouts:,} layouts of {done.cells:,} random cells, {done.open:,} of them on open meshes, in "
+        f"{done.blocks:,} blocks: each triangle between cells has a partner or the border beside it, no edge has three "
+        "quads, closed meshes stay closed, and all keep their handles",
+    )
+
+
 def _mutants(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
     from . import mutations
     from .mutants import MUTANTS
@@ -308,6 +319,7 @@ PARTS = {
             "fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz, continues=True
         ),
         Part("decoders", "The compiled decoder and the reference", "surfaces", 2000, _decoders),
+        Part("layouts", "Random cells of triangle meshes, paired into blocks", "layouts", 1000, _layouts),
         Part("mutants", "Rules of the format changed one by one, beside the golden files", "mutants", 160, _mutants),
         Part(
             "kernels",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import FormatError
 from .cleaning import refine
-from .triangulation import Floats, Integers, Triangulation, split_edges
+from .triangulation import Floats, Integers, Triangulation, distinct, split_edges
 
 __all__ = ["LEAST_CELLS", "Cells", "Sites", "find_nearest", "grow_cells", "place_sites"]
 
@@ -165,7 +165,7 @@ class _Shape:
 
 def _shape_of(mesh: Triangulation, labels: Integers, count: int) -> _Shape:
     vertices = len(mesh.vertices)
-    at = np.unique(np.repeat(labels, 3) * vertices + mesh.faces.reshape(-1))
+    at = distinct(np.repeat(labels, 3) * vertices + mesh.faces.reshape(-1))
     cell, vertex = at // vertices, at % vertices
     beside = np.where(mesh.sides >= 0, labels[mesh.sides], -1)
     inner = beside[:, 0] == beside[:, 1]
@@ -179,7 +179,7 @@ def _shape_of(mesh: Triangulation, labels: Integers, count: int) -> _Shape:
         - rim_count
         + np.bincount(labels, minlength=count)
     )
-    rim_vertices = np.unique(np.repeat(rim_cell, 2) * vertices + mesh.edges[rim_edge].reshape(-1))
+    rim_vertices = distinct(np.repeat(rim_cell, 2) * vertices + mesh.edges[rim_edge].reshape(-1))
     broken = (characteristic != 1) | (rim_count != np.bincount(rim_vertices // vertices, minlength=count))
     border_cell = labels[mesh.sides[mesh.border].max(axis=1)]
     ends = np.repeat(border_cell, 2) * vertices + mesh.edges[mesh.border].reshape(-1)

@@ -7,7 +7,7 @@ import numpy as np
 from ..errors import FormatError
 from ..mesh.places import equal_places
 from .libraries import igl, sparse
-from .triangulation import Floats, Integers, Triangulation, split_edges
+from .triangulation import Floats, Integers, Triangulation, distinct, split_edges
 
 __all__ = ["clean", "longest_edges", "refine"]
 
@@ -47,7 +47,7 @@ def clean(vertices: Floats, faces: Integers) -> tuple[Triangulation, Integers, I
         If coordinates are not finite, or their extent is beyond all measure; if there are no four triangles with an
         area, three triangles meet at an edge, or the surface has one side only.
     """
-    used = np.unique(faces)
+    used = distinct(faces)
     if not np.isfinite(vertices[used]).all():
         wrong = int((~np.isfinite(vertices[used]).all(axis=1)).sum())
         raise FormatError(f"expected finite coordinates of vertices, got {wrong:,} that are not")
@@ -59,8 +59,8 @@ def clean(vertices: Floats, faces: Integers) -> tuple[Triangulation, Integers, I
         )
     places, inverse = equal_places(vertices)
     merged = inverse[faces]
-    distinct = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
-    rows = np.flatnonzero(distinct)
+    proper = (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
+    rows = np.flatnonzero(proper)
     ordered = np.sort(merged[rows], axis=1)
     _, first = np.unique(equal_places(ordered)[1], return_index=True)
     rows = rows[np.sort(first)]
@@ -83,7 +83,7 @@ def _wound_alike(faces: Integers) -> Integers:
     """The faces wound alike, each as the most of its component are; as they are if no order is needed."""
     start, end = faces, faces[:, [1, 2, 0]]
     keys = (start * (faces.max() + 1) + end).reshape(-1)
-    if len(np.unique(keys)) == len(keys):
+    if len(distinct(keys)) == len(keys):
         return faces
     oriented, component = igl().bfs_orient(np.ascontiguousarray(faces))
     same = (oriented == faces).all(axis=1) | (oriented == np.roll(faces, 1, axis=1)).all(axis=1)

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .libraries import igl
 from .samples import Grids, quads_of
-from .triangulation import Floats, Integers, Triangulation
+from .triangulation import Floats, Integers, Triangulation, distinct
 
 __all__ = ["Lines", "Relaxation", "rim_of"]
 
@@ -27,6 +26,16 @@ def rim_of(grids: Grids) -> Integers:
     edges = np.sort(np.stack([quads, np.roll(quads, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     keys, count = np.unique(edges[:, 0] * grids.count + edges[:, 1], return_counts=True)
     return np.stack([keys[count == 1] // grids.count, keys[count == 1] % grids.count], axis=-1)
+
+
+def _edges_of(grids: Grids) -> Integers:
+    """Edges between neighbouring samples, each once, (E, 2)."""
+    numbers = grids.numbers
+    rows = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2)
+    columns = np.stack([numbers[:, :, :-1], numbers[:, :, 1:]], axis=-1).reshape(-1, 2)
+    edges = np.sort(np.concatenate([rows, columns]), axis=1)
+    keys = distinct(edges[:, 0] * grids.count + edges[:, 1])
+    return np.stack([keys // grids.count, keys % grids.count], axis=-1)
 
 
 class Lines:
@@ -51,14 +60,28 @@ class Lines:
 
 @dataclass(frozen=True)
 class _Neighbours:
-    """Pairs of neighbours, each in both directions."""
+    """Pairs of neighbours, each in both directions, in the order of the first of each pair.
+
+    Attributes
+    ----------
+    of, neighbour : int64 arrays of shape (P,)
+    samples : int64 array of shape (S,)
+        The distinct ones of `of`.
+    starts : int64 array of shape (S,)
+        Where the pairs of each begin.
+    """
 
     of: Integers
     neighbour: Integers
+    samples: Integers
+    starts: Integers
 
     @staticmethod
     def along(edges: Integers) -> _Neighbours:
-        return _Neighbours(np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]]))
+        ends = np.concatenate([edges, edges[:, ::-1]])
+        of, neighbour = np.ascontiguousarray(ends[np.argsort(ends[:, 0], kind="stable")].T)
+        samples, starts = np.unique(of, return_index=True)
+        return _Neighbours(of, neighbour, samples, starts)
 
 
 class Relaxation:
@@ -82,7 +105,7 @@ class Relaxation:
         facing = (self._mesh.normals[triangles] * normals).sum(axis=1) > 0
         points = np.where(facing[:, np.newaxis], places, points)
         normals = np.where(facing[:, np.newaxis], self._mesh.normals[triangles], normals)
-        rim = np.unique(rim_of(grids))
+        rim = distinct(rim_of(grids))
         if self._border is not None and len(rim):
             _, points[rim] = self._border.closest(points[rim])
         return points, normals
@@ -100,14 +123,8 @@ class Relaxation:
         -------
         points, normals : float64 arrays of shape (N, 3)
         """
-        numbers = grids.numbers
-        rows = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2)
-        columns = np.stack([numbers[:, :, :-1], numbers[:, :, 1:]], axis=-1).reshape(-1, 2)
-        edges = np.sort(np.concatenate([rows, columns]), axis=1)
-        keys = np.unique(edges[:, 0] * grids.count + edges[:, 1])
-        inner = _Neighbours.along(np.stack([keys // grids.count, keys % grids.count], axis=-1))
-        rim_edges = rim_of(grids)
-        rim, along = np.unique(rim_edges), _Neighbours.along(rim_edges)
+        inner, rim_edges = _Neighbours.along(_edges_of(grids)), rim_of(grids)
+        rim, along = distinct(rim_edges), _Neighbours.along(rim_edges)
         on_rim = np.zeros(grids.count, np.bool_)
         on_rim[rim] = True
         free = np.flatnonzero(~on_rim)
@@ -135,14 +152,9 @@ class Relaxation:
         -------
         float64 array of shape (N, 3)
         """
-        numbers, place = grids.numbers, np.full(grids.count, -1)
+        place, pairs = np.full(grids.count, -1), _Neighbours.along(_edges_of(grids))
         samples = np.setdiff1d(samples, rim_of(grids))
         place[samples] = np.arange(len(samples))
-        rows = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2)
-        columns = np.stack([numbers[:, :, :-1], numbers[:, :, 1:]], axis=-1).reshape(-1, 2)
-        edges = np.sort(np.concatenate([rows, columns]), axis=1)
-        keys = np.unique(edges[:, 0] * grids.count + edges[:, 1])
-        pairs = _Neighbours.along(np.stack([keys // grids.count, keys % grids.count], axis=-1))
         moving = place[pairs.of] >= 0
         of, neighbour = place[pairs.of[moving]], pairs.neighbour[moving]
         count = np.bincount(of, minlength=len(samples))[:, np.newaxis]
@@ -173,18 +185,23 @@ def _offsets(neighbours: _Neighbours, points: Floats, normals: Floats | None) ->
 
     The sparser samples are for the bends of the surface, the less they move; otherwise tips would lose theirs.
     """
-    of, count = neighbours.of, len(points)
-    vectors = points[neighbours.neighbour] - points[of]
-    lengths = np.linalg.norm(vectors, axis=1)
-    if normals is not None:
-        vectors = vectors - (vectors * normals[of]).sum(axis=1, keepdims=True) * normals[of]
-        flat = np.linalg.norm(vectors, axis=1)
-        vectors *= np.minimum(lengths / np.maximum(flat, 1e-300), 4)[:, np.newaxis]
+    of, neighbour, starts = neighbours.of, neighbours.neighbour, neighbours.starts
+    result = np.zeros_like(points)
+    if not len(of):
+        return result
+    vectors = points.take(neighbour, axis=0) - points.take(of, axis=0)
+    lengths = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
     weights = lengths + 1e-300
-    total = np.bincount(of, weights, count) + 1e-300
-    offset = np.stack([np.bincount(of, weights * vectors[:, axis], count) / total for axis in range(3)], axis=-1)
+    total = np.add.reduceat(weights, starts)
     if normals is not None:
-        least: NDArray[np.float64] = np.ones(count)
-        np.minimum.at(least, of, (normals[of] * normals[neighbours.neighbour]).sum(axis=1))
-        offset *= np.clip(least, 0, 1)[:, np.newaxis]
-    return np.asarray(_STEP * offset)
+        normal = normals.take(of, axis=0)
+        vectors -= np.einsum("ij,ij->i", vectors, normal)[:, np.newaxis] * normal
+        flat = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+        weights *= np.minimum(lengths / np.maximum(flat, 1e-300), 4)
+        cosines = np.einsum("ij,ij->i", normal, normals.take(neighbour, axis=0))
+        step = _STEP * np.clip(np.minimum.reduceat(cosines, starts), 0, 1) / total
+    else:
+        step = _STEP / total
+    for axis in range(3):
+        result[neighbours.samples, axis] = np.add.reduceat(vectors[:, axis] * weights, starts) * step
+    return result

@@ -6,7 +6,7 @@ import numpy as np
 
 from .relaxation import Lines, rim_of
 from .samples import Grids
-from .triangulation import Floats, Integers, Triangulation
+from .triangulation import Floats, Integers, Triangulation, distinct
 
 __all__ = ["sharpen"]
 
@@ -48,7 +48,7 @@ def sharpen(mesh: Triangulation, grids: Grids, points: Floats) -> tuple[Floats, 
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
     total = np.bincount(edges.reshape(-1), np.repeat(length, 2), grids.count)
     spacing = total / np.maximum(np.bincount(edges.reshape(-1), minlength=grids.count), 1)
-    rim = np.unique(rim_of(grids))
+    rim = distinct(rim_of(grids))
     if len(sharp):
         distance, places = Lines(mesh.vertices, mesh.edges[sharp]).closest(points)
         _, triangles, _ = mesh.closest(points)

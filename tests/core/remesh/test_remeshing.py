@@ -11,10 +11,9 @@ import lodestream as ls
 from lodestream.errors import FormatError, OptionError, TooLargeError
 from lodestream.mesh import weld
 from lodestream.remesh import remeshing
-from lodestream.remesh.cells import Cells, find_nearest, grow_cells, place_sites
+from lodestream.remesh.cells import find_nearest, grow_cells, place_sites
 from lodestream.remesh.cleaning import clean, longest_edges, refine
 from lodestream.remesh.distances import folded_quads
-from lodestream.remesh.layout import Block, lay_out
 from lodestream.remesh.maps import Maps
 from lodestream.remesh.relaxation import Relaxation
 from lodestream.remesh.remeshing import Remeshing, _unfolded, remesh_triangles
@@ -24,6 +23,7 @@ from lodestream.remesh.triangulation import Triangulation
 from tests.examples import examples
 
 from . import scenes
+from .layouts import blocks_of, check_pairs, cut
 
 pytest.importorskip("igl")
 
@@ -73,43 +73,10 @@ def test_faces_look_the_way_of_the_input(remeshed: tuple[str, Remeshing]) -> Non
     assert ((normals * result.mesh.normals[triangles]).sum(axis=1) > 0).mean() > 0.95
 
 
-def cut(points: scenes.Floats, faces: scenes.Integers, count: int, seed: int | None = None) -> Cells:
-    """Cells round so many sites, evenly placed or at random."""
-    mesh, _, _ = clean(points, faces)
-    parts = int(mesh.components.max()) + 1
-    shares = np.full(parts, max(4, count // parts))
-    longest = np.sqrt(np.bincount(mesh.components, mesh.areas) / shares) / 5
-    fine, parents = refine(mesh, longest)
-    if seed is None:
-        number = np.empty(parts, np.int64)
-        number[fine.components] = mesh.components[parents]
-        sites = place_sites(fine, shares[number])
-    else:
-        chosen = [np.flatnonzero(fine.components == part) for part in range(parts)]
-        random = np.random.default_rng(seed)
-        triangles = [random.choice(part, size, False) for part, size in zip(chosen, shares, strict=True)]
-        sites = find_nearest(fine, np.concatenate(triangles))
-    cells, _ = grow_cells(fine, sites, 4000)
-    return cells
-
-
-def blocks_of(cells: Cells) -> list[Block]:
-    """The blocks of cells, laid out by where the cells lie."""
-    centres = np.stack([cells.mesh.centroids[cells.labels == cell].mean(axis=0) for cell in range(cells.count)])
-    return lay_out(trace_rims(cells), centres)
-
-
 @examples(15)
 @given(st.integers(0, 10_000), st.sampled_from([*ALL]), st.integers(4, 60))
 def test_random_cells_are_paired_without_exception(seed: int, name: str, count: int) -> None:
-    cells = cut(*ALL[name](), count, seed)
-    blocks = blocks_of(cells)
-    closed = name in scenes.CLOSED
-    if closed:
-        assert all(block.second is not None for block in blocks)
-        assert len(blocks) == cells.count - cells.mesh.characteristic().sum()
-    corners = np.flatnonzero(cells.corners & ~cells.mesh.at_border)
-    assert sum(1 if block.second is None else 2 for block in blocks) == len(corners)
+    check_pairs(cut(*ALL[name](), count, seed), name in scenes.CLOSED)
 
 
 def test_cells_are_discs_and_no_triangle_is_turned_over_in_their_maps() -> None:
