@@ -13,6 +13,7 @@ import lodestream as ls
 from lodestream import page
 from lodestream.errors import InputError, NotFoundError, OptionError, StreamError, UnavailableError
 from lodestream_client.viewer.sources import FileSource
+from tests.core.remesh import scenes
 
 from .conftest import Page
 
@@ -72,6 +73,15 @@ def test_other_files_and_arrays_are_encoded(tmp_path: Path, fake_page: Page) -> 
         assert shown.name == name
     close = widget(heights, quality=ls.Quality.of(precision=1.0))
     assert np.abs(ls.decode(whole(fake_page, close)).points - heights).max() <= 1
+
+
+def test_a_mesh_that_was_resampled_is_shown_with_what_was_measured(fake_page: Page) -> None:
+    pytest.importorskip("igl")
+    surface = ls.Surface.from_mesh(*scenes.sphere(), remesh=True, blocks=12, remesh_error=1e-2)
+    decoded = ls.decode(whole(fake_page, widget(surface, name="ball")))
+    for block, original in zip(decoded.blocks, surface.blocks, strict=True):
+        np.testing.assert_array_equal(block.points, original.points)
+    assert decoded.metadata["remesh"] == surface.metadata["remesh"]
 
 
 def test_a_served_surface_is_read_by_the_kernel(server: str, terrain: ls.Surface, fake_page: Page) -> None:
