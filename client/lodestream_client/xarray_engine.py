@@ -11,7 +11,7 @@ import os
 import threading
 import weakref
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,13 +55,18 @@ _WHOLE_POINTS = 1 << 16
 #: Windows that are kept decoded: x, y and z of a window are asked for one after another.
 _WINDOWS = 4
 
+#: What `xarray.open_dataset` hands to every engine that takes it: how values of a file are decoded.
+_DECODERS = (
+    *("mask_and_scale", "decode_times", "concat_characters", "decode_coords", "use_cftime", "decode_timedelta"),
+)
+
 
 class LodeBackend(BackendEntrypoint):
     """The engine ``lode`` of xarray, which finds it by its entry point."""
 
     description = "Open containers of Lodestream (.lode): files, URLs of files, and surfaces of a server"
     open_dataset_parameters = (
-        *("filename_or_obj", "drop_variables", "level", "region", "block", "token", "max_vertices"),
+        *("filename_or_obj", *_DECODERS, "drop_variables", "level", "region", "block", "token", "max_vertices"),
     )
     supports_groups = True
 
@@ -69,6 +74,12 @@ class LodeBackend(BackendEntrypoint):
         self,
         filename_or_obj: str | os.PathLike[str],
         *,
+        mask_and_scale: bool | Mapping[str, bool] | None = None,
+        decode_times: Any = None,
+        concat_characters: bool | Mapping[str, bool] | None = None,
+        decode_coords: bool | str | None = None,
+        use_cftime: bool | Mapping[str, bool] | None = None,
+        decode_timedelta: Any = None,
         drop_variables: str | Iterable[str] | None = None,
         level: int | None = None,
         region: Region | None = None,
@@ -82,6 +93,9 @@ class LodeBackend(BackendEntrypoint):
         ----------
         filename_or_obj : str or path-like
             A file, the URL of a file, or the URL of a surface of a server.
+        mask_and_scale, decode_times, concat_characters, decode_coords, use_cftime, decode_timedelta : optional
+            As of `xarray.decode_cf`, which applies those that are given and not false. None: holes are NaN, and other
+            values as the container has them: numbers of a raster as stored, dates as numbers.
         drop_variables : str or iterable of str, optional
         level : int, optional
             A coarser level; None: full resolution.
@@ -108,7 +122,8 @@ class LodeBackend(BackendEntrypoint):
             raise OptionError(f"expected block= of 0 to {blocks - 1}, or xarray.open_datatree, for {blocks} blocks")
         if block is not None and not 0 <= (block := check_integer("a block", block)) < blocks:
             raise OptionError(f"expected a block of 0 to {blocks - 1}, got {block}")
-        block_dataset = container.dataset(level, block or 0, region)
+        given = (mask_and_scale, decode_times, concat_characters, decode_coords, use_cftime, decode_timedelta)
+        block_dataset = _decoded(container.dataset(level, block or 0, region), dict(zip(_DECODERS, given, strict=True)))
         drop = [drop_variables] if isinstance(drop_variables, str) else list(drop_variables or ())
         return block_dataset.drop_vars(drop, errors="ignore")
 
@@ -123,6 +138,7 @@ class LodeBackend(BackendEntrypoint):
 
     def open_groups_as_dict(self, filename_or_obj: Any, **options: Any) -> dict[str, xr.Dataset]:
         """Return the Datasets of all blocks by their path; see `open_datatree`."""
+        decoders = {name: options.pop(name, None) for name in _DECODERS}
         drop = options.pop("drop_variables", None) or ()
         level, token = options.pop("level", None), options.pop("token", None)
         container = Container(_place(filename_or_obj), token, options.pop("max_vertices", None))
@@ -130,7 +146,10 @@ class LodeBackend(BackendEntrypoint):
             raise OptionError(f"expected level, token or max_vertices, got {next(iter(options))!r}")
         names = [drop] if isinstance(drop, str) else list(drop)
         count = len(container.header.blocks)
-        datasets = [container.dataset(level, number).drop_vars(names, errors="ignore") for number in range(count)]
+        datasets = [
+            _decoded(container.dataset(level, number), decoders).drop_vars(names, errors="ignore")
+            for number in range(count)
+        ]
         return {f"/block_{number}": block_dataset for number, block_dataset in enumerate(datasets)}
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
@@ -143,6 +162,17 @@ class LodeBackend(BackendEntrypoint):
         if is_url(name):
             return name.partition("?")[0].endswith(".lode") or is_surface(name)
         return name.endswith(".lode")
+
+
+def _decoded(data: xr.Dataset, decoders: Mapping[str, Any]) -> xr.Dataset:
+    """Return a Dataset decoded in the ways that are given, lazily; see `xarray.decode_cf`."""
+    given = {name: way for name, way in decoders.items() if way is not None}
+    if not any(given.values()):
+        return data
+    times = {"decode_times": False, "decode_timedelta": False, "mask_and_scale": False, "concat_characters": False}
+    decoded: xr.Dataset = xr.decode_cf(data, **{**times, "decode_coords": False, **given})
+    decoded.set_close(data._close)
+    return decoded
 
 
 def _place(name: Any) -> str:

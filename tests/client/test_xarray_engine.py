@@ -316,3 +316,46 @@ def test_it_offers_itself_for_containers_and_surfaces_only() -> None:
     guess = LodeBackend().guess_can_open
     assert all(map(guess, ["a.lode", Path("a.lode"), "https://h/a.lode?x=1", "http://h/v1/surfaces/12"]))
     assert not any(map(guess, ["a.nc", "https://h/a.nc", b"a.lode", 3]))
+
+
+#: What xarray.open_dataset hands to an engine.
+DECODERS: tuple[dict[str, Any], ...] = (
+    {"decode_times": False},
+    {"decode_times": True},
+    {"mask_and_scale": False},
+    {"mask_and_scale": True, "decode_timedelta": True},
+    {"decode_cf": False},
+    {"decode_cf": True},
+    {"decode_coords": "all", "concat_characters": True},
+    {"decode_times": xr.coders.CFDatetimeCoder(time_unit="s")},
+)
+
+
+@pytest.mark.parametrize("options", DECODERS)
+def test_arguments_of_every_engine_are_taken(path: Path, original: ls.Surface, options: dict[str, Any]) -> None:
+    with opened(path, **options) as found:
+        xr.testing.assert_equal(found, original.to_xarray())
+    with opened(path) as plain, opened(path, **options) as found:
+        for name, variable in plain.variables.items():
+            assert variable.encoding.items() <= found.variables[name].encoding.items()
+    (tree,) = (
+        LodeBackend().open_groups_as_dict(path, **{k: it for k, it in options.items() if k != "decode_cf"}).values()
+    )
+    xr.testing.assert_equal(tree, original.to_xarray())
+
+
+def test_what_is_decoded_is_as_xarray_decodes_it(tmp_path: Path) -> None:
+    values = np.arange(12, dtype="i2").reshape(3, 4)
+    surface = ls.Surface(values, metadata={"scale": 0.5, "offset": 3.0, "scalars": {"time": 36.5}})
+    surface.metadata["tags"] = {"": {"time#units": "hours since 2001-01-01"}}
+    (tmp_path / "a.lode").write_bytes(ls.encode(surface))
+    with opened(tmp_path / "a.lode") as found:
+        np.testing.assert_array_equal(found.z.values, values)
+        assert (found.z.attrs["scale_factor"], found.time.values) == (0.5, 36.5)
+    with opened(tmp_path / "a.lode", mask_and_scale=True, decode_times=True) as found:
+        assert not found.z.variable._in_memory
+        np.testing.assert_array_equal(found.z.values, values * 0.5 + 3)
+        np.testing.assert_array_equal(found.z[1:, 2].values, values[1:, 2] * 0.5 + 3)
+        assert found.time.values == np.datetime64("2001-01-02T12:30")
+    with opened(tmp_path / "a.lode", mask_and_scale=True) as found:
+        assert found.time.values == 36.5

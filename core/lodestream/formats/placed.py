@@ -58,8 +58,8 @@ def place(
     """Put heights over their coordinates.
 
     Where both coordinates are vectors of finite values, the result is heights: with a ``geotransform`` where both are
-    evenly spaced, and with ``axes`` where that alone does not say every coordinate bit for bit. It is x, y, z
-    otherwise: of arrays, where the axes would be too long for metadata, and where values of one are all the same.
+    evenly spaced, and with ``axes`` where that alone does not say every coordinate bit for bit, and its type. It is x,
+    y, z otherwise: of arrays, where the axes would be too long for metadata, and where values of one are all the same.
     Longitudes that jump are unwrapped where that rounds none; an axis that goes once around the Earth is closed, and a
     list of its longitudes then has the first one again at its end, a turn further. A missing height is a hole that
     keeps its x and y: as one of x, y, z it is NaN.
@@ -190,8 +190,10 @@ def _georeference(x: Coordinate, y: Coordinate, across: _Line, down: _Line) -> d
         rules["dtype"] = dtype.name
     if x.axis == 0:
         rules["rows"] = "x"
-    # Without even spacing a geotransform says nothing.
+    # Without even spacing a geotransform says nothing; it has no type.
     metadata: dict[str, Any] = {"geotransform": transform} if across.even and down.even else {"axes": rules}
+    if dtype != np.float64 and dtype.name in DTYPES:
+        metadata["axes"] = rules
     for start, line, axis in ((0, across, x.axis), (3, down, y.axis)):
         place, still = np.arange(len(line.values), dtype=np.float64), np.zeros((1, 1))
         row, column = (place[:, None], still) if axis == 0 else (still, place[None, :])

@@ -15,7 +15,7 @@ from ..formats.netcdf.layout import ORDERED
 from ..formats.netcdf.mark import MARK, Mark
 from ..formats.netcdf.marked import surface_in
 from ..formats.netcdf.names import REFERENCES
-from ..formats.netcdf.values import PACKING, RANGES, is_packed, pieces, stored_number
+from ..formats.netcdf.values import MISSING, PACKING, RANGES, is_packed, pieces, stored_number
 from ..formats.nodata import checked, with_nodata
 from ..formats.notes import warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
@@ -34,9 +34,6 @@ _OPTIONS = ("variable", "x", "y", "time", "at")
 
 #: What a file says of dates.
 _OF_DATES = ("units", "calendar")
-
-#: What says in the encoding of a variable which numbers of its file were missing values.
-_MISSING = ("_FillValue", "missing_value")
 
 
 def from_xarray(
@@ -136,7 +133,7 @@ def _described(xr: Any, variable: Any, places: Mapping[str, str] | None = None) 
     encoding = variable.encoding
     keys: tuple[str, ...] = REFERENCES
     if np.dtype(encoding.get("dtype") or variable.dtype).kind == "f" and not is_packed(encoding):
-        keys = (*keys, *_MISSING)  # xarray passes over a missing value of another type than the values
+        keys = (*keys, *MISSING)  # xarray passes over a missing value of another type than the values
     moved = {key: encoding[key] for key in keys if key in encoding}
     copy = variable.to_base_variable().copy(deep=False)
     copy.encoding = {key: it for key, it in encoding.items() if key not in moved}
@@ -163,7 +160,7 @@ def _as_stored(xr: Any, variable: Any, room: Room) -> Any:
 
 def _missing(encoding: Mapping[str, Any], stored: np.dtype[Any], dtype: np.dtype[Any]) -> list[Any]:
     """Return the missing values of a file that its integers can be; texts and other numbers say nothing."""
-    numbers = [number for key in _MISSING for number in np.ravel(encoding.get(key, ()))]
+    numbers = [number for key in MISSING for number in np.ravel(encoding.get(key, ()))]
     numbers = [stored_number(number, stored, encoding) for number in numbers if np.asarray(number).dtype.kind in "iuf"]
     limits = np.iinfo(dtype)
     return [
@@ -204,7 +201,7 @@ def _limits(xr: Any, variable: Any) -> dict[str, Any]:
         }
     if not is_packed(encoding) or is_packed(variable.attrs):
         return {}
-    packing = {key: encoding[key] for key in PACKING if key in encoding and key not in ("_FillValue", "missing_value")}
+    packing = {key: encoding[key] for key in PACKING if key in encoding and key not in MISSING}
     dtype = np.dtype(encoding.get("dtype") or np.int32)
     stored = xr.Variable((), np.zeros((), dtype), {**variable.attrs, **packing})
     return {key: value for key, value in attributes_with_limits(stored).items() if key in RANGES}

@@ -14,13 +14,28 @@ import numpy as np
 from ...errors import UnavailableError
 from .names import associated
 
-__all__ = ["crs_of", "grid_mapping"]
+__all__ = ["MAPPING", "beside_crs", "crs_of", "grid_mapping"]
 
 #: Attributes that describe an ellipsoid: any of these sets does.
 _ELLIPSOIDS = ({"earth_radius"}, {"semi_major_axis", "semi_minor_axis"}, {"semi_major_axis", "inverse_flattening"})
 
-#: The grid mapping that rioxarray and GDAL name so, where no variable names one.
-_USUAL = "spatial_ref"
+#: The grid mapping that rioxarray and GDAL name so, where no variable names one. What is written has this name too.
+MAPPING = "spatial_ref"
+
+#: Attributes of a grid mapping that a CRS, or a geotransform, says again.
+_OF_CRS = frozenset(
+    (
+        *("crs_wkt", "spatial_ref", "GeoTransform", "grid_mapping_name", "towgs84", "geoid_name"),
+        *("geographic_crs_name", "projected_crs_name", "horizontal_datum_name", "geopotential_datum_name"),
+        *("reference_ellipsoid_name", "prime_meridian_name", "longitude_of_prime_meridian", "earth_radius"),
+        *("semi_major_axis", "semi_minor_axis", "inverse_flattening", "false_easting", "false_northing"),
+        *("grid_north_pole_latitude", "grid_north_pole_longitude", "north_pole_grid_longitude"),
+        *("latitude_of_projection_origin", "longitude_of_projection_origin", "longitude_of_central_meridian"),
+        *("straight_vertical_longitude_from_pole", "standard_parallel", "azimuth_of_central_line"),
+        *("scale_factor_at_central_meridian", "scale_factor_at_projection_origin"),
+        *("perspective_point_height", "sweep_angle_axis", "fixed_angle_axis"),
+    )
+)
 
 #: Parts of an extended attribute: the name of a grid mapping, and the coordinates that it is for.
 _PART = re.compile(r"([^\s:]+)\s*:\s*([^:]*)(?=\s[^\s:]+\s*:|$)")
@@ -52,13 +67,14 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
         If the CRS needs pyproj, and it is not installed.
     """
     variables = dataset.variables
-    mappings = associated(dataset, name)["grid_mapping"] or [_USUAL]
+    mappings = associated(dataset, name)["grid_mapping"] or [MAPPING]
     text = variables[name].attrs.get("grid_mapping", "")
     of_places = {part[1]: set(part[2].split()) for part in _PART.finditer(str(text))}
     mappings.sort(key=lambda mapping: -len(of_places.get(mapping, set()) & set(places)))
     mapping = mappings[0]
     if mapping not in variables:
-        return None, None, []
+        words = str(text).strip()
+        return None, None, [f"the grid mapping {words[:40]!r} of {name} is not there"] if words else []
     attributes = variables[mapping].attrs
     for key in ("crs_wkt", "spatial_ref"):
         wkt = attributes.get(key)
@@ -80,6 +96,11 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         return None, mapping, [f"left out the grid mapping {mapping}, which pyproj does not understand: {reason}"]
     return str(crs.to_wkt()), mapping, []
+
+
+def beside_crs(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Choose the attributes of a grid mapping that its CRS does not say, such as a name or a code."""
+    return {str(key): value for key, value in attributes.items() if key not in _OF_CRS}
 
 
 def _with_meridian(attributes: dict[str, Any]) -> dict[str, Any]:

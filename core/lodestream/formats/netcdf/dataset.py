@@ -6,6 +6,7 @@ by pyproj. Values are those that are stored (xarray's ``decode_cf=False``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,12 +22,24 @@ from ..placed import Coordinate, place
 from ..source import Source, counted
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, Found, offered, others
-from .crs import crs_of
+from .crs import MAPPING, beside_crs, crs_of
 from .geotransform import by_geotransform, transform_of
 from .names import REFERENCES, associated, axis_words, is_geographic, is_grid_mapping
 from .single_numbers import SCALARS, names_of_single, number_of
 from .units import Conversion, conversions_of
-from .values import PACKING, RANGES, UNWRITTEN, Values, chosen, is_packed, raw_values, unusable, values_of
+from .values import (
+    MISSING,
+    PACKING,
+    RANGES,
+    UNWRITTEN,
+    Values,
+    chosen,
+    is_packed,
+    raw_values,
+    stored_number,
+    unusable,
+    values_of,
+)
 
 __all__ = ["attributes_with_limits", "not_taken", "surface_of"]
 
@@ -216,11 +229,7 @@ def _metadata(
     units = {letter: variables[name].attrs.get("units") for letter, name in found.items()}
     conversions, converted = conversions_of(units, crs)
     notes += [*more, *converted]
-    told: dict[str, Any] = {}
-    if main is not None:
-        told["variable"] = main
-        if isinstance(unit := variables[main].attrs.get("units"), str) and unit.strip():
-            told["unit"] = unit
+    told = {} if main is None else _of_heights(main, variables[main])
     if crs is not None:
         told["crs"] = crs
     # Names of coordinates are no attribute of a surface, which has its own.
@@ -239,6 +248,10 @@ def _metadata(
             if str(attributes.get("standard_name", "")).endswith("_angular_coordinate"):
                 del attributes["standard_name"]  # of CF 1.9, for what is an angle no longer
         said |= {f"{letter}#{key}": value for key, value in attributes.items() if not _same(value, usual.get(key))}
+    if crs is not None and mapping is not None:
+        said |= {
+            f"{MAPPING}#{key}": value for key, value in beside_crs(attributes_with_limits(variables[mapping])).items()
+        }
     single = [name for name in names_of_single(dataset, choice) if name != mapping]
     numbers = {name: number for name in single if (number := number_of(dataset, name, choice)) is not None}
     if numbers:
@@ -255,6 +268,28 @@ def _metadata(
     if left_out := _left_out(dataset, choice, taken, single):
         notes.append(f"left out: {listing(left_out)}")
     return metadata, notes, conversions, mapping
+
+
+def _of_heights(name: str, variable: Any) -> dict[str, Any]:
+    """The metadata of heights by the attributes of their variable: its name, unit and missing value."""
+    told: dict[str, Any] = {"variable": name}
+    if isinstance(unit := variable.attrs.get("units"), str) and unit.strip():
+        told["unit"] = unit
+    if (hole := _nodata(variable)) is not None:
+        told["nodata"] = hole
+    return told
+
+
+def _nodata(variable: Any) -> int | float | None:
+    """The number that stands for missing values of a variable; None: there is none, or NaN, or values are packed."""
+    if is_packed(variable.attrs):
+        return None
+    for number in (number for key in MISSING for number in np.ravel(variable.attrs.get(key, ()))):
+        if isinstance(number, np.number):
+            value: int | float = stored_number(number, np.dtype(variable.dtype), variable.attrs).item()
+            if math.isfinite(value):
+                return value if abs(value) < 2**63 else float(value)
+    return None
 
 
 def _same(value: Any, usual: Any) -> bool:

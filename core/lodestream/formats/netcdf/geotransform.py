@@ -59,7 +59,10 @@ def by_geotransform(surface: Surface, heights: Values, transform: list[float]) -
         away = min(max(map(abs, it)) for it in near) if len(near) == 2 else 0.0
         words = f"left out a GeoTransform that lies elsewhere than x and y, by {away:.3g} cells"
         return surface, words if away > _NEAR else None
-    metadata = {key: value for key, value in surface.metadata.items() if key != "axes"} | {"geotransform": transform}
+    # Axes are kept where they say a type, which a geotransform does not.
+    typed = "dtype" in surface.metadata.get("axes", ())
+    metadata = {key: value for key, value in surface.metadata.items() if key != "axes" or typed}
+    metadata["geotransform"] = transform
     points, mask = (surface.points, surface.mask) if surface.points.ndim == 2 else (heights.array, heights.valid)
     attributes = surface.attributes
     return Surface(points, surface.closed, mask=mask, attributes=attributes, metadata=metadata), None

@@ -29,7 +29,7 @@ from ...surface import DTYPES, Block, Closed, Surface
 from ..holes import Rows, fill_of
 from ..notes import survives
 from .attribute_texts import attributes_of
-from .crs import grid_mapping
+from .crs import MAPPING, grid_mapping
 from .names import REFERENCES, axis_words, is_east, is_geographic, is_rotated
 from .single_numbers import numbers_in
 from .values import PACKING
@@ -58,9 +58,6 @@ ORDERED = ("faces", "poles", "turn")
 
 #: Metadata that say where heights lie.
 _PLACE = ("grid", "axes", "geotransform")
-
-#: The variable of the CRS.
-MAPPING = "spatial_ref"
 
 #: Names that only what they stand for has.
 _RESERVED = frozenset(("x", "y", "xc", "yc", MAPPING))
@@ -235,7 +232,7 @@ def parts_of(grid: Grid) -> list[Part]:
         for dim, name, length in zip(grid.dims, ("row", "column"), grid.shape, strict=True):
             places.append(_known(name, (dim,), np.arange(length)))
     if grid.has_place:
-        places.append(_known(MAPPING, (), np.array(0, np.int64), grid.mapping))
+        places.append(_known(MAPPING, (), np.array(0, np.int64), said_of(grid.metadata, MAPPING) | grid.mapping))
     for name, number in numbers_in(grid.metadata).items():
         if name not in taken and not _UNSAFE.search(name):
             places.append(_known(name, (), np.array(number), said_of(grid.metadata, name)))

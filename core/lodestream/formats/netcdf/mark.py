@@ -15,7 +15,7 @@ from ...surface import Closed, Surface
 from ..notes import warn
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, is_numeric
-from .layout import CONVENTIONS, ORDERED, Grid, Part, axis_attributes, said_of, scale_of
+from .layout import CONVENTIONS, MAPPING, ORDERED, Grid, Part, axis_attributes, said_of, scale_of
 from .single_numbers import SCALARS
 
 __all__ = ["MARK", "NUMBERS", "Mark", "in_json", "mark_text"]
@@ -83,6 +83,7 @@ def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
     if not isinstance(tags, Mapping):
         return {}
     owners = [part.source for part in parts if part.source] + [part.name for part in parts if part.is_number]
+    owners += [MAPPING] if grid.has_place else []
     told = {f"{owner}#{key}" for owner in (*owners, _FILE) for key in said_of(grid.metadata, owner)}
     texts = tags.get("")
     usual = _of_every_file(grid.metadata)
@@ -211,8 +212,9 @@ class Mark:
             result[TYPES] = types
         if texts or others:
             result["tags"] = {**others, **({"": texts} if texts else {})}
-        if "variable" in metadata and "variable" not in kept:
-            del result["variable"]  # the name that the layout gave
+        for key in ("variable", "nodata"):
+            if key in metadata and key not in kept:
+                del result[key]  # the name that the layout gave, the number that the writer chose
         return result
 
     def _tag(self, key: str) -> str:

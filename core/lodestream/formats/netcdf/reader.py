@@ -15,6 +15,7 @@ from ..member import Member
 from ..notes import listing, warn
 from ..source import Source, check_allowed
 from . import hdf5_guard, vmec
+from .mark import MARK
 from .marked import surface_in
 from .members import members_of
 
@@ -136,6 +137,8 @@ def parents_of(group: str) -> list[str]:
 def with_parents(dataset: Any, parents: Iterable[Any]) -> Any:
     """Add to a group what it may refer to in the groups around it: variables over dimensions that it has.
 
+    Their attributes are its own too, but for those that it has otherwise.
+
     Parameters
     ----------
     dataset : Dataset of xarray
@@ -151,6 +154,8 @@ def with_parents(dataset: Any, parents: Iterable[Any]) -> Any:
             and all(dataset.sizes.get(dim) == parent.sizes[dim] for dim in variable.dims)
         }
         dataset = dataset.assign_coords(near) if near else dataset
+        if parent.attrs:
+            dataset = dataset.assign_attrs({key: it for key, it in parent.attrs.items() if key != MARK} | dataset.attrs)
     return dataset
 
 

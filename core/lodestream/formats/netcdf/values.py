@@ -17,6 +17,7 @@ from ...scratch import Room
 from ...sources import windows
 
 __all__ = [
+    "MISSING",
     "PACKING",
     "RANGES",
     "UNWRITTEN",
@@ -33,10 +34,10 @@ __all__ = [
 ]
 
 #: Attributes that say which values are missing.
-_MISSING = ("_FillValue", "missing_value")
+MISSING = ("_FillValue", "missing_value")
 
 #: Attributes that say how values are stored.
-PACKING = (*_MISSING, "scale_factor", "add_offset", "_Unsigned")
+PACKING = (*MISSING, "scale_factor", "add_offset", "_Unsigned")
 
 #: Attributes that say which values are valid.
 RANGES = ("valid_range", "valid_min", "valid_max")
@@ -213,7 +214,7 @@ def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArr
     packed = is_packed(attributes)
     raw = _signed(stored, attributes)
     valid = np.ones(raw.shape, np.bool_)
-    for key in _MISSING:
+    for key in MISSING:
         for missing in np.ravel(attributes.get(key, ())):
             if isinstance(missing, np.number):
                 valid &= raw != stored_number(missing, stored.dtype, attributes)
@@ -247,7 +248,7 @@ def _unpacked(stored: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[An
     unused = unusable(attributes)
     packing = {key: attributes[key] for key in PACKING if key in attributes and key not in unused}
     if stored.dtype.kind in "iu":  # xarray takes one fill value of unsigned integers, and of their type
-        numbers = [number for key in _MISSING for number in np.ravel(packing.pop(key, ()))]
+        numbers = [number for key in MISSING for number in np.ravel(packing.pop(key, ()))]
         known = [stored_number(number, stored.dtype, attributes) for number in numbers]
         fills = [number for number in known if number.dtype == _signed(stored[:0], attributes).dtype]
         packing |= {"_FillValue": fills[0].astype(stored.dtype)} if fills else {}
