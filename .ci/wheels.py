@@ -36,8 +36,9 @@ SYSTEM_LIBRARIES = {
     "darwin": re.compile("/usr/lib/libSystem.B.dylib"),
     "win32": re.compile(r"kernel32\.dll|api-ms-win-crt-[a-z0-9-]+\.dll", re.IGNORECASE),
 }
-#: Of a wheel: what it has without the page of the browser, and the page.
-MOST_BYTES = 1_000_000 + 270_000
+#: Of a wheel: what it has without the page of the browser (1.27 MB compressed, 710 kB of it the readers, the codec and
+#: meshes in Python), and the page. Whoever exceeds it has packed something that does not belong there, or raises it.
+MOST_BYTES = 1_400_000 + 270_000
 
 CHECK = """
 import numpy as np
