@@ -245,7 +245,7 @@ def _lock(handle: int, folder: Path) -> None:
         raise InputError(
             f"expected {folder} to be free for this build, the same build is at work there; choose another scratch "
             "folder"
-        )
+        ) from BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))  # by which a server knows that it will pass
 
 
 def _let_go(handle: int) -> None:
