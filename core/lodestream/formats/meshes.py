@@ -47,7 +47,7 @@ MOST_FACES = 2**29 - 1
 
 
 def pad(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles, (T, 3), as rows of four corners, the last of which is -1."""
+    """Return triangles, (T, 3), as rows of four corners, the last of which is -1."""
     return np.concatenate([triangles, np.full((len(triangles), 1), -1, triangles.dtype)], axis=1)
 
 
@@ -105,7 +105,7 @@ def _switch(options: Mapping[str, object], name: str) -> bool:
 
 
 def remesh_options(options: Mapping[str, object]) -> RemeshOptions | None:
-    """The options of `REMESH_OPTIONS`, None if the mesh shall not be resampled.
+    """Return the options of `REMESH_OPTIONS`, None if the mesh shall not be resampled.
 
     Raises
     ------
@@ -163,7 +163,7 @@ def surface_of(source: Source, mesh: Mesh, format_name: str, words: Mapping[str,
 def grids_or_blocks(
     mesh: Mesh, known: Mapping[str, Any], options: RemeshOptions | None, source: Source | None = None
 ) -> Surface:
-    """The grids of a mesh, or, where it has none and that is asked for, blocks that resample it.
+    """Return the grids of a mesh, or, where it has none and that is asked for, blocks that resample it.
 
     A mesh whose grids would lose attributes is resampled too where that is asked for.
 

@@ -31,7 +31,7 @@ class Places:
 
 
 def find_places(mesh: Triangulation, points: Floats) -> Places:
-    """Places of the closest points of a mesh to points, (N, 3)."""
+    """Return places of the closest points of a mesh to points, (N, 3)."""
     _, triangles, places = mesh.closest(points)
     a, b, c = (mesh.corners[triangles, corner] for corner in range(3))
     u, v, w = b - a, c - a, places - a
@@ -45,7 +45,7 @@ def find_places(mesh: Triangulation, points: Floats) -> Places:
 
 
 def sample_attributes(mesh: Mesh, halves: Integers, corners: Integers, places: Places) -> dict[str, NDArray[Any]]:
-    """Values of all attributes at samples.
+    """Return values of all attributes at samples.
 
     Floating-point numbers and bytes, which are colours, are interpolated; other integers, which may be classes, are
     those of the nearest corner. A sample whose triangle has no value there gets NaN, or 0 if it is of integers.

@@ -268,7 +268,7 @@ def _three_at_each_corner(mesh: Triangulation, labels: Integers) -> Cells:
 
 
 def _apart(mesh: Triangulation, vertices: Integers) -> Integers:
-    """Some of the vertices, no two of which have a triangle in common."""
+    """Return some of the vertices, no two of which have a triangle in common."""
     chosen: list[int] = []
     faces = mesh.faces[np.isin(mesh.faces, vertices).any(axis=1)].tolist()
     around: dict[int, list[int]] = {vertex: [] for vertex in vertices.tolist()}

@@ -80,7 +80,7 @@ def clean(vertices: Floats, faces: Integers) -> tuple[Triangulation, Integers, I
 
 
 def _wound_alike(faces: Integers) -> Integers:
-    """The faces wound alike, each as the most of its component are; as they are if no order is needed."""
+    """Return the faces wound alike, each as the most of its component are; as they are if no order is needed."""
     start, end = faces, faces[:, [1, 2, 0]]
     keys = (start * (faces.max() + 1) + end).reshape(-1)
     if len(distinct(keys)) == len(keys):
@@ -94,7 +94,7 @@ def _wound_alike(faces: Integers) -> Integers:
 
 
 def _one_fan_each(mesh: Triangulation) -> Triangulation:
-    """The mesh with a vertex for each fan of triangles round a vertex; vertices that no triangle has are left out."""
+    """Return the mesh with a vertex for each fan of triangles round one, and none that no triangle has."""
     from scipy.sparse.csgraph import connected_components
 
     corner = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
@@ -114,7 +114,7 @@ def _one_fan_each(mesh: Triangulation) -> Triangulation:
 
 
 def longest_edges(mesh: Triangulation, lengths: Floats, cells: Integers) -> Floats:
-    """The greatest lengths to which edges are to be halved, for each component.
+    """Return the greatest lengths to which edges are to be halved, for each component.
 
     They are those wanted, but where long and narrow triangles would become too many: a triangle becomes as many as the
     square of the parts of its edges, so the sum of these squares is bounded.

@@ -45,7 +45,7 @@ class Distances:
 
 
 def _scattered(mesh: Triangulation) -> Floats:
-    """Points scattered evenly over a mesh; the same ones for the same mesh."""
+    """Return points scattered evenly over a mesh; the same ones for the same mesh."""
     random = np.random.default_rng(0)
     count = min(max(_LEAST, _EACH * len(mesh.faces)), _MOST)
     areas = np.cumsum(mesh.areas)

@@ -84,7 +84,7 @@ def lay_out(rims: Rims, centres: Floats) -> list[Block]:
 
 
 def _perfect_matching(ends: Integers, weights: Floats) -> Integers:
-    """The arcs of the heaviest matching of all corners, in increasing order.
+    """Return the arcs of the heaviest matching of all corners, in increasing order.
 
     It is an integer program, one equation for each corner: the arcs chosen there are one. HiGHS solves it in a tenth of
     the time that a matching takes in Python.
@@ -130,13 +130,13 @@ def _triangles(rims: Rims) -> tuple[dict[int, tuple[Link, ...]], set[int]]:
 
 
 def _turned(triangle: tuple[Link, ...], rims: Rims, arc: int) -> tuple[Link, ...]:
-    """A triangle, turned so that the arc lies between its first and its second cell."""
+    """Return a triangle, turned so that the arc lies between its first and its second cell."""
     place = next(k for k, link in enumerate(triangle) if rims.sides[link.cell][link.side].arc == arc)
     return triangle[place:] + triangle[:place]
 
 
 def _weight(first: tuple[Link, ...], second: tuple[Link, ...], cell: int, other: int, centres: Floats) -> float:
-    """The more the angles of two triangles together are right angles, the higher."""
+    """Return a weight, the higher the more the angles of two triangles together are right angles."""
     tips = [next(link.cell for link in triangle if link.cell not in (cell, other)) for triangle in (first, second)]
     quad = centres[[cell, tips[0], other, tips[1]]]
     edges = np.roll(quad, -1, axis=0) - quad

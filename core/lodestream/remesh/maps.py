@@ -122,7 +122,7 @@ class Maps:
         }
 
     def locate(self, cells: Integers, radius: Floats, angle: Floats) -> tuple[Floats, Integers]:
-        """Points of the surface at places in the maps.
+        """Return points of the surface at places in the maps.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class _Unmapped:
     diagonal: float
 
     def _mean_values(self) -> Floats:
-        """Weights of mean values of each corner of a triangle for the next and the one after that, (F, 3, 2)."""
+        """Return weights of mean values of each corner of a triangle for the next and the one after that, (F, 3, 2)."""
         weights = np.empty((len(self.faces), 3, 2))
         corners, least = self.corners, 1e-9 * self.diagonal
         for corner in range(3):
@@ -210,7 +210,7 @@ class _Unmapped:
         return disc
 
     def solved(self) -> Floats:
-        """Places of all nodes, (N, 2)."""
+        """Return places of all nodes, (N, 2)."""
         pinned = np.isfinite(self.disc[:, 0])
         free, fixed = np.flatnonzero(~pinned), np.flatnonzero(pinned)
         count = int(self.labels.max()) + 1
@@ -248,13 +248,13 @@ class _Unmapped:
 
 
 def _normalized(matrix: Any) -> Any:
-    """A matrix whose rows have the sum 1."""
+    """Return a matrix whose rows have the sum 1."""
     total = np.asarray(matrix.sum(axis=1)).reshape(-1)
     return sparse().diags(1 / total) @ matrix
 
 
 def _turned_over(disc: Floats, faces: Integers) -> NDArray[np.bool_]:
-    """Triangles that go round clockwise, or are flat."""
+    """Return triangles that go round clockwise, or are flat."""
     a, b, c = (disc[faces[:, corner]] for corner in range(3))
     area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     return np.asarray(area <= 0)

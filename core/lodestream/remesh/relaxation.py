@@ -21,7 +21,7 @@ _STEP = 0.5
 
 
 def rim_of(grids: Grids) -> Integers:
-    """Edges between samples that have a quad on one side only, (E, 2)."""
+    """Return edges between samples that have a quad on one side only, (E, 2)."""
     quads = quads_of(grids.numbers)
     edges = np.sort(np.stack([quads, np.roll(quads, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     keys, count = np.unique(edges[:, 0] * grids.count + edges[:, 1], return_counts=True)
@@ -29,7 +29,7 @@ def rim_of(grids: Grids) -> Integers:
 
 
 def _edges_of(grids: Grids) -> Integers:
-    """Edges between neighbouring samples, each once, (E, 2)."""
+    """Return edges between neighbouring samples, each once, (E, 2)."""
     numbers = grids.numbers
     rows = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2)
     columns = np.stack([numbers[:, :, :-1], numbers[:, :, 1:]], axis=-1).reshape(-1, 2)
@@ -53,7 +53,7 @@ class Lines:
         self._tree.init(self._vertices, self._edges)
 
     def closest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Distances (N,) and places (N, 3) of the closest points of the lines."""
+        """Return distances (N,) and places (N, 3) of the closest points of the lines."""
         squared, _, places = self._tree.squared_distance(self._vertices, self._edges, np.ascontiguousarray(points))
         return np.sqrt(squared), places
 
@@ -181,7 +181,7 @@ class Relaxation:
 
 
 def _offsets(neighbours: _Neighbours, points: Floats, normals: Floats | None) -> Floats:
-    """How far each sample moves, (N, 3).
+    """Return how far each sample moves, (N, 3).
 
     The sparser samples are for the bends of the surface, the less they move; otherwise tips would lose theirs.
     """

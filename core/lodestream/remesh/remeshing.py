@@ -87,7 +87,7 @@ class _Base:
     blocks: list[Block]
 
     def sampled(self, intervals: int) -> tuple[Grids, Floats, Floats]:
-        """Samples as the maps have them: numbers, points and normals."""
+        """Return samples as the maps have them: numbers, points and normals."""
         grids = number_samples(self.rims, self.blocks, intervals)
         points, triangles = place_samples(grids, self.rims, self.blocks, self.maps)
         return grids, points, self.cells.mesh.normals[triangles]
@@ -168,7 +168,7 @@ def _check_size(blocks: int, most: float) -> None:
 
 
 def _shares(mesh: Triangulation, wanted: float) -> Integers:
-    """Cells of each component, by area, for so many blocks in all.
+    """Return cells of each component, by area, for so many blocks in all.
 
     n cells of a closed surface with Euler characteristic χ make n - χ blocks.
     """
@@ -180,7 +180,7 @@ def _shares(mesh: Triangulation, wanted: float) -> Integers:
 
 
 def _adapted(mesh: Triangulation, wanted: int, progress: Callable[[float], None]) -> _Base:
-    """Cells that lie evenly, and more of them where the surface of their blocks is far from the mesh."""
+    """Return cells that lie evenly, and more of them where the surface of their blocks is far from the mesh."""
     areas = np.bincount(mesh.components, mesh.areas)
     shares = _shares(mesh, _EVEN * wanted)
     most = max(_MOST_CELLS, 4 * wanted)
@@ -227,7 +227,7 @@ def _base_of(cells: Cells, known: Maps | None) -> _Base:
 
 
 def _worst(fine: Triangulation, mesh: Triangulation, distance: Floats, most: int) -> Integers:
-    """Triangles of the finer mesh at the vertices that are farthest away, none near another."""
+    """Return triangles of the finer mesh at the vertices that are farthest away, none near another."""
     distance = distance.copy()
     chosen = []
     for _ in range(most):
@@ -244,7 +244,7 @@ def _worst(fine: Triangulation, mesh: Triangulation, distance: Floats, most: int
 def _finished(
     mesh: Triangulation, relaxation: Relaxation, grids: Grids, points: Floats
 ) -> tuple[Grids, Floats, Distances, int, int]:
-    """Samples unfolded, and put on sharp edges where that brings the surfaces nearer; distances, folds, sharp edges."""
+    """Return samples unfolded, and on sharp edges where that is nearer; distances, folds, sharp edges."""
     quads = quads_of(grids.numbers)
     folded = folded_quads(mesh, quads, points)
     distances = measure(mesh, grids, points)
@@ -291,7 +291,7 @@ def _unfolded(
 def _without_new_folds(
     mesh: Triangulation, quads: Integers, points: Floats, moved: Floats, folded: NDArray[np.bool_]
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Samples as they were moved, but for those whose quads are folded only since then; the quads that still are."""
+    """Return samples as they were moved, except where that folded quads; and the quads that are folded."""
     moved, still = moved.copy(), folded.copy()
     near = np.flatnonzero((moved != points).any(axis=1)[quads].any(axis=1))
     for _ in range(_UNFOLDING):

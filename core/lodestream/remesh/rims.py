@@ -118,7 +118,7 @@ def trace_rims(cells: Cells) -> Rims:
 def _runs(
     cell: int, start: int, following: dict[tuple[int, int], tuple[int, int, int]], corners: NDArray[np.bool_]
 ) -> list[tuple[list[int], int, int]]:
-    """The vertices of each side of a cell, the cell across, and the first edge."""
+    """Return the vertices of each side of a cell, the cell across, and the first edge."""
     runs: list[tuple[list[int], int, int]] = []
     vertex, run, first = start, [start], -1
     while True:
@@ -153,7 +153,7 @@ def _laid_out(
 
 
 def places_along(vertices: Floats) -> Floats:
-    """Places along a line, (N, 3), by its length: from 0 to 1, (N,)."""
+    """Return places along a line, (N, 3), by its length: from 0 to 1, (N,)."""
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(vertices, axis=0), axis=1))])
     if not lengths[-1] > 0:
         return np.linspace(0, 1, len(vertices))

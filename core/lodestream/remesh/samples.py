@@ -36,13 +36,13 @@ class Grids:
 
 
 def quads_of(numbers: Integers) -> Integers:
-    """Quads between samples, counter-clockwise, (Q, 4)."""
+    """Return quads between samples, counter-clockwise, (Q, 4)."""
     corners = numbers[:, :-1, :-1], numbers[:, :-1, 1:], numbers[:, 1:, 1:], numbers[:, 1:, :-1]
     return np.stack(corners, axis=-1).reshape(-1, 4)
 
 
 def triangles_of(numbers: Integers) -> Integers:
-    """The halves of quads, (2 Q, 3): first all lower ones, then all upper ones."""
+    """Return the halves of quads, (2 Q, 3): first all lower ones, then all upper ones."""
     quads = quads_of(numbers)
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
@@ -57,12 +57,12 @@ class _Sides:
         self._points: dict[int, int] = {}
 
     def new(self, count: int) -> Integers:
-        """Numbers that no sample has yet."""
+        """Return numbers that no sample has yet."""
         self.count += count
         return np.arange(self.count - count, self.count)
 
     def across(self, arc: int, first: int, start: int, stop: int) -> Integers:
-        """The line over an arc between two centres; `first` is the cell where the arc begins its description."""
+        """Return the line over an arc between two centres; `first` is the cell where the arc begins its description."""
         forward = start == first
         ends = (start, stop) if forward else (stop, start)
         if (arc, 0) not in self._lines:
@@ -71,7 +71,7 @@ class _Sides:
         return line if forward else line[::-1]
 
     def to_border(self, arc: int, cell: int) -> Integers:
-        """The line along the border from the centre of a cell to the corner at which an arc ends."""
+        """Return the line along the border from the centre of a cell to the corner at which an arc ends."""
         if arc not in self._points:
             self._points[arc] = int(self.new(1)[0])
         return np.concatenate([[cell], self.new(self.intervals - 1), [self._points[arc]]])
@@ -141,7 +141,7 @@ def place_samples(grids: Grids, rims: Rims, blocks: list[Block], maps: Maps) -> 
 
 
 def _in_cells(triangle: tuple[Link, ...], weights: Floats, rims: Rims) -> Floats:
-    """Places in the maps of cells, from barycentric coordinates in a triangle between the centres of three cells.
+    """Return places in the maps of cells, from barycentric coordinates between the centres of three cells.
 
     The medians part the triangle into three quads, one for each cell: centre, where the line to the next centre
     crosses the rim, corner, and where the line to the last centre crosses the rim.
@@ -171,7 +171,7 @@ def _in_cells(triangle: tuple[Link, ...], weights: Floats, rims: Rims) -> Floats
 
 
 def upsample(coarse: Grids, fine: Grids, values: Floats) -> Floats:
-    """Values at twice as many samples along each side: those of the old ones, and means of two or four between them.
+    """Return values at twice as many samples along each side: old ones, and means of two or four between.
 
     Parameters
     ----------

@@ -72,13 +72,13 @@ def sharpen(mesh: Triangulation, grids: Grids, points: Floats) -> tuple[Floats, 
 
 
 def _corners(mesh: Triangulation, edges: Integers) -> Floats:
-    """Vertices at which sharp edges end, meet or fork."""
+    """Return vertices at which sharp edges end, meet or fork."""
     meeting = np.bincount(edges.reshape(-1), minlength=len(mesh.vertices))
     return np.asarray(mesh.vertices[(meeting > 0) & (meeting != 2)])
 
 
 def _bends(mesh: Triangulation, edges: Integers) -> Floats:
-    """Vertices at which the border bends by more than a sharp edge's angle."""
+    """Return vertices at which the border bends by more than a sharp edge's angle."""
     if not len(edges):
         return np.empty((0, 3))
     ends = np.concatenate([edges, edges[:, ::-1]])

@@ -129,7 +129,7 @@ def remesh(
 
 
 def _triangulated(mesh: Mesh, vertices: Floats) -> tuple[Integers, Integers]:
-    """Triangles, and quads cut along their shorter diagonal: the face of each, (T,), and its corners there, (T, 3)."""
+    """Return triangles, and quads cut along their shorter diagonal: their faces, (T,), and corners, (T, 3)."""
     quads = mesh.corners[:, 3] >= 0
     a, b, c, d = (vertices[mesh.corners[:, corner]] for corner in range(4))
     with np.errstate(over="ignore", invalid="ignore"):  # coordinates beyond all measure are refused later
@@ -148,7 +148,7 @@ def _triangulated(mesh: Mesh, vertices: Floats) -> tuple[Integers, Integers]:
 
 
 def _unit(vectors: NDArray[Any]) -> NDArray[Any]:
-    """Vectors, (N, K), of length one, but for those of none."""
+    """Return vectors, (N, K), of length one, but for those of none."""
     length = np.linalg.norm(vectors.astype(np.float64), axis=-1, keepdims=True)
     return (vectors / np.where(length > 0, length, 1)).astype(vectors.dtype)
 
@@ -159,7 +159,7 @@ def _dtype(points: Floats, diagonal: float) -> np.dtype[Any]:
 
 
 def _apart(grids: Grids, points: Floats, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The points in a type, none at the place of another: those with the same coordinates would count as one."""
+    """Return the points in a type, none at the place of another: those with the same coordinates would count as one."""
     result = points.astype(dtype)
     for _ in range(_ROUNDS):
         _, place = equal_places(result)
@@ -173,7 +173,7 @@ def _apart(grids: Grids, points: Floats, dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def _means(grids: Grids, points: Floats) -> Floats:
-    """Means of the neighbours of each sample."""
+    """Return means of the neighbours of each sample."""
     numbers = grids.numbers
     rows = np.stack([numbers[:, :-1], numbers[:, 1:]], axis=-1).reshape(-1, 2)
     columns = np.stack([numbers[:, :, :-1], numbers[:, :, 1:]], axis=-1).reshape(-1, 2)
@@ -185,7 +185,7 @@ def _means(grids: Grids, points: Floats) -> Floats:
 
 
 def _parts(result: Remeshing) -> dict[str, Any]:
-    """Blocks of different components are not joined where these touch."""
+    """Keep blocks of different components apart where these touch."""
     if result.mesh.components.max() == 0:
         return {}
     _, triangles, _ = result.mesh.closest(result.points[result.grids.numbers[:, 1, 1]])

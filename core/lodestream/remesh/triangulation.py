@@ -60,7 +60,7 @@ class Triangulation:
         self.face_edges: Integers = inverse.reshape(3, -1).T
 
     def _named(self, edge: int) -> str:
-        """The vertices of an edge, by their places, which mean something in any program."""
+        """Return the vertices of an edge, by their places, which mean something in any program."""
         ends = (" ".join(f"{value:.6g}" for value in self.vertices[vertex]) for vertex in self.edges[edge])
         return " and ".join(f"({end})" for end in ends)
 
@@ -151,7 +151,7 @@ class Triangulation:
         return np.sqrt(squared), triangles, places
 
     def characteristic(self) -> Integers:
-        """Vertices - edges + triangles of each component, (C,)."""
+        """Return vertices - edges + triangles of each component, (C,)."""
         count = int(self.components.max()) + 1
         part = np.zeros(len(self.vertices), np.int64)
         part[self.faces] = self.components[:, np.newaxis]
@@ -161,7 +161,7 @@ class Triangulation:
 
 
 def distinct(values: NDArray[Any]) -> Integers:
-    """The different ones of integers of any shape, in increasing order.
+    """Return the different ones of integers of any shape, in increasing order.
 
     `numpy.unique` hashes them where nothing else is wanted, which took 50 times as long for these.
     """
@@ -172,7 +172,7 @@ def distinct(values: NDArray[Any]) -> Integers:
 
 
 def normals_of(points: Floats) -> Floats:
-    """Normals of triangles with corners at `points`, shape (N, 3, 3), as long as twice their areas."""
+    """Return normals of triangles with corners at `points`, shape (N, 3, 3), as long as twice their areas."""
     return np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
 
 
@@ -199,7 +199,7 @@ def split_edges(mesh: Triangulation, chosen: NDArray[np.bool_]) -> tuple[Triangu
     parts, parents = [mesh.faces[count == 0]], [np.flatnonzero(count == 0)]
 
     def rotated(wanted: int, first: Integers) -> tuple[Integers, Integers]:
-        """Triangles with some halved edges, and the middles of these, turned so that `first` comes first."""
+        """Return triangles with some halved edges, and the middles of these, turned so that `first` comes first."""
         rows = np.flatnonzero(count == wanted)
         turned = (first[rows, np.newaxis] + np.arange(3)) % 3
         parents.extend([rows] * (wanted + 1))

@@ -153,13 +153,13 @@ def with_attributes(dataset: Any, choice: Choice, names: Iterable[str]) -> Choic
 
 
 def fits(variable: Any, choice: Choice) -> bool:
-    """Whether a variable lies over the same rows and columns, with or without an axis of components behind them."""
+    """Return whether a variable lies over the same rows and columns, with or without components behind them."""
     dims = _left(variable.dims, choice.index)
     return len(dims) <= 3 and set(dims[:2]) == set(choice.dims)
 
 
 def _main(source: Source, dataset: Any) -> tuple[str, Mapping[str, str], bool]:
-    """The variable whose dimensions count, those that options name by their option, and whether points are planar."""
+    """Return the variable whose dimensions count, those that options name, and whether points are planar."""
     variables = dataset.variables
     no_grid = no_grid_of(dataset)
     given = {key: _named(source, variables, key) for key in ("variable", "x", "y") if key in source.options}
@@ -194,7 +194,7 @@ def fields(dataset: Any) -> list[str]:
 
 
 def others(dataset: Any, choice: Choice) -> list[str]:
-    """Variables over the same two dimensions that are not taken, nor belong to those that are."""
+    """Return variables over the same two dimensions that are not taken, nor belong to those that are."""
     variables = dataset.variables
     taken = {choice.heights, *choice.attributes, *(found.name for found in (choice.x, choice.y) if found)}
     for variable in variables.values():
@@ -219,7 +219,7 @@ def _named(source: Source, variables: Mapping[Hashable, Any], key: str) -> str:
 
 
 def is_numeric(variable: Any) -> bool:
-    """Whether a variable has numbers, or flags."""
+    """Return whether a variable has numbers, or flags."""
     return variable.dtype.kind in "iuf" or is_flag(variable)
 
 
@@ -229,7 +229,7 @@ def _listing(variables: Mapping[Hashable, Any]) -> str:
 
 
 def _only(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> str:
-    """The only variable over a surface that is no coordinate of another."""
+    """Return the only variable over a surface that is no coordinate of another."""
     chosen, wide = _fields(dataset, coordinates, no_grid)
     if len(chosen) == 1:
         return chosen[0]
@@ -243,7 +243,7 @@ def _only(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> str:
 
 
 def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tuple[list[str], list[str]]:
-    """The variables over surfaces: those that are no coordinate of another, and all."""
+    """Return the variables over surfaces: those that are no coordinate of another, and all."""
     variables = dataset.variables
     if no_grid is not None:
         on_grids = {name: it for name, it in variables.items() if not no_grid.takes(str(name), it.dims)}
@@ -265,7 +265,7 @@ def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tupl
 
 
 def _referred(variable: Any) -> set[str]:
-    """Names of variables that belong to one."""
+    """Return names of variables that belong to one."""
     return {name for key in REFERENCES for name in str(variable.attrs.get(key, "")).split()}
 
 
@@ -274,7 +274,7 @@ def _left(dims: tuple[Hashable, ...], index: Mapping[str, int]) -> tuple[str, ..
 
 
 def _index(source: Source, dataset: Any, dims: tuple[Hashable, ...]) -> dict[str, int]:
-    """Places along dimensions that options name."""
+    """Return places along dimensions that options name."""
     index: dict[str, int] = {}
     if moment := str(source.options.get("time", "")):
         times = [str(dim) for dim in dims if is_time(dataset, str(dim))]
@@ -297,7 +297,7 @@ def _number(dataset: Any, dim: str, text: str, option: str) -> int:
 
 
 def _moment(dataset: Any, dim: str, text: str) -> int:
-    """The number of a time, or that of the only date that begins so."""
+    """Return the number of a time, or that of the only date that begins so."""
     name = time_of(dataset, dim) or (dim if dim in dataset.variables else None)
     if text.removeprefix("-").isdecimal() and (len(text) < 4 or name is None):
         return _number(dataset, dim, text, "time")
@@ -315,7 +315,7 @@ def _moment(dataset: Any, dim: str, text: str) -> int:
 
 
 def _surface_dims(dataset: Any, name: str, index: Mapping[str, int]) -> tuple[str, str]:
-    """The two dimensions that are left; those of length 1 are left out first."""
+    """Return the two dimensions that are left; those of length 1 are left out first."""
     left = _left(dataset.variables[name].dims, index)
     long = [dim for dim in left if dataset.sizes[dim] > 1]
     if len(long) > 2:
@@ -344,7 +344,7 @@ def _found(dataset: Any, name: str, dims: tuple[str, str], index: Mapping[str, i
 
 
 def _conventional(dataset: Any, main: str, dims: tuple[str, str], index: Mapping[str, int]) -> _Places:
-    """The coordinates that the conventions give a variable.
+    """Return the coordinates that the conventions give a variable.
 
     Vectors that they know come first, unless there are arrays too and the vectors lie elsewhere; then arrays; then any
     vectors along the dimensions. Arrays that are not taken are kept beside the surface.
@@ -391,13 +391,13 @@ def _conventional(dataset: Any, main: str, dims: tuple[str, str], index: Mapping
 
 
 def _counts(vector: Any) -> bool:
-    """Whether a vector does nothing but number its places, from 0 or 1 on."""
+    """Return whether a vector does nothing but number its places, from 0 or 1 on."""
     values = raw_values(vector)
     return values.ndim == 1 and any(np.array_equal(values, np.arange(len(values)) + first) for first in (0, 1))
 
 
 def _pair(x: list[Found], y: list[Found]) -> tuple[Found, Found] | None:
-    """The first array of x and the array of y that belongs to it, by its name; none: there are not both."""
+    """Return the first array of x and the array of y that belongs to it, by its name; none: there are not both."""
     if not x or not y:
         return None
     mates = {mate_of(found.name).lower(): found for found in reversed(x)}

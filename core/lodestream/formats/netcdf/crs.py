@@ -136,7 +136,7 @@ def _said_by_cf(wkt: str) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A number of an attribute as Python has it, several as a list."""
+    """Return a number of an attribute as Python has it, several as a list."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist() if np.size(value) != 1 else np.ravel(value)[0].item()
     return value

@@ -125,7 +125,7 @@ class _Reader:
         self.notes: list[str] = []
 
     def values(self, name: str, dims: Sequence[str]) -> Values:
-        """The values of a variable over these dimensions."""
+        """Return the values of a variable over these dimensions."""
         values = values_of(chosen(self._dataset.variables[name], self._choice.index), dims, self._source.room)
         for key, words in unusable(self._dataset.variables[name].attrs).items():
             text = text_of(self._dataset.variables[name].attrs[key])[0]
@@ -141,7 +141,7 @@ class _Reader:
         return values
 
     def coordinate(self, found: Found, conversion: Conversion | None = None) -> Coordinate:
-        """A coordinate in the unit of the CRS, NaN where it is missing."""
+        """Return a coordinate in the unit of the CRS, NaN where it is missing."""
         room = self._source.room
         values = self._with_nan(found.name, self.values(found.name, found.dims))
         if conversion is not None:
@@ -152,7 +152,7 @@ class _Reader:
         return Coordinate(values, found.axis, found.degrees)
 
     def attribute(self, name: str, heights: Values | None) -> NDArray[Any]:
-        """Further values of the points: integers become floats with NaN where some are missing at valid points."""
+        """Return further values of the points: integers become floats with NaN where some are missing."""
         variable = chosen(self._dataset.variables[name], self._choice.index)
         dims = self._choice.dims
         values = self.values(name, (*dims, *(dim for dim in map(str, variable.dims) if dim not in dims)))
@@ -168,7 +168,7 @@ class _Reader:
             self.notes.append(f"integers of {name} become {dtype}, and the largest are rounded")
 
     def _with_nan(self, name: str, values: Values) -> NDArray[Any]:
-        """Values with NaN where they are missing: integers as floats of 32 bits, or of 64 if these do not hold them."""
+        """Return values with NaN where they are missing: integers as floats of 32 bits, or of 64 if needed."""
         array, valid = values.array, values.valid
         if valid is None or array.dtype.kind == "f":
             return array
@@ -181,7 +181,7 @@ class _Reader:
 
 
 def _unwritten(values: Values, attributes: Mapping[str, Any]) -> int:
-    """How many values are those that NetCDF has where nothing was written and the file does not say otherwise."""
+    """Return how many values are NetCDF's own for places where nothing was written."""
     array = values.array
     default = UNWRITTEN.get(array.dtype.str[1:])
     if default is None or {"_FillValue", "missing_value"} & set(attributes) or is_packed(attributes):
@@ -190,7 +190,7 @@ def _unwritten(values: Values, attributes: Mapping[str, Any]) -> int:
 
 
 def _survive(values: Values, dtype: np.dtype[Any]) -> bool:
-    """Whether all values that there are keep their number in another type."""
+    """Return whether all values that there are keep their number in another type."""
     array, valid = values.array, values.valid
     if array.dtype.kind == "f" or dtype.kind != "f" or array.dtype.itemsize < dtype.itemsize:
         return True
@@ -199,7 +199,7 @@ def _survive(values: Values, dtype: np.dtype[Any]) -> bool:
 
 
 def _plane(axis: Coordinate) -> NDArray[Any]:
-    """A coordinate with two axes, one of which may have length 1."""
+    """Return a coordinate with two axes, one of which may have length 1."""
     return axis.values if axis.axis is None else np.expand_dims(axis.values, 1 - axis.axis)
 
 
@@ -216,7 +216,7 @@ def _without_place(heights: Values, x: Coordinate, y: Coordinate) -> list[str]:
 def _metadata(
     source: Source, dataset: Any, choice: Choice, format_name: str
 ) -> tuple[dict[str, Any], list[str], dict[str, Conversion], str | None]:
-    """What the file says of itself and of the variables that are read; notes; how x and y are converted; the mapping.
+    """Return what the file says of itself and of its variables; notes; how x and y are converted; the mapping.
 
     Tags have the names that GDAL has for attributes of files. Coordinates are x and y, whatever the file calls them;
     what the CRS says of them already is left out.
@@ -271,7 +271,7 @@ def _metadata(
 
 
 def _of_heights(name: str, variable: Any) -> dict[str, Any]:
-    """The metadata of heights by the attributes of their variable: its name, unit and missing value."""
+    """Return the metadata of heights by the attributes of their variable: its name, unit and missing value."""
     told: dict[str, Any] = {"variable": name}
     if isinstance(unit := variable.attrs.get("units"), str) and unit.strip():
         told["unit"] = unit
@@ -281,7 +281,7 @@ def _of_heights(name: str, variable: Any) -> dict[str, Any]:
 
 
 def _nodata(variable: Any) -> int | float | None:
-    """The number that stands for missing values of a variable; None: there is none, or NaN, or values are packed."""
+    """Return the number for missing values of a variable; None: there is none, or NaN, or values are packed."""
     if is_packed(variable.attrs):
         return None
     for number in (number for key in MISSING for number in np.ravel(variable.attrs.get(key, ()))):
@@ -316,7 +316,7 @@ def attributes_with_limits(variable: Any) -> dict[str, Any]:
 
 
 def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequence[str]) -> list[str]:
-    """Variables that say something of the values or of where they lie, and are neither taken nor offered as attributes.
+    """Return variables that say something of the values or their places, neither taken nor offered as attributes.
 
     These are bounds, areas and others along rows or columns; those that the variable names as its coordinates; of
     coordinates with one value those that are no numbers, and bounds; and a CRS that the variable does not name.

@@ -21,7 +21,7 @@ _NEAR = 0.01
 
 
 def transform_of(attributes: Mapping[str, Any]) -> list[float] | None:
-    """The six numbers of the geotransform in the attributes of a grid mapping; None: it says none."""
+    """Return the six numbers of the geotransform in the attributes of a grid mapping; None: it says none."""
     try:
         transform = [float(number) for number in str(attributes["GeoTransform"]).split()]
     except (KeyError, ValueError):
@@ -69,7 +69,7 @@ def by_geotransform(surface: Surface, heights: Values, transform: list[float]) -
 
 
 def _is_whole(offsets: Sequence[float]) -> bool:
-    """Whether all points are off by the same whole number of columns and of rows, as those of a part of a grid."""
+    """Return whether all points are off by the same whole columns and rows, as those of a part of a grid."""
     left, right, top, bottom = offsets
     even = all(map(math.isfinite, offsets)) and max(right - left, bottom - top) <= _NEAR
     return even and max(abs(left - round(left)), abs(top - round(top))) <= _NEAR

@@ -96,7 +96,7 @@ def _check_dataset(dataset: Any) -> None:
 
 
 def _large_chunks(dataset: Any) -> list[tuple[int, ...]]:
-    """The offsets of the chunks that could expand to more than is harmless."""
+    """Return the offsets of the chunks that could expand to more than is harmless."""
     found: list[tuple[int, ...]] = []
 
     def keep(info: Any) -> None:

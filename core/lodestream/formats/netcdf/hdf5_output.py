@@ -43,17 +43,17 @@ class Output(io.RawIOBase):
             raise self.error
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """As of any file; its end is where it would be without failures."""
+        """Seek as in any file; its end is where it would be without failures."""
         if whence == io.SEEK_END:
             offset, whence = self._size + offset, io.SEEK_SET
         return self._file.seek(offset, whence)
 
     def tell(self) -> int:
-        """As of any file."""
+        """Return the place, as of any file."""
         return self._file.tell()
 
     def readinto(self, buffer: Any) -> int:
-        """As of any file, with zeros for what was not written."""
+        """Read as of any file, with zeros for what was not written."""
         view = memoryview(buffer).cast("B")
         found = self._file.readinto(view) or 0
         view[found:] = bytes(len(view) - found)
@@ -72,7 +72,7 @@ class Output(io.RawIOBase):
         return length
 
     def truncate(self, size: int | None = None) -> int:
-        """As of any file."""
+        """Cut as any file, or note the failure."""
         self._size = self._file.tell() if size is None else size
         try:
             if self.error is None:

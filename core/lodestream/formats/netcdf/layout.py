@@ -81,7 +81,7 @@ _NORTH = {"standard_name": "latitude", "long_name": "latitude", "units": "degree
 
 
 def is_ordered(metadata: Mapping[str, Any]) -> bool:
-    """Whether a Dataset needs numbers of rows and columns, which tell whether they are as they were."""
+    """Return whether a Dataset needs numbers of rows and columns, which tell whether they are as they were."""
     return any(metadata.get(key) for key in ORDERED)
 
 
@@ -219,7 +219,7 @@ class Part:
 
 
 def parts_of(grid: Grid) -> list[Part]:
-    """The variables of a block, the heights (or z) first where it has any, coordinates last.
+    """Return the variables of a block, the heights (or z) first where it has any, coordinates last.
 
     Raises
     ------
@@ -240,7 +240,7 @@ def parts_of(grid: Grid) -> list[Part]:
 
 
 def _data_parts(grid: Grid) -> tuple[list[Part], set[str]]:
-    """Heights, or z, and attributes; and the names that are taken, as they were asked for and as they became."""
+    """Return heights, or z, and attributes; and the names that are taken, as they were asked for and as they became."""
     dims, shape = grid.dims, grid.shape
     taken = {*_RESERVED, *dims}
     taken |= {"row", "column"} if is_ordered(grid.metadata) else set()
@@ -324,14 +324,14 @@ def _coordinates_of_heights(grid: Grid) -> list[Part]:
 
 
 def _known(name: str, dims: tuple[str, ...], values: NDArray[Any], attrs: Mapping[str, Any] | None = None) -> Part:
-    """A small coordinate whose values are there."""
+    """Return a small coordinate whose values are there."""
     rows = values.__getitem__ if dims else lambda _: values
     dtype = values.dtype
     return Part(name, dims, values.shape, dtype, dtype, rows=rows, coordinate=True, attrs=dict(attrs or {}))
 
 
 def values_of(block: Block, part: Part, rows: slice = slice(None), fill: Any = None) -> NDArray[Any]:
-    """The values of a variable: shape (row, column), or (row, column, K) of an attribute with components.
+    """Return the values of a variable: shape (row, column), or (row, column, K) of an attribute with components.
 
     Parameters
     ----------
@@ -367,7 +367,7 @@ def values_of(block: Block, part: Part, rows: slice = slice(None), fill: Any = N
 
 
 def packing_of(block: Block, part: Part, nodata: Any) -> dict[str, Any]:
-    """How a file stores a variable with holes, as xarray has it in an encoding; empty where none is missing.
+    """Return how a file stores a variable with holes, as xarray has it in an encoding; empty where none is missing.
 
     Integers with holes are integers again where one of them is no value, and floats with NaN where every one is.
 
@@ -393,14 +393,14 @@ def packing_of(block: Block, part: Part, nodata: Any) -> dict[str, Any]:
 
 
 def _with_nan(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    """The type of floats for values of this type, some of which are NaN."""
+    """Return the type of floats for values of this type, some of which are NaN."""
     if dtype.kind == "f":
         return dtype
     return np.dtype(np.float32 if dtype.itemsize < 4 else np.float64)
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """A name like this one that CF allows and nothing has yet."""
+    """Return a name like this one that CF allows and nothing has yet."""
     name = _UNSAFE.sub("_", name) or "_"
     while name in taken:
         name += "_"
@@ -409,13 +409,13 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def said_of(metadata: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """The attributes that tags make for a variable, for x or y, or for the file (NC_GLOBAL)."""
+    """Return the attributes that tags make for a variable, for x or y, or for the file (NC_GLOBAL)."""
     said = attributes_of(metadata, name).items()
     return {key: _plain(it) for key, it in said if key not in _NO_ATTRIBUTES and not _NO_NAME.search(key)}
 
 
 def scale_of(metadata: Mapping[str, Any], attribute: str | None = None) -> dict[str, float]:
-    """What stored numbers of a raster, of the heights or of an attribute, are to be multiplied by, and what is added.
+    """Return by what stored numbers of the heights or of an attribute are multiplied, and what is added.
 
     Returns
     -------
@@ -433,7 +433,7 @@ def scale_of(metadata: Mapping[str, Any], attribute: str | None = None) -> dict[
 
 
 def _plain(value: Any) -> Any:
-    """A text, a list of texts or numbers, as NetCDF has them; what else JSON can say as a text of it."""
+    """Return a text, a list of texts or numbers, as NetCDF has them; what else JSON can say as a text of it."""
     if isinstance(value, str | int | float | np.ndarray | np.generic) and not isinstance(value, bool):
         return value
     texts = isinstance(value, list) and bool(value) and all(isinstance(word, str) for word in value)
@@ -441,14 +441,14 @@ def _plain(value: Any) -> Any:
 
 
 def dataset_attributes(grid: Grid) -> dict[str, Any]:
-    """The attributes of the Dataset or of the file, without the mark."""
+    """Return the attributes of the Dataset or of the file, without the mark."""
     name = grid.metadata.get("name")
     title = {"title": name} if isinstance(name, str) and name else {}
     return title | said_of(grid.metadata, "NC_GLOBAL") | {"Conventions": CONVENTIONS}
 
 
 def axis_attributes(grid: Grid) -> dict[str, dict[str, Any]]:
-    """The attributes of x and y: what the conventions say of them, and what a file said (tags ``x#units``, ...)."""
+    """Return the attributes of x and y: by the conventions, and as a file said (tags ``x#units``, ...)."""
     crs = grid.metadata.get("crs")
     degrees = {number for number, *_ in angles_of(grid.metadata)}
     x, y = (said_of(grid.metadata, letter) for letter in "xy")
@@ -461,7 +461,7 @@ def axis_attributes(grid: Grid) -> dict[str, dict[str, Any]]:
 
 
 def _x_axis(metadata: Mapping[str, Any]) -> int | None:
-    """The axis that x of heights runs along, y along the other; None where both depend on both, or there are none.
+    """Return the axis that x of heights runs along; None where x and y depend on both, or there are none.
 
     Raises
     ------

@@ -65,7 +65,7 @@ def mark_text(grid: Grid, parts: Sequence[Part], title: str) -> str:
 
 
 def in_json(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The metadata that JSON can hold, and the keys of the others."""
+    """Return the metadata that JSON can hold, and the keys of the others."""
     kept, lost = {}, []
     for key, value in metadata.items():
         try:
@@ -78,7 +78,7 @@ def in_json(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
 
 def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
-    """The tags that stand in no attribute of the Dataset or of a variable, or are what every one says there."""
+    """Return the tags that stand in no attribute of the Dataset or of a variable, or are what every one says there."""
     tags = grid.metadata.get("tags")
     if not isinstance(tags, Mapping):
         return {}
@@ -94,7 +94,7 @@ def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
 
 
 def _of_every_file(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """The tags of a Dataset that the layout makes where there are none."""
+    """Return the tags of a Dataset that the layout makes where there are none."""
     return {f"{_FILE}#Conventions": CONVENTIONS, f"{_FILE}#title": metadata.get("name")}
 
 
@@ -144,16 +144,16 @@ class Mark:
         return cls((high, wide), (bool(rows), bool(columns)), (first, second), dtype, variable, names, metadata)
 
     def options(self, dataset: Any) -> dict[str, str]:
-        """Options that choose the surface in a Dataset which still has it."""
+        """Return options that choose the surface in a Dataset which still has it."""
         names = {"x": "x", "y": "y"} if self.variable is None else {"variable": self.variable}
         return names if all(_is_wide(dataset, name) for name in names.values()) else {}
 
     def attributes_in(self, dataset: Any) -> list[str]:
-        """The variables of attributes that a Dataset still has."""
+        """Return the variables of attributes that a Dataset still has."""
         return [name for name in self.attributes if _is_wide(dataset, name)]
 
     def unscaled(self, dataset: Any) -> tuple[Any, Mark]:
-        """The Dataset with stored numbers of a raster, of which it and the mark say the same scale.
+        """Return the Dataset with stored numbers of a raster, of which it and the mark say the same scale.
 
         Where the Dataset has values instead, since xarray has applied the scale, the mark says it no more.
         """
@@ -173,11 +173,11 @@ class Mark:
         return dataset, replace(self, metadata=metadata)
 
     def is_of(self, choice: Choice) -> bool:
-        """Whether the surface that is chosen is the one that the mark is of."""
+        """Return whether the surface that is chosen is the one that the mark is of."""
         return choice.heights == self.variable
 
     def closed_in(self, dataset: Any) -> Closed:
-        """The closed axes that are as long in a Dataset as they were."""
+        """Return the closed axes that are as long in a Dataset as they were."""
         variable = dataset.variables.get(self.variable, dataset.variables.get("x"))
         if variable is None or variable.ndim < 2:
             return False, False
@@ -187,7 +187,7 @@ class Mark:
         return rows, columns
 
     def restored(self, surface: Surface, dataset: Any, choice: Choice) -> dict[str, Any]:
-        """The metadata of a surface with those of the mark.
+        """Return the metadata of a surface with those of the mark.
 
         What is true of one shape or order only is left out if the Dataset has another.
         """
@@ -218,7 +218,7 @@ class Mark:
         return result
 
     def _tag(self, key: str) -> str:
-        """The name that a tag of the Dataset had, of a variable that had another name."""
+        """Return the name that a tag of the Dataset had, of a variable that had another name."""
         owner, sharp, name = key.partition("#")
         names = self.attributes
         if isinstance(variable := self.metadata.get("variable"), str) and self.variable is not None:
@@ -226,7 +226,7 @@ class Mark:
         return f"{names.get(owner, owner)}{sharp}{name}"
 
     def _texts(self, surface: Surface, metadata: Mapping[str, Any], told: Any) -> dict[str, Any]:
-        """The tags without namespace: those of the file, but for what the layout says of every surface of this kind."""
+        """Return the tags without namespace: those of the file, without what the layout says of every surface."""
         told = told if isinstance(told, dict) else {}
         grid = Grid.of(surface.blocks[0], {**metadata, "tags": {"": told}})
         usual = {
@@ -241,13 +241,13 @@ class Mark:
 
 
 def _is_wide(dataset: Any, name: str) -> bool:
-    """Whether a Dataset has numbers of this name over two dimensions or more."""
+    """Return whether a Dataset has numbers of this name over two dimensions or more."""
     variable = dataset.variables.get(name)
     return variable is not None and variable.ndim > 1 and is_numeric(variable)
 
 
 def _in_order(dataset: Any, choice: Choice) -> bool:
-    """Whether rows and columns are those that were numbered, each at its place."""
+    """Return whether rows and columns are those that were numbered, each at its place."""
     numbers = [dataset.variables.get(name) for name in NUMBERS]
     return all(
         given is not None and given.dims == (dim,) and np.array_equal(given.values, np.arange(length))

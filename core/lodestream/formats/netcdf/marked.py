@@ -106,7 +106,7 @@ def surface_in(
 
 
 def _read(dataset: Any, choice: Choice, stored: Callable[[Any], Any]) -> dict[str, Any]:
-    """The variables of a choice, at the places that it has along other dimensions, as their file has them."""
+    """Return the variables of a choice, at the places that it has along other dimensions, as their file has them."""
     places = [found.name for found in (choice.x, choice.y) if found]
     names = {name for name in (choice.heights, *choice.attributes, *places) if name is not None}
     wide = [name for name in names if dataset.variables[name].ndim > 1]  # others are as in the file already
@@ -114,7 +114,7 @@ def _read(dataset: Any, choice: Choice, stored: Callable[[Any], Any]) -> dict[st
 
 
 def _typed(surface: Surface, name: str, room: Room) -> Surface:
-    """The points as integers of a type, where all of them are such numbers: floats only stood for what is missing."""
+    """Return the points as integers of a type, if all are: floats only stood for what is missing."""
     block = surface.blocks[0]
     dtype = np.dtype(name) if name in DTYPES else surface.dtype
     if dtype.kind not in "iu" or surface.dtype.kind != "f" or block.kept is not None:

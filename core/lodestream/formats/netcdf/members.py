@@ -63,7 +63,7 @@ def members_of(source: Source, dataset: Any, along: str) -> list[Member]:
 
 
 def _dimension(dataset: Any, along: str, dims: list[str], of: str) -> str:
-    """The dimension that is meant."""
+    """Return the dimension that is meant."""
     times = (dim for dim in dims if along == "time" and is_time(dataset, dim))
     dim = along if along in dims else next(times, None)
     if dim is None:
@@ -114,7 +114,7 @@ def _places(source: Source, dataset: Any, names: list[str]) -> dict[str, dict[st
 
 
 def _told_apart(steps: list[_Step]) -> list[_Step]:
-    """Steps whose words are different: those that are not get their number too."""
+    """Return steps whose words are different: those that are not get their number too."""
     counts = Counter(words for *_, words in steps)
     return [
         (value, unit, words if counts[words] == 1 else f"{words} ({index})")
@@ -123,7 +123,7 @@ def _told_apart(steps: list[_Step]) -> list[_Step]:
 
 
 def _steps(dataset: Any, dim: str) -> list[_Step]:
-    """Value, unit and words of each place along a dimension; its number, where there is no coordinate."""
+    """Return value, unit and words of each place along a dimension; its number, where there is no coordinate."""
     count = int(dataset.sizes[dim])
     numbers: list[_Step] = [(index, "", f"{dim} {index}") for index in range(count)]
     name = (time_of(dataset, dim) if is_time(dataset, dim) else None) or dim
@@ -146,13 +146,13 @@ def _steps(dataset: Any, dim: str) -> list[_Step]:
 
 
 def _digits(values: list[float]) -> int:
-    """How many digits tell numbers from each other."""
+    """Return how many digits tell numbers from each other."""
     different = len(set(values))
     return next((digits for digits in (6, 9, 12) if len({f"{value:.{digits}g}" for value in values}) >= different), 17)
 
 
 def _dates(dataset: Any, name: str) -> list[str] | None:
-    """The dates of times in words; None: they are in no calendar that is known."""
+    """Return the dates of times in words; None: they are in no calendar that is known."""
     import xarray
 
     try:

@@ -65,17 +65,17 @@ _UNITS = frozenset(("", "1", "m", "km", "metre", "metres", "meter", "meters", "d
 
 
 def is_geographic(crs: Any) -> bool:
-    """Whether a WKT is one of longitudes and latitudes."""
+    """Return whether a WKT is one of longitudes and latitudes."""
     return isinstance(crs, str) and crs.lstrip().upper().startswith(("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS"))
 
 
 def is_rotated(crs: Any) -> bool:
-    """Whether a WKT is one of longitudes and latitudes of another pole."""
+    """Return whether a WKT is one of longitudes and latitudes of another pole."""
     return is_geographic(crs) and "DERIVINGCONVERSION[" in crs.upper()
 
 
 def axis_words(letter: str, crs: Any) -> dict[str, str]:
-    """What the conventions say of x or y under a CRS (WKT, or nothing)."""
+    """Return what the conventions say of x or y under a CRS (WKT, or nothing)."""
     if is_rotated(crs):
         return {"standard_name": f"grid_{_DEGREES[letter][0]}", "units": "degrees"}
     if is_geographic(crs):
@@ -138,7 +138,7 @@ def associated(dataset: Any, name: str) -> dict[str, list[str]]:
 
 
 def _by_conventions(variables: Mapping[str, Any]) -> dict[str, str]:
-    """The variables that the criteria of cf-xarray make x or y; units are recognised in other spellings too."""
+    """Return the variables that the criteria of cf-xarray make x or y; units are recognised in other spellings too."""
     from cf_xarray.criteria import coordinate_criteria
 
     def is_role(role: str, attributes: Mapping[str, Any]) -> bool:
@@ -161,7 +161,7 @@ def _by_conventions(variables: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _canonical(units: Any) -> Any:
-    """Units of longitudes and latitudes as the conventions spell them, from other spellings; others as they are."""
+    """Return units of longitudes and latitudes as the conventions spell them; others as they are."""
     plain = str(units).strip().lower().replace("_", " ").replace("degrees", "degree")
     if plain in ("degree east", "degree e", "degreee", "degree longitude"):
         return "degrees_east"
@@ -178,28 +178,28 @@ def _says_nothing(*variables: Any) -> bool:
 
 
 def is_east(units: Any) -> bool:
-    """Whether units are degrees to the east."""
+    """Return whether units are degrees to the east."""
     return bool(_canonical(units) == "degrees_east")
 
 
 def is_angle(attributes: Mapping[str, Any]) -> bool:
-    """Whether the units of a coordinate are degrees."""
+    """Return whether the units of a coordinate are degrees."""
     return str(attributes.get("units", "")).strip().lower().startswith("deg")
 
 
 def is_geographic_coordinate(variable: Any) -> bool:
-    """Whether a variable that is x or y is a longitude or latitude, by its standard name or its unit, an angle."""
+    """Return whether x or y is a longitude or latitude, by its standard name or its unit, an angle."""
     standard, units = (str(variable.attrs.get(key, "")).strip().lower() for key in ("standard_name", "units"))
     return standard in ("longitude", "latitude") or units.startswith(("deg", "rad"))
 
 
 def is_grid_mapping(variable: Any) -> bool:
-    """Whether a variable says a CRS, or where the cells of a raster lie."""
+    """Return whether a variable says a CRS, or where the cells of a raster lie."""
     return bool({"crs_wkt", "spatial_ref", "grid_mapping_name", "GeoTransform"} & set(variable.attrs))
 
 
 def is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:
-    """Whether the values of a variable are degrees around the Earth."""
+    """Return whether the values of a variable are degrees around the Earth."""
     standard, units = (str(attributes.get(key, "")).lower() for key in ("standard_name", "units"))
     if is_east(units):
         return True
@@ -209,14 +209,14 @@ def is_longitude(name: str, attributes: Mapping[str, Any]) -> bool:
 
 
 def is_time(dataset: Any, dim: str) -> bool:
-    """Whether a dimension is one of times."""
+    """Return whether a dimension is one of times."""
     attributes = dataset.variables[dim].attrs if dim in dataset.variables else {}
     said = str(attributes.get("axis", "")).upper() == "T" or dim.lower().startswith("time")
     return said or time_of(dataset, dim) is not None
 
 
 def time_of(dataset: Any, dim: str) -> str | None:
-    """The variable with the dates along a dimension: of its own name, or another, such as ``time_centered`` of NEMO."""
+    """Return the variable with the dates along a dimension: of its name, or as ``time_centered`` of NEMO."""
     own = dataset.variables.get(dim)
     if own is not None and own.dims == (dim,) and is_date(own):
         return dim
@@ -228,5 +228,5 @@ def time_of(dataset: Any, dim: str) -> str | None:
 
 
 def is_date(variable: Any) -> bool:
-    """Whether the values of a variable are dates, as numbers since one of them."""
+    """Return whether the values of a variable are dates, as numbers since one of them."""
     return variable.dtype.kind in "iuf" and " since " in str(variable.attrs.get("units", ""))

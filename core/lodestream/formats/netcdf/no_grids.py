@@ -66,11 +66,11 @@ class NoGrid:
     advice: str = _ADVICE
 
     def takes(self, name: str, dims: Any) -> bool:
-        """Whether a variable of this name, over these dimensions, belongs to it."""
+        """Return whether a variable of this name, over these dimensions, belongs to it."""
         return self.whole or name in self.names or bool(self.dims & set(map(str, dims)))
 
     def refusal(self, name: str = "") -> str:
-        """Words of an error about the whole, or about a variable of it."""
+        """Return words of an error about the whole, or about a variable of it."""
         belongs = f", to which {name} belongs" if name else ""
         return f"expected a variable over a grid, got {self.words}{belongs}: {self.advice}"
 
@@ -102,7 +102,7 @@ def no_grid_of(dataset: Any) -> NoGrid | None:
 
 
 def _scattered(dataset: Any) -> NoGrid | None:
-    """Variables over a dimension along which there is both a longitude and a latitude, as of ICON; None: none is so.
+    """Return variables over a dimension that has both a longitude and a latitude, as of ICON, or None.
 
     Longitudes and latitudes over that dimension and another are those of a grid, which the others belong to.
     """
@@ -129,7 +129,7 @@ def _scattered(dataset: Any) -> NoGrid | None:
 
 
 def _tables(variables: dict[str, Any]) -> Iterator[str]:
-    """Names of tables of connectivity: the conventions say so, or their names do."""
+    """Yield names of tables of connectivity: the conventions say so, or their names do."""
     named = {
         word
         for variable in variables.values()
@@ -157,7 +157,7 @@ def _coordinates_of_mesh(variable: Any) -> list[str]:
 
 
 def _lists_of_points(dataset: Any) -> set[str]:
-    """Dimensions along which there is both an x and a y."""
+    """Return dimensions along which there is both an x and a y."""
     letters: dict[str, set[str]] = {}
     for name, letter in letters_of(dataset).items():
         variable = dataset.variables[name]

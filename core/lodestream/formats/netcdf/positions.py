@@ -34,7 +34,7 @@ class _Found(Protocol):
 def are_elsewhere(
     dataset: Any, vectors: tuple[_Found, _Found], arrays: tuple[_Found, _Found], index: Mapping[str, int]
 ) -> bool:
-    """Whether vectors of x and y are the same quantities as arrays, and differ from them by more than half a cell.
+    """Return whether vectors of x and y are the same quantities as arrays, and more than half a cell away.
 
     Vectors in other units, such as those of a projection or of a rotated pole, are other quantities. The longitudes of
     a pole say nothing. A cell is as large as the steps of the vector on both of its sides.
@@ -73,12 +73,12 @@ def are_elsewhere(
 
 
 def _along(line: NDArray[Any], found: _Found, rows: slice) -> NDArray[Any]:
-    """A vector as it lies over some rows, shape (row, 1) or (1, column)."""
+    """Return a vector as it lies over some rows, shape (row, 1) or (1, column)."""
     return line[rows, None] if found.axis == 0 else line[None, :]
 
 
 def _comparable(vector: str, of_vector: Mapping[str, Any], array: str, of_array: Mapping[str, Any]) -> bool:
-    """Whether two coordinates may be the same quantity: both longitudes, or in one unit, or nothing says of which."""
+    """Return whether two coordinates may be the same quantity: both longitudes, or of one unit or of none."""
     if str(of_vector.get("standard_name", "")).lower().startswith(("grid_", "projection_")):
         return False
     unit = str(of_vector.get("units", "")).strip().lower()

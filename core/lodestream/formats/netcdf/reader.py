@@ -55,7 +55,7 @@ _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def sniff(head: bytes, suffix: str) -> bool:
-    """Whether a file begins like NetCDF, or like HDF5 and is not named .cgns."""
+    """Return whether a file begins like NetCDF, or like HDF5 and is not named .cgns."""
     return head.startswith((*_CLASSIC, _CDF5)) or (head.startswith(_HDF5) and suffix != ".cgns")
 
 
@@ -112,7 +112,7 @@ def of_group(
 
 
 def group_of(source: Source) -> str:
-    """The group that options choose, without slashes around it; empty: the file or store itself."""
+    """Return the group that options choose, without slashes around it; empty: the file or store itself."""
     return str(source.options.get("group", "")).strip("/")
 
 
@@ -129,7 +129,7 @@ def check_group(group: str, groups: Sequence[str]) -> None:
 
 
 def parents_of(group: str) -> list[str]:
-    """Paths of the groups around a group, the nearest first, and empty for the file or store itself."""
+    """Return paths of the groups around a group, the nearest first, and empty for the file or store itself."""
     parts = group.split("/") if group else []
     return ["/".join(parts[:count]) for count in range(len(parts) - 1, -1, -1)]
 

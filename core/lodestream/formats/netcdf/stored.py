@@ -56,7 +56,7 @@ class Contents:
 
 
 def contents_of(surface: Surface, title: str) -> Contents:
-    """What a file says of a surface: what its Dataset says, with the rows, columns and angles that it came with.
+    """Return what a file says of a surface: what its Dataset says, with the rows, columns and angles that it came with.
 
     Nothing of the size of the surface is in memory, but what it has itself: variables give their values row by row.
 
@@ -105,7 +105,7 @@ def _variable(block: Block, part: Part, beside: dict[str, Any], nodata: Any) -> 
 
 
 def strips(variable: Variable, height: int) -> Iterator[tuple[slice, NDArray[Any]]]:
-    """All rows of a variable of at least one dimension, some at a time.
+    """Yield all rows of a variable of at least one dimension, some at a time.
 
     Parameters
     ----------

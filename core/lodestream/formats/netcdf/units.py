@@ -123,7 +123,7 @@ def conversions_of(units: Mapping[str, Any], crs: str | None) -> tuple[dict[str,
 
 
 def _axis_unit(crs: str | None) -> tuple[bool, float, str, float | None] | None:
-    """Whether the axes of a CRS are angles, their unit in metres or radians and its name, the height of a satellite."""
+    """Return whether axes of a CRS are angles, their unit in metres or radians, its name, a satellite's height."""
     if crs is None:
         return None
     try:
@@ -141,7 +141,7 @@ def _axis_unit(crs: str | None) -> tuple[bool, float, str, float | None] | None:
 
 
 def _unit(text: str) -> tuple[bool, float] | None:
-    """Whether a unit is an angle, and its size in radians or metres; None: it is not known."""
+    """Return whether a unit is an angle, and its size in radians or metres; None: it is not known."""
     match = _UNIT.fullmatch(text.strip())
     if match is None:
         return None

@@ -66,7 +66,7 @@ class Values:
 
 
 def chosen(variable: Any, index: Mapping[str, int]) -> Any:
-    """A variable without the dimensions of which an index was chosen; nothing is read yet."""
+    """Return a variable without the dimensions of which an index was chosen; nothing is read yet."""
     return variable.isel({dim: at for dim, at in index.items() if dim in variable.dims})
 
 
@@ -83,7 +83,7 @@ def pieces(variable: Any, room: Room) -> Iterator[tuple[Any, Any]]:
 
 
 def _chunk(variable: Any) -> tuple[int, int]:
-    """Rows and columns of the chunks that Dask or a file has, 1 where there are none."""
+    """Return rows and columns of the chunks that Dask or a file has, 1 where there are none."""
     preferred = variable.encoding.get("preferred_chunks") or {}
     lengths = variable.chunks or [preferred.get(dim, 1) for dim in variable.dims]
     rows, columns = (max(length) if isinstance(length, tuple) else int(length) for length in lengths[:2])
@@ -132,19 +132,19 @@ def raw_values(variable: Any) -> NDArray[Any]:
 
 
 def is_flag(variable: Any) -> bool:
-    """Whether the values of a variable are true or false: in a file integers of 8 bits, of which xarray says so."""
+    """Return whether the values of a variable are true or false: in a file integers of 8 bits, by xarray."""
     return variable.dtype.kind == "b" or (
         variable.dtype.kind in "iu" and variable.dtype.itemsize == 1 and str(variable.attrs.get("dtype")) == "bool"
     )
 
 
 def is_packed(attributes: Mapping[str, Any]) -> bool:
-    """Whether stored values are others than those that they stand for; a scale of 1 and an offset of 0 change none."""
+    """Return whether stored values differ from those that they stand for; a scale of 1 changes none."""
     return _number(attributes, "scale_factor", 1.0) != 1.0 or _number(attributes, "add_offset", 0.0) != 0.0
 
 
 def limits_of(attributes: Mapping[str, Any]) -> tuple[Any, Any]:
-    """The least and the greatest valid value, each None where there is none.
+    """Return the least and the greatest valid value, each None where there is none.
 
     Attributes that are no numbers say nothing.
     """
@@ -183,7 +183,7 @@ def _number(attributes: Mapping[str, Any], key: str, default: float) -> float:
 
 
 def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]:
-    """Integers of any shape with or without a sign, as ``_Unsigned`` says of what NetCDF classic has no type for."""
+    """Return integers of any shape with or without a sign, as ``_Unsigned`` says in NetCDF classic."""
     kind = {"true": "u", "false": "i"}.get(str(attributes.get("_Unsigned", "")).lower())
     if kind is None or values.dtype.kind not in "iu" or kind == values.dtype.kind:
         return values
@@ -191,7 +191,7 @@ def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]
 
 
 def stored_number(number: Any, stored: np.dtype[Any], attributes: Mapping[str, Any]) -> Any:
-    """A number of an attribute in the type of stored floats; one that stored integers hold as ``_Unsigned`` says.
+    """Return a number of an attribute in the type of stored floats; of stored integers as ``_Unsigned`` says.
 
     The number may be of any type: -1 in float64 beside unsigned int16 is 65535.
     """
@@ -207,7 +207,7 @@ def stored_number(number: Any, stored: np.dtype[Any], attributes: Mapping[str, A
 
 
 def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None, int]:
-    """Values by the conventions' rules; where there are any (None: everywhere); how many lie outside the valid range.
+    """Return values by the conventions; where there are any (None: everywhere); how many are out of range.
 
     Of packed integers, limits of an integer type are those of stored values, others those of unpacked ones.
     """
@@ -241,7 +241,7 @@ def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArr
 
 
 def _unpacked(stored: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]:
-    """What packed values of any shape stand for, in the type that xarray gives them."""
+    """Return what packed values of any shape stand for, in the type that xarray gives them."""
     import xarray
 
     dims = [f"axis_{number}" for number in range(stored.ndim)]

@@ -24,7 +24,7 @@ _MOST_MODES = 4096
 
 
 def is_vmec(dataset: Any) -> bool:
-    """Whether a NetCDF has what VMEC writes."""
+    """Return whether a NetCDF has what VMEC writes."""
     return all(name in dataset.variables for name in _NEEDED)
 
 
@@ -66,7 +66,7 @@ def _resolution(source: Source) -> tuple[int, int]:
 
 
 def _row(dataset: Any, name: str, length: int | None = None) -> NDArray[np.float64]:
-    """A vector, or the last row of an array."""
+    """Return a vector, or the last row of an array."""
     variable = dataset.variables[name]
     if variable.dtype.kind not in "iuf" or variable.ndim not in (1, 2) or variable.size > _MOST_MODES**2:
         raise FormatError(f"expected a table of numbers in {name}, got {variable.dtype} of shape {variable.shape}")

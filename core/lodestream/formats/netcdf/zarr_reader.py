@@ -45,12 +45,12 @@ _CODECS = frozenset(
 
 
 def is_store(folder: Path) -> bool:
-    """Whether a folder is a store, or a group or an array in one."""
+    """Return whether a folder is a store, or a group or an array in one."""
     return any((folder / name).is_file() for name in _HEADS)
 
 
 def folder_size(folder: Path) -> int:
-    """Bytes of all files in a folder, but for those that vanish meanwhile."""
+    """Return bytes of all files in a folder, but for those that vanish meanwhile."""
     paths = (os.path.join(above, name) for above, _, names in os.walk(folder) for name in names)
     return sum(os.lstat(path).st_size for path in paths if os.path.lexists(path))
 
@@ -99,7 +99,7 @@ def members(source: Source, along: str) -> list[Member]:
 
 
 def _in_group(source: Source) -> Source:
-    """The group in place of one of its variables, which becomes an option."""
+    """Return the group in place of one of its variables, which becomes an option."""
     folder = Path(os.path.realpath(source.path))
     if _is_variable(folder):
         source = replace(source, path=folder.parent, options={"variable": folder.name, **source.options})
@@ -198,7 +198,7 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[s
 
 
 def _groups(group: Any) -> list[str]:
-    """Paths of all groups with arrays inside a group, such as "forecast/surface".
+    """Return paths of all groups with arrays inside a group, such as "forecast/surface".
 
     Raises
     ------
@@ -219,7 +219,7 @@ def _groups(group: Any) -> list[str]:
 
 
 def _left_out(group: Any, others: bool) -> dict[str, str]:
-    """The arrays of a group that are no variables for us, each with the reason in words.
+    """Return the arrays of a group that are no variables for us, each with the reason in words.
 
     Parameters
     ----------
@@ -254,7 +254,7 @@ def _is_array(folder: Path) -> bool:
 
 
 def _is_variable(folder: Path) -> bool:
-    """Whether a folder is an array with names of dimensions, in the folder of a group."""
+    """Return whether a folder is an array with names of dimensions, in the folder of a group."""
     if (folder / ".zarray").is_file():
         return (folder.parent / ".zgroup").is_file() and bool(_said(folder / ".zattrs").get("_ARRAY_DIMENSIONS"))
     said = _said(folder / "zarr.json")
@@ -263,7 +263,7 @@ def _is_variable(folder: Path) -> bool:
 
 
 def _said(path: Path) -> Mapping[str, Any]:
-    """The object in a JSON file of a store; empty: there is none. zarr refuses what is damaged, in its own words."""
+    """Return the object in a JSON file of a store; empty: there is none. zarr itself refuses what is damaged."""
     try:
         said = json.loads(path.read_bytes()) if path.is_file() else {}
     except (OSError, ValueError, RecursionError):
@@ -272,7 +272,7 @@ def _said(path: Path) -> Mapping[str, Any]:
 
 
 def _store(zarr: Any, folder: Path) -> Any:
-    """The store of a folder, to be read only: files of it that are links to others, or no files, are refused."""
+    """Return the store of a folder, to be read only: files of it that are links to others, or no files, are refused."""
     root = os.path.realpath(folder)
 
     def check(key: str) -> None:
@@ -305,7 +305,7 @@ def _store(zarr: Any, folder: Path) -> Any:
 
 
 def _unknown(described: Mapping[str, Any]) -> str:
-    """The first codec of an array that is none of `_CODECS`; empty: there is none."""
+    """Return the first codec of an array that is none of `_CODECS`; empty: there is none."""
     coded = described.get("codecs", ())
     if described.get("zarr_format") == 2:
         coded = [described.get("compressor"), *(described.get("filters") or ())]

@@ -141,7 +141,7 @@ def _write_variable(group: Any, name: str, variable: Variable, codec: Any) -> No
 
 
 def _attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Attributes as JSON has them."""
+    """Return attributes as JSON has them."""
     return {key: plain_of(value) for key, value in attributes.items()}
 
 

@@ -302,7 +302,7 @@ class ObjFile:
         return Mesh(points, corners, attributes, of_corners, self.face_name, self.notes())
 
     def _cuts(self, points: NDArray[np.float64], corners: NDArray[np.int32]) -> list[NDArray[np.int64]]:
-        """How each fan is to be cut, now that all points are known: (N - 2, 3) places among its N corners."""
+        """Return how each fan is to be cut, now that all points are known: (N - 2, 3) places among its N corners."""
         if not self._fans:
             return []
         counts = np.array([count for _, count in self._fans], np.int64)
@@ -334,7 +334,7 @@ class ObjFile:
 
 
 def _around(rows: NDArray[np.int32], first: int, count: int) -> NDArray[np.int32]:
-    """What the corners of a fan name, in their order round the face."""
+    """Return what the corners of a fan name, in their order round the face."""
     return np.concatenate([rows[first, :2], rows[first : first + count - 2, 2]])
 
 

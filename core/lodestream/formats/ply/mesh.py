@@ -138,7 +138,7 @@ def _vertices(tables: dict[str, Table]) -> tuple[NDArray[Any], dict[str, NDArray
 def _places(
     source: Source, lists: Lists, points: NDArray[Any], name: Callable[[int], str]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangles and quads, as places in the lists, (T, 4), and the face that each is a part of, (T,)."""
+    """Return triangles and quads, as places in the lists, (T, 4), and the face that each is a part of, (T,)."""
     polygons = polygons_allowed(source.options)
     wrong = (lists.counts < 3) | ((lists.counts > 4) & (not polygons))
     if wrong.any():
