@@ -103,7 +103,9 @@ def lock(handle: int) -> bool:
             _at_locked_byte(handle, msvcrt.LK_NBLCK)
         else:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):
+    except OSError as error:
+        if error.errno not in (errno.EAGAIN, errno.EACCES):  # the latter is what Windows says
+            raise
         return False
     return True
 
@@ -242,12 +244,22 @@ def allocate(path: Path) -> None:
 
 
 def cache_home() -> Path:
-    """Return the folder in which programs of this user keep what they can do without."""
+    """Return the folder in which programs of this user keep what they can do without.
+
+    Raises
+    ------
+    FileNotFoundError
+        If this user has no home, as in a container under a number that has no name.
+    """
     if chosen := os.environ.get("XDG_CACHE_HOME", "").strip():
         return Path(chosen)
     if sys.platform == "win32" and (local := os.environ.get("LOCALAPPDATA")):
         return Path(local)
-    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    try:
+        home = Path.home()
+    except RuntimeError:
+        raise FileNotFoundError(errno.ENOENT, "this user has no home; set XDG_CACHE_HOME to a folder") from None
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache")
 
 
 def processors() -> int:

@@ -50,7 +50,13 @@ class _TakenError(Exception):
 
 
 def cache_folder() -> Path:
-    """Return the folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory."""
+    """Return the folder named by ``LODESTREAM_CACHE``, or a folder in the user's cache directory.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such name, and the user has no home.
+    """
     chosen = os.environ.get("LODESTREAM_CACHE")
     return Path(chosen) if chosen else cache_home() / "lodestream"
 

@@ -152,7 +152,7 @@ class Build:
         FileNotFoundError
             If there is none, or a file is gone that the surface is in.
         UnavailableError
-            If another version of this program has saved it.
+            If another version of this program has saved it, or one with another numpy.
         """
         # File systems of networks look anew when a file is opened; what they say of one otherwise may be old.
         with (Path(folder) / _FILE).open("rb") as file:

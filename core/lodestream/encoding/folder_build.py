@@ -104,7 +104,7 @@ class FolderBuild:
         TooLargeError
             If the disk has no room for it.
         UnavailableError
-            If a worker has another version of this program.
+            If a worker has another version of this program or of numpy.
         """
         in_memory = sum(array.nbytes for array in self._all() if root_of(array) is None)
         files = [root_of(array) for array in self._all()]

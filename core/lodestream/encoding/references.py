@@ -49,7 +49,7 @@ def load(path: Path) -> Any:
     FileNotFoundError
         If the file is not there, or one that its arrays are in.
     UnavailableError
-        If it was written by another version of this program.
+        If it was written by another version of this program, or with another one of numpy.
     """
     with path.open("rb") as file:
         if (head := file.readline()) != _HEAD:

@@ -130,7 +130,8 @@ def remesh_triangles(
     progress(0.05)
     wanted = min(100, max(24, len(mesh.vertices) // 40)) if blocks is None else blocks
     most = np.inf if most_points is None else most_points
-    _check_size(int(_EVEN * wanted), most)
+    if blocks is not None:  # as many as asked for are made, about, and take longest
+        _check_size(int(_EVEN * wanted), most)
     base = _adapted(mesh, wanted, progress)
     _check_size(len(base.blocks), most)
     relaxation = Relaxation(mesh)
