@@ -124,7 +124,7 @@ def _check(source: Source, scene: dict[str, Any]) -> list[str]:
         raise FormatError("expected GLB that holds its buffers itself, got one that names another file")
     views: list[Any] = [view.get("byteLength") for view in _maps(scene, "bufferViews")]
     # trimesh copies each; views of one part of a buffer are rare.
-    if not all(isinstance(length, int) for length in views) or sum(views) > 2 * source.size:
+    if not all(isinstance(length, int) and length >= 0 for length in views) or sum(views) > 2 * source.size:
         raise FormatError(f"expected views of at most twice the {number(source.size)} bytes of the file, got more")
     if _depth(list(_maps(scene, "nodes"))) > _DEEPEST:
         raise FormatError(f"expected at most {_DEEPEST} nodes above one another in the scene, got more")

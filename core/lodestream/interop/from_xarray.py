@@ -15,7 +15,7 @@ from ..formats.netcdf.layout import ORDERED
 from ..formats.netcdf.mark import MARK, Mark
 from ..formats.netcdf.marked import surface_in
 from ..formats.netcdf.names import REFERENCES
-from ..formats.netcdf.values import MISSING, PACKING, RANGES, is_packed, pieces, stored_number
+from ..formats.netcdf.values import MISSING, PACKING, RANGES, is_packed, pieces, stored_number, whole_number
 from ..formats.nodata import checked, with_nodata
 from ..formats.notes import warn
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
@@ -162,10 +162,8 @@ def _missing(encoding: Mapping[str, Any], stored: np.dtype[Any], dtype: np.dtype
     """Return the missing values of a file that its integers can be; texts and other numbers say nothing."""
     numbers = [number for key in MISSING for number in np.ravel(encoding.get(key, ()))]
     numbers = [stored_number(number, stored, encoding) for number in numbers if np.asarray(number).dtype.kind in "iuf"]
-    limits = np.iinfo(dtype)
-    return [
-        dtype.type(int(number)) for number in numbers if limits.min <= number <= limits.max and number == int(number)
-    ]
+    wholes = [whole_number(number, dtype) for number in numbers]
+    return [dtype.type(whole) for whole in wholes if whole is not None]
 
 
 def _numbered(xr: Any, variable: Any) -> Any:

@@ -163,6 +163,12 @@ REFUSED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
         lambda content: changed(content, lambda scene: scene["bufferViews"].extend(scene["bufferViews"] * 99)),
         "expected views of at most twice the [0-9,]+ bytes of the file",
     ),
+    "a view of less than nothing beside large ones": (
+        lambda content: changed(
+            content, lambda scene: scene["bufferViews"].extend([*scene["bufferViews"] * 99, {"byteLength": -(10**12)}])
+        ),
+        "expected views of at most twice",
+    ),
     "a view of no length": (
         lambda content: changed(content, lambda scene: scene["bufferViews"][0].pop("byteLength")),
         "expected views of at most",

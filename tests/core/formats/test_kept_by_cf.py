@@ -154,3 +154,43 @@ def test_a_group_has_the_attributes_of_the_file(tmp_path: Path, kind: str) -> No
     tags = surface.metadata["tags"][""]
     assert (tags["NC_GLOBAL#title"], tags["NC_GLOBAL#institution"]) == ("of the group", "there")
     assert surface.metadata["types"]["NC_GLOBAL#version"] == ("int32" if kind == "nc" else "int64")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "limits"),
+    [
+        ("i8", {"valid_max": np.float64(2**63 - 1)}),
+        ("i4", {"valid_max": np.float32(2**31 - 1)}),
+        ("u8", {"valid_range": np.array([0, 2.0**64])}),
+        ("u8", {"missing_value": np.float64(2.0**64)}),
+        ("i8", {"missing_value": np.float64(2.0**63)}),
+        ("i4", {"missing_value": np.complex128(1)}),
+    ],
+    ids=str,
+)
+def test_numbers_beyond_a_type_mask_nothing(dtype: str, limits: dict[str, Any]) -> None:
+    surface, _ = noted(lambda: ls.Surface.from_xarray(field(dtype, **limits)))
+    assert surface.mask is None
+
+
+def test_a_tag_says_no_crs_where_there_is_another_or_none() -> None:
+    wkt = rasterio.crs.CRS.from_epsg(32633).to_wkt()
+    tags = {"": {"spatial_ref#crs_wkt": wkt, "spatial_ref#GeoTransform": "9 9 0 9 0 9", "spatial_ref#note": "x"}}
+    place = [5e5, 30.0, 0.0, 4e6, 0.0, -30.0]
+    heights = np.arange(72.0).reshape(8, 9)
+    data = ls.Surface(heights, metadata={"geotransform": place, "tags": tags}).to_xarray()
+    assert "crs_wkt" not in data["spatial_ref"].attrs
+    assert data["spatial_ref"].attrs["note"] == "x"
+    back, _ = noted(lambda: ls.Surface.from_xarray(data))
+    assert "crs" not in back.metadata
+    assert back.metadata["geotransform"] == place
+    assert {"spatial_ref#crs_wkt", "spatial_ref#GeoTransform"} <= back.metadata["tags"][""].keys()
+
+
+def test_nodata_of_a_geotiff_is_a_value_of_no_band(tmp_path: Path) -> None:
+    place = [5e5, 30.0, 0.0, 4e6, 0.0, -30.0]
+    heights = 1 + np.arange(72, dtype=np.int16).reshape(8, 9)
+    surface = ls.Surface(heights, attributes={"w": heights % 2}, metadata={"nodata": 0, "geotransform": place})
+    noted(lambda: ls.write(surface, tmp_path / "a.tif"))
+    with rasterio.open(tmp_path / "a.tif") as dataset:
+        assert dataset.read_masks(2).all()

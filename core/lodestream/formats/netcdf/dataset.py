@@ -285,7 +285,7 @@ def _nodata(variable: Any) -> int | float | None:
     if is_packed(variable.attrs):
         return None
     for number in (number for key in MISSING for number in np.ravel(variable.attrs.get(key, ()))):
-        if isinstance(number, np.number):
+        if np.asarray(number).dtype.kind in "iuf":
             value: int | float = stored_number(number, np.dtype(variable.dtype), variable.attrs).item()
             if math.isfinite(value):
                 return value if abs(value) < 2**63 else float(value)

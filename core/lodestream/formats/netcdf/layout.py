@@ -29,7 +29,7 @@ from ...surface import DTYPES, Block, Closed, Surface
 from ..holes import Rows, fill_of
 from ..notes import survives
 from .attribute_texts import attributes_of
-from .crs import MAPPING, grid_mapping
+from .crs import MAPPING, beside_crs, grid_mapping
 from .names import REFERENCES, axis_words, is_east, is_geographic, is_rotated
 from .single_numbers import numbers_in
 from .values import PACKING
@@ -232,7 +232,9 @@ def parts_of(grid: Grid) -> list[Part]:
         for dim, name, length in zip(grid.dims, ("row", "column"), grid.shape, strict=True):
             places.append(_known(name, (dim,), np.arange(length)))
     if grid.has_place:
-        places.append(_known(MAPPING, (), np.array(0, np.int64), said_of(grid.metadata, MAPPING) | grid.mapping))
+        places.append(
+            _known(MAPPING, (), np.array(0, np.int64), beside_crs(said_of(grid.metadata, MAPPING)) | grid.mapping)
+        )
     for name, number in numbers_in(grid.metadata).items():
         if name not in taken and not _UNSAFE.search(name):
             places.append(_known(name, (), np.array(number), said_of(grid.metadata, name)))

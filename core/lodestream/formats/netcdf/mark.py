@@ -15,6 +15,7 @@ from ...surface import Closed, Surface
 from ..notes import warn
 from .attribute_texts import TYPES, text_of
 from .choice import Choice, is_numeric
+from .crs import beside_crs
 from .layout import CONVENTIONS, MAPPING, ORDERED, Grid, Part, axis_attributes, said_of, scale_of
 from .single_numbers import SCALARS
 
@@ -83,8 +84,9 @@ def _other_tags(grid: Grid, parts: Sequence[Part]) -> dict[str, Any]:
     if not isinstance(tags, Mapping):
         return {}
     owners = [part.source for part in parts if part.source] + [part.name for part in parts if part.is_number]
-    owners += [MAPPING] if grid.has_place else []
     told = {f"{owner}#{key}" for owner in (*owners, _FILE) for key in said_of(grid.metadata, owner)}
+    if grid.has_place:
+        told |= {f"{MAPPING}#{key}" for key in beside_crs(said_of(grid.metadata, MAPPING))}
     texts = tags.get("")
     usual = _of_every_file(grid.metadata)
     told -= {key for key, text in usual.items() if isinstance(texts, Mapping) and texts.get(key) == text}

@@ -190,6 +190,17 @@ def _signed(values: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[Any]
     return values.view(values.dtype.str.replace(values.dtype.kind, kind))
 
 
+def whole_number(number: Any, kind: np.dtype[Any]) -> int | None:
+    """Return a number as an integer that a type of integers holds; None: it is no such number.
+
+    Compared as integers of Python: numpy rounds the limits of a type to floats, beyond which their cast overflows.
+    """
+    if not np.isfinite(number) or number != np.rint(number):
+        return None
+    whole, limits = int(number), np.iinfo(kind)
+    return whole if limits.min <= whole <= limits.max else None
+
+
 def stored_number(number: Any, stored: np.dtype[Any], attributes: Mapping[str, Any]) -> Any:
     """Return a number of an attribute in the type of stored floats; of stored integers as ``_Unsigned`` says.
 
@@ -199,11 +210,9 @@ def stored_number(number: Any, stored: np.dtype[Any], attributes: Mapping[str, A
     if stored.kind == "f" and number.dtype.kind in "iuf":
         with np.errstate(over="ignore"):
             return number.astype(stored)[0]
-    if stored.kind in "iu" and number.dtype.kind in "iuf":
-        limits = np.iinfo(stored)
-        if limits.min <= number[0] <= limits.max and number[0] == int(number[0]):
-            return _signed(number.astype(stored), attributes)[0]
-    return number[0]
+    held = stored.kind in "iu" and number.dtype.kind in "iuf"
+    whole = whole_number(number[0], stored) if held else None
+    return number[0] if whole is None else _signed(np.array([whole], stored), attributes)[0]
 
 
 def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None, int]:
@@ -216,7 +225,7 @@ def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArr
     valid = np.ones(raw.shape, np.bool_)
     for key in MISSING:
         for missing in np.ravel(attributes.get(key, ())):
-            if isinstance(missing, np.number):
+            if np.asarray(missing).dtype.kind in "iuf":
                 valid &= raw != stored_number(missing, stored.dtype, attributes)
     values = _unpacked(stored, attributes) if packed else raw
     if values.dtype.kind == "f":

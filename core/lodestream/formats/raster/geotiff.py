@@ -79,7 +79,7 @@ def write_tiff(surface: Surface, file: BinaryIO, finish: Callable[[Path, int], P
         warn("GeoTIFF cannot express closed axes")
     warn_left_out(_TITLE, metadata_left_out(surface, _HELD))
     names, bands, dtype = _bands(surface)
-    nodata = _nodata(surface, dtype)
+    nodata = _nodata(surface, bands, dtype)
     profile = _profile(surface, len(bands), dtype, nodata)
     with folder_beside(file) as folder, _told(folder), warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
@@ -212,17 +212,17 @@ def _bands(surface: Surface) -> tuple[list[str], list[NDArray[Any]], np.dtype[An
     return names, bands, common
 
 
-def _nodata(surface: Surface, dtype: np.dtype[Any]) -> float | None:
-    """Return the nodata value in the type of all bands; None if there is none."""
+def _nodata(surface: Surface, bands: Sequence[NDArray[Any]], dtype: np.dtype[Any]) -> float | None:
+    """Return the nodata value in the type of all bands, which GDAL has for each of them; None if there is none."""
     value = _number(surface.metadata.get("nodata"))
-    if value is not None and _holds(dtype, value) and not _occurs(surface, dtype.type(value)):
+    if value is not None and _holds(dtype, value) and not _occurs(surface, bands, dtype.type(value)):
         return value
     return float("nan") if surface.mask is not None and dtype.kind == "f" else None
 
 
-def _occurs(surface: Surface, value: Any) -> bool:
-    """Return whether a valid height is this value."""
-    return occurs(value, surface.points.__getitem__, surface.shape, surface.mask)
+def _occurs(surface: Surface, bands: Sequence[NDArray[Any]], value: Any) -> bool:
+    """Return whether a valid height, or a value of another band there, is this value."""
+    return any(occurs(value, band.__getitem__, surface.shape, surface.mask) for band in bands)
 
 
 def _holds(dtype: np.dtype[Any], value: float) -> bool:
