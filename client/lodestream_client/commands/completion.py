@@ -52,5 +52,5 @@ def _library() -> Any:
         return import_module("argcomplete")
     except ImportError:
         raise UnavailableError(
-            "expected argcomplete for completion, which is not installed: install lodestream[completion]"
+            "expected argcomplete for completion, which is not installed: pip install 'lodestream[completion]'"
         ) from None

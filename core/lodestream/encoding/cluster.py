@@ -45,7 +45,7 @@ def require_dask() -> None:
         If they are not installed.
     """
     if find_spec("distributed") is None:
-        raise UnavailableError("expected Dask, which is not installed: install lodestream[distributed]")
+        raise UnavailableError("expected Dask, which is not installed: pip install 'lodestream[distributed]'")
 
 
 @contextmanager

@@ -42,7 +42,7 @@ def parts_of(file: BinaryIO, kind: str) -> list[tuple[trimesh.Trimesh, NDArray[n
         if error.name != "trimesh":
             raise  # it is there, and lacks something itself
         raise UnavailableError(
-            f"expected trimesh for {kind.upper()}, which is not installed: install lodestream[trimesh]"
+            f"expected trimesh for {kind.upper()}, which is not installed: pip install 'lodestream[trimesh]'"
         ) from None
     try:
         scene: Any = trimesh.load(file, file_type=kind, force="scene", process=False)

@@ -19,7 +19,10 @@ INDEX = "index.html"
 _WIDGET = "notebook.js"
 _ELEMENT = "assets/view-*.js"
 
-HOW_TO_BUILD = "The page is not built. In a working tree, make page builds it; that needs Node 20 or newer."
+HOW_TO_BUILD = (
+    "The page of the viewer is not built. In a clone, make page builds it with Node 20 or newer; after that, install "
+    "Lodestream again. Pictures need no page: lodestream view --png."
+)
 
 #: Of every answer with a file of the page. Scripts compile the decoder's WebAssembly and run it in workers, one of
 #: which begins as a blob; nothing comes from another host, and no other page may frame this one.

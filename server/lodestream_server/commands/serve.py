@@ -10,12 +10,18 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from lodestream.interop.optional import require_library
+
 from ..operation.table import GROUPS, TABLE, Setting
 
 if TYPE_CHECKING:
     from ..operation.settings import Settings
 
 __all__ = ["add_option", "chosen_settings", "register", "serve"]
+
+_EXTRA = "server"
+#: Modules of the libraries that a running server imports; the settings need pydantic alone.
+_LIBRARIES = ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn")
 
 
 def register(subparsers: Any) -> None:
@@ -61,10 +67,14 @@ def serve(args: argparse.Namespace) -> int:
     ------
     OptionError
         If an environment variable has an invalid value.
+    UnavailableError
+        If a library of the server is not installed.
     LodestreamError, OSError
         If others can reach the address and there is no token, or the data folder cannot be used or is not complete.
     """
     settings = chosen_settings(args)
+    for library in _LIBRARIES:
+        require_library(library, _EXTRA)
     from ..connections.open_files import raise_file_limit
     from ..operation.logs import configure
     from ..running import serve_alone
@@ -84,7 +94,10 @@ def chosen_settings(args: argparse.Namespace) -> Settings:
     ------
     OptionError
         If an environment variable has an invalid value.
+    UnavailableError
+        If the library of the settings is not installed.
     """
+    require_library("pydantic", _EXTRA)
     from pydantic import ValidationError
 
     from lodestream.errors import OptionError

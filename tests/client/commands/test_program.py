@@ -142,7 +142,7 @@ def test_bash_knows_the_command_by_what_is_printed_for_it() -> None:
 
 def test_completion_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "argcomplete", None)
-    with pytest.raises(UnavailableError, match=r"install lodestream\[completion\]"):
+    with pytest.raises(UnavailableError, match=r"pip install 'lodestream\[completion\]'"):
         completion.complete(build_parser())
 
 

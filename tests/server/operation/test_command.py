@@ -21,9 +21,10 @@ import pytest
 import uvicorn
 
 import lodestream_server
-from lodestream.errors import LodestreamError, OptionError
+from lodestream.errors import LodestreamError, OptionError, UnavailableError
 from lodestream_server import Settings, create_app, running_server
 from lodestream_server.access.tokens import TokenFile
+from lodestream_server.commands import token
 from lodestream_server.commands.serve import register
 from lodestream_server.running import make_server
 from tests.server.helpers import PATIENCE, hills, npy, push
@@ -249,3 +250,25 @@ def test_the_server_blocks_when_a_client_does_not_read(tmp_path: Path) -> None:
     finally:
         flooding.should_exit = True
         thread.join(PATIENCE)
+
+
+@pytest.mark.parametrize("library", ["pydantic", "fastapi", "uvicorn"])
+def test_a_library_of_the_server_that_is_missing_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    args = parse("--data", str(tmp_path / "data"), "--port", "0", "--host", "0.0.0.0")  # refused, without a token
+    with pytest.raises(
+        UnavailableError, match=rf"{library}, which is not installed: pip install 'lodestream\[server\]'"
+    ):
+        args.run(args)
+
+
+def test_tokens_need_the_server_s_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pydantic", None)
+    parser = argparse.ArgumentParser(prog="lodestream")
+    token.register(parser.add_subparsers())
+    args = parser.parse_args(["token", "create", "ci", "--data", str(tmp_path)])
+    with pytest.raises(UnavailableError, match=r"pip install 'lodestream\[server\]'"):
+        args.run(args)
+    assert list(tmp_path.iterdir()) == []

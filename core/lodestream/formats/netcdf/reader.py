@@ -218,5 +218,5 @@ def check_libraries() -> None:
     except ImportError:
         raise UnavailableError(
             "expected xarray, cf-xarray, h5netcdf, h5py, pyproj and scipy for NetCDF, which are not all installed: "
-            "install lodestream[formats]"
+            "pip install 'lodestream[formats]'"
         ) from None

@@ -43,7 +43,7 @@ def write(surface: Surface, file: BinaryIO) -> None:
         import h5netcdf  # noqa: F401
     except ImportError:
         raise UnavailableError(
-            "expected h5netcdf for NetCDF, which is not installed: install lodestream[formats]"
+            "expected h5netcdf for NetCDF, which is not installed: pip install 'lodestream[formats]'"
         ) from None
     contents = contents_of(with_nul_shown("NetCDF", surface), "NetCDF")
     with folder_beside(file) as folder, warnings.catch_warnings():

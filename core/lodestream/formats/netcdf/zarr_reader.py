@@ -145,7 +145,7 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[s
     except ImportError:
         raise UnavailableError(
             "expected zarr and xarray with cf-xarray and pyproj for Zarr stores, which are not all installed: "
-            "install lodestream[zarr]"
+            "pip install 'lodestream[zarr]'"
         ) from None
     store = _store(zarr, source.path)
     try:

@@ -71,7 +71,7 @@ def _write(surface: Surface, folder: Path) -> None:
         from zarr.codecs import BloscCodec
     except ImportError:
         raise UnavailableError(
-            "expected zarr for Zarr stores, which is not installed: install lodestream[zarr]"
+            "expected zarr for Zarr stores, which is not installed: pip install 'lodestream[zarr]'"
         ) from None
     contents = contents_of(surface, "Zarr")
     codec = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")

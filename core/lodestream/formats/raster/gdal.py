@@ -57,7 +57,7 @@ def require_rasterio(format_name: str) -> Any:
         import rasterio
     except ImportError:
         raise UnavailableError(
-            f"expected rasterio for {format_name}, which is not installed: install lodestream[formats]"
+            f"expected rasterio for {format_name}, which is not installed: pip install 'lodestream[formats]'"
         ) from None
     return rasterio
 

@@ -74,7 +74,9 @@ def require_pillow() -> Any:
     try:
         from PIL import PngImagePlugin
     except ImportError:
-        raise UnavailableError("expected Pillow for PNG, which is not installed: install lodestream[formats]") from None
+        raise UnavailableError(
+            "expected Pillow for PNG, which is not installed: pip install 'lodestream[formats]'"
+        ) from None
     return PngImagePlugin
 
 

@@ -127,7 +127,7 @@ def read_grids(source: Source, format_name: str, files: Sequence[Reading]) -> Su
     """
     for_vtk = [file for file in files if file.mapped is None]
     if for_vtk and importlib.util.find_spec("vtkmodules") is None:
-        raise UnavailableError(f"expected VTK for {format_name}, which is not installed: install lodestream[vtk]")
+        raise UnavailableError(f"expected VTK for {format_name}, which is not installed: pip install 'lodestream[vtk]'")
     _check_memory(source, for_vtk)
     known = [file.dims for file in files if file.dims is not None]
     taken, metadata = cuts(source, known) if len(known) == len(files) else ([], {})
