@@ -229,7 +229,7 @@ def test_geotiff_looks_for_nothing_beside_it(tmp_path: Path) -> None:
 def test_geotiff_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.tif").write_bytes(b"II*\0" + bytes(100))
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"pip install 'lodestream\[formats\]'"):
         formats.read(tmp_path / "a.tif")
 
 

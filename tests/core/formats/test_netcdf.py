@@ -495,7 +495,7 @@ def test_only_what_is_wanted_is_read(tmp_path: Path) -> None:
 def test_a_netcdf_without_its_libraries_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "a.nc", {"z": (("y", "x"), hills())})
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"pip install 'lodestream\[formats\]'"):
         formats.read(path)
 
 

@@ -185,8 +185,8 @@ def test_other_pngs_are_refused(tmp_path: Path) -> None:
 def test_a_png_without_its_library_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = save(tmp_path / "a.png", shades(np.uint8))
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(UnavailableError, match=r"install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"pip install 'lodestream\[formats\]'"):
         formats.read(path)
     monkeypatch.setitem(sys.modules, "PIL", None)
-    with pytest.raises(UnavailableError, match=r"expected Pillow for PNG, .*install lodestream\[formats\]"):
+    with pytest.raises(UnavailableError, match=r"expected Pillow for PNG, .*pip install 'lodestream\[formats\]'"):
         formats.write(Surface(shades(np.uint8)), path)

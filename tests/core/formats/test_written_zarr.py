@@ -150,7 +150,7 @@ def test_what_it_cannot_hold_is_said(tmp_path: Path) -> None:
 
 def test_without_the_library_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zarr", None)
-    with pytest.raises(UnavailableError, match=r"expected zarr for Zarr stores, .* install lodestream\[zarr\]"):
+    with pytest.raises(UnavailableError, match=r"expected zarr for Zarr stores, .* pip install 'lodestream\[zarr\]'"):
         formats.write(SURFACES["bare"], tmp_path / "a.zarr")
     assert list(tmp_path.iterdir()) == []
 

@@ -246,7 +246,7 @@ def test_a_folder_that_is_no_store(tmp_path: Path) -> None:
 def test_without_the_libraries(tmp_path: Path, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
     sea().to_zarr(tmp_path / "a.zarr")
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(UnavailableError, match=r"expected zarr and xarray .* install lodestream\[zarr\]"):
+    with pytest.raises(UnavailableError, match=r"expected zarr and xarray .* pip install 'lodestream\[zarr\]'"):
         ls.read(tmp_path / "a.zarr")
 
 

@@ -199,5 +199,7 @@ def test_no_address_is_no_cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_a_server_with_a_scheduler_needs_dask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clusters, "find_spec", lambda name: None)
-    with pytest.raises(ls.UnavailableError, match=r"expected Dask, which is not installed: install lodestream\[distri"):
+    with pytest.raises(
+        ls.UnavailableError, match=r"expected Dask, which is not installed: pip install .lodestream\[distri"
+    ):
         create_app(Settings(data=tmp_path, dask="tcp://127.0.0.1:8786"))
