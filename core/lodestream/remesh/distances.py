@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from .samples import Grids, triangles_of
 from .triangulation import Floats, Integers, Triangulation, normals_of
 
-__all__ = ["Distances", "distances_of_vertices", "folded_quads", "measure"]
+__all__ = ["Distances", "distances_of_vertices", "estimate_rms", "folded_quads", "measure"]
 
 #: Points scattered over each of the two surfaces, by area, beside their vertices: at least, for each triangle, at most.
 _LEAST, _EACH, _MOST = 20_000, 2, 100_000
+#: Points scattered over each for an estimate.
+_FEW = 5_000
 
 
 @dataclass(frozen=True)
@@ -44,10 +46,13 @@ class Distances:
         return max(self.largest_to, self.largest_from)
 
 
-def _scattered(mesh: Triangulation) -> Floats:
+def _samples(mesh: Triangulation) -> int:
+    return min(max(_LEAST, _EACH * len(mesh.faces)), _MOST)
+
+
+def _scattered(mesh: Triangulation, count: int) -> Floats:
     """Return points scattered evenly over a mesh; the same ones for the same mesh."""
     random = np.random.default_rng(0)
-    count = min(max(_LEAST, _EACH * len(mesh.faces)), _MOST)
     areas = np.cumsum(mesh.areas)
     triangles = np.searchsorted(areas, random.random(count) * areas[-1])
     triangles = np.minimum(triangles, len(areas) - 1)
@@ -71,9 +76,9 @@ def measure(mesh: Triangulation, grids: Grids, points: Floats) -> Distances:
     points : float64 array of shape (N, 3)
     """
     surface = Triangulation(points, triangles_of(grids.numbers))
-    to_mesh, _, _ = mesh.closest(_scattered(surface))
+    to_mesh, _, _ = mesh.closest(_scattered(surface, _samples(surface)))
     samples, _, _ = mesh.closest(points)
-    from_mesh, _, _ = surface.closest(_scattered(mesh))
+    from_mesh, _, _ = surface.closest(_scattered(mesh, _samples(mesh)))
     from_vertices, _, _ = surface.closest(mesh.vertices)
     unit = mesh.diagonal
     return Distances(
@@ -82,6 +87,14 @@ def measure(mesh: Triangulation, grids: Grids, points: Floats) -> Distances:
         float(np.sqrt((from_mesh**2).mean())) / unit,
         float(max(from_mesh.max(), from_vertices.max())) / unit,
     )
+
+
+def estimate_rms(mesh: Triangulation, grids: Grids, points: Floats) -> float:
+    """Estimate the larger root mean square distance of both ways by few points, in parts of the diagonal."""
+    surface = Triangulation(points, triangles_of(grids.numbers))
+    to_mesh, _, _ = mesh.closest(_scattered(surface, _FEW))
+    from_mesh, _, _ = surface.closest(_scattered(mesh, _FEW))
+    return float(np.sqrt(max((to_mesh**2).mean(), (from_mesh**2).mean()))) / mesh.diagonal
 
 
 def folded_quads(mesh: Triangulation, quads: Integers, points: Floats) -> NDArray[np.bool_]:

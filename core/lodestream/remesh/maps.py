@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .cells import Cells
-from .libraries import igl, sparse
+from .closest import ClosestPoints
+from .libraries import sparse
 from .rims import Rims, places_along
 from .triangulation import Floats, Integers, normals_of
 
@@ -64,8 +65,7 @@ class Maps:
         self._shift = 3.0 * np.stack([np.arange(self._count) % side, np.arange(self._count) // side], axis=-1)
         plane = self._disc + self._shift[self._cell]
         self._plane: Floats = np.concatenate([plane, np.zeros((len(plane), 1))], axis=1)
-        self._tree = igl().AABB()
-        self._tree.init(self._plane, self._faces)
+        self._closest = ClosestPoints(self._plane, self._faces)
         self.folded = int(np.count_nonzero(_turned_over(self._disc, self._faces)))
 
     def _pin_rims(self, rims: Rims, nodes: Integers, vertices: int) -> None:
@@ -145,7 +145,7 @@ class Maps:
         chord = np.where(high - low > np.pi - 1e-9, 1.0, np.cos((high - low) / 2) / np.cos(turn - (low + high) / 2))
         place = (radius * chord)[:, np.newaxis] * np.stack([np.cos(turn), np.sin(turn)], axis=-1) + self._shift[cells]
         query = np.concatenate([place, np.zeros((len(place), 1))], axis=1)
-        _, triangles, nearest = self._tree.squared_distance(self._plane, self._faces, query)
+        _, triangles, nearest = self._closest.to(query)
         weights = barycentric(nearest[:, :2], self._plane[self._faces[triangles], :2])
         return np.einsum("ij,ijk->ik", weights, self._mesh.corners[triangles]), triangles
 

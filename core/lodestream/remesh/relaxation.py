@@ -7,15 +7,14 @@ weighted by these, and then to the closest point of the surface. Samples at the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from .libraries import igl
+from .closest import ClosestPoints
 from .samples import Grids, quads_of
 from .triangulation import Floats, Integers, Triangulation, distinct
 
-__all__ = ["Lines", "Relaxation", "rim_of"]
+__all__ = ["Relaxation", "rim_of"]
 
 _STEP = 0.5
 
@@ -36,26 +35,6 @@ def _edges_of(grids: Grids) -> Integers:
     edges = np.sort(np.concatenate([rows, columns]), axis=1)
     keys = distinct(edges[:, 0] * grids.count + edges[:, 1])
     return np.stack([keys // grids.count, keys % grids.count], axis=-1)
-
-
-class Lines:
-    """Edges of a mesh, and what finds their closest points.
-
-    Parameters
-    ----------
-    vertices : float64 array of shape (V, 3)
-    edges : int64 array of shape (E, 2)
-    """
-
-    def __init__(self, vertices: Floats, edges: Integers) -> None:
-        self._vertices, self._edges = vertices, np.ascontiguousarray(edges)
-        self._tree: Any = igl().AABB()
-        self._tree.init(self._vertices, self._edges)
-
-    def closest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Return distances (N,) and places (N, 3) of the closest points of the lines."""
-        squared, _, places = self._tree.squared_distance(self._vertices, self._edges, np.ascontiguousarray(points))
-        return np.sqrt(squared), places
 
 
 @dataclass(frozen=True)
@@ -94,7 +73,7 @@ class Relaxation:
 
     def __init__(self, mesh: Triangulation) -> None:
         self._mesh = mesh
-        self._border = Lines(mesh.vertices, mesh.edges[mesh.border]) if mesh.border.any() else None
+        self._border = ClosestPoints(mesh.vertices, mesh.edges[mesh.border]) if mesh.border.any() else None
 
     def project(self, grids: Grids, points: Floats, normals: Floats) -> tuple[Floats, Floats]:
         """Put points on the surface, those of the rim on its border, and give each the normal that it has there.
@@ -107,7 +86,7 @@ class Relaxation:
         normals = np.where(facing[:, np.newaxis], self._mesh.normals[triangles], normals)
         rim = distinct(rim_of(grids))
         if self._border is not None and len(rim):
-            _, points[rim] = self._border.closest(points[rim])
+            _, _, points[rim] = self._border.to(points[rim])
         return points, normals
 
     def relax(self, grids: Grids, points: Floats, normals: Floats, rounds: int) -> tuple[Floats, Floats]:
@@ -175,7 +154,7 @@ class Relaxation:
 
     def _move_along_border(self, rim: Integers, offset: Floats, points: Floats) -> None:
         assert self._border is not None
-        distance, places = self._border.closest(points[rim] + offset)
+        distance, _, places = self._border.to(points[rim] + offset)
         allowed = distance < np.linalg.norm(offset, axis=1) + 1e-9 * self._mesh.diagonal
         points[rim[allowed]] = places[allowed]
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from ..errors import FormatError, TooLargeError
 from .cells import LEAST_CELLS, Cells, grow_cells, place_sites
 from .cleaning import clean, longest_edges, refine
-from .distances import Distances, distances_of_vertices, folded_quads, measure
+from .distances import Distances, distances_of_vertices, estimate_rms, folded_quads, measure
 from .layout import Block, lay_out
 from .maps import Maps
 from .relaxation import Relaxation
@@ -43,6 +44,8 @@ _MOST_CELLS = 1000
 #: Times that samples of folded quads are smoothed at most, rounds of that, and how many times as far surfaces may be
 #: from each other then.
 _UNFOLDING, _SMOOTHING, _FARTHER = 4, 4, 1.15
+#: How many times as far, by an estimate, samples may be that are looked at more closely.
+_REACH = 1.3
 
 
 @dataclass(frozen=True)
@@ -135,29 +138,37 @@ def remesh_triangles(
     base = _adapted(mesh, wanted, progress)
     _check_size(len(base.blocks), most)
     relaxation = Relaxation(mesh)
+    for doublings, (grids, points, last) in enumerate(_samples(base, relaxation, most)):
+        progress(0.6 + 0.07 * doublings)
+        if last or _within_reach(mesh, grids, points, error):
+            points, distances, folds, sharp = _finished(mesh, relaxation, grids, points)
+            if last or distances.rms <= error:
+                break
+    progress(1.0)
+    return Remeshing(mesh, rows, turned, grids, points, distances, folds, base.cells.count, sharp)
+
+
+def _samples(base: _Base, relaxation: Relaxation, most: float) -> Iterator[tuple[Grids, Floats, bool]]:
+    """Relax samples, at first few, then each time twice as many along a side; tell whether there are no more."""
     grids, points, normals = base.sampled(_FIRST)
     points, normals = relaxation.relax(grids, points, normals, _ROUNDS[0])
     used, place = np.unique(grids.numbers[:, ::2, ::2], return_inverse=True)
-    halved = Grids(place.reshape(len(base.blocks), _FEWEST + 1, _FEWEST + 1), len(used))
-    result = _finished(mesh, relaxation, halved, points[used])
-    doublings = 0
-    while True:
-        progress(0.6 + 0.1 * doublings)
-        if result[2].rms > error:
-            result = _finished(mesh, relaxation, grids, points)
-        larger = len(base.blocks) * (2 * grids.intervals + 1) ** 2
-        if result[2].rms <= error or grids.intervals == _MOST or larger > most:
-            break
-        doublings += 1
+    yield Grids(place.reshape(len(base.blocks), _FEWEST + 1, _FEWEST + 1), len(used)), points[used], False
+    for doublings in count(1):
+        last = grids.intervals == _MOST or len(base.blocks) * (2 * grids.intervals + 1) ** 2 > most
+        yield grids, points, last
         fine = number_samples(base.rims, base.blocks, 2 * grids.intervals)
         points, normals = upsample(grids, fine, points), upsample(grids, fine, normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         grids = fine
         points, normals = relaxation.project(grids, points, normals)
         points, normals = relaxation.relax(grids, points, normals, _ROUNDS[min(doublings, len(_ROUNDS) - 1)])
-    kept, places, distances, folds, sharp = result
-    progress(1.0)
-    return Remeshing(mesh, rows, turned, kept, places, distances, folds, base.cells.count, sharp)
+
+
+def _within_reach(mesh: Triangulation, grids: Grids, points: Floats, error: float) -> bool:
+    """Whether an error may be met by the samples, finished or not: full measures and unfolding take long."""
+    sharpened, _ = sharpen(mesh, grids, points)
+    return min(estimate_rms(mesh, grids, places) for places in (points, sharpened)) <= _REACH * error
 
 
 def _check_size(blocks: int, most: float) -> None:
@@ -222,8 +233,7 @@ def _adapted(mesh: Triangulation, wanted: int, progress: Callable[[float], None]
 def _base_of(cells: Cells, known: Maps | None) -> _Base:
     rims = trace_rims(cells)
     maps = Maps(cells, rims, known)
-    count = cells.count
-    centres, _ = maps.locate(np.arange(count), np.zeros(count), np.zeros(count))
+    centres, _ = maps.locate(np.arange(cells.count), np.zeros(cells.count), np.zeros(cells.count))
     return _Base(cells, rims, maps, lay_out(rims, centres))
 
 
@@ -244,7 +254,7 @@ def _worst(fine: Triangulation, mesh: Triangulation, distance: Floats, most: int
 
 def _finished(
     mesh: Triangulation, relaxation: Relaxation, grids: Grids, points: Floats
-) -> tuple[Grids, Floats, Distances, int, int]:
+) -> tuple[Floats, Distances, int, int]:
     """Return samples unfolded, and on sharp edges where that is nearer; distances, folds, sharp edges."""
     quads = quads_of(grids.numbers)
     folded = folded_quads(mesh, quads, points)
@@ -260,7 +270,7 @@ def _finished(
         nearer = measure(mesh, grids, sharpened)
         if nearer.rms < distances.rms:
             points, distances, folded = sharpened, nearer, still
-    return grids, points, distances, int(np.count_nonzero(folded)), sharp
+    return points, distances, int(np.count_nonzero(folded)), sharp
 
 
 def _unfolded(

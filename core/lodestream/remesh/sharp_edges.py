@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .relaxation import Lines, rim_of
+from .closest import ClosestPoints
+from .relaxation import rim_of
 from .samples import Grids
 from .triangulation import Floats, Integers, Triangulation, distinct
 
@@ -50,7 +51,7 @@ def sharpen(mesh: Triangulation, grids: Grids, points: Floats) -> tuple[Floats, 
     spacing = total / np.maximum(np.bincount(edges.reshape(-1), minlength=grids.count), 1)
     rim = distinct(rim_of(grids))
     if len(sharp):
-        distance, places = Lines(mesh.vertices, mesh.edges[sharp]).closest(points)
+        distance, _, places = ClosestPoints(mesh.vertices, mesh.edges[sharp]).to(points)
         _, triangles, _ = mesh.closest(points)
         normals = mesh.normals[triangles]
         crossing = (normals[edges[:, 0]] * normals[edges[:, 1]]).sum(axis=1) < np.cos(np.radians(_SHARP - 5))

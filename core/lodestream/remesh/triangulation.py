@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FormatError
-from .libraries import igl, sparse
+from .closest import ClosestPoints, Floats, Integers
+from .libraries import sparse
 
 __all__ = ["Floats", "Integers", "Triangulation", "distinct", "normals_of", "split_edges"]
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 class Triangulation:
@@ -135,20 +133,12 @@ class Triangulation:
         return np.asarray(connected_components(self.dual, directed=False)[1], np.int64)
 
     @cached_property
-    def tree(self) -> Any:
-        """What finds closest points (libigl's AABB)."""
-        tree = igl().AABB()
-        tree.init(self.vertices, self.faces)
-        return tree
+    def _closest(self) -> ClosestPoints:
+        return ClosestPoints(self.vertices, self.faces)
 
     def closest(self, points: Floats) -> tuple[Floats, Integers, Floats]:
         """Closest points of the surface to others, (N, 3): distances (N,), their triangles (N,), places (N, 3)."""
-        if not len(points):
-            return np.empty(0), np.empty(0, np.int64), np.empty((0, 3))
-        squared, triangles, places = self.tree.squared_distance(
-            self.vertices, self.faces, np.ascontiguousarray(points, np.float64)
-        )
-        return np.sqrt(squared), triangles, places
+        return self._closest.to(points)
 
     def characteristic(self) -> Integers:
         """Return vertices - edges + triangles of each component, (C,)."""

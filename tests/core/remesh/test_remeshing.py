@@ -13,12 +13,12 @@ from lodestream.mesh import weld
 from lodestream.remesh import remeshing
 from lodestream.remesh.cells import find_nearest, grow_cells, place_sites
 from lodestream.remesh.cleaning import clean, longest_edges, refine
-from lodestream.remesh.distances import folded_quads
+from lodestream.remesh.distances import Distances, folded_quads, measure
 from lodestream.remesh.maps import Maps
 from lodestream.remesh.relaxation import Relaxation
 from lodestream.remesh.remeshing import Remeshing, _unfolded, remesh_triangles
 from lodestream.remesh.rims import trace_rims
-from lodestream.remesh.samples import quads_of
+from lodestream.remesh.samples import Grids, quads_of
 from lodestream.remesh.triangulation import Triangulation
 from tests.examples import examples
 
@@ -166,6 +166,19 @@ def test_the_error_that_is_asked_for_decides_how_many_points_a_block_has() -> No
     assert coarse.grids.intervals == 8
     assert fine.grids.intervals > 8
     assert fine.distances.rms <= 5e-4 < coarse.distances.rms
+
+
+def test_samples_that_are_far_from_the_error_are_not_measured_in_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = []
+
+    def measured(mesh: Triangulation, grids: Grids, points: np.ndarray) -> Distances:
+        sizes.append(grids.intervals)
+        return measure(mesh, grids, points)
+
+    monkeypatch.setattr(remeshing, "measure", measured)
+    result = remesh_triangles(*scenes.sphere(), blocks=8, error=1e-9, most_points=12 * 17**2)
+    assert result.grids.intervals == 16
+    assert set(sizes) == {16}
 
 
 def test_the_same_mesh_gives_the_same_blocks() -> None:
