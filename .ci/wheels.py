@@ -17,6 +17,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -68,11 +69,21 @@ KERNELS = _build_module()
 
 
 def build(folder: Path) -> list[Path]:
-    """Build the source distribution, and a wheel from it for each platform."""
-    for number, name in enumerate(KERNELS.PLATFORMS):
-        environment = {**os.environ, "LODESTREAM_WHEEL_FOR": name}
-        run([sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)], environment)
-        print(f"built {number + 1} of {len(KERNELS.PLATFORMS)}: {name}", file=sys.stderr, flush=True)
+    """Build the source distribution, and a wheel from it for each platform, in this environment."""
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder)]
+    # zig is an installed one already: an environment for each wheel would download it again, 100 MB each time.
+    run([*command, "--sdist", str(ROOT)])
+    print("built the source distribution", file=sys.stderr, flush=True)
+    with tempfile.TemporaryDirectory() as name:
+        (sdist,) = folder.glob("*.tar.gz")
+        with tarfile.open(sdist) as archive:
+            archive.extractall(name, filter="data")
+        (sources,) = Path(name).iterdir()
+        # What zig compiles of C libraries and of its own is the same for all libraries of a platform.
+        environment = {**os.environ, "ZIG_GLOBAL_CACHE_DIR": f"{name}/.zig"}
+        for number, platform_name in enumerate(KERNELS.PLATFORMS, 1):
+            run([*command, "--wheel", str(sources)], environment | {"LODESTREAM_WHEEL_FOR": platform_name})
+            print(f"built {number} of {len(KERNELS.PLATFORMS)}: {platform_name}", file=sys.stderr, flush=True)
     return sorted(folder.iterdir())
 
 

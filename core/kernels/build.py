@@ -112,8 +112,11 @@ def machine_flags(command: list[str], wanted: Platform | None = None, *, v3: boo
     if not _is_zig(command):
         return (_X86_64_V2 if wide else []) + (_X86_64_V3 if v3 else []) + strip
     target = ["-target", wanted.target] if wanted else []
-    # macOS and Windows have their C library everywhere, and no shared library goes without it.
-    alone = ["-nostdlib", "-rtlib=compiler-rt"] if system == "linux" else []
+    # The kernels need no C library. On macOS, which has it everywhere, no shared library goes without it; for Windows
+    # zig would compile it first, for a quarter of an hour.
+    alone = [] if system == "darwin" else ["-nostdlib", "-rtlib=compiler-rt"]
+    if system == "win32":
+        alone.append("-DLODE_WITHOUT_LIBC")
     return [*target, f"-mcpu=x86_64_v{3 if v3 else 2}" if wide else "-mcpu=baseline", *alone, *strip]
 
 

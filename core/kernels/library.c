@@ -51,3 +51,13 @@ int lode_runs_v3(void) {
 }
 
 #endif
+
+#if defined(_WIN32) && defined(LODE_WITHOUT_LIBC)
+
+/* What Windows calls when the library is loaded, and a C library would define: there is nothing to prepare. */
+int __stdcall DllMainCRTStartup(void *library, unsigned long reason, void *reserved) {
+    (void)library, (void)reason, (void)reserved;
+    return 1;
+}
+
+#endif

@@ -39,7 +39,8 @@ def own_server() -> Iterator[str]:
     with tempfile.TemporaryDirectory(prefix="lodestream-demo-", ignore_cleanup_errors=True) as folder, raising():
         log = Path(folder) / "server.log"
         port = _free_port()
-        command = [sys.executable, "-m", "lodestream_client", "serve"]
+        # It reads what the demo uploads, from this machine alone.
+        command = [sys.executable, "-m", "lodestream_client", "serve", "--unconfined"]
         command += ["--host", "127.0.0.1", "--port", str(port), "--data", str(Path(folder) / "data")]
         with log.open("wb") as output:
             # A session of its own: a Ctrl-C is ours to handle, and then ours to pass on.

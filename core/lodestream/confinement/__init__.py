@@ -18,7 +18,7 @@ from .places import library_places
 if TYPE_CHECKING or sys.platform == "linux":
     from . import landlock, seccomp
 
-__all__ = ["Rights", "confine", "missing"]
+__all__ = ["Rights", "available", "confine", "missing"]
 
 _NO_NEW_PRIVILEGES = 38  # PR_SET_NO_NEW_PRIVS
 _CAPABILITY_VERSION = 0x20080522  # _LINUX_CAPABILITY_VERSION_3
@@ -76,13 +76,22 @@ def confine(rights: Rights) -> tuple[str, ...]:
     return tuple(held)
 
 
+def available() -> tuple[str, ...]:
+    """Return what `confine` would return on this machine, without giving anything up."""
+    if sys.platform != "linux":
+        return ()
+    libc = ctypes.CDLL(None, use_errno=True)
+    there = {"landlock": landlock.version(libc) > 0, "seccomp": seccomp.is_available(libc)}
+    return tuple(name for name, holds in there.items() if holds)
+
+
 def missing(held: Collection[str]) -> tuple[str, ...]:
     """Say what a confined process may still do on this machine, a sentence for each mechanism that does not hold it.
 
     Parameters
     ----------
     held : collection of str
-        What `confine` has returned.
+        What `confine` has returned, or would return (`available`).
 
     Returns
     -------

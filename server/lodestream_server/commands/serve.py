@@ -70,11 +70,14 @@ def serve(args: argparse.Namespace) -> int:
     UnavailableError
         If a library of the server is not installed.
     LodestreamError, OSError
-        If others can reach the address and there is no token, or the data folder cannot be used or is not complete.
+        If builds would not be confined and `unconfined` is not set, if others can reach the address and there is no
+        token, or if the data folder cannot be used or is not complete.
     """
     settings = chosen_settings(args)
     for library in _LIBRARIES:
         require_library(library, _EXTRA)
+    if not settings.unconfined:
+        _check_confinement()
     from ..connections.open_files import raise_file_limit
     from ..operation.logs import configure
     from ..running import serve_alone
@@ -85,6 +88,17 @@ def serve(args: argparse.Namespace) -> int:
     if server.refusal is not None:
         raise server.refusal
     return 0 if server.started else 1
+
+
+def _check_confinement() -> None:
+    from lodestream.confinement import available, missing
+    from lodestream.errors import LodestreamError
+
+    if lacking := missing(available()):
+        raise LodestreamError(
+            f"builds would not be fully confined here ({'; '.join(lacking)}): start with --unconfined "
+            "(LODESTREAM_UNCONFINED=yes) if you trust everybody who can upload"
+        )
 
 
 def chosen_settings(args: argparse.Namespace) -> Settings:

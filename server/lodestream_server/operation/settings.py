@@ -44,6 +44,7 @@ class Settings(Bounds):
     root_path: str = _field("root_path")
     trusted_proxies: tuple[str, ...] = _field("trusted_proxies")
     insecure: bool = _field("insecure")
+    unconfined: bool = _field("unconfined")
     token_file: Path | None = _field("token_file")
     public_reads: bool = _field("public_reads")
     origins: tuple[str, ...] = _field("origins")

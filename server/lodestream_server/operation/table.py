@@ -269,6 +269,14 @@ _SETTINGS = (
         "access",
     ),
     Setting(
+        "unconfined",
+        _SWITCH,
+        False,
+        "start although this system or its kernel cannot confine the processes that read uploads (Landlock and seccomp "
+        "of Linux): a file that exploits a bug in its reader may then do what the server may do",
+        "access",
+    ),
+    Setting(
         "token_file",
         _PATH,
         None,

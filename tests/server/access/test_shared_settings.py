@@ -40,6 +40,7 @@ NOT_SHARED = {
     "root_path": "a path",
     "trusted_proxies": "addresses",
     "insecure": "a switch",
+    "unconfined": "a switch",
     "token_file": "a path",
     "public_reads": "a switch",
     "origins": "addresses",

@@ -18,6 +18,7 @@ from typing import BinaryIO
 import httpx
 import pytest
 
+from lodestream.confinement import landlock, seccomp
 from lodestream.errors import LodestreamError
 from lodestream_client.__main__ import main
 from lodestream_server import Settings, create_app, running_server
@@ -296,3 +297,32 @@ def test_a_server_starts_on_a_disk_whose_size_cannot_be_told(
         surface = push(http, npy(hills()))
         assert http.get(f"{surface['url']}/levels/0", params={"format": "npy"}).status_code == 200
     assert "the size of the disk is unknown, so that few level files are kept: [Errno 116]" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("landlock_version", "has_seccomp", "lacks"),
+    [(0, True, ["landlock"]), (6, False, ["seccomp"]), (0, False, ["landlock", "seccomp"])],
+)
+def test_a_kernel_that_does_not_confine_builds(
+    landlock_version: int,
+    has_seccomp: bool,
+    lacks: list[str],
+    tmp_path: Path,
+    refused: Refused,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(landlock, "version", lambda libc: landlock_version)
+    monkeypatch.setattr(seccomp, "is_available", lambda libc: has_seccomp)
+    line = refused("serve", "--port", "0", "--data", tmp_path / "data")
+    assert [name for name in ("landlock", "seccomp") if f"{name}: a build may" in line] == lacks
+    assert "--unconfined" in line
+    assert not (tmp_path / "data").exists()
+    # With the word the next thing that is wrong is said.
+    (tmp_path / "file").write_bytes(b"")
+    assert "Not a directory" in refused("serve", "--port", "0", "--data", tmp_path / "file", "--unconfined")
+
+
+def test_what_is_available_is_what_a_process_is_confined_by() -> None:
+    program = "from lodestream.confinement import *; print(available() == confine(Rights()))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    assert subprocess.check_output([sys.executable, "-c", program], env=environment, text=True) == "True\n"
