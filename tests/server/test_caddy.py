@@ -112,7 +112,8 @@ def test_a_surface_through_caddy(tmp_path: Path) -> None:
         # A stream over WebSocket, by the command, which trusts the authorities that OpenSSL is told of.
         trusting = {"SSL_CERT_FILE": str(root), "LODESTREAM_TOKEN": token, "LODESTREAM_CACHE": ""}
         pythonpath = os.pathsep.join(filter(None, sys.path))
-        command = [sys.executable, "-m", "lodestream_client", "pull", f"{address}{surface['url']}", str(tmp_path / "back.npy")]
+        url, back = f"{address}{surface['url']}", tmp_path / "back.npy"
+        command = [sys.executable, "-m", "lodestream_client", "pull", url, str(back)]
         pulled = subprocess.run(
             [*command, "--transport", "ws"],
             env=os.environ | trusting | {"PYTHONPATH": pythonpath},
@@ -122,4 +123,4 @@ def test_a_surface_through_caddy(tmp_path: Path) -> None:
             check=False,
         )
         assert pulled.returncode == 0, pulled.stderr
-        assert np.array_equal(np.load(tmp_path / "back.npy"), heights)
+        assert np.array_equal(np.load(back), heights)
