@@ -6,7 +6,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from ..terminal.output import (
     require_folder,
     require_parent,
 )
+from ..terminal.shared_notes import SharedNotes
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .building_options import (
     BuildingOptions,
@@ -125,12 +126,15 @@ def _run_each(options: EncodeOptions, along: str, folder: Path) -> int:
     folder.mkdir(exist_ok=True)
     reports: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
-    for part, name in named_files(surfaces):
-        try:
-            reports.append(encode_files(replace(options, out=str(folder / name), surface=part.options), part))
-        except (LodestreamError, OSError) as error:
-            failed.append({"file": file, along: part.label, "reason": reason_of(error)})
-            note(f"{part.label}: {failed[-1]['reason']}")
+    with SharedNotes(len(surfaces), "surfaces") as notes:
+        for part, name in named_files(surfaces):
+            step = replace(options, out=str(folder / name), surface=part.options)
+            try:
+                with notes.of(part.label) as show:
+                    reports.append(encode_files(step, part, show))
+            except (LodestreamError, OSError) as error:
+                failed.append({"file": file, along: part.label, "reason": reason_of(error)})
+                note(f"{part.label}: {failed[-1]['reason']}")
     if options.json:
         print_json({"surfaces": reports, "failed": failed})
     elif failed:
@@ -138,7 +142,9 @@ def _run_each(options: EncodeOptions, along: str, folder: Path) -> int:
     return 1 if failed else 0
 
 
-def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, Any]:
+def encode_files(
+    options: EncodeOptions, part: Part | None = None, show: Callable[[str], None] = note
+) -> dict[str, Any]:
     """Write the container, report on standard error, and return the object that ``--json`` prints.
 
     Parameters
@@ -146,6 +152,8 @@ def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, 
     options : EncodeOptions
     part : Part, optional
         Of the files; gives the surface its name and its place in a series.
+    show : callable
+        Takes each note about memory and holes.
 
     Raises
     ------
@@ -160,12 +168,12 @@ def encode_files(options: EncodeOptions, part: Part | None = None) -> dict[str, 
         if part is not None:
             part.mark(surface)
         if options.surface.quality.rms is None:  # a stream for one error is refused instead
-            _note_memory(surface, options.building.memory)
+            _note_memory(surface, options.building.memory, show)
         container = _made(surface, options, executor)
         size = len(container) if container is not None else Path(options.out).stat().st_size
         if container is not None:
             sys.stdout.buffer.write(container)
-        return _report(surface, size, time.monotonic() - started, options)
+        return _report(surface, size, time.monotonic() - started, options, show)
 
 
 def read_surface(
@@ -251,21 +259,23 @@ def _made(surface: Surface, options: EncodeOptions, executor: Executor | None) -
         return encoded(None if options.out == "-" else Path(options.out))
 
 
-def _note_memory(surface: Surface, memory: int | None) -> None:
+def _note_memory(surface: Surface, memory: int | None, show: Callable[[str], None]) -> None:
     """Note that the encoding takes more memory than was asked for, if it cannot take less."""
     from lodestream.encoding.memory import least_memory, whole_memory
 
     least = min(least_memory(surface), whole_memory(surface))
     if memory is not None and memory < least:
-        note(
+        show(
             f"--memory {human_size(memory)} is exceeded, and encoding goes on: "
             f"this surface takes about {human_size(least)} at least"
         )
 
 
-def _report(surface: Surface, size: int, seconds: float, options: EncodeOptions) -> dict[str, Any]:
+def _report(
+    surface: Surface, size: int, seconds: float, options: EncodeOptions, show: Callable[[str], None]
+) -> dict[str, Any]:
     blocks = surface.blocks
-    note_holes(sum(block.holes for block in blocks), sum(math.prod(block.shape) for block in blocks))
+    note_holes(sum(block.holes for block in blocks), sum(math.prod(block.shape) for block in blocks), show)
     raw = sum(array.nbytes for block in blocks for array in (block.points, *block.attributes.values()))
     if not options.json:
         grid = " x ".join(map(str, blocks[0].shape)) if len(blocks) == 1 else f"{len(blocks)} blocks of"

@@ -16,6 +16,7 @@ from lodestream.quality import Quality
 
 from ..errors import UnreachableError
 from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
+from ..terminal.shared_notes import SharedNotes
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
 from .building_options import BuildingOptions
 from .encode import EncodeOptions, encode_files
@@ -133,24 +134,27 @@ def _run_each(options: PushOptions) -> int:
     uploaded: list[dict[str, object]] = []
     failed: list[dict[str, str]] = []
     uploads = _files(options) if options.each == FILE else _parts(options, str(options.each))
-    for label, words, upload in uploads:
-        try:
-            surface = upload()
-        except UnreachableError:
-            raise
-        except (LodestreamError, OSError) as error:
-            reason = reason_of(error)
-            failed.append({**words, "reason": reason})
-            note(reason if label in reason else f"{label}: {reason}")
-            continue
-        note_details(surface.details, f"{label}: ", option_words)
-        uploaded.append({**surface.details, "url": surface.url, **words})
-        if not options.json:
-            say(f"{surface.url} {label}")
+    kind = "files" if options.each == FILE else "surfaces"
+    with SharedNotes(len(uploads), kind) as notes:
+        for label, words, upload in uploads:
+            try:
+                with notes.of(label) as show:
+                    surface = upload()
+                    note_details(surface.details, option_words, show)
+            except UnreachableError:
+                raise
+            except (LodestreamError, OSError) as error:
+                reason = reason_of(error)
+                failed.append({**words, "reason": reason})
+                note(reason if label in reason else f"{label}: {reason}")
+                continue
+            uploaded.append({**surface.details, "url": surface.url, **words})
+            if not options.json:
+                say(f"{surface.url} {label}")
     if options.json:
         print_json({"surfaces": uploaded, "failed": failed})
     elif failed:
-        note(f"{len(failed)} of {len(uploads)} {'files' if options.each == FILE else 'surfaces'} failed")
+        note(f"{len(failed)} of {len(uploads)} {kind} failed")
     return 1 if failed else 0
 
 
@@ -181,7 +185,7 @@ def _encoded(options: PushOptions, part: Part) -> Description:
         encoding = EncodeOptions(
             options.files, str(container), part.options, BuildingOptions(None, None, None), json=True
         )
-        encode_files(encoding, part)
+        encode_files(encoding, part, show=lambda _: None)  # the server counts the holes too
         wanted = replace(options.surface, quality=Quality(), closed="auto", name=None, format_options={}, nodata=None)
         sent = replace(wanted, format_name=None)
         return _uploaded(replace(options, files=(str(container),), surface=sent, local=False))

@@ -147,22 +147,24 @@ def _points(details: Mapping[str, Any]) -> int:
     return sum(math.prod(block["shape"]) for block in details["blocks"])
 
 
-def note_holes(holes: int, total: int, of: str = "") -> None:
-    """Note how many points are holes, if any are; `of` stands before it."""
+def note_holes(holes: int, total: int, show: Callable[[str], None] = note) -> None:
+    """Note how many points are holes, if any are."""
     if holes:
-        note(f"{of}{holes} of {total} points {'is a hole' if holes == 1 else 'are holes'}")
+        show(f"{holes} of {total} points {'is a hole' if holes == 1 else 'are holes'}")
 
 
-def note_details(details: Mapping[str, Any], of: str = "", words: Callable[[str], str] = str) -> None:
-    """Print the notes of a server's build, of lost or chosen data and holes; `of` stands before each.
+def note_details(
+    details: Mapping[str, Any], words: Callable[[str], str] = str, show: Callable[[str], None] = note
+) -> None:
+    """Print the notes of a server's build, of lost or chosen data and holes, or show them otherwise.
 
     ``words`` puts a note as the command line has it.
     """
     notes = (details.get("metadata") or {}).get("notes")
     for text in notes if isinstance(notes, list) else ():  # in a container somebody may have put anything there
-        note(f"{of}{words(str(text))}")
+        show(words(str(text)))
     if details.get("blocks"):
-        note_holes(details.get("holes") or 0, _points(details), of)
+        note_holes(details.get("holes") or 0, _points(details), show)
 
 
 def print_json(value: Mapping[str, Any]) -> None:

@@ -98,11 +98,13 @@ def _of_dataset(
     options: Mapping[str, str],
 ) -> Surface:
     wanted = None if attributes is None else names_in(attributes)
-    given = {**_names(data, Mark.of(data.attrs), options, wanted), **options}
-    chosen = given if wanted is None else {**given, "attributes": wanted}
+    usual = _names(data, Mark.of(data.attrs), options, wanted)
+    chosen = options if wanted is None else {**options, "attributes": wanted}
     source = Source(Path(), "", 0, DEFAULT_MAX_VERTICES, chosen, (), closed, room=room)
     dataset = _as_in_a_file(xr, data)
-    surface, notes = surface_in(source, dataset, "xarray", stored=lambda variable: _as_stored(xr, variable, room))
+    surface, notes = surface_in(
+        source, dataset, "xarray", stored=lambda variable: _as_stored(xr, variable, room), usual=usual
+    )
     for text in notes:
         warn(text)
     return surface

@@ -274,6 +274,35 @@ def test_steps_are_pushed_and_listed_together(
     assert [line.split()[0] for line in stdout.splitlines()] == [line.split()[0] for line in lines]
 
 
+def test_a_note_of_several_steps_is_said_once(run: Run, dataset: xarray.Dataset, tmp_path: Path, server: str) -> None:
+    file = tmp_path / "noted.nc"
+    data = dataset[["air"]].assign(profile=("depth", np.zeros(4)))
+    data["air"].attrs["valid_max"] = np.float32(1e6)
+    data["air"][1:, 0, 0] = 1e7
+    data["air"][1, 0, 1] = 1e7
+    data.to_netcdf(file)
+    for command in (("encode", file, "--each", f"time={tmp_path / 'steps'}"), ("push", file, server, "--each", "time")):
+        code, _, stderr = run(*command)
+        assert code == 0, stderr
+        notes = [line.removeprefix("lodestream: ") for line in stderr.splitlines() if " points, " not in line]
+        label = DATES[2] if command[0] == "encode" else f"noted air {DATES[2]}"
+        before = DATES[1] if command[0] == "encode" else f"noted air {DATES[1]}"
+        assert sorted(notes) == sorted(
+            [
+                "left out: profile",
+                f"{before}: 2 values of air outside its valid range: missing",
+                f"{before}: 2 of 204 points are holes",
+                f"{label}: 1 value of air outside its valid range: missing",
+                f"{label}: 1 of 204 points is a hole",
+            ]
+        )
+    data["air"][1, 0, 1] = 0.0
+    data.to_netcdf(file)
+    _, _, stderr = run("encode", file, "--each", f"time={tmp_path / 'steps'}")
+    assert "1 value of air outside its valid range: missing (2 of 3 surfaces)" in stderr
+    assert "1 of 204 points is a hole (2 of 3 surfaces)" in stderr
+
+
 def test_each_file_is_a_surface_wherever_the_option_stands(run: Run, tmp_path: Path, server: str) -> None:
     names = [tmp_path / "a.npy", tmp_path / "b.npy"]
     for number, name in enumerate(names):

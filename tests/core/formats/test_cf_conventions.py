@@ -638,8 +638,12 @@ def test_what_holds_no_grid_is_refused_as_what_it_is(
 def test_a_grid_beside_a_mesh_is_read(tmp_path: Path, opener: Opener) -> None:
     lon, lat = curvilinear()
     data = ugrid().assign(z=(("y", "x"), (lon * lat).astype("f4")))
-    surface = opener(data, tmp_path)
+    surface, notes = noted(lambda: opener(data, tmp_path))
     np.testing.assert_array_equal(surface.points, data.z.values)
+    if opener is not by_xarray:  # which chooses attributes
+        (note,) = notes
+        mesh = {"face_nodes", "edge_nodes", "node_lon", "node_lat", "depth", "salt"}
+        assert set(note.removeprefix("left out: ").split(", ")) == mesh
 
 
 # Groups

@@ -60,6 +60,25 @@ def test_the_fill_value_of_the_file_is_that_of_what_is_written(
         np.testing.assert_array_equal(np.load(tmp_path / "b.npy"), data.z.values)
 
 
+@pytest.mark.parametrize("opener", [by_netcdf, by_zarr])
+@pytest.mark.parametrize("fill", [2**64 - 1, 2**63 + 1, 2**63])
+def test_a_large_fill_value_is_exact(tmp_path: Path, opener: Opener, fill: int) -> None:
+    data = field("u8")
+    data.z.values[3, 4] = fill
+    data.z.attrs["_FillValue"] = np.uint64(fill)
+    surface = opener(data.drop_vars(["lat", "lon"]), tmp_path)
+    assert surface.metadata["nodata"] == fill
+    again = ls.decode(ls.encode(surface))
+    for name in ("b.nc", "b.zarr"):
+        ls.write(again, tmp_path / name)
+        with xr.open_dataset(tmp_path / name, mask_and_scale=False) as back:
+            assert back.z.attrs["_FillValue"] == np.uint64(fill)
+            np.testing.assert_array_equal(back.z.values, data.z.values)
+        assert ls.read(tmp_path / name).metadata["nodata"] == fill
+    ls.write(again, tmp_path / "b.tif")
+    np.testing.assert_array_equal(ls.read(tmp_path / "b.tif").mask, surface.mask)
+
+
 @every_opener
 @pytest.mark.parametrize("attributes", [{}, {"_FillValue": np.float32(np.nan)}, {"missing_value": np.float32(np.inf)}])
 def test_no_number_stands_for_nan(tmp_path: Path, opener: Opener, attributes: dict[str, Any]) -> None:

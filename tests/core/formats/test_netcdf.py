@@ -191,7 +191,7 @@ def test_axes_that_no_metadata_hold_become_points(tmp_path: Path) -> None:
 
 def test_a_variable_without_coordinates_is_heights(tmp_path: Path) -> None:
     surface = formats.read(save(tmp_path / "a.nc", {"z": (("j", "i"), hills()), "note": ((), 7)}))
-    assert surface.metadata == {"name": "a", "format": "netcdf", "variable": "z"}
+    assert surface.metadata == {"name": "a", "format": "netcdf", "variable": "z", "scalars": {"note": 7}}
     half = formats.read(save(tmp_path / "b.nc", {"z": (("j", "i"), hills()), "j": ("j", np.arange(6.0) * 2)}))
     assert half.metadata["geotransform"] == [-0.5, 1.0, 0.0, -1.0, 0.0, 2.0]
 

@@ -47,6 +47,39 @@ def test_fill_values_are_stored_like_values(
     assert np.array_equal(own[surface.mask], surface.points[surface.mask])
 
 
+@pytest.mark.parametrize(
+    ("stored", "unsigned", "limits", "missing"),
+    [
+        ("i1", True, {"valid_max": np.int16(-1)}, [False] * 4),
+        ("i1", True, {"valid_min": np.int16(-1)}, [True, True, True, False]),
+        ("i1", True, {"valid_min": np.int16(0), "valid_max": np.int16(-1)}, [False] * 4),
+        ("i1", True, {"valid_range": np.array([0, -2], "i2")}, [False, False, False, True]),
+        ("u1", False, {"valid_max": np.int16(-1)}, [False] * 4),
+        ("u1", False, {"valid_min": np.int16(300)}, [False] * 4),
+        ("u1", False, {"valid_range": np.array([-1, 254], "i2")}, [False, False, False, True]),
+        ("u1", False, {"valid_max": np.float32(-1)}, [False] * 4),
+        ("i1", False, {"valid_max": np.int16(-1)}, [True, True, False, False]),
+    ],
+)
+def test_limits_of_another_type_mask_what_netcdf4_masks(
+    tmp_path: Path, stored: str, unsigned: bool, limits: dict[str, Any], missing: list[bool]
+) -> None:
+    """The expected values are those of netCDF4 1.7.5."""
+    with h5netcdf.File(tmp_path / "a.nc", "w") as file:
+        file.dimensions = {"y": 2, "x": 4}
+        values = np.array([[0, 1, -2, -1]] * 2).astype(stored)
+        variable = file.create_variable("c", ("y", "x"), stored, data=values)
+        variable.attrs.update(limits | ({"_Unsigned": "true"} if unsigned else {}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        surfaces = [ls.read(tmp_path / "a.nc")]
+        with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as data:
+            surfaces.append(ls.Surface.from_xarray(data))
+    for surface in surfaces:
+        hidden = np.zeros((2, 4), np.bool_) if surface.mask is None else ~surface.mask
+        assert hidden.tolist() == [missing] * 2
+
+
 #: Attributes beside int16 that are unsigned, and which of 65533, 65534, 65535 and 0 are missing.
 MISSING: dict[str, tuple[dict[str, Any], list[bool]]] = {
     "another type that holds the stored number": ({"_FillValue": np.int32(-1)}, [False, False, True, False]),

@@ -259,7 +259,11 @@ def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tupl
         if is_numeric(variable) and sum(length > 1 for length in variable.shape) >= 2
     ]
     letters = letters_of(dataset)
+    # Terms of a formula, as zeta and h of ROMS, are data too: they count where there is nothing else.
+    terms = {name for it in variables.values() for name in str(it.attrs.get("formula_terms", "")).split()}
+    places = beside - terms | letters.keys()
     free = [name for name in wide if name not in beside and name not in letters]
+    free = free or [name for name in wide if name not in places]
     # Flags and dates belong to something else, unless there is nothing else.
     return [name for name in free if not is_flag(variables[name]) and not is_date(variables[name])] or free, wide
 

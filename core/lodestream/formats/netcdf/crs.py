@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import UnavailableError
-from .names import associated
+from .names import REFERENCES, associated
+from .values import PACKING
 
 __all__ = ["MAPPING", "beside_crs", "crs_of", "grid_mapping"]
 
@@ -81,7 +82,8 @@ def crs_of(dataset: Any, name: str, places: Sequence[str]) -> tuple[str | None, 
         if isinstance(wkt, str) and wkt.strip():
             return wkt, mapping, []
     if "grid_mapping_name" not in attributes:
-        unnamed = set(attributes) - {"GeoTransform"}
+        # xarray writes the names of scalar coordinates on every variable, fill values on all floats.
+        unnamed = set(attributes) - {"GeoTransform", *REFERENCES, *PACKING}
         return None, mapping, [f"left out {mapping}, a grid mapping without a name"] if unnamed else []
     try:
         import pyproj

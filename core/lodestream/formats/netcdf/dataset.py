@@ -25,7 +25,7 @@ from .choice import Choice, Found, offered, others
 from .crs import MAPPING, beside_crs, crs_of
 from .geotransform import by_geotransform, transform_of
 from .names import REFERENCES, associated, axis_words, is_geographic, is_grid_mapping
-from .single_numbers import SCALARS, names_of_single, number_of
+from .single_numbers import SCALARS, constants_of, names_of_single, number_of
 from .units import Conversion, conversions_of
 from .values import (
     MISSING,
@@ -47,7 +47,9 @@ __all__ = ["attributes_with_limits", "not_taken", "surface_of"]
 _STORAGE = (*PACKING, "coordinates", "grid_mapping", "bounds", "_Storage", "_ChunkSizes", "DIMENSION_LABELS")
 
 
-def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -> tuple[Surface, list[str]]:
+def surface_of(
+    source: Source, dataset: Any, choice: Choice, format_name: str, *, complete: bool = False
+) -> tuple[Surface, list[str]]:
     """Make a surface of a variable of a Dataset, its coordinates, and further variables as attributes.
 
     Parameters
@@ -60,6 +62,8 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
     choice : Choice
         What of it, as `choose` finds it by the options and the conventions.
     format_name : str
+    complete : bool
+        Whether a note names variables over other dimensions too, as where nobody has chosen among the variables.
 
     Returns
     -------
@@ -74,7 +78,7 @@ def surface_of(source: Source, dataset: Any, choice: Choice, format_name: str) -
         If it is no surface.
     """
     source.check_array(choice.shape, np.dtype(np.float64))
-    metadata, notes, conversions, mapping = _metadata(source, dataset, choice, format_name)
+    metadata, notes, conversions, mapping = _metadata(source, dataset, choice, format_name, complete)
     reader = _Reader(source, dataset, choice)
     axes = [
         None if found is None else reader.coordinate(found, conversions.get(letter))
@@ -214,7 +218,7 @@ def _without_place(heights: Values, x: Coordinate, y: Coordinate) -> list[str]:
 
 
 def _metadata(
-    source: Source, dataset: Any, choice: Choice, format_name: str
+    source: Source, dataset: Any, choice: Choice, format_name: str, complete: bool
 ) -> tuple[dict[str, Any], list[str], dict[str, Conversion], str | None]:
     """Return what the file says of itself and of its variables; notes; how x and y are converted; the mapping.
 
@@ -253,7 +257,8 @@ def _metadata(
             f"{MAPPING}#{key}": value for key, value in beside_crs(attributes_with_limits(variables[mapping])).items()
         }
     single = [name for name in names_of_single(dataset, choice) if name != mapping]
-    numbers = {name: number for name in single if (number := number_of(dataset, name, choice)) is not None}
+    constants = dict.fromkeys((*single, *(name for name in constants_of(dataset, choice) if name != mapping)))
+    numbers = {name: number for name in constants if (number := number_of(dataset, name, choice)) is not None}
     if numbers:
         told[SCALARS] = numbers
     for name in numbers:
@@ -265,7 +270,7 @@ def _metadata(
         metadata[TYPES] = types
     metadata |= told
     taken = {main, *choice.attributes, *places, *numbers, mapping}
-    if left_out := _left_out(dataset, choice, taken, single):
+    if left_out := _left_out(dataset, choice, taken, single, complete):
         notes.append(f"left out: {listing(left_out)}")
     return metadata, notes, conversions, mapping
 
@@ -288,7 +293,7 @@ def _nodata(variable: Any) -> int | float | None:
         if np.asarray(number).dtype.kind in "iuf":
             value: int | float = stored_number(number, np.dtype(variable.dtype), variable.attrs).item()
             if math.isfinite(value):
-                return value if abs(value) < 2**63 else float(value)
+                return value
     return None
 
 
@@ -315,11 +320,12 @@ def attributes_with_limits(variable: Any) -> dict[str, Any]:
     return attributes
 
 
-def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequence[str]) -> list[str]:
-    """Return variables that say something of the values or their places, neither taken nor offered as attributes.
+def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequence[str], complete: bool) -> list[str]:
+    """Return variables that are neither taken nor offered as attributes: those that say something of values or places.
 
     These are bounds, areas and others along rows or columns; those that the variable names as its coordinates; of
-    coordinates with one value those that are no numbers, and bounds; and a CRS that the variable does not name.
+    coordinates with one value those that are no numbers, and bounds; and a CRS that the variable does not name. All
+    others follow if the list is to be complete.
     """
     variables = dataset.variables
     known = {*others(dataset, choice), *taken, *choice.dims}
@@ -327,7 +333,8 @@ def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequ
     bounds = [str(variables[name].attrs.get("bounds", "")) for name in single]
     along = [str(name) for name, it in variables.items() if set(choice.dims) & set(it.dims)]
     mappings = {str(name) for name in variables if is_grid_mapping(variables[name])}
-    left_out = [name for name in dict.fromkeys((*along, *named, *single, *bounds)) if name in variables]
+    rest = map(str, variables) if complete else ()
+    left_out = [name for name in dict.fromkeys((*along, *named, *single, *bounds, *rest)) if name in variables]
     left_out = [name for name in left_out if name not in known | mappings]
     return left_out + (sorted(mappings) if mappings and not mappings & taken else [])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +23,9 @@ __all__ = ["surface_in"]
 #: Metadata that a file has anyway.
 _OF_THE_FILE = ("name", "format")
 
+#: Options that choose the variable of a surface, or its points.
+_CHOOSING = frozenset(("variable", "x", "y"))
+
 
 def surface_in(
     source: Source,
@@ -31,6 +34,7 @@ def surface_in(
     *,
     deflated: bool = False,
     stored: Callable[[Any], Any] | None = None,
+    usual: Mapping[str, str] | None = None,
 ) -> tuple[Surface, list[str]]:
     """Make a surface of a Dataset, and restore what a mark says of it.
 
@@ -47,6 +51,8 @@ def surface_in(
         Of a Dataset of a user, of which every variable becomes an attribute unless options name some: gives a variable
         of two dimensions or more with the values that its file has. Only what is taken is asked for, so that nothing
         else is read.
+    usual : mapping of str to str, optional
+        Options that count where nobody has chosen a variable, x or y.
 
     Raises
     ------
@@ -61,10 +67,13 @@ def surface_in(
         dataset, mark = mark.unscaled(dataset)
     options = {key: value for key, value in source.options.items() if key != "attributes"}
     wanted = names_in(source.options["attributes"]) if "attributes" in source.options else None
+    is_chosen = wanted is not None or bool(_CHOOSING & set(options))
+    if usual and not _CHOOSING & set(options):
+        options |= usual
     apart: list[str] = []
     numbers: list[str] = []
     if mark is not None:
-        if not {"variable", "x", "y"} & set(options):
+        if not _CHOOSING & set(options):
             options |= mark.options(dataset)
         source = replace(source, closed=source.closed or mark.closed_in(dataset))
         # Neither attributes of a surface nor numbers of rows and columns are coordinates, whatever they are called.
@@ -84,7 +93,7 @@ def surface_in(
         read = read.assign(_read(read, choice, stored))
     if deflated:
         source.check_expansion(choice.nbytes)
-    surface, notes = surface_of(source, read, choice, format_name)
+    surface, notes = surface_of(source, read, choice, format_name, complete=not is_chosen)
     if wanted is None or not in_memory:
         notes += not_taken(read, choice)
     if mark is None and not in_memory:

@@ -1,4 +1,4 @@
-"""Coordinates of a surface that have one value, such as its time: ``scalars`` of the metadata, and back."""
+"""Single numbers beside a surface, such as its time or a constant: ``scalars`` of the metadata, and back."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...scratch import IN_MEMORY
-from .choice import Choice
+from .choice import Choice, is_numeric
 from .names import associated, is_grid_mapping, is_time, time_of
 from .values import chosen, values_of
 
-__all__ = ["SCALARS", "names_of_single", "number_of", "numbers_in"]
+__all__ = ["SCALARS", "constants_of", "names_of_single", "number_of", "numbers_in"]
 
 #: The key of the metadata with the numbers by their names.
 SCALARS = "scalars"
@@ -42,12 +42,23 @@ def names_of_single(dataset: Any, choice: Choice) -> list[str]:
     ]
 
 
+def constants_of(dataset: Any, choice: Choice) -> list[str]:
+    """Find all variables that have one value for a choice, such as constants of a model, but for what says a CRS."""
+    return [
+        str(name)
+        for name, variable in dataset.variables.items()
+        if not set(choice.dims) & set(variable.dims)
+        and all(dim in choice.index or dataset.sizes[dim] == 1 for dim in variable.dims)
+        and not is_grid_mapping(variable)
+    ]
+
+
 def number_of(dataset: Any, name: str, choice: Choice) -> float | int | None:
-    """Read the value of such a coordinate; None: it is no number, or its tags would be taken for others."""
+    """Read the value of such a variable; None: it is no number, or its tags would be taken for others."""
     variable = chosen(dataset.variables[name], choice.index)
-    if variable.ndim or variable.dtype.kind not in "iuf" or name in _RESERVED:
+    if not is_numeric(variable) or name in _RESERVED:
         return None
-    number = values_of(variable, (), IN_MEMORY)
+    number = values_of(variable, variable.dims, IN_MEMORY)
     value: float | int = number.array.item()
     return value if number.valid is None and math.isfinite(value) else None
 

@@ -236,6 +236,8 @@ def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArr
             of_unpacked = packed and stored.dtype.kind in "iu" and limit.dtype.kind == "f"
             if not of_unpacked:
                 limit = stored_number(limit, stored.dtype, attributes)
+                if raw.dtype.kind in "iu" and whole_number(limit, raw.dtype) is None:
+                    continue  # as netCDF4 does: a limit that no value can have says nothing of values
             of_stored = packed and stored.dtype.kind in "iu" and not of_unpacked
             inside = inside & is_within(raw if of_stored else values, limit)
     outside = 0
