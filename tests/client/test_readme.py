@@ -12,6 +12,8 @@ import pytest
 from lodestream_client.demo.terrain import terrain
 from lodestream_client.program import build_parser
 
+from .conftest import Run
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 
@@ -40,6 +42,26 @@ def test_its_commands_are_understood() -> None:
     assert {command[0] for command in found} == {"encode", "info", "decode", "serve", "push", "pull", "token", "view"}
     for command in found:
         build_parser().parse_args([it.replace("URL", "http://127.0.0.1:8000/v1/surfaces/ID") for it in command])
+
+
+def test_its_commands_run(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Run) -> None:
+    """All but `serve`, for which there is the fixture, and the browser."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lodestream-demo").mkdir()
+    np.save(tmp_path / "lodestream-demo" / "terrain.npy", terrain((256, 480)))
+    url = ""
+    for command in commands():
+        if command[0] == "serve" or command == ["view", "terrain.lode"]:
+            continue
+        arguments = [it.replace("http://127.0.0.1:8000", server).replace("URL", url) for it in command]
+        code, printed, said = run(*arguments)
+        assert code == 0, f"{command}: {said}"
+        if command[0] == "push":
+            url = printed.strip()
+    assert len(list(tmp_path.glob("rough-*.png"))) == 3
+    assert np.load("rough.npy").shape == (256, 480)
+    assert np.array_equal(np.load("window.npy"), np.load("lodestream-demo/terrain.npy")[100:220, 300:460])
+    assert (tmp_path / "surfaces" / "tokens.json").is_file()
 
 
 def test_its_programs_run(
