@@ -84,11 +84,11 @@ def _speeds(paths: dict[str, Path]) -> None:
     head = ["million samples a second", "one thread", "of the processor", "two threads", "of the processors"]
     table("Whole encode and decode", [*head, "times", "at best"], rows)
     note(
-        f"The best of {ROUNDS} turns: exact streams, decoded from bytes to points with the SHA-256 checked. By the "
-        "clock, and by the processor time of all threads together, which does not count who else uses the machine. "
-        "`times`: one thread's time by the clock over that of two, which says little where others keep the processors "
-        f"busy: {_load()}. `at best`: one thread's processor time over that of the caller's thread of two, as if it "
-        f"never had to wait for the other. Aims on bigtujunga: {AIMS['encode']:g} and {AIMS['decode']:g} million "
+        f"The best of {ROUNDS} turns: exact streams, decoded from bytes to points with the SHA-256 checked. Wall-clock "
+        "time, and the processor time of all threads together, which other work on the machine does not change. "
+        "`times`: the wall-clock time of one thread over that of two, which says little on a busy machine: "
+        f"{_load()}. `at best`: the processor time of one thread over that of the caller's thread of two, as if it "
+        f"never waited for the other. Aims on bigtujunga: {AIMS['encode']:g} and {AIMS['decode']:g} million "
         f"samples a second of processor time by one thread, and two threads {TWO_THREADS} times as fast by the clock. "
         f"With numba, before there were kernels in C, `encode` did {OF_NUMBA} on such a machine."
     )
@@ -160,8 +160,8 @@ def _peaks(folder: Path) -> None:
     head = [f"bytes a value, {SIDE} x {SIDE}", "encode", "its container", "decode", "its points"]
     table("Memory of encode and decode", head, rows)
     note(
-        "Peak of a process of its own above what it held with its input, without the result. Aims for one thread: at "
-        f"most {MEMORY['encode']:g} bytes a value to encode, {MEMORY['decode']:g} to decode."
+        "Peak memory of a separate process above its memory with the input, without the result. Aims for one thread: "
+        f"at most {MEMORY['encode']:g} bytes a value to encode, {MEMORY['decode']:g} to decode."
     )
 
 

@@ -85,8 +85,8 @@ def main() -> None:
     table(f"Share of the container that a window takes, of {PLACES} places", head, rows)
     note(
         "All bytes count: header, index, footer, segments, chunks of the residual, metadata. The points of every "
-        "window equal those of the surface. `over Range`: the median of what a client of HTTP Range reads, which "
-        "takes what lies between two slices too where that is less than another request costs (16 KiB and more)."
+        "window equal those of the surface. `over Range`: the median of the bytes that a client of HTTP Range "
+        "reads. It also reads the gap between two slices if that costs less than another request (16 KiB and more)."
     )
 
 

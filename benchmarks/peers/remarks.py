@@ -14,20 +14,20 @@ those of the optimal hierarchy.""",
 At most 64 x 64 points: the header and the start of the contexts are most of the stream. The aims are for larger
 surfaces.""",
     "quantised values": """\
-The peer codes whole numbers, quantised with the very step that meets the error, by predictors and contexts chosen
-for this surface, and gives nothing before its end. A stream for this one error, with a trellis, is the setting here: it
-takes 5 to 20 % less than one exact stream.""",
+The peer codes integers, quantised with the step that just meets the error, with predictors and contexts chosen for
+this surface. It shows nothing before its end. Ours is a stream for this one error, with a trellis: 5 to 20 % smaller
+than one exact stream.""",
     "terraces": """\
-A map of heights in 8 bits that are 153 of the 256 values, where two neighbours in three are equal: the peer's tree of
-predictors says so exactly, while the optimal hierarchy spreads each edge of a terrace over its levels. A stream of
-rough layers and then everything at once took 30 % fewer bytes here and was left out: a progressive stream is
-progressive, always (`docs/experiments.md`). Finer classes of contexts (as above) gain nothing; a precision is no help
-below the values' own step.""",
+A map of heights in 8 bits that takes 153 of the 256 values; two neighbours in three are equal. The peer's tree of
+predictors expresses this exactly, while the optimal hierarchy spreads each edge of a terrace over its levels. A stream
+of a few rough layers and then all values at once took 30 % fewer bytes here. It was removed, since it was not
+progressive (`docs/experiments.md`). Finer classes of contexts gain nothing; a precision below the step of the values
+does not help.""",
     "transforms": """\
 The peer is a wavelet coder with longer filters (9/7) and its rates are chosen after coding.""",
     "maximum": """\
-Not an aim. A maximum is met by coding all values quantised, which is what a precision does; before its end the
-largest error of an embedded stream is four times its RMS and more.""",
+Not an aim. A maximum error is met by quantising all values, as a precision does. Before the end of an embedded stream
+the maximum error is at least four times the RMS error.""",
     "noise": """\
 Nothing can be predicted, and what differs is the cost of adapting and of frames (about 1 %); the transform turns
 white noise into noise that is not quite white. At 1e-2 the error lies just below the noise's own: the peer's bytes

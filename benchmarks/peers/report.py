@@ -77,7 +77,7 @@ def _head(results: Results) -> Iterator[str]:
     runs = results.data["runs"].values()
     dates = sorted({run["date"] for run in runs})
     took = sum(run["seconds"] for run in runs)
-    yield "# Seconds, bytes, speed and memory beside the peers\n"
+    yield "# Seconds, bytes, speed and memory, compared with other coders\n"
     yield "This page and its figures are written by\n"
     yield "    make bench-peers\n"
     yield "in an environment of its own (layers of JPEG 2000 need Debian's OpenJPEG: `apt-get install libopenjp2-7`),"
