@@ -236,7 +236,7 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
 
 async def _gone(request: HTTPConnection, error: Exception) -> Response:
     # Nobody is there to read it.
-    return _document(request, 400, "gone", "The client has gone", "the body ended before it was complete", {})
+    return _document(request, 400, "gone", "The client disconnected", "the body ended before it was complete", {})
 
 
 async def _refused(request: Request, error: Exception) -> Response:

@@ -117,7 +117,7 @@ def _show(what: str, details: Mapping[str, Any]) -> None:
     more = len(details.get("channel_names") or []) - _MOST_CHANNELS
     if more > 0:
         out.print()
-        out.print(f"and {more} more channels, whose errors --json tells")
+        out.print(f"and {more} more channels; --json lists their errors")
 
 
 def _last_state(details: Mapping[str, Any]) -> str:

@@ -137,9 +137,9 @@ def _options(args: argparse.Namespace) -> ViewOptions:
     if args.png is not None and args.static is not None:
         args.parser.error("argument --png: not allowed with argument --static")
     if args.at is not None and args.png is None:
-        args.parser.error("argument --at: says when --png draws")
+        args.parser.error("argument --at: needs --png")
     if args.roi is not None and args.png is None:
-        args.parser.error("argument --roi: says what --png draws; the page gets first what is looked at")
+        args.parser.error("argument --roi: needs --png; the page loads the visible part first")
     if args.png is not None and args.png.suffix.lower() != ".png":
         args.parser.error(f"argument --png: expected OUT.png, got {args.png}")
     if len(args.files) > 1 and any(map(is_url, args.files)):

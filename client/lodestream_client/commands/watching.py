@@ -27,7 +27,7 @@ __all__ = ["Watch", "check_picture", "check_watched"]
 
 
 def check_watched(out: str) -> None:
-    """Check early that OUT can be replaced again and again.
+    """Check early that OUT can be replaced while the surface improves.
 
     Raises
     ------
@@ -37,13 +37,13 @@ def check_watched(out: str) -> None:
     from lodestream.formats import for_writing
 
     if for_writing(out).folder is not None:
-        raise InputError(f"cannot write {out} again and again: it is a folder, and only files are replaced")
+        raise InputError(f"cannot rewrite {out} as the surface improves: it is a folder, and --watch needs a file")
     try:
         mode = Path(out).stat().st_mode
     except OSError:
         return
     if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):  # a folder is refused by others, in their words
-        raise InputError(f"cannot write {out} again and again: it is no file")
+        raise InputError(f"cannot rewrite {out} as the surface improves: it is no file")
 
 
 def check_picture(picture: Path) -> None:

@@ -130,7 +130,7 @@ def _build(task: ClusterJob) -> Built | Refused:
             if getattr(error, "errno", None) is not None:
                 raise
             # Of Dask: workers died, the scheduler has gone, a worker lacks this package or has another version.
-            words = str(error) or "its scheduler has gone, or has dropped the tasks"
+            words = str(error) or "the scheduler has ended, or has dropped the tasks"
             return Refused(f"LODESTREAM_DASK: the cluster gave up: {type(error).__name__}: {words}", final=False)
     return Built(moved(container, job.container))
 

@@ -71,7 +71,7 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
     from lodestream.formats import Format
 
     if len(files) > 1:
-        raise FormatError(f"expected a container by itself, got it among {len(files)} files")
+        raise FormatError(f"expected a container as the only file, got one of {len(files)} files")
     for option in options:
         raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
     _check_sections(files[0])

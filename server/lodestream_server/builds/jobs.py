@@ -63,6 +63,7 @@ from .shares import Turns
 __all__ = ["Builder"]
 
 _log = logging.getLogger(__name__)
+_STARTED_AGAIN = "the build of %s starts again from the beginning; continuing it failed: %s"
 
 _DEATHS = 2
 _ENDINGS = 3
@@ -349,7 +350,7 @@ class Builder:
         if problem is None:
             self.ready = True
         else:
-            _log.error("what builds need could not be loaded: %s", problem)
+            _log.error("the libraries of builds could not be loaded: %s", problem)
 
     async def _build(self, record: Record) -> None:
         delay, reason, attempts = _FIRST_DELAY, "", 0
@@ -461,7 +462,7 @@ class Builder:
                 return None
             if continued:
                 # What it continued from may have been at fault, and is gone now.
-                _log.warning("the build of %s begins anew, since continued it ended so: %s", record.id, result.reason)
+                _log.warning(_STARTED_AGAIN, record.id, result.reason)
                 return None
             return await (self._refuse if result.final else self._postpone)(record, result.reason)
         except _LaterError as error:
@@ -470,7 +471,7 @@ class Builder:
         except (MemoryError, ProcessDiedError) as error:
             if not continued or self._closing:
                 raise
-            _log.warning("the build of %s begins anew, since continued it ended so: %s", record.id, error)
+            _log.warning(_STARTED_AGAIN, record.id, error)
             return None
         finally:
             self._running.pop(record.id, None)

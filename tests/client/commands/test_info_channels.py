@@ -52,4 +52,4 @@ def test_heights_alone_have_none_and_of_many_the_first_are_shown(
     path.write_bytes(ls.encode(ls.Surface(terrain((9, 8)), attributes={f"a{k}": terrain((9, 8), k) for k in range(9)})))
     lines = [line.split() for line in shown(path, capsys).splitlines() if "RMS error" in line]
     assert [line[-6:] for line in lines] == [["z", "a0", "a1", "a2", "a3", "a4"]] * 2
-    assert shown(path, capsys).splitlines()[-1] == "and 4 more channels, whose errors --json tells"
+    assert shown(path, capsys).splitlines()[-1] == "and 4 more channels; --json lists their errors"

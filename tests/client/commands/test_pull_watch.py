@@ -383,5 +383,5 @@ def test_what_cannot_be_watched_is_refused_at_once(run: Run, surface: str, tmp_p
 def test_a_store_is_not_replaced_again_and_again(run: Run, surface: str, tmp_path: Path) -> None:
     code, _, stderr = run("pull", surface, tmp_path / "out.zarr", "--watch")
     assert code == 1
-    assert "out.zarr again and again: it is a folder, and only files are replaced" in stderr
+    assert "out.zarr as the surface improves: it is a folder, and --watch needs a file" in stderr
     assert list(tmp_path.iterdir()) == [], "refused before the first state"

@@ -186,7 +186,7 @@ def test_a_surface_that_is_only_parsed_is_no_answer_where_there_is_no_cluster(
         (RuntimeError("3 workers died"), "LODESTREAM_DASK: the cluster gave up: RuntimeError: 3 workers died"),
         (
             CancelledError(),
-            "LODESTREAM_DASK: the cluster gave up: CancelledError: its scheduler has gone, or has dropped the tasks",
+            "LODESTREAM_DASK: the cluster gave up: CancelledError: the scheduler has ended, or has dropped the tasks",
         ),
         (TimeoutError("no answer"), "LODESTREAM_DASK: the cluster gave up: TimeoutError: no answer"),
         (

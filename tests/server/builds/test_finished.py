@@ -121,7 +121,7 @@ def test_a_container_comes_by_itself(http: httpx.Client, data: Path, exact: byte
             parts = [("file", (f"{k}.lode", file)) for k, file in enumerate(files)]
             answer = http.post("/v1/surfaces", files=parts)
             assert problem(answer) == (422, "bad-file")
-            assert "a container by itself" in answer.json()["detail"]
+            assert "a container as the only file" in answer.json()["detail"]
     assert stored(data) == before
 
 

@@ -161,7 +161,7 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
     for number, path in enumerate(sorted((data / "work").glob("*/bands/*/exact/**/*.npy"))):
         if number % 5 == 0:
             os.truncate(path, path.stat().st_size // 2)
-    assert "begins anew" not in _end(data, location, container)
+    assert "starts again from the beginning" not in _end(data, location, container)
 
 
 @needs_landlock
@@ -178,7 +178,7 @@ def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
     exact.touch()
     text = _end(data, location, container)
     assert text.count("continues from what an interrupted attempt had made") == 1
-    assert text.count("begins anew, since continued it ended so: the build failed with an internal error") == 1
+    assert text.count("starts again from the beginning; continuing it failed: the build failed with an internal") == 1
 
 
 def test_another_attempt_goes_on_in_the_same_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
