@@ -3,7 +3,8 @@
 The calls of kernels of `scenes` are recorded with the library that is installed here: every golden file is decoded at
 every layer and level, and encoded anew. Then they are made again by programs that other compilers have made, with and
 without optimisation, and for machines of other kinds, which ``qemu-user`` imitates: one of them stores numbers with
-the highest byte first. What they return and what they leave in memory is compared bit for bit.
+the highest byte first. Under wine a program loads the library of the wheel for Windows. What they return and what they
+leave in memory is compared bit for bit.
 
 ``python -m tests.kernels.portable`` takes what there is on this machine and names what is missing; ``--zig`` installs
 the ``ziglang`` wheel into ``build`` for it.
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import os
 import platform
 import shutil
 import subprocess
@@ -22,10 +24,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lodestream.library import library, wide_name
+from lodestream.library import library, library_name, wide_name
 
-from .compiling import BUILD, build, compiled
-from .declared import declarations
+from .compiling import BUILD, HERE, KERNELS, build, compiled
+from .declared import declarations, dispatch
 from .recording import recorded
 from .scenes import SCENES, check
 
@@ -38,6 +40,12 @@ MACHINES = {
 }
 
 _LEVELS = ("-O0", "-O3")
+
+#: The wheel whose library is run by wine, and the compiler of the program that loads it: for one with a C library zig
+#: takes a quarter of an hour.
+_WINDOWS = "windows-x86_64"
+_MINGW = "x86_64-w64-mingw32-gcc"
+_FILES = ["calls.c", "replay.c"]
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,11 @@ class Build:
     command: tuple[str, ...]
     flags: tuple[str, ...]
     runner: tuple[str, ...] = ()
+
+    @property
+    def is_of_windows(self) -> bool:
+        """Whether the program loads the library of the wheel for Windows, and has no kernels of its own."""
+        return self.machine == _WINDOWS
 
 
 def builds() -> Iterator[Build | str]:
@@ -86,6 +99,7 @@ def builds() -> Iterator[Build | str]:
                 yield Build(_zig_version(zig), machine, zig, (level, "-static", "-target", target), (runner,))
         else:
             yield f"{machine}: neither {cross} nor zig on this machine"
+    yield _windows(zig)
 
 
 class Replayed:
@@ -102,13 +116,17 @@ class Replayed:
         self.seconds = 0.0
         self.wrong: list[str] = []
         name = f"replay-{build_.machine}-{build_.compiler.partition(' ')[0]}{build_.flags[0]}"
-        self._program = compiled(name, build_.command, build_.flags, ["calls.c", "replay.c"])
+        if build_.is_of_windows:
+            self._program = _program_of_windows(build_)
+        else:
+            self._program = compiled(name, build_.command, build_.flags, _FILES)
 
     def replay(self, scene: str, calls: Path) -> None:
         """Make the calls of a scene again, and compare."""
         started = time.monotonic()
         command = [*self.build.runner, str(self._program), str(calls)]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        wine = {"WINEPREFIX": str(BUILD / "wine"), "WINEDEBUG": "-all"}
+        done = subprocess.run(command, env=os.environ | wine, capture_output=True, text=True, errors="replace")
         self.seconds += time.monotonic() - started
         if done.returncode or not done.stdout.endswith("the same\n"):
             self.wrong.append(f"{scene}: {done.stdout}{done.stderr}")
@@ -125,6 +143,31 @@ def _here(compiler: str, command: tuple[str, ...]) -> Iterator[Build]:
     for level, v3 in ((_LEVELS[0], False), (_LEVELS[1], False), *([(_LEVELS[1], True)] if wide else [])):
         processor = [flag for flag in build().machine_flags(list(command), v3=v3) if flag.startswith("-m")]
         yield Build(compiler, f"{platform.machine()}{'-v3' * v3}", command, (level, *processor))
+
+
+def _windows(zig: tuple[str, ...] | None) -> Build | str:
+    """The build of the library for Windows; or why it cannot be run."""
+    wine = shutil.which("wine")
+    if wine is None or shutil.which(_MINGW) is None or zig is None:
+        missing = {"wine": wine, f"{_MINGW} (Debian's gcc-mingw-w64-x86-64)": shutil.which(_MINGW), "zig": zig}
+        return f"windows: no {', no '.join(name for name, there in missing.items() if not there)} on this machine"
+    return Build(_zig_version(zig), _WINDOWS, zig, (_LEVELS[1],), (wine,))
+
+
+def _program_of_windows(build_: Build) -> Path:
+    """Compile the library of a wheel for Windows, and a program that loads it from its own folder."""
+    folder = BUILD / f"replay-{_WINDOWS}"
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = build().PLATFORMS[_WINDOWS]
+    loaded = folder / str(library_name(wanted.system, wanted.machine))
+    build().compile_library(loaded, list(build_.command), wanted)
+    (folder / "dispatch.c").write_text(dispatch(None))
+    sources = [*(str(HERE / name) for name in _FILES), str(folder / "dispatch.c"), str(loaded)]
+    command = [_MINGW, "-std=c11", "-O2", "-static", f"-I{KERNELS}", f"-I{HERE}", *sources]
+    done = subprocess.run([*command, "-o", str(folder / "replay.exe")], capture_output=True, text=True)
+    if done.returncode:
+        raise RuntimeError(f"{_MINGW} ended with {done.returncode}:\n{done.stderr}")
+    return folder / "replay.exe"
 
 
 def _version(command: str) -> str:

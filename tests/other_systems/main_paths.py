@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib
+import io
 import pkgutil
 import sys
 import time
@@ -23,7 +25,7 @@ _LEFT_OUT = ("lodestream.confinement.landlock", "lodestream.confinement.seccomp"
 def main(system: str, folder: Path, url: str) -> None:
     """Run all parts; the name of each is printed when it has passed."""
     imitate(system)
-    for part in (modules, memory, bands, continuing, commands, streams, cache, reader_of_vtk):
+    for part in (modules, memory, bands, continuing, commands, streams, cache, serving, reader_of_vtk):
         place = folder / part.__name__
         place.mkdir()
         part(place, url)
@@ -180,6 +182,19 @@ def cache(folder: Path, url: str) -> None:
     with pytest.raises(OSError, match="symbolic links"):
         CacheFile(folder, "ef" * 32, 1000)
     link.unlink()
+
+
+def serving(folder: Path, url: str) -> None:
+    """Refuse to start a server, in one line."""
+    from lodestream_client.program import main as command
+
+    for words in ((), ("--unconfined",)):
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            code = command(["serve", "--data", str(folder / "data"), "--port", "0", *words])
+        assert code == 1
+        (line,) = said.getvalue().splitlines()
+        assert "needs Linux" in line
+    assert list(folder.iterdir()) == []
 
 
 def reader_of_vtk(folder: Path, url: str) -> None:

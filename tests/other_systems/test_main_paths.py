@@ -31,7 +31,7 @@ def test_the_main_paths_run_on_an_imitated_system(system: str, tmp_path: Path) -
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, timeout=PATIENCE, check=False)
     words = done.stdout.decode("cp1252", "replace") + done.stderr.decode("cp1252", "replace")
     assert done.returncode == 0, words
-    parts = ["modules", "memory", "bands", "continuing", "commands", "streams", "cache", "reader_of_vtk"]
+    parts = ["modules", "memory", "bands", "continuing", "commands", "streams", "cache", "serving", "reader_of_vtk"]
     assert [line for line in words.splitlines() if line in parts] == parts
     folder = {"win32": tmp_path / "Local", "darwin": tmp_path / "Library" / "Caches"}[system] / "lodestream"
     assert folder.is_dir()

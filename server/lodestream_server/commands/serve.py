@@ -70,9 +70,16 @@ def serve(args: argparse.Namespace) -> int:
     UnavailableError
         If a library of the server is not installed.
     LodestreamError, OSError
-        If builds would not be confined and `unconfined` is not set, if others can reach the address and there is no
-        token, or if the data folder cannot be used or is not complete.
+        If this is not Linux, if builds would not be confined and `unconfined` is not set, if others can reach the
+        address and there is no token, or if the data folder cannot be used or is not complete.
     """
+    if sys.platform != "linux":
+        from lodestream.errors import LodestreamError
+
+        raise LodestreamError(
+            "the server needs Linux, which forks and confines the processes that read uploads; here `lodestream view` "
+            "shows files, and the other commands use servers elsewhere"
+        )
     settings = chosen_settings(args)
     for library in _LIBRARIES:
         require_library(library, _EXTRA)
