@@ -1,8 +1,12 @@
-"""Draws docs/blocks.png, surfaces of several blocks at four moments: ``python -m benchmarks.pictures``."""
+"""Draws docs/blocks.png and docs/remeshing.png: ``python -m benchmarks.pictures``.
+
+The first are surfaces of several blocks at four moments, the second triangle meshes that are resampled at three.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
+from tests.core.remesh import scenes
 
 from .arrays import ROOT
+from .remeshing import torus
 from .render import Camera, Patch, draw
 
-PICTURE = ROOT / "docs" / "blocks.png"
+PICTURE, REMESHED = ROOT / "docs" / "blocks.png", ROOT / "docs" / "remeshing.png"
 DATA = ROOT.parent / "shared" / "data"
 
 _PAPER, _INK, _DIM, _ACCENT = "#0e1216", "#e8e6e1", "#98a2ab", "#e9b44c"
@@ -34,51 +40,100 @@ class Subject:
     Attributes
     ----------
     name, title : str
+        The name is that of a file, or of a generated mesh of the tests.
     axes : (int, int, int)
         Which coordinates run to the right, to the back and up.
     camera : (azimuth, elevation, width over the box's diagonal)
-    until : (float, float)
-        RMS errors over the diagonal of the second and the third moment; the others are the first layer and the last.
+    until : tuple of float
+        RMS errors over the diagonal: a moment is the first layer with less. The last moment is the last layer.
     """
 
     name: str
     title: str
     axes: tuple[int, int, int]
     camera: tuple[float, float, float]
-    until: tuple[float, float]
+    until: tuple[float, ...]
 
 
 SUBJECTS = (
-    Subject("m6_small.fmt", "ONERA M6 wing, 9 blocks", (0, 2, 1), (208.0, 24.0, 0.86), (4e-3, 3e-4)),
-    Subject("bamboo_pen.obj", "Bamboo pen holder, 110 blocks", (0, 1, 2), (-62.0, 28.0, 1.02), (2e-2, 1e-3)),
+    Subject("m6_small.fmt", "ONERA M6 wing, 9 blocks", (0, 2, 1), (208.0, 24.0, 0.86), (np.inf, 4e-3, 3e-4)),
+    Subject("bamboo_pen.obj", "Bamboo pen holder, 110 blocks", (0, 1, 2), (-62.0, 28.0, 1.02), (np.inf, 2e-2, 1e-3)),
+)
+
+#: *Spot* by Keenan Crane (CC0), and generated ones.
+MESHES = (
+    Subject(
+        "meshes/spot.obj",
+        "Spot, 5,856 triangles, texture coordinates",
+        (0, 2, 1),
+        (-35.0, 18.0, 1.12),
+        (3e-2, 4e-3),
+    ),
+    Subject("torus", "A torus with bumps", (0, 1, 2), (-62.0, 42.0, 0.86), (3e-2, 4e-3)),
+    Subject("double_torus", "A surface of genus 2", (0, 1, 2), (-62.0, 42.0, 0.9), (3e-2, 4e-3)),
+    Subject("gyroid", "A gyroid, open", (0, 1, 2), (-62.0, 28.0, 1.2), (3e-2, 4e-3)),
+    Subject("capsule", "A rough capsule, 1,796 triangles", (0, 1, 2), (-62.0, 24.0, 0.9), (3e-2, 4e-3)),
+    Subject("bracket", "A bracket of 20 triangles", (0, 1, 2), (-62.0, 28.0, 1.15), (3e-2, 4e-3)),
 )
 
 
 def main() -> int:
     """Draw what is there; exit code 1 where a file is not."""
-    missing = [subject.name for subject in SUBJECTS if not (DATA / subject.name).exists()]
+    files = [subject.name for subject in (*SUBJECTS, *MESHES) if "." in subject.name]
+    missing = [name for name in files if not (DATA / name).exists()]
     if missing:
         print(f"expected {', '.join(missing)} in ../{DATA.relative_to(ROOT.parent)}", file=sys.stderr)
         return 1
-    _compose([(subject, *_moments(subject)) for subject in SUBJECTS], PICTURE)
-    print(f"{PICTURE.relative_to(ROOT)}: {PICTURE.stat().st_size} bytes")
+    _compose([(subject, *_moments(subject, ls.read(DATA / subject.name))) for subject in SUBJECTS], PICTURE, 100)
+    _compose([(subject, *_moments(subject, _resampled(subject))) for subject in MESHES], REMESHED, 66)
+    for path in (PICTURE, REMESHED):
+        print(f"{path.relative_to(ROOT)}: {path.stat().st_size} bytes")
     return 0
 
 
-def _moments(subject: Subject) -> tuple[list[NDArray[np.float32]], list[tuple[str, str]]]:
-    container = ls.encode(ls.read(DATA / subject.name))
+def _resampled(subject: Subject) -> ls.Surface:
+    if subject.name.endswith(".obj"):
+        return ls.read(DATA / subject.name, remesh="yes")
+    points, faces = GENERATED[subject.name]()
+    return ls.Surface.from_mesh(points, faces, remesh=True)
+
+
+def _bracket() -> tuple[Floats, NDArray[np.int64]]:
+    """An extruded L: vertices, triangles."""
+    outline = np.array([[0, 0], [3, 0], [3, 0.6], [0.6, 0.6], [0.6, 2], [0, 2]])
+    points = np.concatenate([np.insert(outline, 1, y, axis=1) for y in (0.0, 1.2)])
+    front = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    start, stop = np.arange(6), np.roll(np.arange(6), -1)
+    sides = np.concatenate(
+        [np.stack([stop, start, start + 6], axis=-1), np.stack([stop, start + 6, stop + 6], axis=-1)]
+    )
+    return points, np.concatenate([front, front[:, ::-1] + 6, sides])
+
+
+GENERATED: dict[str, Callable[[], tuple[Floats, NDArray[np.int64]]]] = {
+    "torus": lambda: torus(20_000),
+    "double_torus": scenes.double_torus,
+    "gyroid": scenes.gyroid,
+    "capsule": scenes.capsule,
+    "bracket": _bracket,
+}
+
+
+def _moments(subject: Subject, read: ls.Surface) -> tuple[list[NDArray[np.float32]], list[tuple[str, str]]]:
+    container = ls.encode(read)
     decoder = ls.Decoder()
     views = decoder.feed(container)
     assert decoder.header is not None, "the container is whole"
     extent = decoder.header.extent
+    report = read.metadata.get("remesh")
     met = [next(view for view in views if view.rms <= limit * extent) for limit in subject.until]
-    chosen = [views[0], *met, views[-1]]
+    chosen = [*met, views[-1]]
     surfaces = [_places(view.surface(), subject.axes) for view in chosen]
     words = []
     for view in chosen:
-        error = (
-            "every value, bit for bit" if view is views[-1] else f"RMS error {view.rms / extent:.2%} of the diagonal"
-        )
+        error = f"RMS error {view.rms / extent:.2%} of the diagonal"
+        if view is views[-1]:
+            error = "every value, bit for bit" if report is None else _distance(report)
         words.append((f"{view.bytes:,} bytes", error))
     every = np.concatenate([points.reshape(-1, 3) for points in surfaces[-1]])
     low, high = every.min(axis=0), every.max(axis=0)
@@ -86,6 +141,11 @@ def _moments(subject: Subject) -> tuple[list[NDArray[np.float32]], list[tuple[st
     x, y, z = (low + high) / 2
     camera = Camera(azimuth, elevation, (x, y, z), share * float(np.linalg.norm(high - low)))
     return [draw(_patches(blocks, camera), camera, _WIDTH, _HEIGHT) for blocks in surfaces], words
+
+
+def _distance(report: Mapping[str, Any]) -> str:
+    rms = max(report["rms_to_input"], report["rms_from_input"]) / report["diagonal"]
+    return f"complete: {report['blocks']} blocks, {rms:.2%} from the mesh"
 
 
 def _places(surface: ls.Surface, axes: tuple[int, int, int]) -> list[Floats]:
@@ -132,20 +192,24 @@ def _normals(blocks: list[Floats]) -> list[Floats]:
     return [part.reshape(points.shape) for part, points in zip(parts, blocks, strict=True)]
 
 
-def _compose(rows: list[tuple[Subject, list[NDArray[np.float32]], list[tuple[str, str]]]], path: Path) -> None:
+def _compose(
+    rows: list[tuple[Subject, list[NDArray[np.float32]], list[tuple[str, str]]]], path: Path, dots: int
+) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(16.0, 3.35 * len(rows)), dpi=100, facecolor=_PAPER)
+    figure = Figure(figsize=(4.0 * len(rows[0][1]), 3.35 * len(rows)), dpi=dots, facecolor=_PAPER)
     FigureCanvasAgg(figure)
-    panels: Any = figure.subplots(len(rows), 4, squeeze=False)
-    figure.subplots_adjust(left=0.008, right=0.992, top=0.985, bottom=0.075, wspace=0.02, hspace=0.2)
+    columns = len(rows[0][1])
+    panels: Any = figure.subplots(len(rows), columns, squeeze=False)
+    margin = 0.15 / len(rows)
+    figure.subplots_adjust(left=0.008, right=0.992, top=1 - margin / 5, bottom=margin, wspace=0.02, hspace=0.2)
     for line, (subject, pictures, words) in zip(panels, rows, strict=True):
         for place, (panel, picture, (size, error)) in enumerate(zip(line, pictures, words, strict=True)):
             panel.set_axis_off()
             panel.imshow(picture, interpolation="antialiased")
             for text, down, colour, points in (
-                (size, -0.015, _ACCENT if place < 3 else _INK, 14.0),
+                (size, -0.015, _ACCENT if place < columns - 1 else _INK, 14.0),
                 (error, -0.105, _DIM, 10.5),
             ):
                 panel.text(

@@ -89,9 +89,10 @@ not explained below: of bijou's float64 values 98 % are float32 numbers. pcodec 
 not."""
 
 RESAMPLED = """\
-Triangle meshes without rows and columns, resampled into blocks ([remeshing.md](remeshing.md)), beside the best of
-Draco over numbers of triangles (quadric decimation by fast-simplification) and of bits, at level 10. Errors are
-distances between surfaces, the larger one of both ways, against the input mesh. `for this error` are streams of
-`--rms`, `one exact stream` the layers of a stream that was made without naming an error. The meshes are those of
+Triangle meshes without rows and columns, resampled into blocks ([remeshing.md](remeshing.md)), beside the shortest file
+of Draco that reaches the error: for each number of bits, the fewest triangles (quadric decimation by
+fast-simplification) are looked for to within 4 %, at level 10. Bytes of Lodestream are interpolated between streams.
+Errors are distances between surfaces, the larger one of both ways, against the input mesh. `for this error` are streams
+of `--rms`, `one exact stream` the layers of a stream that was made without naming an error. The meshes are those of
 `../shared/data/meshes`: two scans, and a CAD model, for which Draco is the better choice.
 """

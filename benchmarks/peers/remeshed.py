@@ -30,7 +30,7 @@ MESHES = ("stanford-bunny.obj", "armadillo.obj", "fandisk.obj")
 ERRORS = (2e-3, 1e-3, 5e-4, 3e-4)
 #: Streams made for one error: in parts of the diagonal, of points, of which sliding along the surface is a part.
 _RMS = (4e-3, 2e-3, 1.4e-3, 1e-3, 7e-4, 5e-4, 3.5e-4, 2.5e-4)
-_BITS, _LEVEL = (8, 9, 10, 11, 12, 13), 10
+_BITS, _LEVEL = (7, 8, 9, 10, 11, 12, 13), 10
 _KEPT = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03, 0.015)
 #: Times that a step between two of these is halved to find the fewest triangles for an error: to within 4 %.
 _HALVINGS = 4
