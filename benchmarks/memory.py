@@ -162,6 +162,7 @@ def _server(data: Path) -> Iterator[tuple[psutil.Process, str]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "lodestream_client", "serve", "--port", str(port), "--data", str(data)]
+    command += ["--unconfined"]  # on any machine
     address = f"http://127.0.0.1:{port}"
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
         try:

@@ -49,7 +49,12 @@ def installed(folder: Path) -> dict[str, str]:
     _run([*pip, "--python", str(environment / "bin" / "python"), "install", "--no-deps", "--no-index", str(wheel)])
     (packages,) = environment.glob("lib/python*/site-packages")
     (packages / "libraries.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "LODESTREAM"))}
+    kept = "LODESTREAM_UNCONFINED"  # see `tests.conftest`
+    variables = {
+        name: value
+        for name, value in os.environ.items()
+        if name == kept or not name.startswith(("PYTHON", "LODESTREAM"))
+    }
     return {
         **variables,
         "PATH": os.pathsep.join([str(environment / "bin"), os.environ["PATH"]]),

@@ -58,8 +58,10 @@ _FENCED = re.compile(r"^```(\w+)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _INDENTED = re.compile(rf"^    (?:\$ )?((?:{PROGRAMS}) .*)$", re.MULTILINE)
 _INLINE = re.compile(rf"`((?:[A-Z_]+=\S+ )*(?:{PROGRAMS})\b[^`]*)`")
 _SHELL = {"console", "bash", "sh"}
-_TARGETS = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(), re.MULTILINE)) | {"help"}
-_EXTRAS = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+_TARGETS = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)) | {
+    "help"
+}
+_EXTRAS = set(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"])
 
 
 def name(page: Path) -> str:
@@ -96,7 +98,7 @@ def command_line() -> argparse.ArgumentParser:
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_commands_of_blocks_are_understood(page: Path, command_line: argparse.ArgumentParser) -> None:
-    for command in block_commands(page.read_text()):
+    for command in block_commands(page.read_text(encoding="utf-8")):
         program, *arguments = words(command)
         if program == "lodestream":
             address = "http://127.0.0.1:8000/v1/surfaces/ID"
@@ -108,7 +110,7 @@ def test_commands_of_blocks_are_understood(page: Path, command_line: argparse.Ar
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_commands_in_the_text_exist(page: Path, command_line: argparse.ArgumentParser) -> None:
     known = parsers(command_line)
-    for command in _INLINE.findall(" ".join(_FENCED.sub("", page.read_text()).split())):
+    for command in _INLINE.findall(" ".join(_FENCED.sub("", page.read_text(encoding="utf-8")).split())):
         program, *arguments = re.sub(r"^(?:[A-Z_]+=\S+ )*", "", command).split()
         if program != "lodestream":
             check_program(program, arguments)
@@ -141,7 +143,7 @@ def check_program(program: str, arguments: list[str]) -> None:
 def test_every_block_is_run_by_a_test_or_there_is_a_reason() -> None:
     there = set()
     for page in PAGES:
-        text = page.read_text()
+        text = page.read_text(encoding="utf-8")
         there |= {(name(page), language) for language, _ in _FENCED.findall(text)}
         if _INDENTED.search(_FENCED.sub("", text)):
             there.add((name(page), "indented"))
@@ -152,7 +154,7 @@ def test_every_block_is_run_by_a_test_or_there_is_a_reason() -> None:
             assert (ROOT / path).exists(), path
         if not runs.startswith("not run: "):
             stem = Path(page_name).name
-            assert stem in (ROOT / runs).read_text() or page_name == "docs/api.md", runs
+            assert stem in (ROOT / runs).read_text(encoding="utf-8") or page_name == "docs/api.md", runs
 
 
 def test_a_command_that_is_not_there_is_noticed(command_line: argparse.ArgumentParser) -> None:

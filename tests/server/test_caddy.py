@@ -31,7 +31,7 @@ def serving(folder: Path) -> Iterator[tuple[str, str]]:
     """A server in a process of its own that trusts its proxy: its address, and a token with all rights."""
     token, _ = TokenFile(folder / "tokens.json").create("admin", ("admin",))
     command = [sys.executable, "-m", "lodestream_client", "serve", "--port", "0", "--data", str(folder)]
-    command += ["--trusted-proxies", "127.0.0.1", "--workers", "1", "--unconfined"]
+    command += ["--trusted-proxies", "127.0.0.1", "--workers", "1"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     # Nobody reads the pipe after the address has come: the server must not mind.
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
@@ -47,12 +47,14 @@ def serving(folder: Path) -> Iterator[tuple[str, str]]:
 @contextmanager
 def caddy(folder: Path, behind: str) -> Iterator[tuple[str, Path]]:
     """Caddy for https://localhost at a free port: its address, and the certificate of its own authority."""
-    with socket.socket() as probe:
+    with socket.socket() as probe, socket.socket() as other:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+        other.bind(("127.0.0.1", 0))
+        port, http_port = probe.getsockname()[1], other.getsockname()[1]
     folder.mkdir()
     names = {"HOME": str(folder), "XDG_DATA_HOME": str(folder), "XDG_CONFIG_HOME": str(folder)}
     names |= {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_UPSTREAM": behind}
+    names["LODESTREAM_HTTP_PORT"] = str(http_port)
     command = ["caddy", "run", "--config", str(ROOT / "docker/Caddyfile"), "--adapter", "caddyfile"]
     root = folder / "caddy/pki/authorities/local/root.crt"
     with (

@@ -16,10 +16,9 @@ from collections.abc import Iterable, Mapping
 
 assert sys.platform == "linux"  # no other system has what follows
 
-__all__ = ["is_available", "restrict"]
+__all__ = ["restrict"]
 
 _SET_FILTER = 1  # SECCOMP_SET_MODE_FILTER
-_KNOWS_ACTION = 2  # SECCOMP_GET_ACTION_AVAIL, of Linux 4.14
 _ALL_THREADS = 1  # SECCOMP_FILTER_FLAG_TSYNC
 _FULL_SPEED = 4  # SECCOMP_FILTER_FLAG_SPEC_ALLOW: or kernels before 5.16 slow everything that computes
 
@@ -122,15 +121,6 @@ def _table(text: str) -> Mapping[str, int]:
 _MACHINES = {"x86_64": (0xC000003E, _table(_X86_64)), "aarch64": (0xC00000B7, _table(_AARCH64))}
 
 
-def is_available(libc: ctypes.CDLL) -> bool:
-    """Return whether the kernel takes filters on this machine; nothing changes."""
-    machine = _machine()
-    if machine is None:
-        return False
-    action = ctypes.c_uint32(_ERROR)
-    return bool(libc.syscall(machine[1]["seccomp"], _KNOWS_ACTION, 0, ctypes.byref(action)) == 0)
-
-
 def restrict(libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool = False) -> bool:
     """Make no call from now on but those allowed; whether the kernel holds this process to it.
 
@@ -145,21 +135,14 @@ def restrict(libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool 
     threads : bool
         Whether further threads of this process may be started.
     """
-    machine = _machine()
-    if machine is None:
+    machine = os.uname().machine
+    if machine not in _MACHINES or sys.maxsize < 1 << 32 or sys.byteorder != "little":
         return False
-    architecture, calls = machine
+    architecture, calls = _MACHINES[machine]
     code = b"".join(_program(architecture, calls, process, processes=processes, threads=threads))
     instructions = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("HxxxxxxP", len(code) // 8, ctypes.addressof(instructions))
     return bool(libc.syscall(calls["seccomp"], _SET_FILTER, _ALL_THREADS | _FULL_SPEED, program) == 0)
-
-
-def _machine() -> tuple[int, Mapping[str, int]] | None:
-    """Return the entry of `_MACHINES` for this machine; None if there is none."""
-    if sys.maxsize < 1 << 32 or sys.byteorder != "little":
-        return None
-    return _MACHINES.get(os.uname().machine)
 
 
 def _program(

@@ -39,7 +39,7 @@ from typing import Any, NoReturn, get_type_hints
 from pydantic import TypeAdapter
 
 from lodestream import parallel
-from lodestream.confinement import Rights, confine
+from lodestream.confinement import Rights, available, confine
 
 from .answers import answer_of
 
@@ -108,8 +108,7 @@ def main() -> None:
         ctypes.CDLL(None).prctl(_INHERIT_ORPHANS, 1)
     gc.disable()  # what is loaded stays
     parent = os.getppid()
-    confinement = _try_confinement()
-    _say(control, {"confinement": confinement})
+    _say(control, {"confinement": _confinement()})
     with _ending_with(parent):
         problem = _preload(sys.argv[2]) if sys.argv[2] else None
     _say(control, {"problem": problem})
@@ -296,7 +295,10 @@ def _limit(allowed: Allowed) -> None:
     write = tuple(path for path in (allowed.write, allowed.kept) if path is not None)
     os.environ[parallel.VARIABLE] = str(allowed.threads)
     os.nice(_NICE)  # streams come first
-    confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1))
+    expected = _confinement()
+    held = confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1))
+    if held != expected:
+        raise RuntimeError(f"this process is confined by {held}, and not by {expected}, as the first one was")
 
 
 def _private_memory() -> int:
@@ -344,9 +346,10 @@ def _tell(connection: socket.socket, message: dict[str, int]) -> None:
         connection.send(json.dumps(message).encode() + b"\n")
 
 
-def _try_confinement() -> list[str]:
-    """Return the confinements that the kernel enforces, found out by a process that confines itself."""
-    return _in_a_fork(lambda: list(confine(Rights()))) or []
+@cache
+def _confinement() -> tuple[str, ...]:
+    """Return how the kernel confines processes. The processes of calls know it from the one that they come from."""
+    return available()
 
 
 def _preload(name: str) -> str | None:
@@ -356,26 +359,6 @@ def _preload(name: str) -> str | None:
     except Exception:
         return traceback.format_exc()[-_TRACEBACK:]
     return None
-
-
-def _in_a_fork(function: Callable[[], Any]) -> Any:
-    """Call a function in a process of its own, and return its result through JSON; None when the process died."""
-    ours, theirs = os.pipe()
-    parent = os.getpid()
-    process = os.fork()
-    if not process:
-        try:
-            os.close(ours)
-            _become_a_call(parent, theirs)
-            with os.fdopen(theirs, "w") as pipe:
-                pipe.write(json.dumps(function()))
-        finally:
-            os._exit(0)
-    os.close(theirs)
-    with os.fdopen(ours, "rb") as pipe:
-        text = pipe.read()
-    os.waitpid(process, 0)
-    return json.loads(text) if text else None
 
 
 @contextmanager

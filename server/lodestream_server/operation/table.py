@@ -273,7 +273,9 @@ _SETTINGS = (
         _SWITCH,
         False,
         "start although this system or its kernel cannot confine the processes that read uploads (Landlock and seccomp "
-        "of Linux): a file that exploits a bug in its reader may then do what the server may do",
+        "of Linux): a file that exploits a bug in its reader may then do what the server may do. "
+        "Without it `lodestream serve` refuses to start; a server that a program starts (`create_app`, "
+        "`running_server`) logs a warning",
         "access",
     ),
     Setting(

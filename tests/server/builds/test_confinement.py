@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ctypes
 import json
 import logging
@@ -21,10 +22,13 @@ import pytest
 import lodestream as ls
 from lodestream.confinement import landlock
 from lodestream_server.builds import jobs, worker
+from lodestream_server.builds.answers import UnforeseenError
 from lodestream_server.builds.fork_control import ForkServer
+from lodestream_server.builds.processes import Call, Pool
 from lodestream_server.maintenance import fsck
 from lodestream_server.storage.durable import remove
 from tests.patience import PATIENCE
+from tests.server.builds import slow
 from tests.server.builds.test_builds import running
 from tests.server.connections import hostile
 from tests.server.helpers import eventually, hills, kept, npy, push, settled
@@ -53,6 +57,26 @@ def other(http: httpx.Client) -> Iterator[dict[str, Any]]:
     yield made
     assert http.get(made["url"]).json() == made
     assert http.get(f"{made['url']}/container", follow_redirects=True).content == container
+
+
+@needs_landlock
+def test_a_call_that_is_confined_less_than_the_trial_does_not_run() -> None:
+    server = ForkServer(slow.weaken)
+
+    async def check() -> None:
+        pool = Pool(1, server)
+        try:
+            async with asyncio.timeout(PATIENCE):
+                with pytest.raises(UnforeseenError, match="RuntimeError") as raised:
+                    await pool.run(Call(slow.number))
+            assert "this process is confined by ('seccomp',)" in raised.value.traceback
+        finally:
+            await asyncio.to_thread(pool.close)
+
+    try:
+        asyncio.run(check())
+    finally:
+        server.close()
 
 
 @needs_landlock

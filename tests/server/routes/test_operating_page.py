@@ -46,7 +46,7 @@ def test_curl_uploads_and_fetches_what_the_page_says(server: str, http: httpx.Cl
 
     def curl(command: str) -> str:
         line = command.replace("http://127.0.0.1:8000", server).replace(
-            "curl ", "curl --silent --show-error --fail ", 1
+            "curl ", "curl -q --noproxy '*' --silent --show-error --fail ", 1
         )
         done = subprocess.run(
             ["bash", "-c", line], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE, check=False
