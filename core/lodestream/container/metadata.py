@@ -89,7 +89,8 @@ def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str,
     """Drop the largest entries of metadata that are too large for a container.
 
     Entries of ``tags``, ``types``, ``bands``, ``scalars`` and ``faces`` are dropped one by one, other values as a
-    whole. Some room is left for later additions, such as a server's notes.
+    whole. Others than ``scalars`` and their tags are dropped only if they would not fit without these either. Some room
+    is left for later additions, such as a server's notes.
 
     Parameters
     ----------
@@ -100,7 +101,7 @@ def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str,
     metadata : dict
         Without the dropped entries; no value of the original is changed.
     dropped : list of (str, int)
-        Name and size in bytes of each dropped entry, the largest first.
+        Name and size in bytes of each dropped entry, the largest first, and then those of ``scalars``.
 
     Raises
     ------
@@ -114,12 +115,15 @@ def fitted(metadata: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[str,
         return result, []
     result |= {key: deepcopy(result[key]) for key in _DEPTHS if key in result}
     single = [path for key, value in result.items() for path in _paths(value, (key,), _DEPTHS.get(key, 0))]
+    of_scalars = _of_scalars(result, single)
+    others = [path for path in single if path not in of_scalars]
     # Maps of large keys, or of very many entries.
     whole_entries: list[_Path] = [(key,) for key in result if key in _DEPTHS]
-    for paths in (single, whole_entries):
-        sizes = {path: len(_packed(path[-1])) + len(_packed(_at(result, path))) for path in paths}
-        for path in sorted(paths, key=lambda path: -sizes[path]):
-            if size <= most:
+    spare = sum(_size(result, path) for path in of_scalars)
+    for paths, enough in ((others, most + spare), ([*of_scalars], most), (whole_entries, most)):
+        sizes = {path: _size(result, path) for path in paths if path[0] in result}
+        for path in sorted(sizes, key=lambda path: -sizes[path]):
+            if size <= enough:
                 break
             _drop(result, path)
             dropped.append((" ".join(str(part) for part in path if part != ""), sizes[path]))
@@ -148,6 +152,22 @@ def _packed(value: Any) -> bytes:
         return bytes(msgpack.packb(value, use_bin_type=True))
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"expected metadata that MessagePack can hold: {error}") from None
+
+
+def _size(metadata: Mapping[str, Any], path: _Path) -> int:
+    """Return the bytes of an entry with its key."""
+    return len(_packed(path[-1])) + len(_packed(_at(metadata, path)))
+
+
+def _of_scalars(metadata: Mapping[str, Any], paths: Sequence[_Path]) -> dict[_Path, None]:
+    """Choose the paths of single numbers, of their tags and of the types of these."""
+    scalars = metadata.get("scalars")
+    names = scalars if isinstance(scalars, Mapping) else {}
+    return dict.fromkeys(
+        path
+        for path in paths
+        if path[0] == "scalars" or (path[0] in ("tags", "types") and str(path[-1]).partition("#")[0] in names)
+    )
 
 
 def _paths(value: Any, path: _Path, depth: int) -> Iterator[_Path]:

@@ -11,11 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..container.digest import DIGEST
+from ..container.metadata import MAX_BYTES
 from ..errors import FormatWarning
 from ..surface import Block, Surface
 from .source import number
 
-__all__ = ["keep_words", "listing", "metadata_left_out", "survives", "warn", "warn_left_out", "with_nul_shown"]
+__all__ = [
+    "keep_words",
+    "listing",
+    "metadata_left_out",
+    "survives",
+    "warn",
+    "warn_left_out",
+    "warn_too_large",
+    "with_nul_shown",
+]
 
 #: Names in one note, and characters of each.
 _MOST_NAMES = 12
@@ -54,6 +64,13 @@ def warn_left_out(kind: str, names: Collection[str], why: str = "which it cannot
     """Issue a note about data that a file cannot hold, if there are any."""
     if names:
         warn(f"{kind} is written without {listing(names)}, {why}")
+
+
+def warn_too_large(dropped: Collection[tuple[str, int]]) -> None:
+    """Issue a note about metadata that were dropped since all of them were too large, with names and bytes."""
+    if dropped:
+        words = listing(f"{key} ({size:,} bytes)" for key, size in dropped)
+        warn(f"metadata are limited to {MAX_BYTES:,} bytes; left out: {words}")
 
 
 def with_nul_shown(kind: str, surface: Surface) -> Surface:

@@ -171,9 +171,7 @@ def read(
         if hole is not None:
             surface = with_nodata(surface, hole, source.room)
         surface.metadata, dropped = metadata.fitted(surface.metadata)
-        if dropped:
-            words = notes.listing(f"{key} ({size:,} bytes)" for key, size in dropped)
-            notes.warn(f"metadata are limited to {metadata.MAX_BYTES:,} bytes; left out: {words}")
+        notes.warn_too_large(dropped)
         return surface if chosen is None else _closed(surface, chosen)
     except InputError as error:
         raise with_name(error, label) from None

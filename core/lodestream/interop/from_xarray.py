@@ -9,15 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..container.metadata import fitted
 from ..errors import FormatError, InputError, OptionError
+from ..formats.netcdf.attribute_texts import TYPES
 from ..formats.netcdf.dataset import attributes_with_limits
 from ..formats.netcdf.layout import ORDERED
 from ..formats.netcdf.mark import MARK, Mark
 from ..formats.netcdf.marked import surface_in
 from ..formats.netcdf.names import REFERENCES
+from ..formats.netcdf.single_numbers import SCALARS
 from ..formats.netcdf.values import MISSING, PACKING, RANGES, is_packed, pieces, stored_number, whole_number
 from ..formats.nodata import checked, with_nodata
-from ..formats.notes import warn
+from ..formats.notes import listing, warn, warn_too_large
 from ..formats.source import DEFAULT_MAX_VERTICES, Source
 from ..scratch import IN_MEMORY, Room
 from ..surface import Closed, Surface
@@ -80,13 +83,42 @@ def _of_any(
         # What is true of the first block in its order is true of all only where each has kept its own.
         lost = {key for key in ORDERED if any(key not in surface.metadata for surface in surfaces)}
         metadata = {key: value for key, value in surfaces[0].metadata.items() if key not in lost}
-        return Surface(blocks=blocks, metadata=metadata)
+        return Surface(blocks=blocks, metadata=_agreed(metadata, [surface.metadata for surface in surfaces]))
     if isinstance(data, xr.DataArray):
         name = "z" if data.name is None or data.name in data.coords else str(data.name)
         return _of_dataset(xr, data.to_dataset(name=name), attributes, closed, room, {"variable": name, **options})
     if isinstance(data, xr.Dataset):
         return _of_dataset(xr, data, attributes, closed, room, options)
     raise InputError(f"expected a Dataset, a DataArray or a DataTree of xarray, got {type(data).__name__}")
+
+
+def _agreed(first: Mapping[str, Any], of_blocks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the metadata of the first block with the single numbers on which all blocks agree, and note the others.
+
+    They agree where number and tags are the same.
+    """
+    names = dict.fromkeys(name for metadata in of_blocks for name in metadata.get(SCALARS, {}))
+    lost = {name for name in names if any(_of_number(it, name) != _of_number(first, name) for it in of_blocks)}
+    if not lost:
+        return dict(first)
+    warn(f"left out, since they are not the same in all blocks: {listing(name for name in names if name in lost)}")
+    result = {**first, SCALARS: {name: it for name, it in first.get(SCALARS, {}).items() if name not in lost}}
+    texts = {key: it for key, it in _texts(first).items() if key.partition("#")[0] not in lost}
+    result["tags"] = {**first.get("tags", {}), "": texts}
+    result[TYPES] = {key: kind for key, kind in first.get(TYPES, {}).items() if key.partition("#")[0] not in lost}
+    return {key: it for key, it in result.items() if key not in (SCALARS, TYPES, "tags") or (it and it != {"": {}})}
+
+
+def _of_number(metadata: Mapping[str, Any], name: str) -> tuple[Any, dict[str, Any]]:
+    """Return a single number, None where there is none, and its tags."""
+    tags = {key: text for key, text in _texts(metadata).items() if key.startswith(f"{name}#")}
+    return metadata.get(SCALARS, {}).get(name), tags
+
+
+def _texts(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the tags that attributes of files have become."""
+    texts: Mapping[str, Any] = metadata.get("tags", {}).get("", {})
+    return texts
 
 
 def _of_dataset(
@@ -107,6 +139,8 @@ def _of_dataset(
     )
     for text in notes:
         warn(text)
+    surface.metadata, dropped = fitted(surface.metadata)
+    warn_too_large(dropped)
     return surface
 
 
@@ -140,7 +174,14 @@ def _described(xr: Any, variable: Any, places: Mapping[str, str] | None = None) 
     copy = variable.to_base_variable().copy(deep=False)
     copy.encoding = {key: it for key, it in encoding.items() if key not in moved}
     copy.attrs = {**(places or {}), **variable.attrs, **moved, **_limits(xr, variable)}
-    return _as_stored(xr, copy, IN_MEMORY) if variable.ndim < 2 else copy
+    if variable.ndim > 1:
+        return copy
+    try:
+        return _as_stored(xr, copy, IN_MEMORY)
+    except Exception:  # of lazy values of any origin: who takes a single number says that it cannot be read
+        if variable.size != 1:
+            raise
+        return copy
 
 
 def _as_stored(xr: Any, variable: Any, room: Room) -> Any:

@@ -91,6 +91,20 @@ def test_the_largest_entries_go_first_and_only_as_many_as_must() -> None:
     assert fitted(small) == (small, [])
 
 
+def test_single_numbers_give_way_before_anything_else() -> None:
+    scalars = {f"constant {number:03}": float(number) for number in range(700)}
+    texts = {"crs#a": "kept", **{f"{name}#units": "m" * 70 for name in scalars}}
+    metadata = {"crs": "W" * 8_000, "geotransform": [0.5] * 6, "scalars": scalars, "tags": {"": texts}}
+    kept, dropped = fitted(metadata)
+    assert (kept["crs"], kept["geotransform"], kept["tags"][""]["crs#a"]) == ("W" * 8_000, [0.5] * 6, "kept")
+    assert all(name.startswith("tags constant") for name, _ in dropped)
+    check(kept)
+    kept, dropped = fitted({**metadata, "crs": "W" * 61_000})
+    assert (len(kept["crs"]), kept["tags"]) == (61_000, {"": {"crs#a": "kept"}})
+    kept, dropped = fitted({**metadata, "scalars": {"mach": 0.5}, "tags": {"": {"history": "h" * MAX_BYTES}}})
+    assert [name for name, _ in dropped] == ["tags history"]
+
+
 def test_very_many_small_entries_are_dropped_without_taking_long() -> None:
     start = time.process_time()
     kept, dropped = fitted({"tags": {"": {f"key {number}": "x" * 20 for number in range(60_000)}}, "unit": "m"})

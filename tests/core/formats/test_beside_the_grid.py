@@ -134,3 +134,104 @@ def test_a_file_of_lodestream_says_nothing_of_itself(tmp_path: Path) -> None:
     with xr.open_dataset(tmp_path / "a.nc") as data:
         data.load().assign(profile=(("depth",), np.zeros(3))).to_netcdf(tmp_path / "b.nc")
     assert noted(lambda: ls.read(tmp_path / "b.nc"))[1] == ["left out: profile"]
+
+
+def many(count: int, **attributes: str) -> dict[str, Any]:
+    """Single numbers with the same attributes."""
+    return {f"constant_{k:03}": ((), 0.5 + k, attributes) for k in range(count)}
+
+
+@every_opener
+def test_single_numbers_give_way_to_coordinates(tmp_path: Path, opener: Opener) -> None:
+    lon = np.linspace(0, 13, 6080) ** 2
+    place = {"lat": ("lat", [0.0, 1.0, 3.0], NORTH), "lon": ("lon", lon, EAST)}
+    more = many(80, long_name="a constant of the model", units="m s-1")
+    data = xr.Dataset({"h": (("lat", "lon"), np.zeros((3, 6080), "f4")), **more}, place)
+    surface, notes = read(opener, data, tmp_path)
+    assert surface.points.shape == (3, 6080)
+    assert surface.metadata["axes"]["x"][:-1] == lon.tolist()
+    (note,) = notes
+    assert note.startswith("metadata are limited to 65,536 bytes; left out: tags constant_000#long_name (47 bytes), ")
+    assert len(surface.metadata["scalars"]) == 80
+    assert ls.decode(ls.encode(surface)).metadata["axes"] == surface.metadata["axes"]
+
+
+@every_opener
+def test_a_dataset_of_very_many_numbers_keeps_the_first_and_its_crs(tmp_path: Path, opener: Opener) -> None:
+    crs = {"grid_mapping_name": "latitude_longitude", "semi_major_axis": 6371229.0, "inverse_flattening": 0.0}
+    data = field(crs=((), 0, crs), **many(100, long_name="a constant of a model, with a name", units="m s-1"))
+    data.h.attrs |= {"grid_mapping": "crs"}
+    surface, notes = read(opener, data, tmp_path, variable="h")
+    kept = surface.metadata["scalars"]
+    assert [*kept] == [f"constant_{k:03}" for k in range(len(kept))]
+    assert 40 < len(kept) < 80
+    (note,) = notes
+    assert note.startswith(f"left out: constant_{len(kept):03}, ")
+    assert note.endswith(f" and {100 - len(kept) - 12} more")
+    back = ls.decode(ls.encode(surface)).metadata
+    assert back["crs"].startswith("GEOG")
+    assert back["scalars"] == kept
+
+
+@every_opener
+def test_a_limit_that_is_no_whole_number_is_noted(tmp_path: Path, opener: Opener) -> None:
+    data = field()
+    values = np.arange(48, dtype="i2").reshape(6, 8)
+    data["h"] = (("lat", "lon"), values, {"valid_max": 20.5, "valid_min": -1e9})
+    surface, notes = read(opener, data, tmp_path)
+    assert notes == ["valid_max of h masks nothing, since it is no whole number of int16: '20.5'"]
+    np.testing.assert_array_equal(surface.points, values)
+
+
+@pytest.mark.parametrize("opener", [by_netcdf, by_xarray])  # Zarr has other rules for names
+def test_numbers_whose_tags_would_be_taken_for_others_are_named(tmp_path: Path, opener: Opener) -> None:
+    crs = {"grid_mapping_name": "latitude_longitude", "semi_major_axis": 6371229.0, "inverse_flattening": 0.0}
+    more = {"p": ((), 1.0, {"q": "of p"}), "p#q": ((), 2.0, {"units": "m"}), "spatial_ref": ((), 3.0, {"units": "s"})}
+    data = field(crs=((), 0, crs), **more)
+    data.h.attrs |= {"grid_mapping": "crs"}
+    for options in ({}, {"variable": "h"}):
+        surface, (note,) = read(opener, data, tmp_path, **options)
+        head, names = note.split(": ")
+        assert (head, {*names.split(", ")}) == ("left out", {"p#q", "spatial_ref"})
+        assert surface.metadata["scalars"] == {"p": 1.0}
+        assert {key for key in surface.metadata["tags"][""] if key[0] in "ps"} == {"p#q"}
+
+
+def test_blocks_keep_the_numbers_on_which_all_agree() -> None:
+    first = field(nx=((), 5, {"units": "1"}), t=((), 1.0, {"units": "s"}), only=((), 3), same=((), 4, {"units": "m"}))
+    second = field(nx=((), 5, {"units": "1"}), t=((), 2.0, {"units": "s"}), more=((), 3), same=((), 4, {"units": "km"}))
+    tree = xr.DataTree.from_dict({"a": first, "b": second})
+    surface, notes = noted(lambda: ls.Surface.from_xarray(tree))
+    assert notes == ["left out, since they are not the same in all blocks: t, only, same, more"]
+    assert surface.metadata["scalars"] == {"nx": 5}
+    assert {key for key in surface.metadata["tags"][""] if key[0] in "nts"} == {"nx#units"}
+    again, notes = noted(lambda: ls.Surface.from_xarray(surface.to_xarray()))
+    assert notes == []
+    assert again.metadata["scalars"] == {"nx": 5}
+    bare, notes = noted(
+        lambda: ls.Surface.from_xarray(xr.DataTree.from_dict({"a": field(t=((), 1, {"a": 1})), "b": field(t=((), 2))}))
+    )
+    assert not {"scalars", "types"} & set(bare.metadata)
+    assert len(notes) == 1
+
+
+@pytest.mark.parametrize("encoding", [{}, {"dtype": "i2", "_FillValue": -1}])
+def test_a_number_that_cannot_be_computed_is_noted(encoding: dict[str, Any]) -> None:
+    array = pytest.importorskip("dask.array")
+    delayed = pytest.importorskip("dask").delayed
+
+    def fail() -> None:
+        raise OSError("the disk is gone")
+
+    number = xr.Variable((), array.from_delayed(delayed(fail)(), (), "f8"))
+    number.encoding = encoding
+    surface, notes = noted(lambda: ls.Surface.from_xarray(field(bad=number, nx=((), 5))))
+    assert notes == ["left out, since they cannot be read: bad (the disk is gone)"]
+    assert surface.metadata["scalars"] == {"nx": 5}
+
+
+def test_a_dataset_in_memory_with_700_numbers_is_encoded() -> None:
+    data = field(**many(700, long_name="a constant of a model, with a name", units="m s-1"))
+    surface, (note,) = noted(lambda: ls.Surface.from_xarray(data))
+    assert note.endswith(f" and {700 - len(surface.metadata['scalars']) - 12} more")
+    assert ls.decode(ls.encode(surface)).metadata["scalars"] == surface.metadata["scalars"]

@@ -25,7 +25,7 @@ from .choice import Choice, Found, offered, others
 from .crs import MAPPING, beside_crs, crs_of
 from .geotransform import by_geotransform, transform_of
 from .names import REFERENCES, associated, axis_words, is_geographic, is_grid_mapping
-from .single_numbers import SCALARS, constants_of, names_of_single, number_of
+from .single_numbers import SCALARS, constants_of, names_of_single, numbers_of
 from .units import Conversion, conversions_of
 from .values import (
     MISSING,
@@ -131,7 +131,8 @@ class _Reader:
     def values(self, name: str, dims: Sequence[str]) -> Values:
         """Return the values of a variable over these dimensions."""
         values = values_of(chosen(self._dataset.variables[name], self._choice.index), dims, self._source.room)
-        for key, words in unusable(self._dataset.variables[name].attrs).items():
+        variable = self._dataset.variables[name]
+        for key, words in unusable(variable.attrs, variable.dtype).items():
             text = text_of(self._dataset.variables[name].attrs[key])[0]
             self.notes.append(f"{key} of {name} {words}: {text[:40]!r}")
         if count := _unwritten(values, self._dataset.variables[name].attrs):
@@ -258,20 +259,22 @@ def _metadata(
         }
     single = [name for name in names_of_single(dataset, choice) if name != mapping]
     constants = dict.fromkeys((*single, *(name for name in constants_of(dataset, choice) if name != mapping)))
-    numbers = {name: number for name in constants if (number := number_of(dataset, name, choice)) is not None}
-    if numbers:
-        told[SCALARS] = numbers
-    for name in numbers:
-        said |= {f"{name}#{key}": value for key, value in attributes_with_limits(variables[name]).items()}
+    numbers = numbers_of(dataset, constants, choice, attributes_with_limits)
+    if numbers.kept:
+        told[SCALARS] = numbers.kept
+    said |= numbers.attributes
     texts = {name: text_of(value) for name, value in said.items()}
     if texts:
         metadata["tags"] = {"": {name: text for name, (text, _) in texts.items()}}
     if types := {name: kind for name, (_, kind) in texts.items() if kind is not None}:
         metadata[TYPES] = types
     metadata |= told
-    taken = {main, *choice.attributes, *places, *numbers, mapping}
-    if left_out := _left_out(dataset, choice, taken, single, complete):
+    taken = {main, *choice.attributes, *places, *numbers.kept, *numbers.unreadable, mapping}
+    if left_out := _left_out(dataset, choice, taken, [*single, *numbers.not_kept], complete):
         notes.append(f"left out: {listing(left_out)}")
+    if numbers.unreadable:
+        error = next(iter(numbers.unreadable.values()))
+        notes.append(f"left out, since they cannot be read: {listing(numbers.unreadable)} ({error:.200})")
     return metadata, notes, conversions, mapping
 
 
@@ -324,8 +327,8 @@ def _left_out(dataset: Any, choice: Choice, taken: set[str | None], single: Sequ
     """Return variables that are neither taken nor offered as attributes: those that say something of values or places.
 
     These are bounds, areas and others along rows or columns; those that the variable names as its coordinates; of
-    coordinates with one value those that are no numbers, and bounds; and a CRS that the variable does not name. All
-    others follow if the list is to be complete.
+    coordinates with one value those that are no numbers, and bounds; numbers that cannot be kept; and a CRS that the
+    variable does not name. All others follow if the list is to be complete.
     """
     variables = dataset.variables
     known = {*others(dataset, choice), *taken, *choice.dims}

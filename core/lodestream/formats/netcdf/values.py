@@ -157,8 +157,16 @@ def limits_of(attributes: Mapping[str, Any]) -> tuple[Any, Any]:
     return low, high
 
 
-def unusable(attributes: Mapping[str, Any]) -> dict[str, str]:
+def unusable(attributes: Mapping[str, Any], stored: np.dtype[Any]) -> dict[str, str]:
     """Find the attributes of missing, valid and packed values that are no numbers, or not as many as they should be.
+
+    Of values that are stored as integers, also limits that are no whole number of the type, unless all are within.
+
+    Parameters
+    ----------
+    attributes : mapping of str to Any
+    stored : dtype
+        Of the stored values.
 
     Returns
     -------
@@ -174,7 +182,23 @@ def unusable(attributes: Mapping[str, Any]) -> dict[str, str]:
         if key in attributes and (numbers.dtype.kind not in "iuf" or numbers.size != count):
             pair = " or pair of numbers" if key == "valid_range" else ""
             result[key] = f"{verb} nothing, since it is no number{pair}"
+    raw = _signed(np.empty(0, stored), attributes).dtype
+    if raw.kind in "iu":
+        least, greatest = np.iinfo(raw).min, np.iinfo(raw).max
+        for key, limits in ((key, np.ravel(attributes.get(key, ()))) for key in RANGES if key not in result):
+            low = limits[:1] if key != "valid_max" else ()
+            high = limits[-1:] if key != "valid_min" else ()
+            excluding = [it for it in low if it > least] + [it for it in high if it < greatest]
+            if any(_is_ignored(limit, stored, raw, attributes) for limit in excluding):
+                result[key] = f"masks nothing, since it is no whole number of {raw}"
     return result
+
+
+def _is_ignored(limit: Any, stored: np.dtype[Any], raw: np.dtype[Any], attributes: Mapping[str, Any]) -> bool:
+    """Return whether a limit of stored integers says nothing of them, as in netCDF4: no value can be that number."""
+    if raw.kind not in "iu" or (is_packed(attributes) and limit.dtype.kind == "f"):  # that is one of unpacked values
+        return False
+    return whole_number(stored_number(limit, stored, attributes), raw) is None
 
 
 def _number(attributes: Mapping[str, Any], key: str, default: float) -> float:
@@ -234,10 +258,10 @@ def _decoded(stored: NDArray[Any], attributes: Mapping[str, Any]) -> tuple[NDArr
     for limit, is_within in zip(limits_of(attributes), (np.greater_equal, np.less_equal), strict=True):
         if limit is not None and not np.isnan(limit):
             of_unpacked = packed and stored.dtype.kind in "iu" and limit.dtype.kind == "f"
+            if _is_ignored(limit, stored.dtype, raw.dtype, attributes):
+                continue
             if not of_unpacked:
                 limit = stored_number(limit, stored.dtype, attributes)
-                if raw.dtype.kind in "iu" and whole_number(limit, raw.dtype) is None:
-                    continue  # as netCDF4 does: a limit that no value can have says nothing of values
             of_stored = packed and stored.dtype.kind in "iu" and not of_unpacked
             inside = inside & is_within(raw if of_stored else values, limit)
     outside = 0
@@ -256,7 +280,7 @@ def _unpacked(stored: NDArray[Any], attributes: Mapping[str, Any]) -> NDArray[An
     import xarray
 
     dims = [f"axis_{number}" for number in range(stored.ndim)]
-    unused = unusable(attributes)
+    unused = unusable(attributes, stored.dtype)
     packing = {key: attributes[key] for key in PACKING if key in attributes and key not in unused}
     if stored.dtype.kind in "iu":  # xarray takes one fill value of unsigned integers, and of their type
         numbers = [number for key in MISSING for number in np.ravel(packing.pop(key, ()))]
