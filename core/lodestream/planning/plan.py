@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -82,3 +83,18 @@ class Plan:
     def max_error(self) -> float:
         """Maximum error at the end."""
         return self.marks[-1].max_error
+
+    def steps(self) -> Iterator[tuple[Mark, list[ByteRange]]]:
+        """Yield each mark with the slices between the previous mark and itself."""
+        todo = list(reversed(self.ranges))
+        sent = 0
+        for mark in self.marks:
+            places = []
+            while sent < mark.sent:
+                place = todo.pop()
+                size = min(place.length, mark.sent - sent)  # slices were put together: a state may end inside one
+                places.append(ByteRange(place.offset, size))
+                if size < place.length:
+                    todo.append(ByteRange(place.offset + size, place.length - size))
+                sent += size
+            yield mark, places

@@ -49,7 +49,7 @@ def region_first(index: Index, chosen: Plan, region: Region) -> Plan:
     rest: list[ByteRange] = []
     steps: list[_Step] = []
     ahead = behind = 0
-    for mark, places in _between(chosen):
+    for mark, places in chosen.steps():
         for place in places:
             if not steps:  # without the first state nothing can be drawn, inside the region or out of it
                 head.append(place)
@@ -73,22 +73,6 @@ class _Step(NamedTuple):
     mark: Mark
     ahead: int
     behind: int
-
-
-def _between(chosen: Plan) -> Iterator[tuple[Mark, list[ByteRange]]]:
-    """Yield each mark with the slices between the previous mark and itself."""
-    todo = list(reversed(chosen.ranges))
-    sent = 0
-    for mark in chosen.marks:
-        places = []
-        while sent < mark.sent:
-            place = todo.pop()
-            size = min(place.length, mark.sent - sent)  # slices were put together: a state may end inside one
-            places.append(ByteRange(place.offset, size))
-            if size < place.length:
-                todo.append(ByteRange(place.offset + size, place.length - size))
-            sent += size
-        yield mark, places
 
 
 def _marks(steps: list[_Step]) -> Iterator[Mark]:
