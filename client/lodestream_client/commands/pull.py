@@ -84,6 +84,12 @@ def register(subparsers: Subparsers) -> None:
         help="draw into a picture too, as view --png does",
     )
     parser.add_argument(
+        "--until-done",
+        action="store_true",
+        help="with --watch and --picture: stop as soon as the picture looks done, that is, when less than 1 %% of its "
+        "pixels are expected to change visibly",
+    )
+    parser.add_argument(
         "--resume",
         action="store_true",
         help="continue an earlier pull: request only the data that are missing in the folder LODESTREAM_CACHE "
@@ -127,6 +133,8 @@ class PullOptions:
     resume, json, watch : bool
     picture : Path or None
         Picture to draw beside OUT.
+    until_done : bool
+        Stop when the picture looks done.
     """
 
     url: str
@@ -141,6 +149,7 @@ class PullOptions:
     json: bool
     watch: bool
     picture: Path | None
+    until_done: bool
 
     @property
     def name(self) -> str:
@@ -165,6 +174,11 @@ def _options(args: argparse.Namespace) -> PullOptions:
         args.parser.error(f"argument --picture: expected P.png, got {args.picture}")
     if args.picture is not None and args.picture == Path(args.out):
         args.parser.error("argument --picture: expected another name than OUT")
+    if args.until_done and not (args.watch and args.picture is not None):
+        args.parser.error("argument --until-done: needs --watch and --picture")
+    others = target.until_rms, target.until_max, target.max_bytes, target.seconds, target.level, target.region
+    if args.until_done and (any(other is not None for other in others) or target.order != "quality"):
+        args.parser.error("argument --until-done: not allowed with another limit, a window, or the order of levels")
     return PullOptions(
         args.url,
         args.out,
@@ -178,6 +192,7 @@ def _options(args: argparse.Namespace) -> PullOptions:
         args.json,
         args.watch,
         args.picture,
+        args.until_done,
     )
 
 
@@ -199,7 +214,16 @@ def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:
         return nullcontext()
     from ..viewer.drawing import Drawing
 
-    return Drawing(options.picture, options.url, window=options.target.region is not None)
+    layers = None
+    if options.until_done:
+        from contextlib import closing
+
+        from ..viewer.pictures import layers_of
+        from ..viewer.sources import RemoteSource
+
+        with closing(RemoteSource(options.url, options.token)) as source:
+            layers = layers_of(source, options.max_vertices)
+    return Drawing(options.picture, options.url, window=options.target.region is not None, layers=layers)
 
 
 def _pull(options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
@@ -241,6 +265,11 @@ def _written(
     header = stream.decoder.header
     if drawing is not None and header is not None:
         drawing.draw(stream.decoder.view(), header.layout, metadata())
+    if drawing is not None and drawing.done is not None and broke is None and outcome.ended == "stopped":
+        from ..viewer.picture_change import done_text
+
+        received, share = drawing.done
+        note(done_text(received, stream.planned or outcome.bytes, share))
     return outcome, broke
 
 
@@ -280,6 +309,8 @@ def _receive(
             max_vertices=options.max_vertices,
         )
         kept.follow(stream)
+        if drawing is not None:
+            drawing.when_done = stream.stop
         metadata = Metadata(stream, kept, options.token, arrived)
         watch = Watch(options.out, drawing, options.target, metadata) if options.watch else None
         try:

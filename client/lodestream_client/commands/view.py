@@ -60,6 +60,8 @@ class ViewOptions:
         Picture to draw in place of serving.
     at : tuple of (str, int or None), or None
         A picture after each of these sizes: as it was written, and in bytes (None: all).
+    until_done : bool
+        The picture is that of the first state that looks done.
     region : ((int, int), (int, int)) or None
         The window that is drawn.
     max_vertices : int or None
@@ -75,6 +77,7 @@ class ViewOptions:
     static: Path | None
     png: Path | None
     at: tuple[tuple[str, int | None], ...] | None
+    until_done: bool
     region: Region | None
     max_vertices: int | None
     token: str | None
@@ -123,6 +126,12 @@ def register(subparsers: Subparsers) -> None:
         help="write a picture after each of these sizes, for example 1kB,20kB,all, as OUT-1kB.png and so on",
     )
     parser.add_argument(
+        "--until-done",
+        action="store_true",
+        help="with --png: read only until the picture looks done, that is, until less than 1 %% of its pixels are "
+        "expected to change visibly",
+    )
+    parser.add_argument(
         "--roi",
         type=parse_region,
         metavar="R0:R1,C0:C1",
@@ -138,6 +147,8 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         args.parser.error("argument --png: not allowed with argument --static")
     if args.at is not None and args.png is None:
         args.parser.error("argument --at: needs --png")
+    if args.until_done and (args.png is None or args.at is not None or args.roi is not None):
+        args.parser.error("argument --until-done: needs --png, without --at or --roi")
     if args.roi is not None and args.png is None:
         args.parser.error("argument --roi: needs --png; the page loads the visible part first")
     if args.png is not None and args.png.suffix.lower() != ".png":
@@ -152,6 +163,7 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         args.static,
         args.png,
         args.at,
+        args.until_done,
         args.roi,
         args.max_vertices,
         token_of(args),
@@ -217,10 +229,17 @@ def _wait() -> None:
 
 
 def _draw(options: ViewOptions, out: Path) -> None:
-    from ..viewer.pictures import Picture, least_size, view_after, write_png
+    from ..viewer.picture_change import done_text
+    from ..viewer.pictures import Picture, least_size, view_after, view_when_done, write_png
 
     require_folder(out)
     with _source(options) as source:
+        if options.until_done:
+            view, picture, share = view_when_done(source, source.name, options.max_vertices)
+            write_png(picture.png(), out)
+            words = "complete" if view.complete else done_text(view.bytes, source.size, share)
+            note(f"{out}: {words}")
+            return
         sizes = options.at or (("", None),)
         least = least_size(source, options.max_vertices, options.region)
         if all(most is not None and most < least for _, most in sizes):

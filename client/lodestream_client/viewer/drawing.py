@@ -1,8 +1,9 @@
 """A process that draws the pictures of ``pull``, so that seconds of drawing do not delay the stream.
 
 This module run as a program is that process. It reads a pickled `Picture` after another from its standard input and
-answers each on standard output with a pickled PNG, or with the error; its first answer says that it is ready. It ends
-when its input does, so also if the program that has started it was killed.
+answers each on standard output with a pickled PNG and how much of it is expected to change, or with the error; its
+first answer says that it is ready. What it reads first are the layers of the surface, if pictures are to be judged, or
+None. It ends when its input does, so also if the program that has started it was killed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -21,11 +22,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lodestream.errors import LodestreamError, UnavailableError
 from lodestream.operating_system import new_session
 
+from .picture_change import DONE, Judge
 from .pictures import Picture, write_png
 
 if TYPE_CHECKING:
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
+    from lodestream.planning.plan import Mark
 
     # Bytes of a state, whether it is complete, and what the surface is called.
     _State = tuple[int, bool, str]
@@ -49,9 +52,22 @@ class Drawing:
         What the surface is called if its metadata do not say.
     window : bool
         The states are of a window.
+    layers : sequence of Mark, optional
+        Judges the pictures: the states of the whole surface in order, see `Judge`.
+
+    Attributes
+    ----------
+    done : (int, float) or None
+        Of the first picture that looks done: bytes of its state, and the share of its pixels that is expected to change
+        visibly after it.
+    when_done : callable
+        Called once, in a thread of its own, when a picture looks done.
     """
 
-    def __init__(self, path: Path, name: str, *, window: bool) -> None:
+    def __init__(self, path: Path, name: str, *, window: bool, layers: Sequence[Mark] | None = None) -> None:
+        self.done: tuple[int, float] | None = None
+        self.when_done: Callable[[], None] = lambda: None
+        self._layers = layers
         self._path = path
         self._name = name
         self._window = window
@@ -69,7 +85,7 @@ class Drawing:
         )
         # The thread waits for the process, so that nothing else does.
         self._thread = ThreadPoolExecutor(1, "lodestream-drawing")
-        self._answer: Future[None] = self._thread.submit(self._received)
+        self._answer: Future[None] = self._thread.submit(self._prepared)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -112,16 +128,23 @@ class Drawing:
         picture = Picture.of(view, None if self._window else layout, called)
         self._answer = self._thread.submit(self._drawn, picture)
 
+    def _prepared(self) -> None:
+        self._write(self._layers)
+        self._received()
+
     def _drawn(self, picture: Picture) -> None:
-        assert self._process.stdin is not None
         began = monotonic()
+        self._write(picture)
+        self._received()
+        self._next = 2 * monotonic() - began
+
+    def _write(self, value: object) -> None:
+        assert self._process.stdin is not None
         try:
-            pickle.dump(picture, self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            pickle.dump(value, self._process.stdin, pickle.HIGHEST_PROTOCOL)
             self._process.stdin.flush()
         except OSError:  # it has ended
             raise self._ended() from None
-        self._received()
-        self._next = 2 * monotonic() - began
 
     def _received(self) -> None:
         """Wait for an answer of the process, and write the picture if it is one."""
@@ -132,8 +155,12 @@ class Drawing:
             raise self._ended() from None
         if isinstance(answer, LodestreamError):
             raise answer
-        if answer:
-            write_png(answer, self._path)
+        if answer is not None:
+            png, remaining = answer
+            write_png(png, self._path)
+            if remaining < DONE and self.done is None and self._sent is not None:
+                self.done = self._sent[0], remaining
+                self.when_done()
 
     def _ended(self) -> UnavailableError:
         code = self._process.wait()
@@ -154,13 +181,15 @@ def serve(pictures: BinaryIO, answers: BinaryIO) -> None:
     pictures, answers : binary files
     """
 
-    def answer(value: bytes | LodestreamError) -> None:
+    def answer(value: tuple[bytes, float] | LodestreamError | None) -> None:
         pickle.dump(value, answers)
         answers.flush()
 
     import matplotlib.figure  # noqa: F401 - before the first picture, while the stream begins
 
-    answer(b"")
+    answer(None)
+    layers: Sequence[Mark] | None = pickle.load(pictures)
+    judge = None if layers is None else Judge(layers)
     while True:
         try:
             picture = pickle.load(pictures)
@@ -168,13 +197,14 @@ def serve(pictures: BinaryIO, answers: BinaryIO) -> None:
             return
         try:
             png = picture.png()
+            remaining = float("nan") if judge is None else judge.remaining(picture.stage, picture.pixels())
         except LodestreamError as error:
             answer(error)
         except Exception as error:  # of a library that does not say what it may raise
             words = " ".join(str(error).split())
             answer(UnavailableError(f"the picture cannot be drawn: {type(error).__name__}: {words}"))
         else:
-            answer(png)
+            answer((png, remaining))
 
 
 if __name__ == "__main__":

@@ -8,26 +8,40 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.container import read_index
+from lodestream.container import Index, read_index
 from lodestream.container.capacity import Capacity
 from lodestream.decoding.decoder import Decoder
 from lodestream.errors import UnavailableError
-from lodestream.interop.pictures import DPI, draw_surface
+from lodestream.interop.pictures import DPI, draw_surface, is_height_field, pixels_of
+from lodestream.planning.plan import Mark, Plan
 from lodestream.planning.planner import plan
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target
 from lodestream.text import is_remeshed, printable
 
 from ..terminal.output import human_size, replacing
+from .picture_change import DONE, Judge, Stage
 from .sources import Source, read_fully
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
 
-__all__ = ["Picture", "least_size", "require_matplotlib", "view_after", "write_png"]
+__all__ = [
+    "Picture",
+    "layers_of",
+    "least_size",
+    "require_matplotlib",
+    "view_after",
+    "view_when_done",
+    "write_png",
+]
 
 _PIXELS = 1000  # along the longer side of a height field
+_THINNED = 2  # levels by which a surface in space is drawn coarser, since it has a quarter as many nodes along an axis
 _LONGEST = 100  # characters of a name
 
 
@@ -59,13 +73,59 @@ def view_after(
         If the container is damaged or too large.
     """
     read = partial(read_fully, source)
-    target = Target(max_bytes=most, region=region)
-    decoder = Decoder(target, max_vertices=max_vertices)
-    index = read_index(read, source.size, Capacity(decoder.capacity.max_vertices))
-    chosen = plan(index, target)
-    for place in (*chosen.before, index.metadata, *chosen.ranges):
+    decoder, index, chosen = _begun(source, Target(max_bytes=most, region=region), max_vertices)
+    for place in chosen.ranges:
         decoder.feed_at(place.offset, read(place.offset, place.length))
     return decoder.view(), index.header.layout if region is None else None
+
+
+def view_when_done(source: Source, name: str, max_vertices: int | None = None) -> tuple[View, Picture, float]:
+    """Read a container layer by layer until its picture looks done.
+
+    Parameters
+    ----------
+    source : Source
+    name : str
+        Of the surface.
+    max_vertices : optional
+        As in `view_after`.
+
+    Returns
+    -------
+    (View, Picture, float)
+        The state, its picture, and the share of its pixels that is expected to change visibly after it; 0 at the end.
+    """
+    read = partial(read_fully, source)
+    decoder, index, chosen = _begun(source, Target(), max_vertices)
+    layout = index.header.layout
+    judge = Judge(chosen.marks)
+    for _, places in chosen.steps():
+        for place in places:
+            decoder.feed_at(place.offset, read(place.offset, place.length))
+        view = decoder.view()
+        if view.complete:
+            break
+        picture = Picture.of(view, layout, name)
+        share = judge.remaining(picture.stage, picture.pixels())
+        if share < DONE:
+            return view, picture, share
+    return view, Picture.of(view, layout, name), 0.0
+
+
+def _begun(source: Source, target: Target, max_vertices: int | None) -> tuple[Decoder, Index, Plan]:
+    """Return a decoder that has what comes before the slices of a plan."""
+    decoder = Decoder(target, max_vertices=max_vertices)
+    index = read_index(partial(read_fully, source), source.size, Capacity(decoder.capacity.max_vertices))
+    chosen = plan(index, target)
+    for place in (*chosen.before, index.metadata):
+        decoder.feed_at(place.offset, read_fully(source, place.offset, place.length))
+    return decoder, index, chosen
+
+
+def layers_of(source: Source, max_vertices: int | None = None) -> tuple[Mark, ...]:
+    """Return the states of a whole container in order: its layers, and the exact end if it has one."""
+    capacity = Decoder(max_vertices=max_vertices).capacity
+    return plan(read_index(partial(read_fully, source), source.size, Capacity(capacity.max_vertices)), Target()).marks
 
 
 def least_size(source: Source, max_vertices: int | None = None, region: Region | None = None) -> int:
@@ -91,10 +151,11 @@ def require_matplotlib() -> None:
 
 @dataclass(frozen=True)
 class Picture:
-    """The content of a picture: points of one level by block, the known angles, and the title."""
+    """The content of a picture: points of one level by block, the known angles, the title, and what it shows."""
 
     surface: Surface
     title: str
+    stage: Stage
 
     @classmethod
     def of(cls, view: View, layout: Layout | None, name: str) -> Picture:
@@ -108,13 +169,24 @@ class Picture:
         name : str
             Of the surface.
         """
-        surface = view.surface(None if layout is None else _level(layout))
+        level = None if layout is None else _level(layout)
+        surface = view.surface(level)
         blocks = [Block(block.points, block.closed, mask=block.mask) for block in surface.blocks]
         errors = f"RMS error {view.rms:.3g}, maximum {view.max_error:.3g}"
         if view.complete and view.rms == 0:
             errors = "complete" if is_remeshed(surface.metadata) else "exact"
         title = printable(" ".join(name.split()))[:_LONGEST]
-        return cls(Surface(blocks=blocks, metadata=surface.metadata), f"{title}\n{human_size(view.bytes)}, {errors}")
+        shown = Surface(blocks=blocks, metadata=surface.metadata)
+        finest = level
+        if finest is not None and not is_height_field(shown):
+            finest -= _THINNED
+        stage = Stage(view.number, view.level, finest)
+        return cls(shown, f"{title}\n{human_size(view.bytes)}, {errors}", stage)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """Return the colours of the picture without its title and legend, (row, column, rgba), to be compared."""
+        require_matplotlib()
+        return pixels_of(self.surface, _PIXELS)
 
     def png(self) -> bytes:
         """Draw the picture, and return it as PNG.

@@ -15,7 +15,7 @@ from ..surface import Block, Surface
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DPI", "SMALL", "draw_surface", "small_png"]
+__all__ = ["DPI", "SMALL", "draw_surface", "is_height_field", "pixels_of", "small_png"]
 
 #: Pixels of an inch.
 DPI = 100
@@ -23,6 +23,7 @@ DPI = 100
 #: Pixels of a small picture, along the longer side.
 SMALL = 320
 
+_COLOURS = "terrain"  # the colour map of heights
 _LIGHT = 315, 45  # azimuth and altitude in degrees: north-west, as maps have it
 _FLAT = 1e-300  # heights that differ by no more have no relief, and no factor would give them one
 _DEGREES = 360.0  # of a full turn
@@ -43,10 +44,44 @@ def draw_surface(figure: Figure, surface: Surface, pixels: int) -> None:
         Of the longer side of a height field. In space there are a quarter as many nodes along an axis, since matplotlib
         draws each quad as a polygon.
     """
-    if len(surface.blocks) == 1 and surface.blocks[0].points.ndim == 2:
+    if is_height_field(surface):
         _heights(figure, _as_map(surface), pixels)
     else:
         _in_space(figure, surface, pixels)
+
+
+def pixels_of(surface: Surface, pixels: int) -> NDArray[np.uint8]:
+    """Return the colours of a surface as `draw_surface` draws it, without title and legend.
+
+    Parameters
+    ----------
+    surface : Surface
+    pixels : int
+        As in `draw_surface`.
+
+    Returns
+    -------
+    ndarray of uint8, shape (row, column, 4)
+        Red, green, blue and alpha (sRGB); alpha is 0 where nothing is drawn. A pixel is a node of a height field.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if is_height_field(surface):
+        # A picture has no more pixels than this, whatever the surface has.
+        block = _thinned(_as_map(surface), pixels)
+        return np.asarray(np.rint(255 * _shaded(_valid(block.points.astype(np.float64), block.mask))), np.uint8)
+    figure = Figure(layout="constrained", dpi=DPI, facecolor="none")
+    canvas: Any = FigureCanvasAgg(figure)
+    _in_space(figure, surface, pixels)
+    figure.axes[0].patch.set_visible(False)  # axes in space paint their background even if they are off
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba()).copy()
+
+
+def is_height_field(surface: Surface) -> bool:
+    """Return whether a surface is drawn as a shaded map: one block of heights."""
+    return len(surface.blocks) == 1 and surface.blocks[0].points.ndim == 2
 
 
 def small_png(surface: Surface) -> bytes | None:
@@ -58,9 +93,9 @@ def small_png(surface: Surface) -> bytes | None:
         return None
     figure = Figure(layout="constrained", dpi=DPI)
     FigureCanvasAgg(figure)
-    if len(surface.blocks) == 1 and surface.blocks[0].points.ndim == 2:
+    if is_height_field(surface):
         surface = Surface(blocks=[_as_map(surface)])
-    blocks = [_thinned(block) for block in surface.blocks]
+    blocks = [_thinned(block, SMALL) for block in surface.blocks]
     angles: dict[str, Any] = {key: surface.metadata[key] for key in ("angles", "turn") if key in surface.metadata}
     draw_surface(figure, Surface(blocks=blocks, metadata=angles), SMALL)
     file = io.BytesIO()
@@ -89,9 +124,9 @@ def _as_map(surface: Surface) -> Block:
     return Block(points, mask=None if mask is None else mask[down][:, across])
 
 
-def _thinned(block: Block) -> Block:
-    """Return a block with fewer rows and columns, if it has more than a small picture shows."""
-    rows, columns = (slice(None, None, max(1, length // SMALL)) for length in block.shape)
+def _thinned(block: Block, pixels: int) -> Block:
+    """Return a block with fewer rows and columns, if it has more than a picture of so many pixels shows."""
+    rows, columns = (slice(None, None, max(1, length // pixels)) for length in block.shape)
     mask = None if block.mask is None else block.mask[rows, columns]
     if mask is not None and not mask.any():
         return block
@@ -99,29 +134,39 @@ def _thinned(block: Block) -> Block:
 
 
 def _heights(figure: Figure, block: Block, pixels: int) -> None:
-    from matplotlib.colors import LightSource
-
     heights = _valid(block.points.astype(np.float64), block.mask)
     rows, columns = heights.shape
     scale = pixels / max(rows, columns)
     figure.set_size_inches(max(columns * scale, 300) / DPI + 1.5, max(rows * scale, 200) / DPI + 0.7)
     axes = figure.add_subplot()
-    low, high = (float(edge) for edge in (np.nanmin(heights), np.nanmax(heights))) if heights.size else (0.0, 1.0)
-    height = high - low
-    image = axes.imshow(heights, cmap="terrain", vmin=low, vmax=high)
+    low, high = _range(heights)
+    image = axes.imshow(heights, cmap=_COLOURS, vmin=low, vmax=high)
     if min(rows, columns) > 1:
-        shaded = LightSource(*_LIGHT).shade(
-            np.nan_to_num(heights, nan=low),
-            image.cmap,
-            blend_mode="soft",
-            vmin=low,
-            vmax=high,
-            vert_exag=_RELIEF * max(rows, columns) / height if height > _FLAT else 0.0,
-        )
-        shaded[..., 3] = np.isfinite(heights)
-        axes.imshow(shaded)
+        axes.imshow(_shaded(heights))
     axes.set_axis_off()
     figure.colorbar(image, ax=axes, shrink=0.8)
+
+
+def _range(heights: NDArray[np.float64]) -> tuple[float, float]:
+    return (float(np.nanmin(heights)), float(np.nanmax(heights))) if heights.size else (0.0, 1.0)
+
+
+def _shaded(heights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the colours of heights, (row, column, rgba) from 0 to 1; in a single row or column they are not shaded."""
+    import matplotlib
+    from matplotlib.colors import LightSource, Normalize
+
+    low, high = _range(heights)
+    height = high - low
+    colours = matplotlib.colormaps[_COLOURS]
+    known = np.nan_to_num(heights, nan=low)
+    if min(heights.shape) > 1:
+        rise = _RELIEF * max(heights.shape) / height if height > _FLAT else 0.0
+        shaded = LightSource(*_LIGHT).shade(known, colours, blend_mode="soft", vmin=low, vmax=high, vert_exag=rise)
+    else:
+        shaded = colours(Normalize(low, high)(known))
+    shaded[..., 3] = np.isfinite(heights)
+    return np.asarray(shaded, np.float64)
 
 
 def _in_space(figure: Figure, surface: Surface, pixels: int) -> None:

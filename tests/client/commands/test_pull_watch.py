@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import sys
 from itertools import pairwise
@@ -362,6 +363,53 @@ def test_an_out_that_cannot_be_replaced_ends_it(
     assert code == 1
     assert f"{out}: No space left on device" in stderr
     assert not out.exists()
+
+
+@pytest.mark.parametrize("transport", ["ws", "http"])
+def test_a_stream_stops_when_its_picture_looks_done(
+    run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transport: str
+) -> None:
+    """Each state is drawn before the next one is taken, so that it does not matter how long that takes."""
+
+    def each(self: watching.Watch, view: View, layout: Layout) -> None:
+        assert self._drawing is not None
+        self._drawing.draw(view, layout, self._metadata())
+
+    monkeypatch.setattr(watching.Watch, "write", each)
+    out, picture = tmp_path / "out.npy", tmp_path / "out.png"
+    options = ("--watch", "--picture", picture, "--until-done", "--transport", transport, "--limit-rate", "200kbit")
+    code, _, stderr = run("pull", surface, out, *options)
+    assert code == 0, stderr
+    told = re.search(r"looks done after \S+ k?B of \S+ k?B \(estimate: (\S+) % of", stderr)
+    assert told is not None, stderr
+    assert float(told[1]) < 1
+    assert "lodestream: stopped: " in stderr
+    rms = float(np.sqrt(np.mean((np.load(out).astype(float) - terrain) ** 2)))
+    assert 0 < rms < 0.05 * np.ptp(terrain)
+    with Image.open(picture) as shown:
+        shown.load()
+    # From a server, a picture alone: no more is read than it needs.
+    code, _, stderr = run("view", surface, "--png", picture, "--until-done")
+    assert (code, "looks done after" in stderr) == (0, True)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--until-done",),
+        ("--until-done", "--watch"),
+        ("--until-done", "--picture", "a.png"),
+        ("--until-done", "--watch", "--picture", "a.png", "--until-rms", "1"),
+        ("--until-done", "--watch", "--picture", "a.png", "--level", "1"),
+        ("--until-done", "--watch", "--picture", "a.png", "--roi", "0:9,0:9"),
+        ("--until-done", "--watch", "--picture", "a.png", "--order", "level"),
+    ],
+)
+def test_a_stream_that_stops_by_its_picture_needs_one_and_no_other_end(
+    run: Run, surface: str, tmp_path: Path, options: tuple[str, ...]
+) -> None:
+    code, _, stderr = run("pull", surface, tmp_path / "out.npy", *options)
+    assert (code, "argument --until-done" in stderr) == (2, True)
 
 
 def test_what_cannot_be_watched_is_refused_at_once(run: Run, surface: str, tmp_path: Path) -> None:

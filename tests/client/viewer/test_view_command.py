@@ -18,6 +18,8 @@ import pytest
 import lodestream as ls
 from lodestream import page
 from lodestream_client.program import main
+from lodestream_client.viewer.picture_change import DONE, VISIBLE, picture_change, share_above
+from lodestream_client.viewer.pictures import Picture, view_after, view_when_done
 from lodestream_client.viewer.sources import FileSource, RemoteSource
 from lodestream_client.viewer.static import write_static
 from tests.client.files import ranged
@@ -136,6 +138,38 @@ def test_pictures_without_a_browser(tmp_path: Path, container: Path, capsys: pyt
     assert (tmp_path / "out-1kB.png").read_bytes() != (tmp_path / "out-all.png").read_bytes()
 
 
+def test_a_picture_is_drawn_as_soon_as_it_looks_done(
+    tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", str(container), "--png", str(tmp_path / "a.png"), "--until-done"]) == 0
+    told = re.search(r"looks done after (\S+) (k?B) of .* \(estimate: (\S+) % of", capsys.readouterr().err)
+    assert told is not None
+    received = round(float(told[1]) * (1000 if told[2] == "kB" else 1))
+    assert 0 < received < 0.5 * container.stat().st_size
+    assert float(told[3]) < 1
+    # The same state by its bytes: its picture is the same, and hardly differs from the exact one.
+    source = FileSource(container)
+    view, picture, share = view_when_done(source, source.name)
+    assert share < DONE
+    assert (tmp_path / "a.png").read_bytes() == picture.png()
+    last, layout = view_after(source, None)
+    exact = Picture.of(last, layout, source.name).pixels()
+    assert share_above(picture_change(picture.pixels(), exact), VISIBLE) < 0.03
+    assert view.bytes < last.bytes
+
+
+def test_a_picture_that_is_never_done_before_its_end_is_the_exact_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "noise.lode"
+    noise = np.random.default_rng(3).integers(0, 3, (40, 50), np.int16)
+    path.write_bytes(ls.encode(noise))
+    assert main(["view", str(path), "--png", str(tmp_path / "a.png"), "--until-done"]) == 0
+    assert "complete" in capsys.readouterr().err
+    assert main(["view", str(path), "--png", str(tmp_path / "b.png")]) == 0
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
 def test_a_picture_of_a_window_is_that_of_its_points(
     tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -214,6 +248,9 @@ def test_pictures_of_every_kind(tmp_path: Path, surface: ls.Surface) -> None:
         ["--png", "a.png", "--static", "b"],
         ["--at", "1kB"],
         ["--roi", "0:9,0:9"],
+        ["--until-done"],
+        ["--png", "a.png", "--until-done", "--at", "1kB"],
+        ["--png", "a.png", "--until-done", "--roi", "0:9,0:9"],
         ["--png", "a.gif"],
         ["--port", "65536"],
         ["other.npy", "http://host/a.lode"],
