@@ -164,17 +164,21 @@ class Tab:
         """Wait until the status is one of these."""
         expect(self.status).to_have_text(re.compile("|".join(map(re.escape, statuses))), timeout=WAIT)
 
-    def go_on_below_a_pixel(self) -> None:
+    def go_on_to_the_end(self) -> None:
         """Uncheck that it stops there."""
         self.until(self._goes_on)
 
     def _goes_on(self) -> bool:
         # By the keyboard, since a click may miss what moves as rows above it come and go; and again if the page has
         # only now given the view its surface, with which it begins anew.
-        box = self.view.get_by_label("Stop when below a pixel")
+        box = self.view.get_by_label("Stop when the picture looks done")
         if box.is_checked():
             box.press("Space")
         return not box.is_checked()
+
+    def everything_is_here(self) -> None:
+        """Wait until the whole surface is drawn, whether it is exact or not."""
+        self.until(lambda: self._goes_on() and self.status.inner_text() in ("Complete: exact", "Complete"), 600)
 
     def everything(self, unit: str = "") -> None:
         """Wait for an exact surface, and until it is drawn."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -89,7 +90,7 @@ def test_the_error_on_the_screen_falls_to_what_the_server_promised(tabs: Tabs, s
     tab = tabs(shelf.address("terrain"))
     prices = httpx.get(shelf.description("terrain").url, trust_env=False).json()["layers"]
     seen = []
-    tab.go_on_below_a_pixel()
+    tab.go_on_to_the_end()
 
     def exact() -> bool:
         seen.append((tab.rms.inner_text(), tab.max.inner_text()))
@@ -124,7 +125,7 @@ def test_a_slow_link_can_be_seen_once_everything_has_come(tabs: Tabs, shelf: She
     again.until(lambda: again.moments and not again.moments[-1]["complete"])
     assert again.view.get_by_label("Link", exact=True).input_value() == "7000"
     again.choose("Link", "As it comes")
-    again.shown("Complete: exact", "Below a pixel: paused")
+    again.shown("Complete: exact", "The picture looks done (estimate)")
     again.until(lambda: "b=" not in again.page.url)
 
 
@@ -177,8 +178,8 @@ def test_status_and_errors_are_of_one_moment_while_detail_is_blended_in(tabs: Ta
 
 def test_a_target_may_be_the_error_of_an_attribute(tabs: Tabs, shelf: Shelf) -> None:
     tab = tabs(shelf.address("attribute"))
-    tab.shown("Below a pixel: paused", "Complete: exact")
-    tab.go_on_below_a_pixel()
+    tab.shown("The picture looks done (estimate)", "Complete: exact")
+    tab.go_on_to_the_end()
     row = tab.view.get_by_label("Error of", exact=True)
     assert not row.is_visible()
     tab.choose("Target", "RMS error")
@@ -192,7 +193,7 @@ def test_a_target_may_be_the_error_of_an_attribute(tabs: Tabs, shelf: Shelf) -> 
 
 def test_a_target_is_met_and_the_values_are_within_its_error(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(rate=5_000.0)) as (tab, _):
-        tab.go_on_below_a_pixel()
+        tab.go_on_to_the_end()
         tab.until(lambda: tab.moments)
         tab.choose("Target", "RMS error")
         tab.view.get_by_label("Target value").fill("0.005")
@@ -234,7 +235,7 @@ def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> N
     frames: list[Frames] = []
     slow = Fault(delay=0.05, rate=20_000.0)
     with over_a_link(tabs, shelf, slow, watch=lambda tab: frames.append(Frames(tab))) as (tab, _):
-        tab.go_on_below_a_pixel()
+        tab.go_on_to_the_end()
         (messages,) = frames
         tab.until(lambda: messages.data > 20_000)
         tab.button("Stop").click()
@@ -256,7 +257,7 @@ def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> N
 
 def test_stop_and_on_by_one_key(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(rate=20_000.0)) as (tab, _):
-        tab.go_on_below_a_pixel()
+        tab.go_on_to_the_end()
         tab.until(lambda: tab.moments)
         tab.press("s")
         tab.shown("Stopped")
@@ -284,23 +285,19 @@ def test_a_lost_link_is_told_and_the_surface_goes_on(tabs: Tabs, shelf: Shelf, h
 
 def test_a_link_without_a_word_is_told(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(cut_down=30_000, vanish=True)) as (tab, _):
-        tab.go_on_below_a_pixel()
+        tab.go_on_to_the_end()
         tab.shown("Waiting: no data for")
         assert tab.moments
         assert tab.rms.inner_text().endswith(" m")
 
 
-def test_below_a_pixel_it_pauses_and_goes_on_when_one_looks_closer(tabs: Tabs, shelf: Shelf) -> None:
-    with over_a_link(tabs, shelf, Fault(rate=30_000.0)) as (tab, _):
-        tab.shown("Below a pixel: paused")
+def test_it_stops_when_the_picture_looks_done_and_gets_the_rest_when_that_is_wanted(tabs: Tabs, shelf: Shelf) -> None:
+    with over_a_link(tabs, shelf, Fault(rate=2_000.0)) as (tab, _):
+        tab.shown("The picture looks done (estimate)")
+        assert re.fullmatch(r"The picture looks done \(estimate\): \S+ k?B of \S+ k?B", tab.status.inner_text())
+        assert not tab.moments[-1]["complete"]
         paused = tab.moments[-1]
-        assert not paused["complete"]
-
-        def closer() -> bool:
-            tab.press("+")
-            return bool(tab.moments[-1]["number"] > paused["number"])
-
-        # A busy machine pauses later, with a smaller error: how close one has to look depends on it.
-        tab.until(closer)
-        # What is in the view comes first: meanwhile nobody knows the error of the whole surface.
-        tab.until(lambda: tab.moments[-1]["max"] < paused["max"])
+        tab.button("Get the rest").click()
+        tab.until(lambda: tab.moments[-1]["number"] > paused["number"] + 1)
+        assert not tab.view.get_by_label("Stop when the picture looks done").is_checked()
+        tab.shown("Receiving", "Complete: exact")

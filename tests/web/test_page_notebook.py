@@ -52,12 +52,12 @@ def until(notebook: Notebook, true: Callable[[], object]) -> None:
 
 
 def everything(notebook: Notebook, view: Locator) -> None:
-    view.get_by_label("Stop when below a pixel").uncheck()
+    view.get_by_label("Stop when the picture looks done").uncheck()
     notebook.status(view, "Complete: exact")
 
 
 def test_a_surface_comes_into_focus_over_the_comm(notebook: Notebook, container: bytes, hills: ls.Surface) -> None:
-    widget = Widget(container, stop_below_pixel=False, height=500)
+    widget = Widget(container, stop_when_done=False, height=500)
     view = notebook.show(widget)
     notebook.status(view, "Complete: exact")
     until(notebook, lambda: widget.state == "complete" and widget.rms == 0)
@@ -124,7 +124,7 @@ def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook
 
 
 def test_a_target_ends_the_transmission_and_another_goes_on(notebook: Notebook, container: bytes) -> None:
-    widget = Widget(container, target=ls.Target(max_bytes=20_000), stop_below_pixel=False)
+    widget = Widget(container, target=ls.Target(max_bytes=20_000), stop_when_done=False)
     view = notebook.show(widget)
     until(notebook, lambda: widget.state == "target")
     assert 0 < widget.bytes_received <= 20_000
@@ -144,7 +144,7 @@ def test_stop_ends_the_questions(notebook: Notebook) -> None:
     heights = np.random.default_rng(2).integers(0, 60_000, (900, 900))
     data = ls.encode(heights)
     end = read_index(lambda offset, length: data[offset : offset + length], len(data)).surface_end
-    widget = Widget(data, stop_below_pixel=False)
+    widget = Widget(data, stop_when_done=False)
     notebook.page.evaluate("window.held = 6")
     view = notebook.show(widget)
     until(notebook, lambda: widget.state == "receiving" and widget.bytes_sent > 200_000)

@@ -80,7 +80,7 @@ def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, h
         ls.decode(bytes(data))
     with ranged(host) as server:
         tab = tabs(f"{server.url}/index.html")
-        tab.go_on_below_a_pixel()
+        tab.go_on_to_the_end()
         tab.shown("Failed")
         expect(tab.notice).not_to_be_empty()
         assert not any(moment["complete"] for moment in tab.moments)
@@ -99,7 +99,7 @@ def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tab
     with ranged(host) as server:
         server.tags = tags
         tab = tabs(f"{server.url}/index.html")
-        tab.go_on_below_a_pixel()
+        tab.go_on_to_the_end()
         tab.shown("Failed")
         expect(tab.notice).to_contain_text("the file was cut short")
         expect(tab.notice).to_contain_text(str(len(whole) - 5000))
@@ -114,7 +114,7 @@ def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tab
         expect(tab.notice).to_be_empty()
         expect(tab.rms).to_have_text("0 m", timeout=WAIT)
         assert tab.view.get_by_label("Colour map").input_value() == "cividis"
-        assert not tab.view.get_by_label("Stop when below a pixel").is_checked()
+        assert not tab.view.get_by_label("Stop when the picture looks done").is_checked()
 
 
 def test_what_is_chosen_before_the_surface_is_known_holds_for_its_first_picture(tabs: Tabs, host: Path) -> None:

@@ -66,8 +66,8 @@ class Widget(AnyWidget):
         What heights are multiplied by, 0.1 to 100; None: a factor that follows the surface.
     lines : bool
         Whether the quads of the level that is drawn are shown.
-    stop_below_pixel : bool
-        Whether the transmission ends once the maximum error is less than a pixel; True unless given.
+    stop_when_done : bool
+        Whether the transmission ends once the picture looks done; True unless given.
     target : Target or None
         As above; another one can be set at any time.
     state : str
@@ -127,7 +127,7 @@ class Widget(AnyWidget):
     )
     exaggeration = traitlets.CFloat(None, allow_none=True).tag(sync=True)
     lines = traitlets.Bool(False).tag(sync=True)
-    stop_below_pixel = traitlets.Bool(True).tag(sync=True)
+    stop_when_done = traitlets.Bool(True).tag(sync=True)
     state = traitlets.Unicode("connecting").tag(sync=True)
     detail = traitlets.Unicode().tag(sync=True)
     bytes_received = traitlets.CInt(0).tag(sync=True)
@@ -266,7 +266,7 @@ class Widget(AnyWidget):
 
 
 _SETTABLE = frozenset(
-    ("height", "theme", "field", "colour_map", "value_range", "exaggeration", "lines", "stop_below_pixel")
+    ("height", "theme", "field", "colour_map", "value_range", "exaggeration", "lines", "stop_when_done")
 )
 
 

@@ -54,9 +54,9 @@ function place(program: Program, comm: Comm, model: Model, el: HTMLElement, sign
     const theme = model.get("theme") === "auto" ? themeOf(document) : String(model.get("theme"));
     if (theme === null) element.removeAttribute("theme");
     else element.setAttribute("theme", theme);
-    element.setAttribute("autostop", model.get("stop_below_pixel") ? "on" : "off");
+    element.setAttribute("autostop", model.get("stop_when_done") ? "on" : "off");
   };
-  for (const name of ["height", "theme", "stop_below_pixel"]) follow(name, frame);
+  for (const name of ["height", "theme", "stop_when_done"]) follow(name, frame);
   signal.addEventListener("abort", watchTheme(document, frame));
   const aim = (): void => {
     element.target = (model.get("_target") ?? {}) as Target;

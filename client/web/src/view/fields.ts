@@ -54,9 +54,14 @@ export function fieldValues(field: Field, input: FieldInput): Float64Array {
   }
 }
 
-/** The values of a field where the same nodes were a picture before; null: as now. */
-export function fieldBefore(field: Field, old: Grid, input: FieldInput): Float64Array | null {
+/**
+ * The values of a field where the same nodes were a picture before; null: as now.
+ *
+ * @param normals - Of the nodes as they were before: [node, xyz], not normalised.
+ */
+export function fieldBefore(field: Field, old: Grid, normals: Float64Array, input: FieldInput): Float64Array | null {
   if (field.kind === "height" && input.before !== null) return heights(input.before, input.frame);
+  if (field.kind === "slope") return slopes(normals, input.rise);
   if (field.kind !== "attribute") return null;
   const { grid } = input;
   const down = between(

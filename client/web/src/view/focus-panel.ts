@@ -17,7 +17,7 @@ export interface FocusActions {
   throttle(rate: number | null): void;
   /** A session begins at this rate. */
   limit(rate: number): void;
-  stopBelowPixel(on: boolean): void;
+  endByItself(on: boolean): void;
 }
 
 const TARGETS: readonly (readonly [string, string])[] = [
@@ -100,7 +100,7 @@ export class FocusPanel {
     html("div", { class: "row" }, html("label", { for: "target" }, "Target"), this.target, this.amount),
     this.attributeRow,
     html("div", { class: "row" }, html("label", { for: "rate" }, "Link"), this.rate),
-    html("div", { class: "row check" }, html("label", {}, this.below, "Stop when below a pixel")),
+    html("div", { class: "row check" }, html("label", {}, this.below, "Stop when the picture looks done")),
     html("div", { class: "row" }, this.button),
   );
 
@@ -112,7 +112,7 @@ export class FocusPanel {
     this.amount.addEventListener("change", () => this.sendTarget());
     this.rate.addEventListener("change", () => actions.throttle(this.chosenRate));
     this.attribute.addEventListener("change", () => this.sendTarget());
-    this.below.addEventListener("change", () => actions.stopBelowPixel(this.below.checked));
+    this.below.addEventListener("change", () => actions.endByItself(this.below.checked));
   }
 
   /** Whether there is something to stop. */
@@ -156,8 +156,8 @@ export class FocusPanel {
     this.sendTarget();
   }
 
-  /** Says whether it stops below a pixel. */
-  setBelowPixel(on: boolean): void {
+  /** Says whether it stops when the picture looks done. */
+  setEndsByItself(on: boolean): void {
     this.below.checked = on;
   }
 
@@ -191,7 +191,8 @@ export class FocusPanel {
     setText(this.shown, drawn === null ? "" : formatBytes(drawn.bytes));
     // Of the picture, as the label is: the knob may be elsewhere already.
     this.slider.setAttribute("aria-valuetext", drawn === null ? "nothing yet" : momentText(drawn, unit));
-    setText(this.button, this.canStop ? "Stop" : progress.state === "failed" ? "Try again" : "Continue");
+    const goOn = progress.state === "failed" ? "Try again" : state.looksDone ? "Get the rest" : "Continue";
+    setText(this.button, this.canStop ? "Stop" : goOn);
     this.button.hidden = isWhole(state);
   }
 

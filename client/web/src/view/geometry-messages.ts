@@ -107,8 +107,6 @@ export type FromGeometry =
       readonly level: number;
       /** What of the only block is in the view; null: most of it, or there are several. */
       readonly region: Region | null;
-      /** Pixels of a length of 1 in the surface's unit, where it is nearest. */
-      readonly pixels: number;
     }
   | { readonly kind: "hit"; readonly id: number; readonly hit: Hit | null }
   | { readonly kind: "failed"; readonly detail: string };

@@ -53,8 +53,8 @@ function take(message: ToGeometry): void {
 
 function wants(): void {
   if (!geometry.sees) return;
-  const { region, pixels, finer } = geometry;
-  scope.postMessage({ kind: "wants", level: Math.max(0, level + finer), region, pixels });
+  const { region, finer } = geometry;
+  scope.postMessage({ kind: "wants", level: Math.max(0, level + finer), region });
 }
 
 function send({ patches, triangles }: Change, fresh: boolean): void {

@@ -41,7 +41,6 @@ export class Geometry {
   private ends: BoundaryNormals = new Map();
   private joined = false;
   private geographic = false;
-  private heights = false;
   private field: Field = { kind: "height" };
   private known: [number, number] | null = null;
   private base: { low: number; span: number } | null = null;
@@ -76,7 +75,6 @@ export class Geometry {
     this.grids = grids;
     this.joined = joined;
     this.geographic = options.geographic;
-    this.heights = options.heights;
     const fitting = frameOf(this.box, options);
     if (this.fixed === null || isOther(this.fixed, fitting)) this.fixed = fitting;
     this.ends = boundaryNormals(grids, this.fixed);
@@ -88,10 +86,7 @@ export class Geometry {
     });
     this.bounds = this.patches.map((patch) => boundsOf(grids[patch.block]!, patch, this.frame));
     this.strides = this.wishedStrides();
-    return this.built(
-      this.patches.map((_, k) => k),
-      true,
-    );
+    return this.built(this.patches.map((_, k) => k));
   }
 
   /** Takes another view. @returns the buffers of patches that are drawn in another way now. */
@@ -102,7 +97,7 @@ export class Geometry {
     const changed = (patch: number): boolean => patch >= 0 && strides[patch] !== this.strides[patch];
     const again = this.patches.flatMap(({ beside }, patch) => (changed(patch) || beside.some(changed) ? [patch] : []));
     this.strides = strides;
-    return this.built(again, false);
+    return this.built(again);
   }
 
   /** Colours by another field. @returns the buffers of all patches. */
@@ -110,10 +105,7 @@ export class Geometry {
     this.field = field;
     this.known = null;
     this.base = null;
-    return this.built(
-      this.patches.map((_, k) => k),
-      false,
-    );
+    return this.built(this.patches.map((_, k) => k));
   }
 
   /** Draws other numbers of triangles from the next view on. */
@@ -129,15 +121,6 @@ export class Geometry {
   /** How many levels finer or coarser a grid the view would show, see `Strides.finer`. */
   get finer(): number {
     return this.chosen?.finer ?? 0;
-  }
-
-  /** Pixels of an error of 1 in the surface's unit where it is nearest. */
-  get pixels(): number {
-    const { chosen, eye } = this;
-    if (chosen === null || eye === null || !Number.isFinite(chosen.nearest)) return 0;
-    const upwards = this.frame.scale[2] * eye.exaggeration;
-    // Heights err in z only, which may have a scale of its own.
-    return (eye.focal / chosen.nearest) * (this.heights ? upwards : Math.max(this.frame.scale[0], upwards));
   }
 
   /** What of the only block is in the view, at full resolution; null: more than half of it, or there are more blocks. */
@@ -189,8 +172,8 @@ export class Geometry {
     return this.joined ? everywhere(1) : this.chosen.strides;
   }
 
-  private built(numbers: readonly number[], withBefore: boolean): Change {
-    const patches = numbers.map((patch) => this.buffers(patch, withBefore));
+  private built(numbers: readonly number[]): Change {
+    const patches = numbers.map((patch) => this.buffers(patch));
     const triangles = this.patches.reduce((sum, patch, k) => {
       const lines = (of: readonly [number, number]): number => Math.ceil((of[1] - of[0]) / this.strides[k]!);
       return sum + 2 * lines(patch.rows) * lines(patch.columns);
@@ -198,7 +181,7 @@ export class Geometry {
     return { patches, triangles };
   }
 
-  private buffers(number: number, withBefore: boolean): PatchBuffers {
+  private buffers(number: number): PatchBuffers {
     const patch = this.patches[number]!;
     const grid = this.grids[patch.block]!;
     const old = this.before?.[patch.block];
@@ -209,17 +192,18 @@ export class Geometry {
     const normals = normalSums(lattice);
     this.joinNormals(patch, rows, columns, normals);
     let beforeAround = null;
-    if (old !== undefined && (withBefore || this.field.kind === "change")) {
+    if (old !== undefined) {
       const places = (lines: number[], axis: 0 | 1): number[] =>
         placesOf(around(lines), axis === 0 ? grid.rowsAt : grid.columnsAt, grid.full[axis], grid.closed[axis]);
       beforeAround = latticeBetween(old, places(rows, 0), places(columns, 1), this.frame);
     }
     const nodes = inner(lattice);
     const before = beforeAround === null ? null : inner(beforeAround);
+    const normalsBefore = beforeAround === null ? null : normalSums(beforeAround);
     const input: FieldInput = { grid, rows, columns, nodes, before, normals, frame: this.frame, rise: this.rise };
     const values = this.packed(fieldValues(this.field, input));
-    const blended = withBefore && old !== undefined && before !== null && beforeAround !== null ? before : null;
-    const valuesBefore = blended !== null && old !== undefined ? fieldBefore(this.field, old, input) : null;
+    const valuesBefore =
+      normalsBefore !== null && old !== undefined ? fieldBefore(this.field, old, normalsBefore, input) : null;
     const beside = patch.beside.map((other) => (other < 0 ? 0 : this.strides[other]!)) as unknown as StridesBeside;
     const whole = stitched(patch, stride, beside, grid.mask === null ? null : nodes.valid);
     const triangles = withoutJumps(whole, nodes.points, this.frame.scale, grid.periods);
@@ -229,9 +213,9 @@ export class Geometry {
       patch: number,
       pieces: line ? piecesOf(nodes.valid) : null,
       positions: Float32Array.from(nodes.points),
-      from: blended === null ? null : merged(blended.points, blended.valid, nodes.points),
+      from: before === null ? null : merged(before.points, before.valid, nodes.points),
       normals: packedNormals(normals, line),
-      fromNormals: blended === null || beforeAround === null ? null : packedNormals(normalSums(beforeAround), line),
+      fromNormals: normalsBefore === null ? null : packedNormals(normalsBefore, line),
       values,
       fromValues: valuesBefore === null ? null : this.packed(valuesBefore),
       places: placesOfNodes(rows, columns),

@@ -1,6 +1,6 @@
-/** Which level of a surface is computed for the view, and when its error cannot be seen. */
+/** Which level of a surface is computed for the view. */
 
-import type { Moment, SurfaceInfo } from "./source";
+import type { SurfaceInfo } from "./source";
 
 /** Points of all blocks at a level, about. */
 export function pointsAt(info: SurfaceInfo, level: number): number {
@@ -32,13 +32,4 @@ export function firstLevel(info: SurfaceInfo, pixels: number): number {
     if (pointsAt(info, level) <= Math.max(pixels, 10_000)) return level;
   }
   return 0;
-}
-
-/**
- * Whether the error of a moment is less than a pixel.
- *
- * @param pixels - Pixels of a length of 1 where the surface is nearest; 0: not known.
- */
-export function belowPixel(moment: Moment, pixels: number): boolean {
-  return pixels > 0 && moment.max * pixels < 1;
 }

@@ -28,7 +28,7 @@ export type SourceMaker = (src: string, options: { readonly token: string | null
  * Shows the surface at `src`.
  *
  * Attributes: `src`, the address of a surface or container; `max-triangles`, 4 million unless given; `autostop="off"`
- * goes on when the error is below a pixel; `share` keeps the view in the address of the page, after #; `name` is shown
+ * goes on when the picture looks done; `share` keeps the view in the address of the page, after #; `name` is shown
  * in place of the surface's.
  *
  * Events: `lodestream-info`, `lodestream-moment`, `lodestream-progress`, each with what has come as `detail`, and
@@ -79,7 +79,7 @@ export class LodestreamView extends HTMLElement {
       setTarget: (target) => this.session?.setTarget(target),
       throttle: (rate) => this.throttle(rate),
       limit: (rate) => this.session?.source.throttle(rate),
-      stopBelowPixel: (on) => this.stopBelowPixel(on),
+      endByItself: (on) => this.endByItself(on),
     });
     this.lookPanel = new LookPanel(
       (look) => this.changeLook(look),
@@ -211,7 +211,7 @@ export class LodestreamView extends HTMLElement {
     if (before === value || this.stage === null) return;
     if (name === "src") this.open();
     else if (name === "max-triangles") this.session?.setTriangles(this.mostTriangles);
-    else this.stopBelowPixel(value !== "off");
+    else this.endByItself(value !== "off");
   }
 
   private get mostTriangles(): number {
@@ -256,7 +256,7 @@ export class LodestreamView extends HTMLElement {
       },
       this.mostTriangles,
     );
-    this.stopBelowPixel(this.getAttribute("autostop") !== "off");
+    this.endByItself(this.getAttribute("autostop") !== "off");
     this.look = { ...this.look, field: this.shared.field ?? { kind: "height" }, range: this.shared.range ?? null };
     this.session.setField(this.look.field);
     this.colour();
@@ -268,6 +268,7 @@ export class LodestreamView extends HTMLElement {
     const { session } = this;
     if (session?.progress.state !== "failed" || session.progress.useless !== true) {
       session?.resume();
+      this.focusPanel.setEndsByItself(session?.endsByItself ?? true); // whoever wants the rest wants all of it
       return;
     }
     this.again();
@@ -275,10 +276,10 @@ export class LodestreamView extends HTMLElement {
 
   /** Begins anew, seen as it is now. */
   private again(): void {
-    const below = this.session?.stopsBelowPixel ?? true;
+    const below = this.session?.endsByItself ?? true;
     this.shared = this.viewpoint.framing === null ? this.ordered() : this.view();
     this.open();
-    this.stopBelowPixel(below);
+    this.endByItself(below);
   }
 
   /** Asks for at most so many bytes a second; where nothing is under way any more, for all of them again. */
@@ -289,11 +290,11 @@ export class LodestreamView extends HTMLElement {
     else session?.source.throttle(rate);
   }
 
-  private stopBelowPixel(on: boolean): void {
-    this.focusPanel.setBelowPixel(on);
+  private endByItself(on: boolean): void {
+    this.focusPanel.setEndsByItself(on);
     if (this.session === null) return;
-    this.session.stopsBelowPixel = on;
-    this.session.considerPixels();
+    this.session.endsByItself = on;
+    this.session.judge();
     this.refresh();
   }
 
@@ -385,7 +386,7 @@ export class LodestreamView extends HTMLElement {
         following: session.following,
         awaited: session.awaitsChosen,
         progress: session.progress,
-        belowPixel: session.stoppedBelowPixel,
+        looksDone: session.looksDone,
         silent,
       });
     });
@@ -414,6 +415,7 @@ export class LodestreamView extends HTMLElement {
     this.look = look;
     if (look.exaggeration !== before.exaggeration) this.viewpoint.exaggerate(look.exaggeration);
     this.colour();
+    this.session?.judgeSoon();
     this.sharing.later();
   }
 

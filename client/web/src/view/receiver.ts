@@ -225,9 +225,12 @@ export class Receiver {
     }
     for (const view of decoder.layers.slice(this.views.length)) {
       const number = this.views.push(view) - 1;
-      const { level, bytes, rms, maxError: max, complete } = view;
+      const { number: layer, level, bytes, rms, maxError: max, complete } = view;
       const seconds = (performance.now() - this.began) / 1000;
-      this.events.moment({ number, level, bytes, seconds, rms, max, complete });
+      const attributes = attributeErrors(view, decoder.header);
+      // Nobody knows the errors of the whole while a region comes first.
+      const region = Number.isNaN(rms) ? this.region : null;
+      this.events.moment({ number, layer, region, level, bytes, seconds, rms, max, attributes, complete });
     }
   }
 
@@ -267,4 +270,16 @@ export class Receiver {
 function isUseless(error: unknown): boolean {
   if (error instanceof RemoteError) return error.code === "other-container";
   return [CorruptStreamError, CutShortError, UnsupportedVersionError].some((kind) => error instanceof kind);
+}
+
+/** RMS errors of the attributes, each of all of its components together; NaN where they are not known. */
+function attributeErrors({ channels }: View, { attributes }: Header): number[] {
+  let last = channels.length;
+  const errors = attributes.toReversed().map(({ components }) => {
+    const first = last - Math.max(components, 1);
+    const squares = Array.from({ length: last - first }, (_, k) => (channels[first + k]?.[0] ?? Number.NaN) ** 2);
+    last = first;
+    return Math.sqrt(squares.reduce((sum, square) => sum + square, 0));
+  });
+  return errors.toReversed();
 }

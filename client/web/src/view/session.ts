@@ -1,12 +1,14 @@
 /** A surface coming into focus on a stage: moments in, pictures out; what the view asks for back to the source. */
 
 import { isStill } from "./dom";
+import { AGAIN, COMPARED, DONE, remainingShare } from "./ending";
 import type { Field, FromGeometry, Hit, ToGeometry } from "./geometry-messages";
 import GeometryWorker from "./geometry-worker?worker&inline";
-import { belowPixel, firstLevel } from "./levels";
+import { firstLevel } from "./levels";
+import { pictureChange } from "./picture-change";
 import type { DetailWindow, Moment, Progress, Region, Source, SurfaceInfo, Target } from "./source";
 import type { Stage } from "./stage";
-import { drawingFor } from "./windows";
+import { drawingFor, isInside } from "./windows";
 
 type Patches = Extract<FromGeometry, { kind: "patches" }>;
 
@@ -32,18 +34,22 @@ export class Session {
   readonly moments: Moment[] = [];
   info: SurfaceInfo | null = null;
   progress: Progress = { state: "connecting", bytes: 0, planned: 0, rate: 0, detail: "" };
-  /** Stop when the error is below a pixel, and go on when it is not any more. */
-  stopsBelowPixel = true;
-  /** The transmission was ended since the error is below a pixel. */
-  stoppedBelowPixel = false;
+  /** Stop when the picture looks done, and go on when it does not any more. */
+  endsByItself = true;
+  /** The transmission was ended since the picture looks done. */
+  looksDone = false;
+  /** Share of the drawn pixels that will still change visibly, as estimated for the picture in hand; NaN: not known. */
+  remaining = Number.NaN;
   private readonly worker = new GeometryWorker();
   private readonly picks = new Map<number, (hit: Hit | null) => void>();
   private chosen: number | null = null;
   private shown: { moment: Moment; level: number; window: DetailWindow | null } | null = null;
+  private before: Moment | null = null;
+  private field: Field = { kind: "height" };
+  private target: Target = {};
   private awaited: { take(patches: Patches): void; fail(error: Error): void } | null = null;
   private wanted: number | null = null;
   private region: Region | null = null;
-  private pixels = 0;
   private asked = 0;
   private busy = false;
   private eyeDue = false;
@@ -52,6 +58,7 @@ export class Session {
   private triangles: number;
   private eyeTimer: ReturnType<typeof setTimeout> | undefined;
   private focusTimer: ReturnType<typeof setTimeout> | undefined;
+  private judgeTimer: ReturnType<typeof setTimeout> | undefined;
   private focused: Region | null = null;
 
   constructor(
@@ -72,7 +79,7 @@ export class Session {
       moment: (moment) => {
         this.moments.push(moment);
         events.moment(moment);
-        this.considerPixels();
+        if (moment.complete) this.looksDone = false; // the last bytes may have come after it was stopped
         void this.pump();
       },
       progress: (progress) => {
@@ -106,6 +113,8 @@ export class Session {
 
   /** Colours by another field. */
   setField(field: Field): void {
+    this.field = field;
+    this.remaining = Number.NaN;
     this.post({ kind: "field", field });
   }
 
@@ -136,22 +145,23 @@ export class Session {
   /** Ends the transmission. */
   stop(): void {
     this.userStopped = true;
-    this.stoppedBelowPixel = false;
+    this.looksDone = false;
     this.source.stop();
   }
 
   /** Goes on; what cannot be seen is asked for too. */
   resume(): void {
-    if (this.stoppedBelowPixel) this.stopsBelowPixel = false;
+    if (this.looksDone) this.endsByItself = false;
     this.userStopped = false;
-    this.stoppedBelowPixel = false;
+    this.looksDone = false;
     this.source.resume();
   }
 
-  /** Another target; goes on. */
+  /** Another target; goes on. Where it has a limit, the picture ends nothing. */
   setTarget(target: Target): void {
+    this.target = target;
     this.userStopped = false;
-    this.stoppedBelowPixel = false;
+    this.looksDone = false;
     this.source.setTarget(target);
   }
 
@@ -160,25 +170,46 @@ export class Session {
     this.closed = true;
     clearTimeout(this.eyeTimer);
     clearTimeout(this.focusTimer);
+    clearTimeout(this.judgeTimer);
     this.source.close();
     this.worker.terminate();
     for (const resolve of this.picks.values()) resolve(null);
   }
 
-  /** Stops below a pixel, or goes on above it. */
-  considerPixels(): void {
+  /** Estimates how much of the picture will still change in this view, and stops where that is little, or goes on. */
+  judge(): void {
     const last = this.moments.at(-1);
-    // The last bytes may have come after it was stopped.
-    if (last?.complete) this.stoppedBelowPixel = false;
-    if (last === undefined || last.complete || this.userStopped) return;
-    const below = this.stopsBelowPixel && belowPixel(last, this.pixels);
-    if (below && this.progress.state === "receiving") {
-      this.stoppedBelowPixel = true;
+    if (this.closed || !this.following || this.userStopped || last === undefined || last.complete) return;
+    if (this.progress.state !== "receiving" && !this.looksDone) return;
+    const limited = Object.values(this.target).some((limit) => limit !== undefined);
+    this.remaining = this.endsByItself && !limited ? this.estimate() : Number.NaN;
+    const done = this.remaining < DONE;
+    if (done && !this.looksDone) {
+      this.looksDone = true;
       this.source.stop();
-    } else if (!below && this.stoppedBelowPixel) {
-      this.stoppedBelowPixel = false;
+    } else if (!(this.remaining < AGAIN) && this.looksDone && this.shown?.moment === last) {
+      this.looksDone = false;
       this.source.resume();
     }
+  }
+
+  /** Judges once the view and its colours rest. */
+  judgeSoon(): void {
+    clearTimeout(this.judgeTimer);
+    this.judgeTimer = setTimeout(() => this.judge(), REST);
+  }
+
+  /** Which share of the drawn pixels is expected to change visibly after the picture in hand; NaN: not known. */
+  estimate(): number {
+    const { shown, before, info, field } = this;
+    // Colours that show the last change are others with each moment.
+    if (info === null || shown === null || before === null || field.kind === "change") return Number.NaN;
+    // Outside the region that comes first a layer is not there yet.
+    if (![before, shown.moment].every(({ region }) => region === null || isInside(this.region, region)))
+      return Number.NaN;
+    const change = pictureChange(...this.stage.pictures(COMPARED));
+    const finest = Math.min(this.wanted ?? shown.level, info.levels);
+    return remainingShare(change, { before, now: shown.moment, finest }, info, field);
   }
 
   private tellEye(): void {
@@ -229,13 +260,16 @@ export class Session {
       this.post({ kind: "picture", picture: number, level: drawn, grids, options }, [...new Set(buffers)]);
       const patches = await came;
       if (this.closed) return;
+      this.before = patches.patches.some(({ from }) => from !== null) ? (this.shown?.moment ?? null) : null;
       this.shown = { moment: taken, level, window };
+      this.remaining = Number.NaN;
       // What is to be followed by another at once is not worth the time.
       const superseded = this.chosen === null && this.moments.at(-1) !== taken;
       const blended = !isStill() && !superseded && patches.patches.some(({ from }) => from !== null);
       await new Promise<void>((resolve) => {
         this.stage.show(patches.patches, true, blended, resolve);
         this.events.drawn(patches, taken);
+        this.judge();
       });
     } catch (error) {
       if (!this.closed) this.events.failed(error instanceof Error ? error.message : String(error));
@@ -258,13 +292,13 @@ export class Session {
         } else if (this.shown !== null) {
           this.stage.show(message.patches, false, false, () => {});
           this.events.drawn(message, this.shown.moment);
+          this.judgeSoon();
         }
         break;
       case "wants":
         this.wanted = message.level;
         this.region = message.region;
-        this.pixels = message.pixels;
-        this.considerPixels();
+        this.judgeSoon();
         this.considerFocus(message.region);
         void this.pump();
         break;

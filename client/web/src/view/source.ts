@@ -103,6 +103,10 @@ export interface Grid {
 export interface Moment {
   /** Rises by one from moment to moment. */
   readonly number: number;
+  /** Number of the layer that has come last; all before it are there too. */
+  readonly layer: number;
+  /** The region that the layer has come for, while that comes first; null: it has come for all of the surface. */
+  readonly region: Region | null;
   /** Finest level with data. */
   readonly level: number;
   /** Bytes of the surface that are there. */
@@ -112,6 +116,8 @@ export interface Moment {
   /** Errors at full resolution in the surface's unit; NaN where they are not known. */
   readonly rms: number;
   readonly max: number;
+  /** RMS errors of the attributes in the order of `SurfaceInfo.attributes`, each in its own unit; NaN where not known. */
+  readonly attributes: readonly number[];
   /** Whether nothing is missing. */
   readonly complete: boolean;
 }

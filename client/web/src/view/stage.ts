@@ -14,12 +14,14 @@ import {
   Sphere,
   Vector3,
   WebGLRenderer,
+  WebGLRenderTarget,
 } from "three";
 import { clipping, type Orbit, positionOf, VIEW_ANGLE } from "./camera";
 import type { Eye, PatchBuffers } from "./geometry-messages";
-import type { Look } from "./look";
+import { type Look, sameField } from "./look";
 import { SurfaceMaterial } from "./material";
 
+type Range = readonly [low: number, high: number];
 type Drawable = Mesh<BufferGeometry, SurfaceMaterial> | LineSegments<BufferGeometry, SurfaceMaterial>;
 
 /** Milliseconds in which new detail is blended in. */
@@ -38,6 +40,9 @@ export class Stage {
   private exaggeration = 1;
   private frame = 0;
   private blend: { readonly began: number; readonly done: () => void } | null = null;
+  private look: Look | null = null;
+  private range: Range = [0, 1];
+  private rangeBefore: Range | null = null;
 
   /**
    * @param canvas - Of any size; `resize` says how large it is shown.
@@ -79,6 +84,7 @@ export class Stage {
   show(patches: readonly PatchBuffers[], fresh: boolean, blended: boolean, done: () => void): void {
     if (fresh) {
       this.finishBlend();
+      this.rangeBefore = this.range;
       for (const mesh of this.meshes.values()) this.forget(mesh);
       this.meshes.clear();
     }
@@ -105,7 +111,11 @@ export class Stage {
   }
 
   /** Colours by a map over a range of the values in the buffers. */
-  setLook({ map, lines, field }: Look, low: number, high: number): void {
+  setLook(look: Look, low: number, high: number): void {
+    const { map, lines, field } = look;
+    if (this.look === null || !sameField(this.look.field, field) || look.range !== null) this.rangeBefore = null;
+    this.look = look;
+    this.range = [low, high];
     this.material.setMap(map);
     this.material.setRange(low, high);
     this.material.set("lines", lines ? 1 : 0);
@@ -158,6 +168,40 @@ export class Stage {
     const [width, height] = this.size;
     const at = new Vector3(point[0], point[1], point[2] * this.exaggeration).project(this.camera);
     return [((at.x + 1) / 2) * width, ((1 - at.y) / 2) * height];
+  }
+
+  /**
+   * Draws the picture before and the one in hand into memory, with one sample a pixel and at most so many pixels.
+   *
+   * @returns of each picture red, green, blue and alpha from 0 to 255, [row from below, column, 4]; alpha is 0 where
+   * nothing is drawn. Without a picture before both are the same.
+   */
+  pictures(most: number): readonly [before: Uint8Array, now: Uint8Array] {
+    const [width, height] = this.size;
+    const share = Math.min(1, Math.sqrt(most / (width * height)));
+    const target = new WebGLRenderTarget(
+      Math.max(1, Math.floor(share * width)),
+      Math.max(1, Math.floor(share * height)),
+    );
+    this.place();
+    try {
+      return [this.picture(target, 0, this.rangeBefore ?? this.range), this.picture(target, 1, this.range)];
+    } finally {
+      this.renderer.setRenderTarget(null);
+      target.dispose();
+      this.material.set("morph", this.blend === null ? 1 : 0); // while it is blended, the next frame sets it
+    }
+  }
+
+  private picture(target: WebGLRenderTarget, morph: 0 | 1, range: Range): Uint8Array {
+    const { width, height } = target;
+    const colours = new Uint8Array(4 * width * height);
+    this.material.set("morph", morph);
+    this.material.setRange(...range);
+    this.renderer.setRenderTarget(target);
+    this.renderer.render(this.scene, this.camera);
+    this.renderer.readRenderTargetPixels(target, 0, 0, width, height, colours);
+    return colours;
   }
 
   /** Draws with the next frame. */

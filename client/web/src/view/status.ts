@@ -18,7 +18,7 @@ export interface FocusState {
   /** A moment was chosen that is not drawn yet. */
   readonly awaited: boolean;
   readonly progress: Progress;
-  readonly belowPixel: boolean;
+  readonly looksDone: boolean;
   /** Seconds without a byte, while receiving. */
   readonly silent: number;
 }
@@ -36,14 +36,17 @@ export function isWhole({ progress, moments }: FocusState): boolean {
 
 /** One or a few words. */
 export function statusText(state: FocusState): string {
-  const { progress, belowPixel, silent, info, moments, drawn, following } = state;
+  const { progress, looksDone, silent, info, moments, drawn, following } = state;
   const last = moments.at(-1);
   if (state.awaited && progress.state !== "failed") return "Drawing the moment chosen";
   const whole = isWhole(state) && progress.state !== "failed";
-  if (last !== undefined && drawn?.number !== last.number && (whole || belowPixel || progress.state === "target"))
+  if (last !== undefined && drawn?.number !== last.number && (whole || looksDone || progress.state === "target"))
     return following ? "Received: drawing" : "Earlier moment";
   if (whole) return info?.exact === false || last?.rms !== 0 ? "Complete" : "Complete: exact";
-  if (belowPixel) return "Below a pixel: paused";
+  if (looksDone && progress.state !== "failed") {
+    const total = progress.planned || info?.size || 0;
+    return `The picture looks done (estimate): ${formatBytes(progress.bytes)} of ${formatBytes(total)}`;
+  }
   switch (progress.state) {
     case "connecting":
       return "Connecting";

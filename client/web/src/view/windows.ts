@@ -52,7 +52,9 @@ export function drawingFor(
   return { level: around, window: kept ? before : { region: wide, stride } };
 }
 
-function isInside(inner: Region, outer: Region): boolean {
+/** Whether all of a region is in another one; null: all of the surface. */
+export function isInside(inner: Region | null, outer: Region): boolean {
+  if (inner === null) return false;
   return [0, 1].every((axis) => {
     const [a, b] = [inner[axis as 0 | 1], outer[axis as 0 | 1]];
     return a[0] >= b[0] && a[1] <= b[1];

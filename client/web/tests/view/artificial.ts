@@ -125,7 +125,15 @@ export class ArtificialSource implements Source {
     }
     const complete = this.number === this.info.levels;
     const seconds = (performance.now() - this.started) / 1000;
-    const moment: Moment = { number: this.number, seconds, complete, ...price };
+    const moment: Moment = {
+      number: this.number,
+      layer: this.number,
+      region: null,
+      seconds,
+      attributes: [],
+      complete,
+      ...price,
+    };
     this.number += 1;
     this.tell(complete ? "complete" : "receiving");
     for (const events of this.events) events.moment(moment);

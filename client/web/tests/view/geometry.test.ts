@@ -261,28 +261,6 @@ describe("colours and values", () => {
     expect(geometry.colouring().range[0]).toBeCloseTo((Math.atan(100) * 180) / Math.PI, 6);
   });
 
-  it.each([
-    [true, false],
-    [false, false],
-    [true, true],
-  ])("errors of heights are as large as they are drawn, fitted: %j, over degrees: %j", (fitted, geographic) => {
-    const geometry = new Geometry();
-    const options = { joined: false, geographic, heights: true, diagonal: 0, relief: 0, fresh: true };
-    const grid = plane(30, 40, (i) => (fitted ? 1e7 : 1) * Math.sin(i / 9));
-    geometry.setPicture([grid], options);
-    geometry.setEye(eyeAt([0, 0, 5], 800));
-    const { scale } = geometry.frame;
-    const nearest =
-      5 -
-      Math.max(
-        ...[0, 1].map((at) => Math.abs(((at ? 1 : -1) * (geometry.box[1][2] - geometry.box[0][2]) * scale[2]) / 2)),
-      );
-    // A step of 1 in z, where the surface comes nearest, or closer by no more than a patch is deep.
-    const expected = (800 / nearest) * scale[2];
-    expect(geometry.pixels / expected).toBeGreaterThan(0.8);
-    expect(geometry.pixels / expected).toBeLessThan(1.25);
-  });
-
   it("an attribute has its own range", () => {
     const drawn = new Drawn().picture([plane(3, 4, () => 0)]);
     drawn.take(drawn.geometry.setField({ kind: "attribute", name: "twice", component: 0 }).patches);

@@ -16,9 +16,9 @@ import {
 } from "../../src/view/format";
 import { Geometry } from "../../src/view/geometry";
 import type { Component } from "../../src/view/geometry-messages";
-import { belowPixel, finestDrawn, firstLevel, pointsAt } from "../../src/view/levels";
+import { finestDrawn, firstLevel, pointsAt } from "../../src/view/levels";
 import { fieldName, fieldsOf, sameField } from "../../src/view/look";
-import type { Grid, Moment, SurfaceInfo } from "../../src/view/source";
+import type { Grid, SurfaceInfo } from "../../src/view/source";
 import { formatView, parseView, type SharedView, withView } from "../../src/view/url-state";
 
 describe("colour maps", () => {
@@ -189,14 +189,6 @@ describe("levels", () => {
     expect(finestDrawn({ ...info, blocks: [{ shape: [9, 9], closed: [true, true] }], joined: true }, 4_000_000)).toBe(
       12,
     );
-  });
-
-  it("an error is below a pixel where all of it is, and where it is known", () => {
-    const moment: Moment = { number: 0, level: 3, bytes: 1, seconds: 0, rms: 0.1, max: 0.5, complete: false };
-    expect(belowPixel(moment, 1.9)).toBe(true);
-    expect(belowPixel(moment, 2.1)).toBe(false);
-    expect(belowPixel(moment, 0)).toBe(false);
-    expect(belowPixel({ ...moment, max: Number.NaN }, 0.001)).toBe(false);
   });
 
   it("relief is exaggerated by a round number where it could not be seen", () => {

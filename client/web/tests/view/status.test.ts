@@ -4,11 +4,14 @@ import { detailText, type FocusState, statusText } from "../../src/view/status";
 
 const moment = (number: number, rms: number): Moment => ({
   number,
+  layer: number,
+  region: null,
   level: number,
   bytes: 100 * (number + 1),
   seconds: number,
   rms,
   max: 4 * rms,
+  attributes: [],
   complete: rms === 0,
 });
 const MOMENTS = [moment(0, 4), moment(1, 1), moment(2, 0)];
@@ -22,7 +25,7 @@ function state(progress: Progress["state"], given: Partial<FocusState> = {}): Fo
     following: true,
     awaited: false,
     progress: { state: progress, bytes: 300, planned: 300, rate: 0, detail: "" },
-    belowPixel: false,
+    looksDone: false,
     silent: 0,
     ...given,
   };
@@ -51,8 +54,10 @@ describe("the status", () => {
     ];
     expect(statusText(state("target", late))).toBe("Target met");
     expect(statusText(state("target", early))).toBe("Received: drawing");
-    expect(statusText(state("stopped", { ...late, belowPixel: true }))).toBe("Below a pixel: paused");
-    expect(statusText(state("stopped", { ...early, belowPixel: true }))).toBe("Received: drawing");
+    expect(statusText(state("stopped", { ...late, looksDone: true }))).toBe(
+      "The picture looks done (estimate): 300 B of 300 B",
+    );
+    expect(statusText(state("stopped", { ...early, looksDone: true }))).toBe("Received: drawing");
     expect(statusText(state("receiving", early))).toBe("Receiving");
     expect(statusText(state("receiving", { ...early, silent: 4 }))).toBe("Waiting: no data for 4 s");
   });
