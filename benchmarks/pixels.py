@@ -96,10 +96,10 @@ async ({ calm }) => {
     session.show(number);
     await came;
     const truth = different(stage.pictures(Infinity)[1], exact);
-    states.push([bytes, truth, String(session.estimate()), max * pixels < 1]);
+    states.push([bytes, truth, String(session.estimate()), pixels > 0 && max * pixels < 1]);
     unchanged = truth < 0.0005 ? unchanged + 1 : 0;
   }
-  return { states, camera: view.camera, size: session.moments.at(-1).bytes };
+  return { states, camera: view.camera, size: session.moments.at(-1).bytes, scaled: pixels > 0 };
 }
 """
 
@@ -116,12 +116,13 @@ class State:
 
 @dataclass(frozen=True)
 class Case:
-    """A surface in a view, with its states in order and the bytes of all of it."""
+    """A surface in a view, with its states in order, the bytes of all of it, and whether its scale is known."""
 
     surface: str
     view: str
     states: tuple[State, ...]
     size: int
+    scaled: bool
 
     @property
     def first(self) -> int:
@@ -155,8 +156,8 @@ def main() -> None:
                 f"{stop.bytes / case.first:.2f}",
                 f"{100 * stop.estimate:.2f}",
                 f"{100 * stop.truth:.2f}",
-                f"{old.bytes:,}",
-                f"{100 * old.truth:.2f}",
+                f"{old.bytes:,}" if case.scaled else "-",
+                f"{100 * old.truth:.2f}" if case.scaled else "-",
             ]
         )
     head = ["surface", "view", "bytes", "done at", "stops at", "ratio", "estimate, %", "truth, %"]
@@ -164,8 +165,8 @@ def main() -> None:
     note(
         f"Pictures of {SIZE[0]} x {SIZE[1]} points in Chromium, drawn by the processor. Estimate and truth: share of "
         "the drawn pixels whose colour is more than 5 (CIE76) away from the exact picture. Below a pixel: the rule "
-        "before, with a pixel as large as it is at the point that the camera turns around. Other surfaces were used to "
-        "fit the rule: " + "; ".join(TUNED)
+        "before, with a pixel as large as it is at the point that the camera turns around; - where x and y have no "
+        "unit. Other surfaces were used to fit the rule: " + "; ".join(TUNED)
     )
     stops = [case.stop() for case in cases]
     within = sum(stop.truth <= VISIBLE for stop in stops) / len(stops)
@@ -190,7 +191,7 @@ def _cases() -> Iterator[Case]:
                 found = _drawn(browser, Heard(), address + extra)
                 camera = found["camera"] if view == "default" else camera
                 states = (State(size, truth, float(estimate), old) for size, truth, estimate, old in found["states"])
-                case = Case(name, view, tuple(states), found["size"])
+                case = Case(name, view, tuple(states), found["size"], found["scaled"])
                 stop = case.stop()
                 figures = f"stops at {stop.bytes:,} with {100 * stop.truth:.2f} %, done at {case.first:,}"
                 print(f"{name}, {view}: {figures}", file=sys.stderr, flush=True)
