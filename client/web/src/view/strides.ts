@@ -28,8 +28,6 @@ export interface Strides {
   readonly finer: number;
   /** Which patches are in the view. */
   readonly seen: boolean[];
-  /** Distance of the nearest patch in the view; infinite: none is. */
-  readonly nearest: number;
 }
 
 /**
@@ -41,7 +39,7 @@ export interface Strides {
 export function chooseStrides(bounds: readonly PatchBounds[], eye: Eye, most: number, size: number): Strides {
   const planes = frustum(eye.matrix);
   const seen: boolean[] = [];
-  let [nearest, finer] = [Number.POSITIVE_INFINITY, Number.NEGATIVE_INFINITY];
+  let finer = Number.NEGATIVE_INFINITY;
   const wished = bounds.map((of) => {
     const centre: Triple = [of.centre[0], of.centre[1], of.centre[2] * eye.exaggeration];
     const half: Triple = [of.half[0], of.half[1], of.half[2] * eye.exaggeration];
@@ -55,10 +53,7 @@ export function chooseStrides(bounds: readonly PatchBounds[], eye: Eye, most: nu
       1e-6,
     );
     const wish = Math.log2((QUAD_PIXELS * distance) / (Math.max(of.edge, 1e-12) * eye.focal));
-    if (visible) {
-      nearest = Math.min(nearest, distance);
-      finer = Math.max(finer, -wish - 0.5);
-    }
+    if (visible) finer = Math.max(finer, -wish - 0.5);
     return visible ? wish : wish + Math.log2(OUTSIDE);
   });
   const largest = Math.log2(size);
@@ -70,7 +65,7 @@ export function chooseStrides(bounds: readonly PatchBounds[], eye: Eye, most: nu
       return stride;
     });
     if (triangles <= most || strides.every((stride) => stride === size)) {
-      return { strides, triangles, finer: Number.isFinite(finer) ? Math.ceil(finer) : 0, seen, nearest };
+      return { strides, triangles, finer: Number.isFinite(finer) ? Math.ceil(finer) : 0, seen };
     }
   }
 }
