@@ -40,6 +40,7 @@ def socket_options(dial: Dial, make: Callable[..., Any], landed: list[str]) -> d
         "compression": None,  # what travels is coded already
         "max_size": MAX_MESSAGE,
         "max_queue": _MAX_QUEUE,
+        "ping_interval": None,  # the server pings, and silence is what the session looks for
         "open_timeout": dial.seconds,
         "close_timeout": dial.close_seconds,
         "create_connection": noted,

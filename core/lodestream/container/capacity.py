@@ -14,8 +14,9 @@ Surfaces and views that the caller keeps are not counted, nor is memory for writ
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 from ..errors import TooLargeError
@@ -34,6 +35,9 @@ _SHARE = 0.4
 
 _COEFFICIENT, _RECONSTRUCTION, _MASKS, _TABLE = 7, 16, 4, 2048
 _EDGE = 12  # rows or columns
+
+# The files of control groups take longer to read than the first view of a stream to decode, so they are read so often.
+_SECONDS_OF_LIMITS = 5.0
 
 #: Rows and columns of a grid, and the bytes of a number in each of its channels.
 Extent = tuple[tuple[int, int], Iterable[int]]
@@ -115,13 +119,23 @@ class Capacity:
 
 
 def memory_limit() -> int:
-    """Return the memory available to this process in bytes: the least limit of machine, control group and process."""
-    return min(filter(None, (memory_of_machine(), *_group_limits(), *memory_of_process())), default=1 << 32)
+    """Return the memory available to this process in bytes: the least limit of machine, control group and process.
+
+    A change of a control group's limit is seen after five seconds.
+    """
+    groups = _group_limit(time.monotonic() // _SECONDS_OF_LIMITS)
+    return min(filter(None, (memory_of_machine(), groups, *memory_of_process())), default=1 << 32)
 
 
 def default_memory() -> int:
     """Return a quarter of the memory that this process may have, in bytes: what encoding or a check may take."""
     return memory_limit() // 4
+
+
+@lru_cache(maxsize=1)
+def _group_limit(period: float) -> int | None:
+    """Return the least limit of the control groups in a period of time; None if there is none."""
+    return min(_group_limits(), default=None)
 
 
 def _group_limits(proc: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:

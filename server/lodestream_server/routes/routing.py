@@ -48,7 +48,8 @@ class State:
     planning: Turns = field(default_factory=lambda: Turns(1, _PLANS_REMEMBERED), init=False)
 
 
-def _parts(connection: HTTPConnection) -> State:
+# A coroutine, because FastAPI calls a plain function in a thread.
+async def _parts(connection: HTTPConnection) -> State:
     state: State = connection.app.state.parts
     return state
 

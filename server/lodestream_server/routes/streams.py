@@ -100,8 +100,11 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         with parts.limits.stream(caller) as credit:
             record = ready(parts, surface)
             with still_there(parts, surface):
-                share = partial(parts.limits.check_indexes, caller)
-                container = await asyncio.to_thread(parts.containers.open, record.container or "", caller.key, share)
+                sha256 = record.container or ""
+                container = parts.containers.open_known(sha256, caller.key)
+                if container is None:
+                    share = partial(parts.limits.check_indexes, caller)
+                    container = await asyncio.to_thread(parts.containers.open, sha256, caller.key, share)
             sender = Sender(container.index, container.sha256, credit, container.window_errors)
             await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
     except WebSocketDisconnect:

@@ -141,15 +141,9 @@ class Containers:
             If the indexes of open containers leave no memory for its index, or it was deleted and stored again at this
             moment.
         """
+        file = self._file(sha256)
         try:
-            file = self._storage.container(sha256).open("rb")
-        except FileNotFoundError:
-            raise self._storage.gone(sha256) from None
-        try:
-            index = self._index(sha256, file, caller, share)
-            with self._lock:
-                self._open.setdefault(caller, Counter())[sha256] += 1
-            return OpenContainer(sha256, index, file, partial(self._let_go, caller, sha256))
+            return self._opened(sha256, self._index(sha256, file, caller, share), file, caller)
         except StreamError as error:
             file.close()
             damage.tell(self._storage, sha256, error)
@@ -157,6 +151,29 @@ class Containers:
         except BaseException:
             file.close()
             raise
+
+    def open_known(self, sha256: str, caller: str = "") -> OpenContainer | None:
+        """Open a container if its index is in memory, so that nothing is read; otherwise return None.
+
+        Raises
+        ------
+        NotFoundError, MissingError, BusyError
+            See `open`.
+        """
+        with self._lock:
+            index = self._known(sha256)
+        return None if index is None else self._opened(sha256, index, self._file(sha256), caller)
+
+    def _file(self, sha256: str) -> BinaryIO:
+        try:
+            return self._storage.container(sha256).open("rb")
+        except FileNotFoundError:
+            raise self._storage.gone(sha256) from None
+
+    def _opened(self, sha256: str, index: Index, file: BinaryIO, caller: str) -> OpenContainer:
+        with self._lock:
+            self._open.setdefault(caller, Counter())[sha256] += 1
+        return OpenContainer(sha256, index, file, partial(self._let_go, caller, sha256))
 
     def _let_go(self, caller: str, sha256: str) -> None:
         with self._lock:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import ClientConnection
 
+from lodestream import Target, Tolerance
 from lodestream_client import sync
 
 from ..conftest import Run, make_terrain
@@ -86,6 +87,36 @@ def test_many_streams_that_are_left_log_nothing(large: str, caplog: pytest.LogCa
                 for _, _ in zip(range(number % 6 + 1), stream, strict=False):
                     pass
     assert caplog.messages == []
+
+
+class _LateSocket(socket.socket):
+    """Hands over what it has read a moment later, as where the thread that reads waits for a processor."""
+
+    def recv(self, most: int, flags: int = 0) -> bytes:
+        data = super().recv(most, flags)
+        time.sleep(0.001)
+        return data
+
+
+def test_none_of_300_streams_to_their_end_logs_anything(
+    large: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = ClientConnection.__init__
+
+    def with_late_socket(connection: ClientConnection, given: socket.socket, *others: Any, **options: Any) -> None:
+        make(connection, _LateSocket(fileno=given.detach()), *others, **options)
+
+    monkeypatch.setattr(ClientConnection, "__init__", with_late_socket)
+    target = Target(until_rms=Tolerance(1e-2, relative=True))
+    ended = set()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(300):
+            with sync.connect(large, target=target, transport="ws") as stream:
+                for _ in stream:
+                    pass
+            ended.add(stream.ended)
+    assert caplog.messages == []
+    assert ended == {"rms"}
 
 
 @pytest.mark.parametrize("options", [("--roi", "10:60,10:60"), ("--max-bytes", "20000"), ("--until-max", "20")])

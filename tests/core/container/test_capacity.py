@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -222,6 +223,12 @@ def test_limits_of_this_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     proc.write_text("12:cpu,memory:/c\n3:pids:/c\n0::/a/b\n")
     assert sorted(capacity._group_limits(proc, root)) == [3_000_000, 7_000_000]
     assert list(capacity._group_limits(tmp_path / "none", root)) == []
-    monkeypatch.setattr(capacity, "_group_limits", lambda: iter([5_000_000]))
-    assert memory_limit() == 5_000_000
+    now, limits = [100.0], iter([5_000_000, 10_000_000])
+    monkeypatch.setattr(capacity, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(capacity, "_group_limits", lambda: [next(limits)])
+    capacity._group_limit.cache_clear()
+    assert [memory_limit(), memory_limit()] == [5_000_000, 5_000_000]
     assert Capacity().bytes == 16 * 2**20
+    now[0] += 5
+    assert memory_limit() == 10_000_000
+    capacity._group_limit.cache_clear()

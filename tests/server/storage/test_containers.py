@@ -36,6 +36,7 @@ def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
         (tmp_path / name).write_bytes(data)
     monkeypatch.setattr(Storage, "__init__", lambda self: None)
     monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
+    monkeypatch.setattr(Storage, "gone", lambda self, sha256: BusyError(sha256))
     return found
 
 
@@ -52,6 +53,21 @@ def test_an_index_is_shared_while_a_container_is_open(names: list[str]) -> None:
     assert all(one.index is other.index for one, other in zip(again, third, strict=True))
     for opened in (*again, *third):
         opened.close()
+
+
+def test_only_a_container_whose_index_is_in_memory_opens_at_once(names: list[str]) -> None:
+    made = Containers(Storage.__new__(Storage))
+    assert made.open_known(names[0], "me") is None
+    first = made.open(names[0], "me")
+    again = made.open_known(names[0], "me")
+    assert again is not None
+    assert again.index is first.index
+    for opened in (first, again):
+        opened.close()
+    assert made._open == {}
+    (Path(first.file.name)).unlink()
+    with pytest.raises(BusyError):
+        made.open_known(names[0])
 
 
 def test_no_more_indexes_are_kept_than_are_worth_it(names: list[str]) -> None:
