@@ -17,6 +17,7 @@ resource = pytest.importorskip("resource")
 _WRITE = """
 import resource, signal, sys
 import numpy, lodestream
+sys.dont_write_bytecode = True  # modules that are imported under the limit would be kept cut short, for everybody
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 random = numpy.random.default_rng(1)
 values = {"q": random.normal(size=(300, 300))}
@@ -46,6 +47,7 @@ def test_a_netcdf_that_does_not_fit_is_told_and_kills_nobody(tmp_path: Path, lim
 _STORE = """
 import resource, sys
 import numpy, lodestream
+sys.dont_write_bytecode = True
 surface = lodestream.Surface(numpy.random.default_rng(1).normal(size=(700, 1500)))
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 for _ in range(5):
