@@ -135,6 +135,7 @@ class Core:
                     yield from over_http.receive(session)
                 return
             except LodestreamError as error:
+                session.windows.forget(session.url)
                 if isinstance(error, RemoteError | InputError | NotFoundError):
                     error.args = (f"{error}{session.withheld}", *error.args[1:])
                 yield HangUp(abort=True)

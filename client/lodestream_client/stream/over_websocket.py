@@ -47,6 +47,8 @@ def receive(session: Session) -> Flow[None]:
         waited = session.clock() - session.asked
         yield from session.pace(len(message))
         session.take(partial(download.receive, message, session.clock(), waited))
+    if download.window.measured:
+        session.windows.remember(session.url, download.window.size, session.clock())
     yield Send()
     # Whoever receives has everything: a close frame from the other side, a round trip later, would tell nothing.
     yield HangUp(over=True)
@@ -55,7 +57,8 @@ def receive(session: Session) -> Flow[None]:
 def _opened(session: Session) -> Flow[Download]:
     with session.lock:
         turns, session.download = session.turns, None
-        download = Download(window=session.window, reception=session.reception)
+        first = session.windows.first(session.url, session.clock())
+        download = Download(window=session.window, reception=session.reception, first_window=first)
     began = session.clock()
     opening = to_address(download.opening)
     dialled = yield from _dialled(session, addresses.stream_url(session.url, opening))

@@ -21,6 +21,7 @@ from lodestream.transfer.receiver_state import ReceiverState
 from ..errors import SilenceError
 from ..requests import addresses, answers, problems
 from .effects import Flow, Send, Wait
+from .known_windows import KnownWindows
 from .options import ConnectOptions
 from .pacing import Link, window_for
 from .reconnecting import Transports
@@ -34,6 +35,9 @@ __all__ = ["Session"]
 # The shortest wait for an answer once the time for closing is over: 0 would mean no limit to some libraries.
 _LEAST_PATIENCE = 0.001
 
+# Of all streams of this process.
+_windows = KnownWindows()
+
 
 class Session:
     """The state of a stream.
@@ -45,6 +49,8 @@ class Session:
     options : ConnectOptions
     clock : callable
         Seconds of any clock that does not go back.
+    windows : KnownWindows or None
+        What other streams have found, by the same clock; None: those of this process.
 
     Attributes
     ----------
@@ -52,6 +58,7 @@ class Session:
     options : ConnectOptions
     silence : float
         Seconds without data after which a connection counts as lost.
+    windows : KnownWindows
     transports : Transports
         Which transport comes next, and when.
     reception : ReceiverState
@@ -83,9 +90,16 @@ class Session:
         If the seconds of silence or the rate are not positive.
     """
 
-    def __init__(self, url: str, options: ConnectOptions, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        url: str,
+        options: ConnectOptions,
+        clock: Callable[[], float] = time.monotonic,
+        windows: KnownWindows | None = None,
+    ) -> None:
         self.options = options
         self.clock = clock
+        self.windows = _windows if windows is None else windows
         self.transports = Transports(url, options.transport, options.deadline)
         self.url = self.transports.url
         self.silence = options.silence

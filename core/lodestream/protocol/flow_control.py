@@ -63,24 +63,30 @@ class FlowWindow:
     Parameters
     ----------
     fixed : int or None
-        A constant size, 1 to `MAX_CREDIT`; None: measured, first `FIRST_WINDOW`, then between `MIN_WINDOW` and what the
+        A constant size, 1 to `MAX_CREDIT`; None: measured, first ``first``, then between `MIN_WINDOW` and what the
         server allows.
+    first : int
+        The window before anything is measured: `FIRST_WINDOW`, or what an earlier connection found, of which at most
+        `BASE_CREDIT` counts.
 
     Attributes
     ----------
     size : int
         Bytes that may be outstanding now.
+    measured : bool
+        Whether the size is what this connection found.
     round_trip : float or None
         Shortest round-trip time seen, in seconds.
     """
 
-    def __init__(self, fixed: int | None = None) -> None:
+    def __init__(self, fixed: int | None = None, first: int = FIRST_WINDOW) -> None:
         if fixed is not None and not 0 < fixed <= MAX_CREDIT:
             raise OptionError(f"expected a window of 1 to {MAX_CREDIT} bytes, got {fixed}")
         self.round_trip: float | None = None
+        self.measured = False
         self._fixed = fixed
         self._most = BASE_CREDIT
-        self.size = FIRST_WINDOW if fixed is None else min(fixed, self._most)
+        self.size = min(max(first, MIN_WINDOW) if fixed is None else fixed, self._most)
         self._granted = 0
         self._arrived = 0
         self._grants: deque[tuple[int, float]] = deque()
@@ -160,7 +166,7 @@ class FlowWindow:
             answered = round_trip + self._thinking(took, round_trip)
             size = _GAIN * (self._arrived - first) / max(now - begun, answered) * answered
             size += max(2 * SMALL_MESSAGE, self._largest - size / _SHARES)
-        self.size = int(min(max(size, MIN_WINDOW), self._most))
+        self.size, self.measured = int(min(max(size, MIN_WINDOW), self._most)), True
         self._rounds.append((self._arrived, now))
         self._waits, self._messages, self._largest = (0.0, 0.0), 0, 0
 

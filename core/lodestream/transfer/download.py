@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import RemoteError, TruncatedStreamError
 from ..protocol.connection import Connection, Side, State
-from ..protocol.flow_control import FlowWindow
+from ..protocol.flow_control import FIRST_WINDOW, FlowWindow
 from ..protocol.messages import CODES, MAX_HELD, Bye, Credit, End, Error, Layer, Open, Opened, Segments, Stop
 from ..target import Region, Target
 from .receiver_state import Ended, ReceiverState
@@ -37,6 +37,8 @@ class Download:
         idle at times. None: a `FlowWindow` measures the link; this needs times.
     reception : ReceiverState or None
         What has arrived over other connections; its target is used then.
+    first_window : int
+        The window before the link is measured, see `FlowWindow`.
 
     Attributes
     ----------
@@ -53,10 +55,15 @@ class Download:
     """
 
     def __init__(
-        self, target: Target | None = None, *, window: int | None = None, reception: ReceiverState | None = None
+        self,
+        target: Target | None = None,
+        *,
+        window: int | None = None,
+        reception: ReceiverState | None = None,
+        first_window: int = FIRST_WINDOW,
     ) -> None:
         self.reception = ReceiverState(target) if reception is None else reception
-        self.window = FlowWindow(window)
+        self.window = FlowWindow(window, first_window)
         self.answer: Opened | None = None
         self.layer: Layer | None = None
         self._connection = Connection(Side.CLIENT)

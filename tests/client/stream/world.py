@@ -36,6 +36,7 @@ from lodestream_client.stream.effects import (
     Send,
     Wait,
 )
+from lodestream_client.stream.known_windows import KnownWindows
 from lodestream_client.stream.options import ConnectOptions
 from lodestream_client.stream.session import Session
 
@@ -77,15 +78,25 @@ class World:
     ----------
     acts : mapping of int to Act
         What happens at an effect, by its number.
+    windows : KnownWindows or None
+        What other streams have found; None: nothing.
     """
 
-    def __init__(self, acts: Mapping[int, Act] | None = None, url: str = URL, **options: Any) -> None:
+    def __init__(
+        self,
+        acts: Mapping[int, Act] | None = None,
+        url: str = URL,
+        windows: KnownWindows | None = None,
+        **options: Any,
+    ) -> None:
         self.now = 0.0
         self.effects: list[Effect] = []
         self.sent: list[Event] = []
         self.views: list[View] = []
         self.stopped_at: int | None = None
-        self.session = Session(url, ConnectOptions(**options), lambda: self.now)
+        self.session = Session(
+            url, ConnectOptions(**options), lambda: self.now, KnownWindows() if windows is None else windows
+        )
         self.core = Core(self.session)
         self.acts = acts or {}
         self.ahead: Get | None = None

@@ -34,13 +34,14 @@ def transfer(
     most_credit: int = MAX_CREDIT,
     work: float = 0.0,
     told: bool = True,
+    first: int = FIRST_WINDOW,
 ) -> Outcome:
     """Receive so many bytes over a link that lets nothing through but every ``burst`` seconds.
 
     The server keeps so much credit, and sends messages of a share of the most that there was. The client computes so
     many seconds for each byte, and tells how long it waited for messages in between.
     """
-    window = FlowWindow()
+    window = FlowWindow(first=first)
     window.allow(most_credit)
     outstanding = credit = window.size
     window.grant(window.size, 0.0)
@@ -166,6 +167,41 @@ def test_a_link_that_becomes_faster_is_filled_again() -> None:
 def test_on_256_kbit_per_second_no_more_than_32_kib_are_under_way(round_trip: float, burst: float) -> None:
     outcome = transfer(32e3, round_trip, 1_000_000, burst=burst)
     assert outcome.most <= 32 * 1024
+
+
+@pytest.mark.parametrize("round_trip", [0.005, 0.02, 0.1])
+@pytest.mark.parametrize("rate", [12.5e6, 125e6])
+def test_a_window_that_is_known_saves_round_trips(rate: float, round_trip: float) -> None:
+    total = 300_000
+    cold = transfer(rate, round_trip, total)
+    assert cold.window.measured
+    warm = transfer(rate, round_trip, total, first=cold.window.size)
+    saved = total / rate * (1 / cold.use - 1 / warm.use) / round_trip
+    assert saved > 0.3
+
+
+@pytest.mark.parametrize("rate", [8e3, 32e3, 125e3])
+def test_a_window_that_is_known_of_a_faster_link_lasts_until_it_has_come_once(rate: float) -> None:
+    outcome = transfer(rate, 0.05, 2_000_000, first=MAX_CREDIT)
+    assert outcome.most == BASE_CREDIT
+    assert outcome.settled <= max(MIN_WINDOW, 1.1 * rate * 0.06) + BASE_CREDIT // 16  # of the largest message
+    assert outcome.use > 0.95
+
+
+def test_a_first_window_stays_within_what_every_server_keeps() -> None:
+    assert FlowWindow(first=MAX_CREDIT).size == BASE_CREDIT
+    assert FlowWindow(first=1).size == MIN_WINDOW
+    assert FlowWindow(50_000, first=MAX_CREDIT).size == 50_000
+
+
+def test_it_is_measured_when_a_whole_window_has_come_and_never_where_it_is_fixed() -> None:
+    for window, last in ((FlowWindow(first=40_000), True), (FlowWindow(40_000), False)):
+        window.heard(0.01)
+        window.began(0.0, 0.01)
+        window.arrive(38_000, 0.02)
+        assert not window.measured
+        window.arrive(2_000, 0.03)
+        assert window.measured is last
 
 
 def test_a_link_without_limits_gets_all_that_is_allowed() -> None:
