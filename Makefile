@@ -8,7 +8,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal clean
+.PHONY: help demo docs site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal image-check clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -144,6 +144,9 @@ wheels: page ## build and check dist/: wheels for Linux, macOS and Windows, and 
 release-rehearsal: page ## build all that a release has into dist/, and try it in empty environments; publishes nothing
 	@$(BIN)/python -P -c 'import auditwheel, build, lief, twine' 2>/dev/null || $(BIN)/python -m pip install --quiet --group wheels
 	@PATH="$(CURDIR)/$(BIN):$$PATH" PYTHON=$(CURDIR)/$(BIN)/python $(BIN)/python .ci/rehearse.py dist
+
+image-check: ## run every step of docker/Dockerfile in an empty Debian root, and stream from its server; as root, with debootstrap
+	@$(PYTHON) .ci/image.py build/image
 
 clean: ## remove the environment and everything else that can be made again
 	rm -rf $(VENV) $(PEERS) build dist core/lodestream/native $(PAGE) $(WEB)/node_modules $(WEB)/dist $(WEB)/src/kernels/module.ts .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
