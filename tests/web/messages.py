@@ -34,7 +34,7 @@ _DIGEST = "0123456789abcdef" * 4
 _EVENTS: list[Event] = [
     Open(Target(level=3), 1000, ((0, 96), (200, 1)), _DIGEST, "lode_dG9rZW4"),
     Open(Target(until_rms=Tolerance(1e-3, True), max_bytes=20000, region=((0, 4), (2, 9)), attributes=("a",)), 0),
-    Open(Target(level=3, region=((0, 4), (2, 9))), 0, window_errors=True),
+    Open(Target(level=3, region=((0, 4), (2, 9))), 0, window_errors=True, decodes=True),
     Open(Target(until_rms={"speed": 0.5}, until_max={"speed": 2.0, "z": 1.0}), 0),
     Credit(5),
     Stop(),

@@ -130,6 +130,9 @@ class Open:
         For a client that cannot send a header with the handshake, such as a browser; not allowed in an address.
     window_errors : bool or None
         True: of a window, the client knows bounds of errors, and takes the section that has them.
+    decodes : bool or None
+        True: the client reads from the data where layers end, so it gets no `Layer`, and `Segments` that go on across
+        their ends once its credit is large.
     """
 
     type: ClassVar[str] = "open"
@@ -139,6 +142,7 @@ class Open:
     container: str | None = None
     token: str | None = field(default=None, repr=False)
     window_errors: bool | None = None
+    decodes: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -219,6 +223,7 @@ class Segments:
 class Layer:
     """From the server: a layer (quality order) or a level (level order) is complete with what was sent so far.
 
+    A client that decodes gets none, see `Open.decodes`.
     ``number`` counts layers or levels from 0. ``bytes``, ``rms`` and ``max`` are those recorded in the container. If a
     region comes first, the message is sent when the layer is complete in the region, and again when it is complete
     everywhere. While the client has been sent more than belongs to the layer, ``rms`` and ``max`` are NaN, and

@@ -207,6 +207,7 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
         "container": _digest,
         "token": _text,
         "window_errors": _flag,
+        "decodes": _flag,
     },
     Credit: {"bytes": _positive},
     Stop: {},
@@ -232,14 +233,15 @@ _FIELDS: Mapping[type[Event], Mapping[str, _Read]] = {
 _TYPES: Mapping[str, type[Event]] = {kind.type: kind for kind in _FIELDS}
 
 #: What may be left out: a client that wants the whole surface and holds nothing says only its version and credit, and
-#: those of earlier releases say nothing of errors of windows, nor servers how much they keep of the credit, or that
-#: they know errors of channels.
+#: those of earlier releases say nothing of errors of windows or that they decode, nor servers how much they keep of the
+#: credit, or that they know errors of channels.
 _OPTIONAL = {
     (Open, "target"),
     (Open, "held"),
     (Open, "container"),
     (Open, "token"),
     (Open, "window_errors"),
+    (Open, "decodes"),
     (Opened, "credit"),
     (Opened, "window_errors"),
     (Opened, "channels"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..errors import RemoteError, TruncatedStreamError
 from ..protocol.connection import Connection, Side, State
 from ..protocol.flow_control import FIRST_WINDOW, FlowWindow
-from ..protocol.messages import CODES, MAX_HELD, Bye, Credit, End, Error, Layer, Open, Opened, Segments, Stop
+from ..protocol.messages import CODES, MAX_HELD, Bye, Credit, End, Error, Open, Opened, Segments, Stop
 from ..target import Region, Target
 from .receiver_state import Ended, ReceiverState
 
@@ -46,8 +46,6 @@ class Download:
         What has arrived so far.
     answer : Opened or None
         The server's first message.
-    layer : Layer or None
-        The server's last `layer` message.
     window : FlowWindow
         The number of bytes that may be in flight.
     opening : bytes
@@ -65,7 +63,6 @@ class Download:
         self.reception = ReceiverState(target) if reception is None else reception
         self.window = FlowWindow(window, first_window)
         self.answer: Opened | None = None
-        self.layer: Layer | None = None
         self._connection = Connection(Side.CLIENT)
         self._opened: float | None = None
         self._turning = False  # this end has stopped in order to open again
@@ -134,9 +131,7 @@ class Download:
             return self._take(event, now)
         if isinstance(event, Opened):
             return self._begin(event, now)
-        if isinstance(event, Layer):
-            self.layer = event
-        elif isinstance(event, End):
+        if isinstance(event, End):
             if event.why == "stopped" and self._turning:
                 self._turning = False
                 # The server knows what it has sent, and that nothing more of the last grants will come.
@@ -146,7 +141,7 @@ class Download:
                 return []
             self._outbox.append(self._connection.send(Bye()))
             return [self.reception.end(event.why)]
-        elif isinstance(event, Error):
+        if isinstance(event, Error):
             raise RemoteError(event.code, f"{event.title}: {event.detail}")
         return []
 
@@ -259,7 +254,9 @@ class Download:
         self.window.grant(self.window.size)  # untimed: the answer to `Open` measures the first round trip
         target = self.reception.target
         asks = None if target.region is None else True
-        return self._connection.send(Open(target, self.window.size, cached, container, window_errors=asks))
+        return self._connection.send(
+            Open(target, self.window.size, cached, container, window_errors=asks, decodes=True)
+        )
 
     def _begin(self, event: Opened, now: float | None) -> list[DownloadEvent]:
         """Process the start of a transmission."""

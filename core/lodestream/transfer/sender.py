@@ -37,6 +37,9 @@ __all__ = ["Sender"]
 # granted again for a message before all of it has come.
 _SHARES = 16
 
+# Who has granted so much has a link on which no layer waits for the one behind it.
+_LARGE_CREDIT = 64 * 1024
+
 
 class Sender:
     """One surface being sent.
@@ -89,6 +92,8 @@ class Sender:
         self._provided = 0
         self._given = RangeSet()
         self._window = 0
+        self._decodes = False  # the client reads from the data where layers end
+        self._completed = 0  # layers or levels that end in the slice that is handed out next
         self._ended = "complete"
 
     @property
@@ -132,6 +137,7 @@ class Sender:
             self._outbox = deque([End("stopped")])
             self._slices.clear()
             self._marks.clear()
+            self._completed = 0
         return event
 
     def fail(self, code: str, detail: str) -> None:
@@ -150,8 +156,8 @@ class Sender:
         if isinstance(event, Segments):
             self.sent += len(event.data)
             self._given.add(event.offset, len(event.data))
-        elif isinstance(event, Layer):
-            self.layers += 1
+            self.layers += self._completed
+            self._completed = 0
         elif isinstance(event, End):
             self.why = event.why
         return self._connection.send(event)
@@ -160,10 +166,12 @@ class Sender:
         """Return the slice to read now, limited by the credit and the size of a message; None if there is none."""
         if not self._ready():
             return None
-        # A message ends where a layer ends, so that on a slow link the layer is drawn before the next one is sent.
-        until_mark = self._marks[0][0] - self._provided if self._marks else MAX_DATA
         credit = self._connection.credit
         self._window = max(self._window, credit)
+        # A message ends where a layer ends, so that on a slow link the layer is drawn before the next one is sent, and
+        # on any link the first one is.
+        across = self._decodes and self.layers > 0 and self._window >= _LARGE_CREDIT
+        until_mark = self._marks[0][0] - self._provided if self._marks and not across else MAX_DATA
         share = min(credit, max(self._window // _SHARES, SMALL_MESSAGE))
         slice_ = self._slices[0]
         return ByteRange(slice_.offset, min(slice_.length, until_mark, share, MAX_DATA))
@@ -205,7 +213,7 @@ class Sender:
             chosen = plan(index, event.target, self._said(event), windows=windows, bounded=bounded)
         except OptionError as error:
             raise MessageError("bad-target", str(error)) from None
-        self.why = None
+        self.why, self._decodes = None, bool(event.decodes)
         marks = _as_cached(chosen) if self._given else chosen.marks
         self._follow(chosen.slices, marks, sum(slice_.length for slice_ in chosen.before))
         self._ended = chosen.ended
@@ -246,10 +254,12 @@ class Sender:
         return cached
 
     def _mark(self) -> None:
-        """Queue messages for the layers whose bytes were sent."""
+        """Count the layers whose bytes were sent, and queue messages for them if the client does not decode."""
         while self._marks and self._marks[0][0] <= self._provided:
             mark = self._marks.popleft()[1]
-            self._outbox.append(Layer(mark.number, mark.level, mark.bytes, mark.rms, mark.max_error))
+            self._completed += 1
+            if not self._decodes:
+                self._outbox.append(Layer(mark.number, mark.level, mark.bytes, mark.rms, mark.max_error))
 
     def _end_if_done(self) -> None:
         """Queue the end message if no slice remains."""

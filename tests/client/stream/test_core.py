@@ -350,7 +350,7 @@ def test_another_region_is_asked_for_over_the_same_websocket() -> None:
     complete(world)
     assert sum(isinstance(effect, Dial) for effect in world.effects) == 1
     changes = [event for event in world.sent if not isinstance(event, Credit)]
-    assert changes == [Stop(), Open(ls.Target(first=NEAR), 500), Bye()]
+    assert changes == [Stop(), Open(ls.Target(first=NEAR), 500, decodes=True), Bye()]
 
 
 def test_for_another_region_an_answer_is_left_and_another_range_is_asked_for() -> None:

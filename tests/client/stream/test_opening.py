@@ -141,7 +141,7 @@ def test_the_server_reads_it_in_the_address(
     views, stream = follow(surface, asynchronous, target=target, window=3000)
     assert stream.ended == "bytes"
     assert views[-1].bytes == stream.planned
-    assert dialled == [Dialled(Open(target, 3000), SUBPROTOCOL)]
+    assert dialled == [Dialled(Open(target, 3000, decodes=True), SUBPROTOCOL)]
     views, stream = follow(surface, asynchronous)
     assert np.array_equal(views[-1].points, terrain)
 

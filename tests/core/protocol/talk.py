@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -12,13 +12,13 @@ import numpy as np
 import lodestream as ls
 from lodestream.container import ByteRange, Index, read_index
 from lodestream.decoding.decoder import View
-from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, Segments
-from lodestream.protocol.wire import parse
+from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, Open, Segments
+from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.receiver_state import ReceiverState
 from lodestream.transfer.sender import Sender
 
-__all__ = ["Link", "container", "index"]
+__all__ = ["Link", "container", "index", "without_decodes"]
 
 SHAPE = (61, 47)
 
@@ -36,14 +36,21 @@ def index() -> Index:
     return read_index(lambda offset, length: data[offset : offset + length], len(data))
 
 
+def without_decodes(message: bytes) -> bytes:
+    """The same message as a client of an earlier release sends it, or a server of one understands it."""
+    event = parse(message)
+    return serialize(replace(event, decodes=None)) if isinstance(event, Open) else message
+
+
 @dataclass
 class Link:
-    """A client and a server, and what is under way between them."""
+    """A client and a server, and what is under way between them; without ``decodes`` one of an earlier release."""
 
     target: ls.Target = field(default_factory=ls.Target)
     window: int = BASE_CREDIT
     now: float = 0.0
     reception: ReceiverState | None = None
+    decodes: bool = True
 
     def __post_init__(self) -> None:
         self.client = Download(self.target, window=self.window, reception=self.reception)
@@ -72,7 +79,8 @@ class Link:
         return True
 
     def hear(self) -> None:
-        self.server.receive(self.to_server.popleft())
+        message = self.to_server.popleft()
+        self.server.receive(message if self.decodes else without_decodes(message))
 
     def take(self) -> None:
         message = self.to_client.popleft()

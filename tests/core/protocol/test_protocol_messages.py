@@ -36,7 +36,7 @@ DIGEST = "0123456789abcdef" * 4
 EVENTS: list[Event] = [
     Open(),
     Open(Target(level=3), 1000, ((0, 96), (200, 1)), DIGEST),
-    Open(Target(region=((0, 3), (1, 5))), window_errors=True),
+    Open(Target(region=((0, 3), (1, 5))), window_errors=True, decodes=True),
     Open(Target(region=((0, 3), (1, 5)), level=2), window_errors=True),
     Open(token="lode_dG9rZW4"),
     Open(Target(until_rms=Tolerance(1e-3, True), until_max=Tolerance(2.5), max_bytes=20000, order="level"), 0),

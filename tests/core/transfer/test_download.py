@@ -21,7 +21,18 @@ from lodestream.errors import (
 )
 from lodestream.planning.planner import plan
 from lodestream.protocol.connection import State
-from lodestream.protocol.messages import CODES, MAX_CREDIT, End, Error, Layer, MessageError, Open, Opened, Segments
+from lodestream.protocol.messages import (
+    BASE_CREDIT,
+    CODES,
+    MAX_CREDIT,
+    End,
+    Error,
+    Layer,
+    MessageError,
+    Open,
+    Opened,
+    Segments,
+)
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.download import Download, Ended
 
@@ -76,13 +87,12 @@ def test_every_target_ends_where_the_plan_does(target: ls.Target, ended: str, wi
         (index().metadata.offset, index().metadata.length),
         planned.prefix,
     )
-    last = planned.marks[-1]
-    assert link.client.layer == Layer(last.number, last.level, last.bytes, last.rms, last.max_error)
     assert link.server.sent == sum(part.length for part in (*planned.before, *planned.ranges, *planned.after))
 
 
-def test_a_message_ends_where_a_layer_does() -> None:
-    link = Link()
+@pytest.mark.parametrize(("window", "decodes"), [(65_535, True), (BASE_CREDIT, False)])
+def test_a_message_ends_where_a_layer_does(window: int, decodes: bool) -> None:
+    link = Link(window=window, decodes=decodes)
     sizes = []
     link.hear()
     while link.serve():
@@ -94,6 +104,62 @@ def test_a_message_ends_where_a_layer_does() -> None:
             total += len(event.data)
             sizes.append(total)
     assert [mark.sent for mark in plan(index()).marks] == sizes[:-1]
+
+
+@pytest.mark.parametrize("target", [ls.Target(), ls.Target(order="level"), ls.Target(first=((0, 20), (0, 20)))])
+def test_messages_to_a_client_that_decodes_end_with_the_first_layer_and_then_anywhere(target: ls.Target) -> None:
+    link, slow = Link(target, 65_536), Link(target, 65_535)
+    link.hear()
+    first = min(mark.sent for mark in plan(index(), target).marks)
+    messages, service = [], sum(place.length for place in plan(index(), target).before)
+    while link.serve():
+        pass
+    for message in link.to_client:
+        event = parse(message)
+        messages.append(event)
+        assert not isinstance(event, Layer)
+    sizes = np.cumsum([len(event.data) for event in messages if isinstance(event, Segments)])
+    assert service + first in sizes
+    assert sizes[-1] == link.server.sent
+    link.run()
+    slow.run()
+    assert link.server.layers == slow.server.layers == len(plan(index(), target).marks) > 4
+    assert [(view.bytes, view.rms) for view in link.views] == [(view.bytes, view.rms) for view in slow.views]
+    if plan(index(), target).prefix:
+        assert len(sizes) < len(link.views), "where slices are not contiguous, each is a message"
+    assert np.array_equal(link.client.decoder.surface().points, ls.decode(container()).points)
+
+
+def test_layers_count_when_they_are_handed_out() -> None:
+    link = Link()
+    link.hear()
+    link.serve()
+    wanted = link.wanted()
+    link.server.provide(wanted, container()[wanted.offset : wanted.end])
+    assert link.server.layers == 0
+    assert link.serve()
+    assert link.server.layers == 1
+    wanted = link.wanted()
+    link.server.provide(wanted, container()[wanted.offset : wanted.end])
+    link.stop()
+    link.hear()
+    link.run()
+    assert link.server.layers == 1
+
+
+@pytest.mark.parametrize("cut", [1, 7, 300, 2000])
+@pytest.mark.parametrize("decodes", [(True, False), (False, True), (True, True)])
+def test_a_stream_that_breaks_goes_on_at_a_server_of_another_release(cut: int, decodes: tuple[bool, bool]) -> None:
+    link = Link(decodes=decodes[0])
+    link.hear()
+    while link.client.reception.data_bytes < cut and (link.serve() or link.to_client):
+        if link.to_client:
+            link.take()
+    again = Link(reception=link.client.reception, decodes=decodes[1])
+    again.run()
+    assert again.client.ended == "complete"
+    assert again.client.reception.data_bytes == again.client.reception.cached.total
+    assert np.array_equal(again.client.decoder.surface().points, ls.decode(container()).points)
 
 
 def test_no_more_is_in_flight_than_granted_when_the_client_does_not_read() -> None:
@@ -128,7 +194,7 @@ def test_the_credit_is_granted_again_in_few_messages() -> None:
 
 
 def test_stop_overtakes_what_has_not_been_handed_out() -> None:
-    link = Link()
+    link = Link(window=60_000)
     link.hear()
     for _ in range(6):
         link.serve()
@@ -173,7 +239,7 @@ def test_stopping_twice_or_after_the_end_does_nothing() -> None:
 
 
 def test_seconds_are_the_clients_business() -> None:
-    link = Link(ls.Target(seconds=5.0))
+    link = Link(ls.Target(seconds=5.0), window=60_000)
     assert link.client.tick(100.0) == 5.0
     assert link.client.tick(103.0) == 2.0
     link.hear()
@@ -267,7 +333,7 @@ def test_a_connection_that_breaks_is_never_silent(
 
 
 def test_damaged_bytes_are_reported_with_their_offset() -> None:
-    link = Link()
+    link = Link(window=60_000)
     link.hear()
     while link.serve():
         pass

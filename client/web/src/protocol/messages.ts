@@ -85,6 +85,11 @@ export interface Open {
   readonly token?: string | undefined;
   /** True: of a window, the client knows bounds of errors, and takes the section that has them. */
   readonly window_errors?: boolean | undefined;
+  /**
+   * True: the client reads from the data where layers end, so it gets no `layer`, and `segments` that go on across their
+   * ends once its credit is large.
+   */
+  readonly decodes?: boolean | undefined;
 }
 
 /** From the client: this many more bytes of `segments.data` may be sent. */
@@ -137,7 +142,8 @@ export interface Segments {
 }
 
 /**
- * From the server: a layer (quality order) or a level (level order) is complete with what was sent so far.
+ * From the server: a layer (quality order) or a level (level order) is complete with what was sent so far. A client that
+ * decodes gets none, see `Open.decodes`.
  *
  * `rms` and `max` are NaN while the client has been sent more than belongs to the layer. Of a window they are bounds.
  */

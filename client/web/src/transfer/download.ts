@@ -6,7 +6,7 @@ import { ErrorLimits } from "../planning/limits";
 import { sameRegion } from "../planning/target";
 import { Connection } from "../protocol/connection";
 import { Window } from "../protocol/flow-control";
-import { CODES, type Header, type Layer, MAX_HELD, type Segments } from "../protocol/messages";
+import { CODES, type Header, MAX_HELD, type Segments } from "../protocol/messages";
 import type { Region, Target, ViewInfo } from "../types";
 import type { ReceiverState } from "./receiver-state";
 
@@ -33,8 +33,6 @@ export interface DownloadOptions {
 export class Download<View extends ViewInfo> {
   /** The server's first message. */
   header: Header | undefined;
-  /** The server's last `layer` message. */
-  layer: Layer | undefined;
   /** The number of bytes that may be in flight. */
   readonly window: Window;
   /** The first message, for use in the address of the handshake, see `opened`; it may not be put there with a token. */
@@ -89,9 +87,6 @@ export class Download<View extends ViewInfo> {
         return this.take(event, now);
       case "header":
         return this.begin(event, now);
-      case "layer":
-        this.layer = event;
-        return [];
       case "end":
         this.finish(event.why);
         return [];
@@ -207,7 +202,8 @@ export class Download<View extends ViewInfo> {
     this.window.grant(credit);
     const { target } = this.reception;
     const window_errors = target.region === undefined ? undefined : true;
-    return this.connection.send({ type: "open", target, credit, held, container, token, window_errors });
+    const opening = { target, credit, held, container, token, window_errors, decodes: true };
+    return this.connection.send({ type: "open", ...opening });
   }
 
   private begin(event: Header, now: number | undefined): View[] {
