@@ -76,9 +76,6 @@ static bool band_fits(const int64_t *fields, int64_t size, int64_t flags) {
            band.parent + parent_row * band.parent_stride + parent_column + WIDE <= size;
 }
 
-/* Raw bits of a pass, each of a coefficient: no array has as many. */
-#define MOST_BITS (INT64_C(1) << 48)
-
 /* Passes of one tile: a row of the table of runs. */
 struct run {
     int64_t band, bands, model, first, last, start, length, large;
@@ -149,18 +146,20 @@ static bool go_on(bool reads, const struct run *run, const struct position *at, 
 enum outcome { DONE, PAUSED, REFUSED };
 
 /* Go on with a run of a large unit until it is done or the budget is spent. */
-static enum outcome read_large(const struct run *run, const struct tiles *tiles, const int64_t *bands,
-                               const uint8_t *data, struct position *at, int64_t *state, int64_t *budget) {
+static enum outcome read_large(struct unit *unit, bool goes_on, const struct run *run, const struct tiles *tiles,
+                               const int64_t *bands, const uint8_t *data, struct position *at, int64_t *state,
+                               int64_t *budget) {
     struct class_place place = {at->passes, at->band, at->block, 0, 0};
     if (at->passes || at->band || at->block) {
         place.bytes = state[AT_PLACE];
-        place.bits = state[AT_LOW];
+        place.bits = (int)(state[AT_LOW] & 7);
+        if (state[AT_LOW] != place.bits)
+            return REFUSED;
     }
-    if (place.passes < 0 || place.band < 0 || place.stripe < 0 || place.bytes < 0 || place.bytes > run->length ||
-        place.bits < 0 || place.bits > MOST_BITS)
+    if (place.passes < 0 || place.band < 0 || place.stripe < 0 || place.bytes < 0 || place.bytes > run->length)
         return REFUSED;
-    bool done = lode_class_read(tiles, bands + run->band * BAND_FIELDS, run->bands, run->first, run->last,
-                                data + run->start, run->length, &place, budget);
+    bool done = lode_class_read(unit, goes_on, tiles, bands + run->band * BAND_FIELDS, run->bands, run->first,
+                                run->last, data + run->start, run->length, &place, budget);
     *at = (struct position){at->run, place.passes, place.band, place.stripe, 0};
     state[AT_PLACE] = place.bytes;
     state[AT_LOW] = place.bits;
@@ -178,6 +177,8 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const struct lode_passes *ar
         return LODE_REFUSED;
     struct position at = {call.state[AT_RUN], call.state[AT_PASSES], call.state[AT_BAND], call.state[AT_BLOCK],
                           (int)(call.state[AT_TRELLIS] & (TRELLIS_STATES - 1))};
+    struct unit unit;
+    struct run before = {0};
     for (; at.run < all && budget > 0; at = (struct position){at.run + 1, 0, 0, 0, 0}) {
         int64_t *fields = call.runs + at.run * LODE_RUN_FIELDS;
         struct run run = run_of(fields);
@@ -192,7 +193,11 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const struct lode_passes *ar
         if (run.large && trellis)
             return LODE_REFUSED;
         if (run.large && reads) {
-            enum outcome outcome = read_large(&run, &tiles, call.bands, call.data, &at, call.state, &budget);
+            bool goes_on =
+                before.large && before.band == run.band && before.bands == run.bands && before.model == run.model;
+            before = run;
+            enum outcome outcome =
+                read_large(&unit, goes_on, &run, &tiles, call.bands, call.data, &at, call.state, &budget);
             if (outcome == REFUSED)
                 return LODE_REFUSED;
             if (outcome == PAUSED)
@@ -204,12 +209,13 @@ int64_t lode_passes(int64_t reads, int64_t trellis, const struct lode_passes *ar
                                           call.costs};
             fields[LODE_RUN_LENGTH] = -1;
             if (run.first >= 0 && run.last == 0 && run.first < call.costs_count)
-                fields[LODE_RUN_LENGTH] = lode_class_write(&tiles, call.bands + run.band * BAND_FIELDS, run.bands,
-                                                           run.first, &output, &budget);
+                fields[LODE_RUN_LENGTH] = lode_class_write(&unit, &tiles, call.bands + run.band * BAND_FIELDS,
+                                                           run.bands, run.first, &output, &budget);
             if (fields[LODE_RUN_LENGTH] < 0)
                 return LODE_REFUSED;
             continue;
         }
+        before = run;
         struct coder coder;
         if (!go_on(reads, &run, &at, call.state, call.data, &coder))
             return LODE_REFUSED;

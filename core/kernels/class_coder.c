@@ -10,7 +10,6 @@
 enum {
     CLASS_STATES = CLASS_CONTEXTS, /* of a model: where the two states are kept */
     MOST_KEPT = 16,                /* adaptation count from one plane to the next */
-    MOST_IN_STRIPE = 2 * MOST_IN_RUN + STRIPE_BLOCKS,
 };
 
 _Static_assert(CLASS_STATES + 2 <= CONTEXTS, "a model holds the contexts of either coder");
@@ -32,9 +31,9 @@ static void load_contexts(struct contexts *contexts, const int32_t *model) {
     for (int k = 0; k < CLASS_CONTEXTS; k++) {
         contexts->probability[k] = (uint16_t)(model[k] & 0xFFFF);
         contexts->adapted[k] = (uint8_t)(model[k] >> 16 & 127);
-        contexts->counted[k] = 0;
         set_coded(contexts, k);
     }
+    memset(contexts->counts, 0, sizeof contexts->counts);
 }
 
 static void start_contexts(int32_t *model) {
@@ -52,7 +51,6 @@ static void begin_pass(struct unit *unit, int64_t number) {
     struct contexts *contexts = &unit->contexts;
     if (!(number & 1))
         return;
-    unit->seen = 0;
     for (int k = 0; k < CLASS_CONTEXTS; k++)
         contexts->adapted[k] = contexts->adapted[k] < MOST_KEPT ? contexts->adapted[k] : MOST_KEPT;
 }
@@ -80,58 +78,78 @@ static int64_t start_unit(int32_t *model, uint32_t states[2], const uint8_t *dat
     return taken;
 }
 
+/* What is known of stripes is that before a plane. */
+static void enter_plane(struct unit *unit, int plane) {
+    if (unit->plane != plane)
+        unit->seen = 0;
+    unit->plane = plane;
+}
+
+/* Let what was read of the plane be known. */
+static void know_pending(struct unit *unit, const int64_t *bands, int64_t count) {
+    for (int64_t b = 0, number = 0; b < count && unit->pending; b++) {
+        struct band band = band_of(bands + b * BAND_FIELDS);
+        for (int64_t s = 0, stripes = stripes_in(&band); s < stripes && unit->pending; s++, number++) {
+            struct stripe stripe = stripe_of(&band, s);
+            if (unit->pending & kept_bit(number))
+                add_pending(unit, &band, &stripe, number);
+        }
+    }
+}
+
 /* Read a pass from where the walk stands until it is done or the budget is spent; whether it is done. */
 static bool read_pass(struct unit *unit, const int64_t *bands, int64_t count, int64_t number, struct class_place *at,
                       int64_t *budget) {
     int plane = (int)(number >> 1);
     bool first_pass = number & 1;
+    enter_plane(unit, plane);
     if (at->band == 0 && at->stripe == 0)
         begin_pass(unit, number);
-    int64_t rounds = first_pass ? count : 2 * count,
-            before = stripes_before(bands, at->band < count ? at->band : count);
+    int64_t rounds = first_pass ? count : 2 * count;
     for (; at->band < rounds; at->band++, at->stripe = 0) {
         bool raw = at->band >= count;
-        struct band band = band_of(bands + (raw ? at->band - count : at->band) * BAND_FIELDS);
-        int64_t stripes = stripes_in(&band);
-        for (; at->stripe < stripes; at->stripe++) {
+        int64_t own = raw ? at->band - count : at->band, before = stripes_before(bands, own);
+        struct band band = band_of(bands + own * BAND_FIELDS);
+        for (int64_t stripes = stripes_in(&band); at->stripe < stripes; at->stripe++) {
             if (*budget <= 0)
                 return false;
             struct stripe stripe = stripe_of(&band, at->stripe);
             *budget -= stripe.rows * stripe.columns;
             if (raw)
-                at->bits = read_raw(unit->tiles, &band, &stripe, plane, unit->rans.at, unit->rans.end - unit->rans.at,
-                                    at->bits);
+                at->bits = read_raw(unit, &band, &stripe, before + at->stripe, plane, at->bits);
             else if (first_pass)
                 code_stripe(true, true, unit, &band, &stripe, before + at->stripe, plane);
             else
                 code_stripe(true, false, unit, &band, &stripe, before + at->stripe, plane);
         }
-        before += stripes;
     }
-    int64_t left = unit->rans.end - unit->rans.at, bytes = (at->bits + 7) >> 3;
-    unit->rans.at += bytes < left ? bytes : left;
+    unit->rans.at += at->bits > 0;
     at->bits = 0;
     return true;
 }
 
-bool lode_class_read(const struct tiles *tiles, const int64_t *bands, int64_t count, int64_t first, int64_t last,
-                     const uint8_t *data, int64_t size, struct class_place *at, int64_t *budget) {
-    struct unit unit;
+bool lode_class_read(struct unit *unit, bool goes_on, const struct tiles *tiles, const int64_t *bands, int64_t count,
+                     int64_t first, int64_t last, const uint8_t *data, int64_t size, struct class_place *at,
+                     int64_t *budget) {
     uint32_t *states = (uint32_t *)tiles->model + CLASS_STATES;
     if (states[0] == 0) /* that of a unit is never 0 once it has begun */
         at->bytes = start_unit(tiles->model, states, data, size);
-    load_contexts(&unit.contexts, tiles->model);
-    unit.tiles = tiles;
-    unit.seen = 0;
-    unit.rans = (struct rans){states[0], states[1], data + at->bytes, data + size};
-    while (at->passes <= first - last && read_pass(&unit, bands, count, first - at->passes, at, budget)) {
+    load_contexts(&unit->contexts, tiles->model);
+    unit->tiles = tiles;
+    unit->plane = goes_on ? unit->plane : -1;
+    unit->pending = 0;
+    unit->near_end = false;
+    unit->rans = (struct rans){{states[0], states[1]}, data + at->bytes, data + size};
+    while (at->passes <= first - last && read_pass(unit, bands, count, first - at->passes, at, budget)) {
         at->passes++;
         at->band = 0;
     }
-    at->bytes = unit.rans.at - data;
-    states[0] = unit.rans.next;
-    states[1] = unit.rans.other;
-    store_contexts(&unit.contexts, tiles->model);
+    know_pending(unit, bands, count);
+    int64_t left = unit->rans.end - unit->rans.at;
+    at->bytes = size - (left > 0 ? left : 0);
+    states[0] = unit->rans.states[0];
+    states[1] = unit->rans.states[1];
+    store_contexts(&unit->contexts, tiles->model);
     return at->passes > first - last;
 }
 
@@ -147,6 +165,7 @@ static int64_t count_coefficients(const int64_t *bands, int64_t count, int64_t m
 static int64_t list_pass(struct unit *unit, const int64_t *bands, int64_t count, int64_t number, const symbol_t *end) {
     int plane = (int)(number >> 1);
     int64_t bits = 0, done = 0;
+    enter_plane(unit, plane);
     begin_pass(unit, number);
     for (int64_t b = 0; b < count; b++) {
         struct band band = band_of(bands + b * BAND_FIELDS);
@@ -187,26 +206,25 @@ static void know_all(const struct tiles *tiles, const int64_t *bands, int64_t co
     }
 }
 
-int64_t lode_class_write(const struct tiles *tiles, const int64_t *bands, int64_t count, int64_t first,
-                         const struct class_output *output, int64_t *budget) {
-    struct unit unit;
+int64_t lode_class_write(struct unit *unit, const struct tiles *tiles, const int64_t *bands, int64_t count,
+                         int64_t first, const struct class_output *output, int64_t *budget) {
     int64_t decisions[MOST_PASSES + 1], bits[MOST_PASSES];
     int64_t coefficients = count_coefficients(bands, count, output->symbols_count);
     if (coefficients > output->symbols_count / ((first >> 1) + 1)) /* else no more work than memory */
         return -1;
     *budget -= coefficients * (first + 1);
-    unit.tiles = tiles;
-    unit.seen = 0;
-    unit.symbols = output->symbols;
+    unit->tiles = tiles;
+    unit->plane = -1;
+    unit->symbols = output->symbols;
     start_contexts(tiles->model);
-    load_contexts(&unit.contexts, tiles->model);
+    load_contexts(&unit->contexts, tiles->model);
     know_all(tiles, bands, count);
     decisions[first + 1] = 0;
     for (int64_t number = first; number >= 0; number--) {
-        bits[number] = list_pass(&unit, bands, count, number, output->symbols + output->symbols_count);
+        bits[number] = list_pass(unit, bands, count, number, output->symbols + output->symbols_count);
         if (bits[number] < 0)
             return -1;
-        decisions[number] = unit.symbols - output->symbols;
+        decisions[number] = unit->symbols - output->symbols;
     }
     uint32_t states[2] = {LOWEST_STATE, LOWEST_STATE};
     uint8_t *end = output->data + output->data_count, *begin = end;

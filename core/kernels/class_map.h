@@ -1,39 +1,39 @@
-/* What the class coder knows of a stripe before a pass, 8 rows and 64 columns of a band (docs/format.md, "Large
+/* What the class coder knows of a stripe before a plane, 8 rows and 64 columns of a band (docs/format.md, "Large
  * units"): the planes above and the parents alone decide which coefficients a pass visits, and in which contexts.
  *
- * A coefficient has an age: 0 where it is not significant above this plane, 1 where its highest bit stands in the plane
- * above, 2 where higher. It follows from the plane in which the coefficient was found, a byte each.
+ * A row of the stripe is a mask of 64 bits, one for each column. The weights of a row, 0, 2 and 3, follow from the
+ * planes in which coefficients were found, a byte each.
  */
 #ifndef LODE_CLASS_MAP_H
 #define LODE_CLASS_MAP_H
 
-#include <stdbool.h>
-#include <stdint.h>
-
-#include "contexts.h"
+#include "class_unit.h"
+#include "lanes.h"
 
 enum {
-    STRIPE_ROWS = BLOCK,
-    STRIPE_COLUMNS = 64,
-    STRIPE_BLOCKS = STRIPE_COLUMNS / BLOCK,
-    STRIPE_SIZE = STRIPE_ROWS * STRIPE_COLUMNS,
-    DISTANT = 5, /* classes of what is further off, for each class of the eight neighbours */
-    CLASSES = 5 * DISTANT,
-    /* A mark is 1 + the plane in which a coefficient was found, and this if its second pass did. */
-    FOUND_SECOND = 128,
+    MARKED_ROWS = STRIPE_ROWS + 2 * MARGIN,
+    ROW_ROOM = STRIPE_COLUMNS + LANES, /* of a row and its margins, as far as vectors reach */
+    DISTANT = 5,                       /* classes of what is further off, for each class of the eight neighbours */
+    CLASSES = 5 * DISTANT,             /* beside them a refinement */
 };
 
-/* A part of a band. */
-struct stripe {
-    int64_t top, left; /* its first row and column */
-    int64_t first;     /* the place of its first coefficient */
-    int rows, columns;
-};
+/* All ones in the first bytes: from the place 8 - n on, in n of eight. */
+static const uint8_t WITHIN[2 * BLOCK] = {255, 255, 255, 255, 255, 255, 255, 255};
 
-struct class_map {
-    uint8_t weights[STRIPE_ROWS + 2 * MARGIN][STRIPE_COLUMNS + 2 * MARGIN + 12]; /* by age: 0, 2, 3 */
-    uint8_t context[STRIPE_ROWS][STRIPE_COLUMNS]; /* of significance; CLASSES for a refinement */
-};
+LODE_INLINE uint64_t columns_of(const struct stripe *stripe) {
+    return UINT64_MAX >> (STRIPE_COLUMNS - stripe->columns);
+}
+
+/* So many bytes of a row where whole vectors may be loaded: in their place, or copied into `room` with zeros behind
+ * them. Of a band no more is there than eights that begin before the end. */
+LODE_INLINE const uint8_t *loadable(const uint8_t *row, int bytes, bool whole, uint8_t room[ROW_ROOM]) {
+    if (whole)
+        return row;
+    memset(room, 0, ROW_ROOM);
+    for (int j = 0; j < bytes; j += BLOCK)
+        put_eight(room + j, eight_at(row + j) & eight_at(bytes - j < BLOCK ? WITHIN + BLOCK - (bytes - j) : WITHIN));
+    return room;
+}
 
 /* What the parents of a row of the stripe add to what is far; nothing where there are none. */
 LODE_INLINE void sum_parents(const uint8_t *above, const uint8_t *own, const uint8_t *below, int columns, int shift,
@@ -60,95 +60,107 @@ LODE_INLINE void see_parents(const uint32_t *at, int64_t stride, int rows, int c
         }
 }
 
-LODE_INLINE void see_weights(const uint8_t *marks, int64_t stride, int rows, int columns, int plane,
-                             struct class_map *map) {
-    marks -= MARGIN * stride + MARGIN;
-    uint8_t one = (uint8_t)(plane + 2), two = (uint8_t)(plane + 3);
-    for (int i = 0; i < rows + 2 * MARGIN; i++, marks += stride)
-        for (int j = 0; j < columns + 2 * MARGIN; j++) {
-            uint8_t mark = marks[j] & (FOUND_SECOND - 1);
-            map->weights[i][j] = (uint8_t)((mark >= one ? 2 : 0) + (mark >= two ? 1 : 0));
-        }
-}
-
-/* Sixteen small numbers at once. */
-typedef uint8_t bytes_t __attribute__((vector_size(16)));
-
-static inline bytes_t bytes_at(const uint8_t *at) {
-    bytes_t bytes;
-    memcpy(&bytes, at, sizeof bytes);
-    return bytes;
-}
-
-/* The context of each coefficient of a row, from the sums of its parents and the weights of five rows, of which the
- * third is its own; each of them begins at the margin. */
-static inline void see_contexts(const uint8_t *sums, const uint8_t *a, const uint8_t *b, const uint8_t *own,
-                                const uint8_t *d, const uint8_t *e, uint8_t *context) {
-    for (int j = 0; j < STRIPE_COLUMNS; j += 16, a += 16, b += 16, own += 16, d += 16, e += 16) {
-        bytes_t corners = bytes_at(b + 1) + bytes_at(d + 1) + bytes_at(b + 3) + bytes_at(d + 3);
-        bytes_t beside = bytes_at(own + 1) + bytes_at(own + 3) + bytes_at(b + 2) + bytes_at(d + 2);
-        bytes_t across = bytes_at(own) + bytes_at(own + 4) + bytes_at(a + 2) + bytes_at(e + 2);
-        bytes_t ring = bytes_at(b) + bytes_at(d) + bytes_at(b + 4) + bytes_at(d + 4) + bytes_at(a) + bytes_at(e) +
-                       bytes_at(a + 1) + bytes_at(e + 1) + bytes_at(a + 3) + bytes_at(e + 3) + bytes_at(a + 4) +
-                       bytes_at(e + 4);
-        bytes_t near = 3 * beside + 2 * corners, far = 2 * across + ring + bytes_at(sums + j);
-        /* A comparison that holds gives 255, which is -1. */
-        bytes_t high = (bytes_t)(near >= 1) + (bytes_t)(near >= 6) + (bytes_t)(near >= 13) + (bytes_t)(near >= 24);
-        bytes_t low = (bytes_t)(far >= 1) + (bytes_t)(far >= 4) + (bytes_t)(far >= 9) + (bytes_t)(far >= 18);
-        bytes_t class = 0 - DISTANT * high - low, significant = (bytes_t)(bytes_at(own + 2) != 0);
-        class = (class & ~significant) | (CLASSES & significant);
-        memcpy(context + j, &class, sizeof class);
-    }
-}
-
-/* Whether a row has a coefficient that is not significant among those that may be. */
-static inline bool has_zeros(const uint8_t *weights, const uint8_t *possible) {
-    bytes_t any = {0};
-    for (int j = 0; j < STRIPE_COLUMNS; j += 16)
-        any |= (bytes_t)(bytes_at(weights + j) == 0) & bytes_at(possible + j);
-    uint64_t halves[2];
-    memcpy(halves, &any, sizeof halves);
-    return (halves[0] | halves[1]) != 0;
-}
-
-/* Look at a stripe before a pass.
- *
- * marks:    of the stripe's band; `parents` begins at that of its first coefficient.
- * possible: 255 for each column that may be visited, else 0.
- */
-static void see_stripe(const uint8_t *marks, int64_t stride, const struct stripe *stripe, const uint32_t *parents,
-                       int64_t parent_stride, int row_shift, int column_shift, int plane, const uint8_t *possible,
-                       struct class_map *map) {
-    if (stripe->rows == STRIPE_ROWS && stripe->columns == STRIPE_COLUMNS)
-        see_weights(marks, stride, STRIPE_ROWS, STRIPE_COLUMNS, plane, map);
-    else {
-        memset(map->weights, 0, sizeof map->weights);
-        see_weights(marks, stride, stripe->rows, stripe->columns, plane, map);
-    }
-    uint8_t seen[STRIPE_ROWS + 2][STRIPE_COLUMNS + 16], sums[STRIPE_COLUMNS] = {0};
+/* What the parents add, of all rows. `parents` begins at that of the first coefficient. */
+static void sum_all_parents(const struct stripe *stripe, const uint32_t *parents, int64_t stride, int row_shift,
+                            int column_shift, int plane, uint8_t sums[STRIPE_ROWS][STRIPE_COLUMNS]) {
+    uint8_t seen[STRIPE_ROWS + 2][STRIPE_COLUMNS + 16];
     int64_t first = stripe->top >> row_shift, before = -1;
     int rows = (int)(((stripe->top + stripe->rows - 1) >> row_shift) - first) + 1;
     int columns = ((stripe->columns - 1) >> column_shift) + 1;
-    for (int i = 0; i < stripe->rows; i++) {
-        if (!has_zeros(map->weights[i + MARGIN] + MARGIN, possible)) {
-            memset(map->context[i], CLASSES, STRIPE_COLUMNS);
-            continue;
-        }
-        if (before < 0) {
-            if (rows == STRIPE_ROWS / 2 && columns == STRIPE_COLUMNS / 2)
-                see_parents(parents, parent_stride, STRIPE_ROWS / 2, STRIPE_COLUMNS / 2, plane, seen);
-            else
-                see_parents(parents, parent_stride, rows, columns, plane, seen);
-        }
+    if (rows == STRIPE_ROWS / 2 && columns == STRIPE_COLUMNS / 2)
+        see_parents(parents, stride, STRIPE_ROWS / 2, STRIPE_COLUMNS / 2, plane, seen);
+    else
+        see_parents(parents, stride, rows, columns, plane, seen);
+    for (int i = 0; i < STRIPE_ROWS; i++) {
         int64_t parent = ((stripe->top + i) >> row_shift) - first;
-        if (parent != before && column_shift == 1 && stripe->columns == STRIPE_COLUMNS)
-            sum_parents(seen[parent], seen[parent + 1], seen[parent + 2], STRIPE_COLUMNS, 1, sums);
-        else if (parent != before)
-            sum_parents(seen[parent], seen[parent + 1], seen[parent + 2], stripe->columns, column_shift, sums);
+        if (i >= stripe->rows)
+            memset(sums[i], 0, STRIPE_COLUMNS);
+        else if (parent == before)
+            memcpy(sums[i], sums[i - 1], STRIPE_COLUMNS);
+        else if (column_shift == 1 && stripe->columns == STRIPE_COLUMNS)
+            sum_parents(seen[parent], seen[parent + 1], seen[parent + 2], STRIPE_COLUMNS, 1, sums[i]);
+        else
+            sum_parents(seen[parent], seen[parent + 1], seen[parent + 2], stripe->columns, column_shift, sums[i]);
         before = parent;
-        see_contexts(sums, map->weights[i], map->weights[i + 1], map->weights[i + 2], map->weights[i + 3],
-                     map->weights[i + 4], map->context[i]);
     }
+}
+
+/* Weights of a stripe and of the margin around it. */
+LODE_INLINE void weigh(const uint8_t *marks, int64_t stride, const struct stripe *stripe, int plane,
+                       uint8_t weights[MARKED_ROWS][ROW_ROOM]) {
+    uint8_t room[ROW_ROOM];
+    bool whole = stripe->columns == STRIPE_COLUMNS;
+    lanes_t one = (lanes_t){0} + (int8_t)(plane + 1), two = one + 1;
+    marks -= MARGIN * stride + MARGIN;
+    for (int i = 0; i < stripe->rows + 2 * MARGIN; i++, marks += stride) {
+        const uint8_t *row = loadable(marks, stripe->columns + 2 * MARGIN, whole, room);
+        for (int j = 0; j < STRIPE_COLUMNS; j += LANES) {
+            lanes_t mark = lanes_at(row + j) & (FOUND_SECOND - 1);
+            put_lanes(weights[i] + j, ((lanes_t)(mark > one) & 2) | ((lanes_t)(mark > two) & 1));
+        }
+        eight_t mark = eight_at(row + STRIPE_COLUMNS) & 127 * EACH; /* four are wanted */
+        put_eight(weights[i] + STRIPE_COLUMNS, 2 * reaching(mark, plane + 2) + reaching(mark, plane + 3));
+    }
+    for (int i = stripe->rows + 2 * MARGIN; i < MARKED_ROWS; i++)
+        memset(weights[i], 0, ROW_ROOM);
+}
+
+/* Contexts, and which coefficients have a significant neighbour. */
+static void see_contexts(uint8_t weights[MARKED_ROWS][ROW_ROOM], uint8_t sums[STRIPE_ROWS][STRIPE_COLUMNS],
+                         struct class_map *map) {
+    memset(map->near, 0, sizeof map->near);
+    for (int j = 0; j < STRIPE_COLUMNS; j += LANES) {
+        lanes_t own[MARKED_ROWS], beside[MARKED_ROWS], across[MARKED_ROWS]; /* at distance one and two in the row */
+        for (int i = 0; i < MARKED_ROWS; i++) {
+            const uint8_t *row = weights[i] + j;
+            own[i] = lanes_at(row + 2);
+            beside[i] = lanes_at(row + 1) + lanes_at(row + 3);
+            across[i] = lanes_at(row) + lanes_at(row + 4);
+        }
+        for (int i = 0; i < STRIPE_ROWS; i++) {
+            const lanes_t *o = own + i, *b = beside + i, *a = across + i;
+            lanes_t corners = b[1] + b[3], four = o[1] + o[3] + b[2], both = four + corners;
+            lanes_t near = both + both + four, straight = a[2] + o[0] + o[4];
+            lanes_t far = straight + straight + a[1] + a[3] + a[0] + a[4] + b[0] + b[4] + lanes_at(sums[i] + j);
+            lanes_t any = (lanes_t)(near > 0);
+            lanes_t high = any + (lanes_t)(near > 5) + (lanes_t)(near > 12) + (lanes_t)(near > 23);
+            lanes_t low = (lanes_t)(far > 0) + (lanes_t)(far > 3) + (lanes_t)(far > 8) + (lanes_t)(far > 17);
+            lanes_t twice = high + high, class = 0 - (twice + twice + high + low), found = (lanes_t)(o[2] > 0);
+            put_lanes(map->context[i] + j, (class & ~found) | (found & CLASSES));
+            map->near[i] |= negative_lanes(any) << j;
+        }
+    }
+}
+
+/* Look at a stripe before a plane.
+ *
+ * marks:   of the stripe's band, at its first coefficient.
+ * parents: magnitudes, at the parent of that.
+ */
+static void see_stripe(const uint8_t *marks, int64_t stride, const struct stripe *stripe, const uint32_t *parents,
+                       int64_t parent_stride, int row_shift, int column_shift, int plane, struct class_map *map) {
+    uint8_t weights[MARKED_ROWS][ROW_ROOM], sums[STRIPE_ROWS][STRIPE_COLUMNS];
+    uint64_t within = columns_of(stripe), any = 0;
+    weigh(marks, stride, stripe, plane, weights);
+    for (int i = 0; i < STRIPE_ROWS; i++) {
+        uint64_t zero = 0, young = 0;
+        for (int j = 0; j < STRIPE_COLUMNS; j += LANES) {
+            lanes_t weight = lanes_at(weights[i + MARGIN] + MARGIN + j);
+            zero |= negative_lanes((lanes_t)(weight == 0)) << j;
+            young |= negative_lanes((lanes_t)(weight == 2)) << j;
+        }
+        map->zero[i] = i < stripe->rows ? zero & within : 0;
+        map->young[i] = i < stripe->rows ? young & within : 0;
+        any |= map->zero[i];
+    }
+    memset(map->ones, 0, sizeof map->ones);
+    if (!any) {
+        memset(map->near, 0, sizeof map->near);
+        memset(map->context, CLASSES, sizeof map->context);
+        return;
+    }
+    sum_all_parents(stripe, parents, parent_stride, row_shift, column_shift, plane, sums);
+    see_contexts(weights, sums, map);
 }
 
 #endif

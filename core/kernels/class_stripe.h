@@ -10,6 +10,7 @@
 
 #include "block_coder.h"
 #include "class_map.h"
+#include "class_raw.h"
 #include "class_tables.h"
 #include "inlining.h"
 #include "rans.h"
@@ -20,54 +21,83 @@ enum {
     CLASS_SIGNS = CLASS_REFINEMENT + 1,
     CLASS_FLAGS = CLASS_SIGNS + 15,
     CLASS_CONTEXTS = CLASS_FLAGS + 27,
-    KEPT_MAPS = 32, /* of the first stripes; the last one is that of all others */
 };
 
-_Static_assert((int)CLASS_CONTEXTS <= (int)MOST_CONTEXTS &&
+_Static_assert((int)CLASS_CONTEXTS == (int)MOST_CONTEXTS &&
                    CLASS_CONTEXTS == sizeof CLASS_STARTS / sizeof *CLASS_STARTS,
                "each context has a place and begins somewhere");
-_Static_assert((int)STRIPE_SIZE <= (int)MOST_IN_RUN, "the decisions of a stripe are one run, the signs another");
-
-/* All ones in the first bytes: from the place 8 - n on, in n of eight. And a 1 in every other byte. */
-static const uint8_t WITHIN[2 * BLOCK] = {255, 255, 255, 255, 255, 255, 255, 255};
-static const uint8_t EVEN[BLOCK + 1] = {1, 0, 1, 0, 1, 0, 1, 0, 1};
 
 typedef uint16_t places_t __attribute__((vector_size(16)));
-typedef uint32_t units_of_four_t __attribute__((vector_size(16)));
 
-/* A unit while it is read, or written: then its decisions are kept.
- *
- * What the first pass of a plane has seen of the first stripes of all bands is not looked at again in the second.
- */
-struct unit {
-    const struct tiles *tiles;
-    struct contexts contexts;
-    struct rans rans;
-    symbol_t *symbols; /* where the next one will stand */
-    uint32_t seen;     /* a bit for each map that holds what this plane's first pass has seen */
-    struct class_map maps[KEPT_MAPS];
-};
+LODE_INLINE void code_decision(bool reads, uint8_t number, const uint16_t *coded, uint16_t *counts, uint32_t *state,
+                               const uint8_t **at, uint8_t *bit, symbol_t *symbol) {
+    uint32_t probability = coded[number], own = reads ? read_bit(state, at, probability) : *bit;
+    if (reads)
+        *bit = (uint8_t)own;
+    else
+        *symbol = symbol_of(probability, own);
+    counts[2 * number + own]++;
+}
 
 /* Code decisions in turn: of each the context and the bit stand at its place. */
+LODE_INLINE void code_in_turn(bool reads, struct unit *unit, const uint16_t *places, int many, const uint8_t *context,
+                              uint8_t *bits) {
+    const uint16_t *coded = unit->contexts.coded;
+    uint16_t *counts = unit->contexts.counts[0], *more = unit->contexts.counts[1];
+    uint32_t even = unit->rans.states[0], odd = unit->rans.states[1];
+    const uint8_t *at = unit->rans.at;
+    symbol_t *symbols = unit->symbols;
+    int i = 0;
+    for (; i < many - 1; i += 2) {
+        int one = places[i], two = places[i + 1];
+        code_decision(reads, context[one], coded, counts, &even, &at, bits + one, symbols + i);
+        code_decision(reads, context[two], coded, more, &odd, &at, bits + two, symbols + i + 1);
+    }
+    if (i < many)
+        code_decision(reads, context[places[i]], coded, counts, &even, &at, bits + places[i], symbols + i);
+    unit->rans.states[0] = many & 1 ? odd : even;
+    unit->rans.states[1] = many & 1 ? even : odd;
+    unit->rans.at = at;
+    unit->symbols = symbols + (reads ? 0 : many);
+}
+
+/* These loops need all registers. */
+static LODE_ALONE void read_decisions(struct unit *unit, const uint16_t *places, int many, const uint8_t *context,
+                                      uint8_t *bits) {
+    code_in_turn(true, unit, places, many, context, bits);
+}
+
+static LODE_ALONE void keep_decisions(struct unit *unit, const uint16_t *places, int many, const uint8_t *context,
+                                      uint8_t *bits) {
+    code_in_turn(false, unit, places, many, context, bits);
+}
+
 LODE_INLINE void code_decisions(bool reads, struct unit *unit, const uint16_t *places, int many, const uint8_t *context,
                                 uint8_t *bits) {
     if (reads)
-        read_run(&unit->rans, &unit->contexts, places, many, context, bits);
+        read_decisions(unit, places, many, context, bits);
     else
-        unit->symbols = keep_run(unit->symbols, &unit->contexts, places, many, context, bits);
+        keep_decisions(unit, places, many, context, bits);
 }
 
-/* Adapt contexts that have coded decisions, from number `first` to the one before `last`. */
-static inline void adapt_all(struct contexts *contexts, int first, int last) {
-    for (int k = first; k < last; k++)
-        if (contexts->counted[k])
-            adapt(contexts, k);
+/* All bits of the parents of a block. */
+LODE_INLINE uint32_t family_of(const struct tiles *tiles, const struct band *band, const struct block *block) {
+    if (band->row_shift != 1 || band->column_shift != 1 || block->rows != BLOCK || block->columns != BLOCK)
+        return parents_in(tiles, band, block);
+    const uint32_t *parents =
+        tiles->known + band->parent + (block->top >> 1) * band->parent_stride + (block->left >> 1);
+    units_of_four_t all = {0}, row;
+    for (int i = 0; i < BLOCK / 2; i++, parents += band->parent_stride) {
+        memcpy(&row, parents, sizeof row);
+        all |= row;
+    }
+    return all[0] | all[1] | all[2] | all[3];
 }
 
 /* Code whether a block that has no significant coefficient so far gets one in this plane. */
 LODE_INLINE uint8_t code_class_flag(bool reads, struct unit *unit, const struct band *band, const struct block *block,
                                     const uint8_t *flag, int plane) {
-    uint32_t family = parents_in(unit->tiles, band, block) >> plane;
+    uint32_t family = family_of(unit->tiles, band, block) >> plane;
     int before = (flag[-1] != 0) + (flag[-band->across - 1] != 0);
     int after = (flag[1] != 0) + (flag[band->across + 1] != 0);
     uint8_t context = (uint8_t)(CLASS_FLAGS + (before * 3 + after) * 3 + (int)(family < 2 ? family : 2));
@@ -77,287 +107,214 @@ LODE_INLINE uint8_t code_class_flag(bool reads, struct unit *unit, const struct 
     return bit;
 }
 
-/* Of each column of a stripe whether its block is significant, and whether it became so in this pass: 255, else 0. */
+/* Columns of a stripe whose blocks are significant, and those whose blocks became so in this pass. */
 struct columns {
-    uint8_t possible[STRIPE_COLUMNS], fresh[STRIPE_COLUMNS];
-    bool any_fresh;
+    uint64_t possible, fresh;
 };
 
-/* Look at the blocks of a stripe, whose flags a second pass codes; whether any is significant. */
-LODE_INLINE bool code_flags(bool reads, bool first_pass, struct unit *unit, const struct band *band,
-                            const struct stripe *stripe, int plane, struct columns *columns) {
-    int64_t row = stripe->top / BLOCK;
-    uint8_t *flags = unit->tiles->flags + band->flags + row * (band->across + 1) + stripe->left / BLOCK;
+/* Look at the blocks of a stripe, whose flags a second pass codes. */
+LODE_INLINE struct columns code_flags(bool reads, bool first_pass, struct unit *unit, const struct band *band,
+                                      const struct stripe *stripe, int plane) {
+    uint8_t *flags = unit->tiles->flags + band->flags + stripe->top / BLOCK * (band->across + 1) + stripe->left / BLOCK;
+    struct columns columns = {0, 0};
     bool any = false;
-    memset(columns, 0, sizeof *columns);
-    for (int number = 0; number * BLOCK < stripe->columns; number++) {
-        uint8_t *flag = flags + number;
-        int left = number * BLOCK, rest = stripe->columns - left, wide = rest < BLOCK ? rest : BLOCK;
-        if (!*flag && !first_pass) {
-            struct block block = {stripe->top, stripe->left + left, stripe->rows, wide, 0};
-            *flag = code_class_flag(reads, unit, band, &block, flag, plane);
-            if (*flag) {
-                memset(columns->fresh + left, 255, BLOCK);
-                columns->any_fresh = true;
-            }
-        }
-        if (*flag) {
-            memset(columns->possible + left, 255, (size_t)wide);
+    for (int left = 0; left < stripe->columns; left += BLOCK, flags++) {
+        uint64_t own = UINT64_C(255) << left;
+        if (!*flags && !first_pass) {
+            int rest = stripe->columns - left;
+            struct block block = {stripe->top, stripe->left + left, stripe->rows, rest < BLOCK ? rest : BLOCK, 0};
+            *flags = code_class_flag(reads, unit, band, &block, flags, plane);
+            columns.fresh |= *flags ? own : 0;
             any = true;
         }
+        columns.possible |= *flags ? own : 0;
     }
-    return any;
+    if (any)
+        adapt(&unit->contexts, CLASS_FLAGS, CLASS_CONTEXTS);
+    columns.possible &= columns_of(stripe);
+    return columns;
 }
 
-/* In the k-th of four numbers a 1 in the byte that comes k-th in memory. */
-LODE_INLINE units_of_four_t one_in_each(void) {
-    static const uint8_t bytes[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
-    units_of_four_t ones;
-    memcpy(&ones, bytes, sizeof ones);
-    return ones;
-}
-
-/* Add bits of a plane, 0 or 1 a byte, to what is known of eight coefficients. */
-LODE_INLINE void add_bits(uint32_t *known, eight_t ones, int plane) {
-    uint32_t halves[2], bit = UINT32_C(1) << plane;
-    units_of_four_t each = one_in_each(), now[2];
-    memcpy(halves, &ones, sizeof halves);
-    memcpy(now, known, sizeof now);
-    for (int k = 0; k < 2; k++) {
-        units_of_four_t bits = {halves[k], halves[k], halves[k], halves[k]};
-        now[k] += (units_of_four_t)((bits & each) != 0) & bit;
+/* List the places of the 1s among `width` bits of a mask, `step` apart from place `first` on, behind `many` others; how
+ * many there are then. Seven more places of the list are overwritten. */
+LODE_INLINE int list_places(uint64_t mask, int width, int first, int step, uint16_t *places, int many) {
+    for (int j = 0; j < width; j += BLOCK, mask >>= BLOCK, first += step * BLOCK) {
+        uint8_t numbers __attribute__((vector_size(8)));
+        memcpy(&numbers, SET_BITS[mask & 255], sizeof numbers);
+        places_t eight = __builtin_convertvector(numbers, places_t) * (uint16_t)step + (uint16_t)first;
+        memcpy(places + many, &eight, sizeof eight);
+        many += __builtin_popcount(mask & 255);
     }
-    memcpy(known, now, sizeof now);
-}
-
-/* List the places of the 1s among eight bytes of 0 and 1 behind `many` others; how many there are then. Seven more
- * places of the list are overwritten. */
-LODE_INLINE int list_places(eight_t ones, int first, uint16_t *places, int many) {
-    uint32_t bits = bits_of(ones);
-    places_t eight;
-    memcpy(&eight, SET_BITS[bits], sizeof eight);
-    eight += (uint16_t)first;
-    memcpy(places + many, &eight, sizeof eight);
-    return many + __builtin_popcount(bits);
-}
-
-/* List what a pass visits, in raster order; how many these are. */
-LODE_INLINE int list_visited(bool first_pass, const struct class_map *map, const struct stripe *stripe,
-                             const struct columns *columns, uint16_t *places) {
-    int many = 0;
-    for (int i = 0; i < stripe->rows; i++)
-        for (int j = 0; j < stripe->columns; j += 2 * BLOCK) {
-            bytes_t weight = bytes_at(map->weights[i + MARGIN] + MARGIN + j), context = bytes_at(map->context[i] + j);
-            bytes_t zero = (bytes_t)(weight == 0), near = (bytes_t)(context >= DISTANT), visited = zero & near;
-            if (!first_pass)
-                visited = (zero & (~near | bytes_at(columns->fresh + j))) | (bytes_t)(weight == 2);
-            visited &= bytes_at(columns->possible + j) & 1;
-            uint8_t ones[2 * BLOCK];
-            memcpy(ones, &visited, sizeof ones);
-            many = list_places(eight_at(ones), i * STRIPE_COLUMNS + j, places, many);
-            many = list_places(eight_at(ones + BLOCK), i * STRIPE_COLUMNS + j + BLOCK, places, many);
-        }
     return many;
 }
 
-/* The context of a sign by those of its neighbours, and whether the opposite case shares it. */
-LODE_INLINE int sign_context(const struct band *band, const int8_t *sign, int *flip) {
-    int x = clamped(sign[-1] + sign[1], -1, 1), y = clamped(sign[-band->stride] + sign[band->stride], -1, 1);
-    int sum = band->kind == 2 ? 3 * y + x : 3 * x + y;
-    *flip = sum < 0;
-    return CLASS_SIGNS + 3 * (sum < 0 ? -sum : sum) + (band->kind > 1 ? band->kind - 1 : 0);
+/* The even bits of a mask side by side. */
+LODE_INLINE uint64_t even_bits(uint64_t mask) {
+    mask &= UINT64_C(0x5555555555555555);
+    mask = (mask | mask >> 1) & UINT64_C(0x3333333333333333);
+    mask = (mask | mask >> 2) & UINT64_C(0x0F0F0F0F0F0F0F0F);
+    mask = (mask | mask >> 4) & UINT64_C(0x00FF00FF00FF00FF);
+    mask = (mask | mask >> 8) & UINT64_C(0x0000FFFF0000FFFF);
+    return (mask | mask >> 16) & UINT32_MAX;
+}
+
+/* By the sums of the signs beside, x, and of those above and below, y, each modulo 8: twice what a context's number is
+ * beyond that of the kind, three times a class, and 1 more where the opposite case shares it. Other sums have no
+ * meaning. And where both change places. */
+#define CUT(n) ((n) < -1 ? -1 : (n) > 1 ? 1 : (n))
+#define CASE(sum) (uint8_t)((sum) < 0 ? -6 * (sum) + 1 : 6 * (sum))
+#define CASES_OF(x, y) CASE(3 * CUT(x) + CUT(y))
+#define ROW_OF(x) {CASES_OF(x, 0), CASES_OF(x, 1), CASES_OF(x, 2), 0, 0, 0, CASES_OF(x, -2), CASES_OF(x, -1)}
+#define TURNED_ROW_OF(y) {CASES_OF(0, y), CASES_OF(1, y), CASES_OF(2, y), 0, 0, 0, CASES_OF(-2, y), CASES_OF(-1, y)}
+static const uint8_t SIGN_CASES[2][8][8] = {
+    {ROW_OF(0), ROW_OF(1), ROW_OF(2), {0}, {0}, {0}, ROW_OF(-2), ROW_OF(-1)},
+    {TURNED_ROW_OF(0), TURNED_ROW_OF(1), TURNED_ROW_OF(2), {0}, {0}, {0}, TURNED_ROW_OF(-2), TURNED_ROW_OF(-1)},
+};
+
+/* Code the sign at a place of a stripe, and mark the coefficient. Contexts are those of the band's kind. */
+LODE_INLINE void code_class_sign(bool reads, int8_t *sign, int64_t stride, const uint8_t cases[8][8],
+                                 const uint16_t *coded, uint16_t *counts, uint32_t *state, const uint8_t **bytes,
+                                 int32_t truth, symbol_t *symbol) {
+    int x = sign[-1] + sign[1], y = sign[-stride] + sign[stride];
+    size_t found = cases[x & 7][y & 7], flip = found & 1, number = found >> 1;
+    uint32_t bit;
+    if (reads)
+        bit = read_bit(state, bytes, coded[number]);
+    else
+        *symbol = symbol_of(coded[number], bit = (truth < 0) ^ (uint32_t)flip);
+    counts[2 * number + bit]++;
+    *sign = (int8_t)(1 - 2 * (int)(bit ^ flip));
 }
 
 /* Code the signs of coefficients found in a stripe, those at even or at odd places. */
-LODE_INLINE void code_signs(bool reads, struct unit *unit, const struct band *band, const struct stripe *stripe,
-                            const uint16_t *places, int many) {
-    const struct tiles *tiles = unit->tiles;
-    struct run run;
-    run.rans = &unit->rans;
-    if (reads)
-        begin_run(&run, many);
-    for (int i = 0; i < many; i++) {
-        int64_t at = stripe->first + places[i] / STRIPE_COLUMNS * band->stride + places[i] % STRIPE_COLUMNS;
-        int flip, context = sign_context(band, tiles->sign + at, &flip);
-        int bit = reads ? next_bit(&run, unit->contexts.coded[context]) : (tiles->truth[at] < 0) ^ flip;
-        if (!reads)
-            *unit->symbols++ = symbol_of(&unit->contexts, context, bit);
-        count(&unit->contexts, context, bit);
-        tiles->sign[at] = (int8_t)(1 - 2 * (bit ^ flip));
+LODE_INLINE void code_signs_in_turn(bool reads, struct unit *unit, const struct band *band, int64_t first,
+                                    const uint16_t *places, int many, uint8_t mark) {
+    int base = CLASS_SIGNS + (band->kind > 1 ? band->kind - 1 : 0);
+    const uint16_t *coded = unit->contexts.coded + base;
+    uint16_t *counts = unit->contexts.counts[0] + 2 * base, *more = unit->contexts.counts[1] + 2 * base;
+    const uint8_t (*cases)[8] = SIGN_CASES[band->kind == 2];
+    int8_t *sign = unit->tiles->sign + first;
+    uint8_t *marks = unit->tiles->early + first;
+    const int32_t *truth = reads ? 0 : unit->tiles->truth + first;
+    uint32_t even = unit->rans.states[0], odd = unit->rans.states[1];
+    const uint8_t *at = unit->rans.at;
+    symbol_t *symbols = unit->symbols;
+    int64_t stride = band->stride, down = stride - STRIPE_COLUMNS;
+    for (int i = 0; i < many; i += 2) {
+        int64_t one = places[i] + places[i] / STRIPE_COLUMNS * down;
+        marks[one] = mark;
+        code_class_sign(reads, sign + one, stride, cases, coded, counts, &even, &at, reads ? 0 : truth[one],
+                        symbols + i);
+        if (i + 1 == many)
+            break;
+        int64_t two = places[i + 1] + places[i + 1] / STRIPE_COLUMNS * down;
+        marks[two] = mark;
+        code_class_sign(reads, sign + two, stride, cases, coded, more, &odd, &at, reads ? 0 : truth[two],
+                        symbols + i + 1);
     }
+    unit->rans.states[0] = many & 1 ? odd : even;
+    unit->rans.states[1] = many & 1 ? even : odd;
+    unit->rans.at = at;
+    unit->symbols = symbols + (reads ? 0 : many);
+}
+
+static LODE_ALONE void read_signs(struct unit *unit, const struct band *band, int64_t first, const uint16_t *places,
+                                  int many, uint8_t mark) {
+    code_signs_in_turn(true, unit, band, first, places, many, mark);
+}
+
+static LODE_ALONE void keep_signs(struct unit *unit, const struct band *band, int64_t first, const uint16_t *places,
+                                  int many, uint8_t mark) {
+    code_signs_in_turn(false, unit, band, first, places, many, mark);
+}
+
+LODE_INLINE void code_signs(bool reads, struct unit *unit, const struct band *band, int64_t first,
+                            const uint16_t *places, int many, uint8_t mark) {
     if (reads)
-        end_run(&run);
+        read_signs(unit, band, first, places, many, mark);
+    else
+        keep_signs(unit, band, first, places, many, mark);
 }
 
-/* Places of a list, and room for what the last step of listing overwrites. */
-typedef uint16_t list_t[STRIPE_SIZE + BLOCK];
-
-/* Take bits of a plane, 0 or 1 for each coefficient of the stripe, into what is known, and list what they find: at
- * places whose row and column have an even sum, and at the others. */
-LODE_INLINE void take_bits(bool reads, bool first_pass, const struct tiles *tiles, const struct band *band,
-                           const struct stripe *stripe, int plane, const struct class_map *map, const uint8_t *bits,
-                           list_t found[2], int counts[2]) {
-    uint64_t mark = (uint64_t)(plane + 1 + (first_pass ? 0 : FOUND_SECOND));
-    counts[0] = counts[1] = 0;
-    for (int i = 0; i < stripe->rows; i++)
-        for (int j = 0; j < stripe->columns; j += BLOCK) {
-            int place = i * STRIPE_COLUMNS + j;
-            eight_t ones = eight_at(bits + place);
-            if (!ones)
-                continue;
-            int64_t at = stripe->first + i * band->stride + j;
-            if (reads)
-                add_bits(tiles->known + at, ones, plane);
-            eight_t new = ones & ~reaching(eight_at(map->weights[i + MARGIN] + MARGIN + j), 1);
-            if (!new)
-                continue;
-            put_eight(tiles->early + at, (eight_at(tiles->early + at) & ~(255 * new)) + mark * new);
-            eight_t even = eight_at(EVEN + (i & 1));
-            counts[0] = list_places(new &even, place, found[0], counts[0]);
-            counts[1] = list_places(new & ~even, place, found[1], counts[1]);
-        }
-}
-
-/* The bits of a stripe that is written, all of whose magnitudes are known. */
-static void stripe_bits(const struct tiles *tiles, const struct band *band, const struct stripe *stripe, int plane,
-                        const uint16_t *places, int many, uint8_t *bits) {
-    for (int i = 0; i < many; i++) {
-        int64_t at = stripe->first + places[i] / STRIPE_COLUMNS * band->stride + places[i] % STRIPE_COLUMNS;
-        bits[places[i]] = (uint8_t)(tiles->known[at] >> plane & 1);
-    }
-}
-
-/* What is known of a stripe, by its number in the pass. */
-LODE_INLINE const struct class_map *map_of(bool first_pass, struct unit *unit, const struct band *band,
-                                           const struct stripe *stripe, int64_t number, int plane,
-                                           const struct columns *columns) {
-    uint32_t kept = number < KEPT_MAPS - 1 ? UINT32_C(1) << number : 0;
-    struct class_map *map = &unit->maps[kept ? number : KEPT_MAPS - 1];
-    if (!first_pass && !columns->any_fresh && unit->seen & kept)
+/* What is known of a stripe. */
+LODE_INLINE struct class_map *map_of(struct unit *unit, const struct band *band, const struct stripe *stripe,
+                                     int64_t number, int plane) {
+    struct class_map *map = &unit->maps[map_number(number)];
+    if (unit->seen & kept_bit(number))
         return map;
     const uint32_t *parents = unit->tiles->known + band->parent +
                               (stripe->top >> band->row_shift) * band->parent_stride +
                               (stripe->left >> band->column_shift);
     see_stripe(unit->tiles->early + stripe->first, band->stride, stripe, parents, band->parent_stride, band->row_shift,
-               band->column_shift, plane, columns->possible, map);
-    unit->seen |= kept;
+               band->column_shift, plane, map);
+    unit->seen |= kept_bit(number);
     return map;
+}
+
+/* Bits of a plane of a row that is written, all of whose magnitudes are known. */
+LODE_INLINE void take_row(const uint32_t *known, int columns, int plane, uint8_t *bits) {
+    for (int j = 0; j < columns; j++)
+        bits[j] = (uint8_t)(known[j] >> plane & 1);
 }
 
 /* Code the bits of a stripe some of whose blocks are significant, and their signs. */
 LODE_INLINE void code_bits(bool reads, bool first_pass, struct unit *unit, const struct band *band,
-                           const struct stripe *stripe, int64_t number, int plane, const struct columns *columns) {
-    const struct tiles *tiles = unit->tiles;
-    const struct class_map *map = map_of(first_pass, unit, band, stripe, number, plane, columns);
-    list_t visited, found[2];
-    int counts[2], many = list_visited(first_pass, map, stripe, columns, visited);
+                           const struct stripe *stripe, int64_t number, int plane, struct columns columns) {
+    uint32_t *known = unit->tiles->known + stripe->first;
+    struct class_map *map = map_of(unit, band, stripe, number, plane);
+    uint64_t visited[STRIPE_ROWS];
+    uint16_t places[STRIPE_SIZE + BLOCK], found[2][STRIPE_SIZE / 2 + BLOCK];
+    uint8_t bits[STRIPE_SIZE] = {0};
+    int many = 0, counts[2] = {0, 0};
+    for (int i = 0; i < stripe->rows; i++) {
+        uint64_t zero = map->zero[i], near = map->near[i];
+        visited[i] = (first_pass ? zero & near : (zero & (~near | columns.fresh)) | map->young[i]) & columns.possible;
+        many = list_places(visited[i], STRIPE_COLUMNS, i * STRIPE_COLUMNS, 1, places, many);
+        if (!reads && stripe->columns == STRIPE_COLUMNS)
+            take_row(known + i * band->stride, STRIPE_COLUMNS, plane, bits + i * STRIPE_COLUMNS);
+        else if (!reads)
+            take_row(known + i * band->stride, stripe->columns, plane, bits + i * STRIPE_COLUMNS);
+    }
     if (many == 0)
         return;
-    uint8_t bits[STRIPE_SIZE] = {0};
-    if (!reads)
-        stripe_bits(tiles, band, stripe, plane, visited, many, bits);
-    code_decisions(reads, unit, visited, many, map->context[0], bits);
-    adapt_all(&unit->contexts, 0, CLASS_SIGNS);
-    take_bits(reads, first_pass, tiles, band, stripe, plane, map, bits, found, counts);
+    code_decisions(reads, unit, places, many, map->context[0], bits);
+    adapt(&unit->contexts, 0, CLASS_SIGNS);
+    bool kept = kept_bit(number) != 0;
+    for (int i = 0; i < stripe->rows; i++) {
+        uint64_t ones = 0;
+        for (int j = 0; j < STRIPE_COLUMNS; j += LANES)
+            ones |= negative_lanes((lanes_t)(lanes_at(bits + i * STRIPE_COLUMNS + j) > 0)) << j;
+        ones &= visited[i];
+        if (reads && kept)
+            map->ones[i] |= ones;
+        else if (reads)
+            add_ones(known + i * band->stride, ones, stripe->columns, plane);
+        uint64_t new = ones & map->zero[i];
+        if (!new)
+            continue;
+        int odd = i & 1, place = i * STRIPE_COLUMNS;
+        counts[0] = list_places(even_bits(new >> odd), STRIPE_COLUMNS / 2, place + odd, 2, found[0], counts[0]);
+        counts[1] =
+            list_places(even_bits(new >> (1 - odd)), STRIPE_COLUMNS / 2, place + 1 - odd, 2, found[1], counts[1]);
+    }
+    if (reads)
+        unit->pending |= kept_bit(number);
     if (counts[0] + counts[1] == 0)
         return;
-    code_signs(reads, unit, band, stripe, found[0], counts[0]);
-    code_signs(reads, unit, band, stripe, found[1], counts[1]);
-    adapt_all(&unit->contexts, CLASS_SIGNS, CLASS_FLAGS);
+    uint8_t mark = (uint8_t)(plane + 1 + (first_pass ? 0 : FOUND_SECOND));
+    code_signs(reads, unit, band, stripe->first, found[0], counts[0], mark);
+    code_signs(reads, unit, band, stripe->first, found[1], counts[1], mark);
+    adapt(&unit->contexts, CLASS_SIGNS, CLASS_FLAGS);
 }
 
 /* Code a stripe, of which the number in the pass is given, without the raw bits. */
 LODE_INLINE void code_stripe(bool reads, bool first_pass, struct unit *unit, const struct band *band,
                              const struct stripe *stripe, int64_t number, int plane) {
-    struct columns columns;
-    if (code_flags(reads, first_pass, unit, band, stripe, plane, &columns))
-        code_bits(reads, first_pass, unit, band, stripe, number, plane, &columns);
-    if (!first_pass)
-        adapt_all(&unit->contexts, CLASS_FLAGS, CLASS_CONTEXTS);
-}
-
-/* A 1 for each of eight coefficients in a row whose two highest bits stand above a plane: all further ones are raw. */
-LODE_INLINE eight_t refined_in(const uint8_t *marks, int plane, int64_t columns) {
-    eight_t refined = reaching(eight_at(marks) & 127 * EACH, plane + 3);
-    return columns < BLOCK ? refined & eight_at(WITHIN + BLOCK - columns) : refined;
-}
-
-/* Read the raw bits of a stripe from `data`, of which `bits` are taken; those that are taken then. */
-static int64_t read_raw(const struct tiles *tiles, const struct band *band, const struct stripe *stripe, int plane,
-                        const uint8_t *data, int64_t size, int64_t bits) {
-    uint8_t rest[STRIPE_SIZE / 8 + 8];
-    int64_t left = size - (bits >> 3);
-    const uint8_t *from = left > 0 ? data + (bits >> 3) : rest;
-    if (left < (int64_t)sizeof rest) {
-        memset(rest, 0, sizeof rest);
-        if (left > 0)
-            memcpy(rest, from, (size_t)left);
-        from = rest;
-    }
-    int start = (int)(bits & 7), at = start;
-    for (int i = 0; i < stripe->rows; i++)
-        for (int j = 0; j < stripe->columns; j += BLOCK) {
-            int64_t place = stripe->first + i * band->stride + j;
-            eight_t refined = refined_in(tiles->early + place, plane, stripe->columns - j);
-            if (!refined)
-                continue;
-            uint32_t chosen = bits_of(refined);
-            const uint8_t *byte = from + (at >> 3);
-            uint32_t coming = (byte[0] | (uint32_t)byte[1] << 8) >> (at & 7) & 255;
-            at += __builtin_popcount(chosen);
-            /* Each chosen byte keeps the bit that is its own, and becomes 1 if that is not 0. */
-            eight_t own = coming * EACH & eight_at(RANKS[chosen]);
-            own = (((own & 127 * EACH) + 127 * EACH) | own) >> 7 & EACH;
-            add_bits(tiles->known + place, own, plane);
-        }
-    return bits + at - start;
-}
-
-/* How many raw bits a stripe has. */
-static int64_t count_raw(const struct tiles *tiles, const struct band *band, const struct stripe *stripe, int plane) {
-    int64_t bits = 0;
-    for (int i = 0; i < stripe->rows; i++)
-        for (int j = 0; j < stripe->columns; j += BLOCK)
-            bits +=
-                (int64_t)(refined_in(tiles->early + stripe->first + i * band->stride + j, plane, stripe->columns - j) *
-                              EACH >>
-                          56);
-    return bits;
-}
-
-/* Bits of a plane of eight magnitudes in a row, 0 or 1 each. */
-LODE_INLINE eight_t bits_in(const uint32_t *magnitudes, int plane) {
-    units_of_four_t all[2];
-    memcpy(all, magnitudes, sizeof all);
-    units_of_four_t each = one_in_each();
-    uint32_t halves[2];
-    for (int k = 0; k < 2; k++) {
-        units_of_four_t ones = (0 - (all[k] >> (uint32_t)plane & 1)) & each;
-        halves[k] = ones[0] | ones[1] | ones[2] | ones[3];
-    }
-    eight_t bits;
-    memcpy(&bits, halves, sizeof bits);
-    return bits;
-}
-
-/* Write the raw bits of a stripe behind `bits` others into zeros; those that are there then. */
-static int64_t write_raw(const struct tiles *tiles, const struct band *band, const struct stripe *stripe, int plane,
-                         uint8_t *data, int64_t bits) {
-    for (int i = 0; i < stripe->rows; i++)
-        for (int j = 0; j < stripe->columns; j += BLOCK) {
-            int64_t place = stripe->first + i * band->stride + j;
-            uint32_t chosen = bits_of(refined_in(tiles->early + place, plane, stripe->columns - j));
-            if (!chosen)
-                continue;
-            eight_t ones = bits_in(tiles->known + place, plane);
-            uint32_t coming = (uint32_t)((255 * ones & eight_at(RANKS[chosen])) * EACH >> 56) << (bits & 7);
-            uint8_t *byte = data + (bits >> 3);
-            byte[0] |= (uint8_t)coming;
-            if (coming >> 8)
-                byte[1] |= (uint8_t)(coming >> 8);
-            bits += __builtin_popcount(chosen);
-        }
-    return bits;
+    if (reads)
+        find_bytes(unit);
+    struct columns columns = code_flags(reads, first_pass, unit, band, stripe, plane);
+    if (columns.possible)
+        code_bits(reads, first_pass, unit, band, stripe, number, plane, columns);
 }
 
 #endif

@@ -13,6 +13,7 @@ from pathlib import Path
 _HERE = Path(__file__).parent
 
 _MOST_ADAPTED = 127
+_MOST_IN_STRIPE = 512
 _LOGARITHMS = 256
 
 #: Of a large unit's contexts before its first pass: the probabilities of a 1 over 2**16, and the adaptation count.
@@ -55,12 +56,11 @@ def set_bits() -> list[list[int]]:
     return [found + [0] * (8 - len(found)) for found in numbers]
 
 
-def ranks() -> list[list[int]]:
-    """For each byte and each of its bits that are 1 the power of two by how many of the lower bits are; else 0."""
-    return [
-        [1 << (byte & ((1 << bit) - 1)).bit_count() if byte >> bit & 1 else 0 for bit in range(8)]
-        for byte in range(256)
-    ]
+def adaptation() -> list[int]:
+    """By what part a large unit's context moves, over 2**16, by its adaptation count and what it has coded: 2**17 /
+    (2 n + 1), rounded down; 0 for 0, where nothing moves.
+    """
+    return [0, *(2**17 // (2 * count + 1) for count in range(1, _MOST_ADAPTED + _MOST_IN_STRIPE + 1))]
 
 
 def _lines(entries: Sequence[str]) -> str:
@@ -105,8 +105,8 @@ def headers() -> dict[Path, str]:
         "class_tables": [
             f"enum {{ STARTING_COUNT = {_STARTING_COUNT} }};\n",
             _array("CLASS_STARTS", "uint16_t", "By context, over 2^16.", class_starts()),
-            _array("SET_BITS", "uint16_t", "By byte: the numbers of its 1s.", set_bits()),
-            _array("RANKS", "uint8_t", "By byte: for each 1 the bit that has its rank among them.", ranks()),
+            _array("SET_BITS", "uint8_t", "By byte: the numbers of its 1s.", set_bits()),
+            _array("ADAPTATION", "uint16_t", "By the count of decisions, over 2^16.", adaptation()),
         ],
     }
     return {_HERE / f"{name}.h": _header(name, *parts) for name, parts in texts.items()}
