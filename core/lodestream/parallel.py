@@ -14,7 +14,7 @@ from weakref import ref
 from .errors import OptionError
 from .operating_system import processors, run_in_forks
 
-__all__ = ["VARIABLE", "spread", "threads"]
+__all__ = ["VARIABLE", "aside", "spread", "threads"]
 
 #: The environment variable that says how many threads work; unset or empty: one for each processor.
 VARIABLE = "LODESTREAM_THREADS"
@@ -59,6 +59,33 @@ def spread(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Re
     return _Spread(work, queue).results(count - 1)
 
 
+def aside(work: Callable[[], object]) -> bool:
+    """Have another thread do work while the caller goes on; return False, and do nothing, if there is no other thread.
+
+    Nobody waits for the work or hears of its errors: it says by itself what has become of it. It may call `spread`. As
+    many pieces of such work are done at a time as `threads` leaves beside the caller; others wait for them.
+
+    Raises
+    ------
+    OptionError
+        See `threads`.
+    """
+    others = threads() - 1
+    return others > 0 and _pool("aside", others).take(_Aside(work))
+
+
+class _Aside:
+    """Work of `aside`."""
+
+    def __init__(self, work: Callable[[], object]) -> None:
+        self._work = work
+
+    def help(self) -> None:
+        """Do it."""
+        with suppress(BaseException):  # the thread has other work to do after it
+            self._work()
+
+
 class _Spread(Generic[_Item, _Result]):
     """Items that several threads take one after another.
 
@@ -80,7 +107,7 @@ class _Spread(Generic[_Item, _Result]):
         """Return all results in order, with the help of ``others`` threads."""
         self._places.extend([None] * others)
         try:
-            _pool().ask(self, others)
+            _pool("spread", threads() - 1).ask(self, others)
             self._take()
         finally:
             self._waiting.clear()
@@ -139,15 +166,24 @@ class _Pool:
     """Threads that start when there is work, and end with the process."""
 
     def __init__(self, most: int) -> None:
-        # References are weak, so that finished work need not wait for a thread that has not started on it.
-        self._asked: SimpleQueue[ref[_Spread[Any, Any]]] = SimpleQueue()
+        self._asked: SimpleQueue[Callable[[], _Spread[Any, Any] | _Aside | None]] = SimpleQueue()
+        self._most = most
         self._unborn = deque(range(most))
 
     def ask(self, work: _Spread[Any, Any], count: int) -> None:
         """Ask ``count`` threads to help when they are free. Where no thread can be started, the caller works alone."""
         for _ in range(count):
+            # The reference is weak, so that finished work need not wait for a thread that has not started on it.
             self._asked.put(ref(work))
             self._start()
+
+    def take(self, work: _Aside) -> bool:
+        """Have a thread do this when it is free; return False if no thread can be started."""
+        self._start()
+        if len(self._unborn) == self._most:
+            return False
+        self._asked.put(lambda: work)
+        return True
 
     def _start(self) -> None:
         """Start a thread if there are fewer than the maximum."""
@@ -166,20 +202,19 @@ class _Pool:
             self._help(self._asked.get()())
 
     @staticmethod
-    def _help(work: _Spread[Any, Any] | None) -> None:
+    def _help(work: _Spread[Any, Any] | _Aside | None) -> None:
         """Help with work that still exists."""
         if work is not None:
             work.help()
 
 
-#: The threads of this process, by how many there are at most.
-_pools: dict[int, _Pool] = {}
+#: The threads of this process, by what they do and how many there are at most.
+_pools: dict[tuple[str, int], _Pool] = {}
 
 
-def _pool() -> _Pool:
-    """Return the pool for the current number of threads."""
-    most = threads() - 1
-    return _pools.get(most) or _pools.setdefault(most, _Pool(most))
+def _pool(use: str, most: int) -> _Pool:
+    """Return the pool of a use with so many threads."""
+    return _pools.get((use, most)) or _pools.setdefault((use, most), _Pool(most))
 
 
 run_in_forks(_pools.clear)  # threads do not survive a fork

@@ -15,7 +15,7 @@ import pytest
 
 from lodestream import parallel
 from lodestream.errors import OptionError
-from lodestream.parallel import VARIABLE, spread, threads
+from lodestream.parallel import VARIABLE, aside, spread, threads
 from tests.patience import PATIENCE
 
 
@@ -95,6 +95,42 @@ def test_without_another_thread_the_caller_does_all(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(threading.Thread, "start", refused)
     assert spread(lambda item: item + 1, range(30)) == list(range(1, 31))
+
+
+def test_work_aside_is_done_while_the_caller_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "2")
+    meeting, over, done = threading.Barrier(2, timeout=PATIENCE), threading.Event(), list[object]()
+
+    def work() -> None:
+        meeting.wait()
+        done.append(spread(abs, [-1, -2]))
+        done.append(threading.get_ident())
+        over.set()
+
+    def failing() -> None:
+        raise KeyboardInterrupt
+
+    assert aside(failing)
+    assert aside(work)
+    meeting.wait()
+    assert spread(abs, range(-3, 0)) == [3, 2, 1]
+    assert over.wait(PATIENCE)
+    assert done[0] == [1, 2]
+    assert done[1] != threading.get_ident()
+
+
+def test_nothing_is_done_aside_where_there_is_no_other_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[int] = []
+    monkeypatch.setenv(VARIABLE, "1")
+    assert not aside(lambda: done.append(1))
+    monkeypatch.setenv(VARIABLE, "201")  # a pool that no other test has started
+
+    def refused(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", refused)
+    assert not aside(lambda: done.append(2))
+    assert done == []
 
 
 def test_whoever_comes_late_finds_nothing_and_keeps_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from ..entropy.bitplanes import pass_count
 from ..entropy.part_table import part_of
 from ..entropy.tiles import Reading, Tiles, TileTable
 from ..errors import CorruptStreamError
-from ..parallel import spread
+from ..parallel import aside, spread
 from .batches import Coded, batch_length, rounds_of
 from .region import Region
 from .values import Values, mark_holes, restore, values_of
@@ -40,6 +40,9 @@ class SegmentQueue:
         self._added = self._decoded = self._forgotten = 0
         self._begun: tuple[int, list[list[Reading]]] = 0, []  # the batch on its way: the number after it, its rounds
         self._lock = Lock()
+        self._wanted = 0  # segments to decode in advance
+        self._preparing = False  # another thread does it
+        self._failure: BaseException | None = None  # what it has met
         self._chunks: dict[int, tuple[bytes | memoryview, int]] = {}
         self._channels: list[Tiles] = []
         #: Whether what was added is forgotten, see `drop`.
@@ -62,19 +65,53 @@ class SegmentQueue:
 
     def drop(self) -> None:
         """Drop all that was added and is not decoded, because no values will be asked for."""
-        self._waiting.clear()
-        self._chunks.clear()
-        self.dropped = True
+        with self._lock:
+            self._waiting.clear()
+            self._chunks.clear()
+            self.dropped = True
 
     def prepare(self, length: int) -> None:
-        """Decode the first ``length`` segments, if there are enough of them to be worth the calls."""
+        """Decode the first ``length`` segments, if there are enough of them to be worth the calls.
+
+        Where there are several threads, another one does it while the caller goes on. What that one raises, the next
+        call raises.
+        """
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            raise failure
+        self._wanted = max(self._wanted, length)
+        if self._preparing:
+            return
         with self._lock:
-            size = 0
-            for number in range(self._decoded, length):
-                size += len(self._waiting[number].data)
-                if size >= _WORTH_PREPARING_BYTES:
-                    self._decode(length)
-                    return
+            if not self._worth_decoding():
+                return
+        self._preparing = True
+        if not aside(self._prepare_aside):
+            self._preparing = False
+            with self._lock:
+                self._decode(self._wanted)
+
+    def _prepare_aside(self) -> None:
+        """Decode in advance as long as there is enough of it."""
+        try:
+            while True:
+                with self._lock:
+                    if not self._worth_decoding():
+                        return
+                    self._decode(self._wanted)
+        except BaseException as error:
+            self._failure = error
+        finally:
+            self._preparing = False
+
+    def _worth_decoding(self) -> bool:
+        """Return whether as much waits as is worth the calls; the lock is held."""
+        size = 0
+        for number in range(self._decoded, 0 if self.dropped else self._wanted):
+            size += len(self._waiting[number].data)
+            if size >= _WORTH_PREPARING_BYTES:
+                return True
+        return False
 
     def keep_last(self, state: NDArray[np.int8]) -> None:
         """Decode all segments, and drop the data that only states before the last one need.

@@ -128,9 +128,15 @@ class View:
     def prepare(self) -> None:
         """Decode the bytes received so far in advance, so that the points of this view or a later one come sooner.
 
-        It changes no result, and does nothing where little waits. A program that shows the last view only, and receives
-        more slowly than it decodes, calls it for each view that it does not show: at the end the last layers alone are
-        left. All is decoded once, whenever that is.
+        It changes no result, and does nothing where little waits. With two processors or more another thread does it
+        while the caller goes on (``LODESTREAM_THREADS`` says how many threads there are). A program that shows the last
+        view only, and receives more slowly than it decodes, calls it for each view that it does not show: at the end
+        the last layers alone are left. All is decoded once, whenever that is.
+
+        Raises
+        ------
+        Exception
+            What an earlier call has met in the other thread.
         """
         self._queue.prepare(self._length)
 
