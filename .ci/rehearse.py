@@ -2,7 +2,8 @@
 
 ``python .ci/rehearse.py FOLDER`` makes wheels and source distribution (``wheels.py``) and the npm package, lets twine
 look at what PyPI would get, and installs the wheel of this machine with the oldest and the newest Python that are on
-PATH. There the demo is run from the wheel. Nothing is published.
+PATH. There the demo is run from the wheel. mypy checks library and clients as if this were macOS and Windows, which
+takes too long for ``make lint``. Nothing is published.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 #: Minor versions of Python 3 that are looked for, see ``requires-python``.
 VERSIONS = range(11, 20)
+#: As `sys.platform` says there.
+OTHER_SYSTEMS = ("darwin", "win32")
 
 
 def pythons() -> list[str]:
@@ -51,6 +54,9 @@ def try_wheel(wheel: Path, python: str) -> None:
 
 def main(folder: Path) -> None:
     """Build, look, install, run."""
+    for system in OTHER_SYSTEMS:
+        cache = f"--cache-dir=build/mypy-{system}"
+        step(f"types on {system}", sys.executable, "-m", "mypy", f"--platform={system}", cache, "core", "client")
     step("wheels and source distribution", sys.executable, ".ci/wheels.py", str(folder))
     packages = [str(path) for path in sorted(folder.glob("*.whl")) + sorted(folder.glob("*.tar.gz"))]
     step("what PyPI would say", sys.executable, "-m", "twine", "check", "--strict", *packages)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import signal
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -27,6 +28,20 @@ settings.register_profile("ci", settings.get_profile("default"))
 settings.register_profile("torture", settings.get_profile("default"), derandomize=False, max_examples=2000)
 settings.register_profile("sanitizers", settings.get_profile("default"), max_examples=10)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
+
+
+#: Tests of what needs Linux, beside those that start a server in this process, which are skipped one by one.
+OF_LINUX = ("server", "faults", "torture", "client/requests/test_local.py", "client/stream/test_interrupted.py")
+
+if sys.platform != "linux":
+    import lodestream_server
+
+    def _skip(*_: object, **__: object) -> None:
+        pytest.skip("the server needs Linux")
+
+    # Many modules of tests import it by its name.
+    lodestream_server.running_server = _skip
+    collect_ignore = list(OF_LINUX)
 
 
 #: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
@@ -102,6 +117,9 @@ def one_fork_server() -> Iterator[None]:
     Those that are programs of their own do as they always do. For the whole session, since tests of several folders
     take turns in a process of pytest-xdist.
     """
+    if sys.platform != "linux":
+        yield
+        return
     from lodestream_server.builds import jobs
     from lodestream_server.builds.fork_control import ForkServer
     from tests.server.builds import slow

@@ -1,8 +1,9 @@
-"""What differs between operating systems, for all other modules of the library and the clients.
+"""What differs between operating systems, for all other modules.
 
 Linux and macOS have the interface of POSIX, Windows does not. Where a system lacks something, a function here does it
-another way or does nothing, as its docstring says. No other module asks which system this is, except the confinement
-(`lodestream.confinement`), which needs Linux, and `lodestream.library`, which names the kernels of each system.
+another way or does nothing, as its docstring says. Other modules ask which system this is only where they need Linux:
+the confinement (`lodestream.confinement`), and the server, which forks and confines its builds.
+`lodestream.library` names the kernels of each system.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ import os
 import shutil
 import signal
 import stat
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     import subprocess
@@ -28,30 +30,38 @@ if sys.platform == "win32":
 else:
     import fcntl
     import resource
+    import termios
 
 __all__ = [
     "NO_LOCKS",
     "allocate",
     "cache_home",
     "close_and_remove",
+    "file_limit",
+    "give_to_owner",
     "is_of_another_user",
     "is_writable_by_others",
     "kill_session",
     "limit_files",
     "limit_memory",
     "limit_processor",
+    "limited_file_size",
     "lock",
+    "lower_limit",
     "memory_of_machine",
     "memory_of_process",
     "new_session",
     "open_own",
     "processors",
+    "raise_file_limit",
     "read_at",
+    "read_cached",
     "remove_closed",
     "remove_folder",
     "run_in_forks",
     "synchronise_folder",
     "touch",
+    "unacknowledged",
     "unlock",
     "write_at",
 ]
@@ -90,8 +100,8 @@ def open_own(path: Path, create: bool = False) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
 
 
-def lock(handle: int) -> bool:
-    """Lock an open file against other programs until it is closed; return whether it was free.
+def lock(handle: int, *, wait: bool = False) -> bool:
+    """Lock an open file against other programs until it is closed; return whether it was free, or could be waited for.
 
     Raises
     ------
@@ -100,9 +110,9 @@ def lock(handle: int) -> bool:
     """
     try:
         if sys.platform == "win32":
-            _at_locked_byte(handle, msvcrt.LK_NBLCK)
+            _at_locked_byte(handle, msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK)
         else:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except OSError as error:
         if error.errno not in (errno.EAGAIN, errno.EACCES):  # the latter is what Windows says
             raise
@@ -142,6 +152,19 @@ def read_at(handle: int, length: int, offset: int) -> bytes:
         with _at(handle, offset):
             return os.read(handle, length)
     return os.pread(handle, length, offset)
+
+
+def read_cached(handle: int, length: int, offset: int) -> bytes | None:
+    """Read exactly so many bytes at an offset without waiting for the disk.
+
+    None if they are not all in memory or the file is shorter, and always on macOS and Windows.
+    """
+    if sys.platform == "linux" and hasattr(os, "RWF_NOWAIT"):
+        buffer = bytearray(length)
+        with suppress(OSError):
+            if os.preadv(handle, [buffer], offset, os.RWF_NOWAIT) == length:
+                return bytes(buffer)
+    return None
 
 
 def write_at(handle: int, data: bytes, offset: int) -> int:
@@ -208,6 +231,13 @@ def is_of_another_user(status: os.stat_result) -> bool:
 def is_writable_by_others(status: os.stat_result) -> bool:
     """Return whether other users may write to a file by its mode; False on Windows, where modes do not say it."""
     return sys.platform != "win32" and bool(status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+
+
+def give_to_owner(path: Path, status: os.stat_result) -> None:
+    """Give a file to the owner of another one, if this process may; nothing on Windows."""
+    if sys.platform != "win32":
+        with suppress(PermissionError):
+            os.chown(path, status.st_uid, status.st_gid)
 
 
 def synchronise_folder(folder: Path) -> None:
@@ -307,15 +337,14 @@ def limit_memory(budget: int) -> None:
         ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
         with open("/proc/self/status", encoding="utf-8") as status:
             used = next(int(line.split()[1]) << 10 for line in status if line.startswith("VmData"))
-        _lower(resource.RLIMIT_DATA, used + budget)
+        lower_limit("DATA", used + budget)
 
 
 def limit_processor(seconds: int) -> None:
     """Let this process take so many seconds of a processor, and write no file; not on Windows."""
-    if sys.platform != "win32":
-        _lower(resource.RLIMIT_CPU, seconds)
-        _lower(resource.RLIMIT_CORE, 0)
-        _lower(resource.RLIMIT_FSIZE, 0)
+    lower_limit("CPU", seconds)
+    lower_limit("CORE", 0)
+    lower_limit("FSIZE", 0)
 
 
 def limit_files(count: int) -> None:
@@ -323,14 +352,89 @@ def limit_files(count: int) -> None:
     if sys.platform != "win32":
         free = os.open(os.devnull, os.O_RDONLY)
         os.close(free)
-        _lower(resource.RLIMIT_NOFILE, free + count)
+        lower_limit("NOFILE", free + count)
 
 
-def _lower(kind: int, limit: int) -> None:
+def lower_limit(name: Literal["CORE", "CPU", "DATA", "FSIZE", "NOFILE"], limit: int, *, grace: int = 0) -> None:
+    """Lower a limit of POSIX (``RLIMIT_`` and the name) for this process for good; nothing on Windows.
+
+    Parameters
+    ----------
+    name : str
+    limit : int
+        The process is told by a signal when it exceeds the limit, or its call fails.
+    grace : int
+        How much more it may take until it is killed, for a limit that does so.
+    """
     if sys.platform != "win32":
-        before = resource.getrlimit(kind)[1]
-        limit = limit if before == resource.RLIM_INFINITY else min(limit, before)
-        resource.setrlimit(kind, (limit, limit))
+        kind = getattr(resource, f"RLIMIT_{name}")
+        hard = _at_most(limit + grace, resource.getrlimit(kind)[1])
+        resource.setrlimit(kind, (min(limit, hard), hard))
+
+
+def _at_most(limit: int, hard: int) -> int:
+    if sys.platform != "win32" and hard != resource.RLIM_INFINITY:
+        return min(limit, hard)
+    return limit
+
+
+@contextmanager
+def limited_file_size(limit: int) -> Iterator[Callable[[], bool]]:
+    """Limit the files that this process writes for the length of a block; no limit on Windows.
+
+    Parameters
+    ----------
+    limit : int
+        Length of a file in bytes.
+
+    Yields
+    ------
+    callable
+        Returns whether a file was to become longer, whatever the library that writes it makes of that.
+    """
+    exceeded: list[int] = []
+    if sys.platform != "win32":
+        before, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        handler = signal.signal(signal.SIGXFSZ, lambda number, frame: exceeded.append(number))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (_at_most(limit, hard), hard))
+    try:
+        yield lambda: bool(exceeded)
+    finally:
+        if sys.platform != "win32":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (before, hard))
+            signal.signal(signal.SIGXFSZ, handler)
+
+
+def file_limit() -> int | None:
+    """Return how many files this process may have open; None if that is not limited, as on Windows."""
+    if sys.platform != "win32" and (limit := resource.getrlimit(resource.RLIMIT_NOFILE)[0]) != resource.RLIM_INFINITY:
+        return limit
+    return None
+
+
+def raise_file_limit(count: int) -> int:
+    """Let this process open at least so many files, or as many as the system allows; return which of the two holds."""
+    if sys.platform != "win32":
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        count = _at_most(count, hard)
+        if soft != resource.RLIM_INFINITY and soft < count:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (count, hard))
+    return count
+
+
+def unacknowledged(handle: int) -> int:
+    """Return the bytes in a socket's send buffer that the other side has not acknowledged; 0 on Windows.
+
+    Raises
+    ------
+    OSError
+        If the system does not tell.
+    ValueError
+        If the socket is closed.
+    """
+    if sys.platform != "win32":
+        return int(struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))[0])
+    return 0
 
 
 def run_in_forks(function: Callable[[], Any]) -> None:

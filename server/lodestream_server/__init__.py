@@ -22,4 +22,8 @@ __all__ = ["Settings", "create_app", "running_server"]
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name != "Settings":
+        from .linux import require_linux
+
+        require_linux()
     return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)

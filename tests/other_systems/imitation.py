@@ -1,9 +1,9 @@
-"""Imitate macOS or Windows for the modules of the library and the clients, in a process of its own.
+"""Imitate macOS or Windows for the modules of Lodestream, in a process of its own.
 
 `imitate` changes what these modules see, not what Python and other libraries see: the name of the system, modules and
 names that it does not have, and for Windows also its rules for files. An open or mapped file cannot be removed, renamed
 or replaced, names of devices and some characters are refused, a file is locked by `msvcrt`, and text files without an
-encoding are an error. The server and the confinement are for Linux and are not imitated.
+encoding are an error. What confines processes and forks builds is for Linux and is not imitated.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class _Seen(ModuleType):
         setattr(self._module, name, value)
 
 
-def imitate(system: str) -> None:
-    """Imitate a system of `SYSTEMS` for all modules of the library and the clients that are imported from now on."""
+def imitate(system: str, *, also_tests: bool = False) -> None:
+    """Imitate a system of `SYSTEMS` for all modules of Lodestream that are imported from now on, and for its tests."""
     # Other libraries look at this machine when they are imported.
     import h5netcdf  # noqa: F401
     import matplotlib.figure  # noqa: F401
@@ -91,16 +91,16 @@ def imitate(system: str) -> None:
         _refuse_open_files()
         _refuse_names()
         warnings.filterwarnings("error", category=EncodingWarning, module="lodestream")
-    _import(modules, absent)
+    _import(modules, absent, ("lodestream", "tests") if also_tests else ("lodestream",))
 
 
-def _import(modules: dict[str, ModuleType], absent: set[str]) -> None:
+def _import(modules: dict[str, ModuleType], absent: set[str], importers: tuple[str, ...]) -> None:
     ordinary = builtins.__import__
 
     def imported(name: str, globals: Any = None, locals: Any = None, fromlist: Any = (), level: int = 0) -> ModuleType:
         importer = (globals or {}).get("__name__", "")
         top = name.partition(".")[0]
-        if level == 0 and importer.startswith("lodestream") and not importer.startswith(_AS_THEY_ARE):
+        if level == 0 and importer.startswith(importers) and not importer.startswith(_AS_THEY_ARE):
             if top in absent:
                 raise ModuleNotFoundError(f"No module named {name!r}", name=name)
             if top in modules and name == top:

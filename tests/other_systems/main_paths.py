@@ -20,12 +20,14 @@ from tests.other_systems.imitation import imitate
 
 #: Modules that are for Linux alone, or for a process of their own.
 _LEFT_OUT = ("lodestream.confinement.landlock", "lodestream.confinement.seccomp", "lodestream.formats.vtk.process")
+#: Packages of the server that do not build surfaces, which needs Linux.
+_SERVER = ("access", "commands", "connections", "operation", "storage")
 
 
 def main(system: str, folder: Path, url: str) -> None:
     """Run all parts; the name of each is printed when it has passed."""
     imitate(system)
-    for part in (modules, memory, bands, continuing, commands, streams, cache, serving, reader_of_vtk):
+    for part in (modules, memory, bands, continuing, commands, streams, cache, serving, limits, reader_of_vtk):
         place = folder / part.__name__
         place.mkdir()
         part(place, url)
@@ -40,7 +42,8 @@ def modules(folder: Path, url: str) -> None:
     import lodestream
     import lodestream_client
 
-    for package in (lodestream, lodestream_client):
+    parts = [importlib.import_module(f"lodestream_server.{name}") for name in _SERVER]
+    for package in (lodestream, lodestream_client, *parts):
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.", onerror=_refuse):
             if module.name not in _LEFT_OUT and not module.name.endswith("__main__"):
                 importlib.import_module(module.name)
@@ -185,16 +188,53 @@ def cache(folder: Path, url: str) -> None:
 
 
 def serving(folder: Path, url: str) -> None:
-    """Refuse to start a server, in one line."""
+    """Explain the commands of a server, and refuse each in one line, as the names that start one in Python."""
+    import lodestream_server
+    from lodestream.errors import UnavailableError
     from lodestream_client.program import main as command
 
-    for words in ((), ("--unconfined",)):
+    data = str(folder / "data")
+    for words in (
+        ("serve", "--data", data, "--port", "0"),
+        ("serve", "--data", data, "--unconfined"),
+        ("token", "create", "--data", data),
+        ("fsck", data),
+    ):
+        with contextlib.redirect_stdout(io.StringIO()) as said, pytest.raises(SystemExit, match="0"):
+            command([words[0], "--help"])
+        assert said.getvalue().startswith(f"usage: lodestream {words[0]}")
         with contextlib.redirect_stderr(io.StringIO()) as said:
-            code = command(["serve", "--data", str(folder / "data"), "--port", "0", *words])
+            code = command([*words])
         assert code == 1
         (line,) = said.getvalue().splitlines()
         assert "needs Linux" in line
+    for name in ("create_app", "running_server"):
+        with pytest.raises(UnavailableError, match="needs Linux"):
+            getattr(lodestream_server, name)
+    assert lodestream_server.Settings().port == 8000
     assert list(folder.iterdir()) == []
+
+
+def limits(folder: Path, url: str) -> None:
+    """Read and lower the limits of a process that the server reads and lowers, as far as the system has them."""
+    import socket
+
+    from lodestream import operating_system
+
+    before = operating_system.file_limit()
+    assert operating_system.raise_file_limit(64) == 64
+    assert operating_system.file_limit() == before
+    assert before is None or before >= 64
+    with operating_system.limited_file_size(100) as exceeded, (folder / "file").open("wb", buffering=0) as file:
+        assert file.write(bytes(100)) == 100
+        assert not exceeded()
+    with (folder / "file").open("rb") as file:
+        assert operating_system.read_at(file.fileno(), 10, 95) == bytes(5)
+        assert operating_system.read_cached(file.fileno(), 10, 0) is None
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        assert operating_system.unacknowledged(ours.fileno()) == 0
+    operating_system.lower_limit("CORE", 0)
 
 
 def reader_of_vtk(folder: Path, url: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -31,7 +32,24 @@ def test_the_main_paths_run_on_an_imitated_system(system: str, tmp_path: Path) -
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, timeout=PATIENCE, check=False)
     words = done.stdout.decode("cp1252", "replace") + done.stderr.decode("cp1252", "replace")
     assert done.returncode == 0, words
-    parts = ["modules", "memory", "bands", "continuing", "commands", "streams", "cache", "serving", "reader_of_vtk"]
+    parts = ["modules", "memory", "bands", "continuing", "commands", "streams", "cache", "serving", "limits"]
+    parts.append("reader_of_vtk")
     assert [line for line in words.splitlines() if line in parts] == parts
     folder = {"win32": tmp_path / "Local", "darwin": tmp_path / "Library" / "Caches"}[system] / "lodestream"
     assert folder.is_dir()
+
+
+def test_the_tests_without_a_server_are_collected_where_there_is_none_and_the_others_skipped() -> None:
+    command = [sys.executable, "-m", "pytest", "-p", "tests.other_systems.plugin", "-p", "no:cacheprovider", "-n", "0"]
+    environment = {**os.environ, "LODESTREAM_IMITATED": "win32", "PYTHONIOENCODING": "utf-8"}
+
+    def run(*arguments: str) -> str:
+        whole = [*command, "-q", *arguments]
+        done = subprocess.run(whole, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    run("--collect-only", "tests/core", "tests/golden", "tests/client")
+    words = run("-rs", "tests/client/requests/test_memory.py", "tests/core/test_text.py")
+    assert "the server needs Linux" in words
+    assert re.search(r"\d+ passed, \d+ skipped", words)

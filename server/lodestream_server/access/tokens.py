@@ -7,7 +7,6 @@ A token is 256 random bits, so a plain SHA-256 reveals nothing about it, and it 
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import hmac
 import json
@@ -15,13 +14,14 @@ import logging
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from lodestream.errors import LodestreamError, NotFoundError, OptionError
+from lodestream.operating_system import give_to_owner, lock
 
 from ..storage.durable import NewFile, remove, rename
 from ..storage.private import make_private
@@ -171,7 +171,7 @@ class TokenFile:
         # A lock on the folder: the file is replaced, so a lock on it would be one on the old file.
         handle = os.open(self.path.parent, os.O_RDONLY)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
+            lock(handle, wait=True)
             yield
         finally:
             os.close(handle)
@@ -194,8 +194,7 @@ class TokenFile:
             status = self.path.stat()
         except FileNotFoundError:
             return
-        with suppress(PermissionError):
-            os.chown(new, status.st_uid, status.st_gid)
+        give_to_owner(new, status)
         new.chmod(status.st_mode & 0o777)
 
 

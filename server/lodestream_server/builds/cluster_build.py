@@ -12,7 +12,6 @@ nobody else can write there: the confined process has ended with all that it had
 from __future__ import annotations
 
 import os
-import resource
 import stat
 import sys
 import threading
@@ -24,6 +23,7 @@ from pathlib import Path
 from pydantic import TypeAdapter
 
 from lodestream.errors import FormatWarning, InputError, LodestreamError, OptionError, TooLargeError, UnavailableError
+from lodestream.operating_system import lower_limit
 
 from ..storage.durable import remove
 from .answers import answer_of
@@ -59,8 +59,7 @@ def main() -> None:
     task = TypeAdapter(ClusterJob).validate_json(sys.stdin.buffer.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     # What does not go by bands after all must not take the memory of everybody else.
-    most = 2 * task.memory + _BESIDE
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    lower_limit("DATA", 2 * task.memory + _BESIDE)
     sys.stdout.buffer.write(answer_of(lambda: build(task)))
 
 

@@ -18,6 +18,8 @@ from typing import Any
 from .answers import LONGEST_ANSWER, ProcessDiedError, WrongAnswerError, name_of
 from .forkserver import Allowed
 
+assert sys.platform == "linux"  # no other system has what follows
+
 __all__ = ["ONE_THREAD", "ForkServer", "Process", "Started"]
 
 _LOOK_SECONDS = 0.1

@@ -19,7 +19,6 @@ import json
 import math
 import os
 import re
-import resource
 import selectors
 import signal
 import socket
@@ -40,8 +39,11 @@ from pydantic import TypeAdapter
 
 from lodestream import parallel
 from lodestream.confinement import Rights, available, confine
+from lodestream.operating_system import lower_limit
 
 from .answers import answer_of
+
+assert sys.platform == "linux"  # no other system has what follows
 
 __all__ = ["Allowed", "main", "receive_exactly", "resolve"]
 
@@ -104,8 +106,8 @@ def main() -> None:
     # Ctrl-C, and the end of a service, reach every process: this one is its parent's to end.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    if sys.platform == "linux":  # or nobody would know when what a call has left behind has ended
-        ctypes.CDLL(None).prctl(_INHERIT_ORPHANS, 1)
+    # Otherwise nobody would know when what a call has left behind has ended.
+    ctypes.CDLL(None).prctl(_INHERIT_ORPHANS, 1)
     gc.disable()  # what is loaded stays
     parent = os.getppid()
     _say(control, {"confinement": _confinement()})
@@ -230,10 +232,9 @@ def _wait_for_group(group: int) -> None:
 
 def _become_a_call(parent: int, answer: int) -> None:
     os.setpgid(0, 0)
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
+    ctypes.CDLL(None).prctl(_DIE_WITH_PARENT, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
     for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD):
         signal.signal(number, signal.SIG_DFL)
     nothing = os.open(os.devnull, os.O_RDWR)
@@ -276,22 +277,17 @@ def _arguments(function: Callable[..., Any], values: list[Any]) -> list[Any]:
 def _limit(allowed: Allowed) -> None:
     if allowed.write is not None:
         tempfile.tempdir = os.environ["TMPDIR"] = os.fspath(allowed.write)
-    limits = {
+    if allowed.memory is not None:
         # The libraries that are loaded already are the same pages for all processes.
-        resource.RLIMIT_DATA: None if allowed.memory is None else allowed.memory + _private_memory(),
-        resource.RLIMIT_FSIZE: allowed.file_bytes,
-        resource.RLIMIT_NOFILE: _MOST_FILES,
-        resource.RLIMIT_CORE: 0,
-    }
-    for kind, most in limits.items():
-        if most is not None:
-            hard = resource.getrlimit(kind)[1]
-            most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-            resource.setrlimit(kind, (most, most))
+        lower_limit("DATA", allowed.memory + _private_memory())
+    if allowed.file_bytes is not None:
+        lower_limit("FSIZE", allowed.file_bytes)
+    lower_limit("NOFILE", _MOST_FILES)
+    lower_limit("CORE", 0)
     if allowed.seconds is not None:
         most = math.ceil(min(time.process_time() + allowed.threads * allowed.seconds, _MOST_SECONDS))
-        # Told so by SIGXCPU; who does not listen is killed.
-        resource.setrlimit(resource.RLIMIT_CPU, (most, most + 1))
+        # The process gets SIGXCPU; if it goes on, it is killed.
+        lower_limit("CPU", most, grace=1)
     write = tuple(path for path in (allowed.write, allowed.kept) if path is not None)
     os.environ[parallel.VARIABLE] = str(allowed.threads)
     os.nice(_NICE)  # streams come first

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import resource
-import signal
 import tempfile
 import warnings
 from collections.abc import Iterator
@@ -28,6 +26,7 @@ from lodestream.errors import (
     UnavailableError,
 )
 from lodestream.formats import formats
+from lodestream.operating_system import limited_file_size
 
 from .answers import reason_of
 
@@ -237,22 +236,15 @@ def _short_files(job: LevelJob, aside: int) -> Iterator[None]:
     FileTooLongError
         When one was to become longer, whatever the library makes of that.
     """
-    exceeded: list[int] = []
-    before, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    most = job.most_bytes - aside
-    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-    handler = signal.signal(signal.SIGXFSZ, lambda number, frame: exceeded.append(number))
     folder, tempfile.tempdir = tempfile.tempdir, str(job.folder)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (most, hard))
-    try:
-        yield
-    except Exception as error:
-        if not exceeded:
-            raise
-        raise FileTooLongError(os.strerror(errno.EFBIG)) from error
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (before, hard))
-        tempfile.tempdir = folder
-        signal.signal(signal.SIGXFSZ, handler)
-    if exceeded:
+    with limited_file_size(job.most_bytes - aside) as exceeded:
+        try:
+            yield
+        except Exception as error:
+            if not exceeded():
+                raise
+            raise FileTooLongError(os.strerror(errno.EFBIG)) from error
+        finally:
+            tempfile.tempdir = folder
+    if exceeded():
         raise FileTooLongError(os.strerror(errno.EFBIG))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import CorruptStreamError, InputError, StreamError, TooLargeError
+from lodestream.operating_system import read_at
 
 from ..storage import containers
 from . import finished
@@ -78,7 +79,7 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
         def read(offset: int, length: int) -> bytes:
             if length > _MOST_AT_ONCE:
                 raise CorruptStreamError(f"expected at most {_MOST_AT_ONCE} bytes at once, got {length}", offset)
-            return os.pread(handle, length, offset)
+            return read_at(handle, length, offset)
 
         try:
             index = read_index(read, status.st_size)

@@ -29,6 +29,7 @@ from lodestream.errors import (
     UnavailableError,
     UnsupportedVersionError,
 )
+from lodestream.operating_system import open_own
 
 from ..storage.durable import NewFile
 from . import finished
@@ -76,28 +77,12 @@ ALLOWED_BY = "on this server; its setting LODESTREAM_FORMATS lists those that ar
 #: Errors of the system where a disk, or somebody's part of it, is full.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
-# Errors of the system that say nothing of what is in a file.
-_LOCAL = {
-    errno.EACCES,
-    errno.EAGAIN,
-    errno.EBADMSG,
-    errno.EDQUOT,
-    errno.EHOSTDOWN,
-    errno.EIO,
-    errno.EMFILE,
-    errno.ENFILE,
-    errno.ENODEV,
-    errno.ENOENT,
-    errno.ENOMEM,
-    errno.ENOSPC,
-    errno.ENXIO,
-    errno.EPERM,
-    errno.EREMOTEIO,
-    errno.EROFS,
-    errno.ESTALE,
-    errno.ETIMEDOUT,
-    errno.EUCLEAN,
-}
+# Errors of the system that say nothing of what is in a file; not every system has each of them.
+_LOCAL_NAMES = """
+    EACCES EAGAIN EBADMSG EDQUOT EHOSTDOWN EIO EMFILE ENFILE ENODEV ENOENT ENOMEM ENOSPC ENXIO EPERM EREMOTEIO
+    EROFS ESTALE ETIMEDOUT EUCLEAN
+"""
+_LOCAL = {getattr(errno, name) for name in _LOCAL_NAMES.split() if hasattr(errno, name)}
 
 _SHORT_OF_MEMORY = re.compile(
     r"memory alloc|cannot allocate|can't allocate|unable to allocate|out of memory|bad_alloc|filter returned failure",
@@ -301,7 +286,7 @@ def may_pass(error: LodestreamError) -> bool:
 def read_progress(folder: Path) -> float:
     """Return the fraction of a build that is done, 0 to 1; safe whatever the build has put into its folder."""
     try:
-        handle = os.open(folder / _PROGRESS, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        handle = open_own(folder / _PROGRESS)
     except OSError:
         return 0.0
     try:

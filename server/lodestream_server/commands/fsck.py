@@ -15,6 +15,8 @@ from lodestream.errors import LodestreamError, OptionError
 from lodestream.library import require
 from lodestream.text import printable
 
+from ..linux import require_linux
+
 if TYPE_CHECKING:
     from ..maintenance.fsck import Report
     from ..storage.records import Record
@@ -63,9 +65,12 @@ def fsck(args: argparse.Namespace) -> int:
     LodestreamError
         If it is not the data folder of a server, or another process uses it; or if the folder is to be changed and the
         compiled kernels are missing.
+    UnavailableError
+        If this is not Linux.
     """
     from ..storage.folders import Folders
 
+    require_linux()
     folder: Path = args.data
     if args.repair or args.adopt or args.retry:
         require("building surfaces again")

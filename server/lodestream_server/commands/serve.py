@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from lodestream.interop.optional import require_library
 
+from ..linux import require_linux
 from ..operation.table import GROUPS, TABLE, Setting
 
 if TYPE_CHECKING:
@@ -68,18 +69,12 @@ def serve(args: argparse.Namespace) -> int:
     OptionError
         If an environment variable has an invalid value.
     UnavailableError
-        If a library of the server is not installed.
+        If this is not Linux, or a library of the server is not installed.
     LodestreamError, OSError
-        If this is not Linux, if builds would not be confined and `unconfined` is not set, if others can reach the
+        If builds would not be confined and `unconfined` is not set, if others can reach the
         address and there is no token, or if the data folder cannot be used or is not complete.
     """
-    if sys.platform != "linux":
-        from lodestream.errors import LodestreamError
-
-        raise LodestreamError(
-            "the server needs Linux, which forks and confines the processes that read uploads; here `lodestream view` "
-            "shows files, and the other commands use servers elsewhere"
-        )
+    require_linux()
     settings = chosen_settings(args)
     for library in _LIBRARIES:
         require_library(library, _EXTRA)

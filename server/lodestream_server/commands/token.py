@@ -14,6 +14,7 @@ import sys
 from typing import Any
 
 from ..access.tokens import SCOPES, TokenFile
+from ..linux import require_linux
 from ..operation.table import TABLE
 from .serve import add_option, chosen_settings
 
@@ -61,9 +62,14 @@ def register(subparsers: Any) -> None:
     end.set_defaults(run=revoke)
 
 
+def _file(args: argparse.Namespace) -> TokenFile:
+    require_linux()
+    return TokenFile(chosen_settings(args).tokens)
+
+
 def create(args: argparse.Namespace) -> int:
     """Create a token and print it."""
-    file = TokenFile(chosen_settings(args).tokens)
+    file = _file(args)
     scopes = tuple(dict.fromkeys(scope for group in args.scope or [("read",)] for scope in group))
     text, token = file.create(args.name or f"token-{secrets.token_hex(3)}", scopes, args.days)
     if args.json:
@@ -77,7 +83,7 @@ def create(args: argparse.Namespace) -> int:
 
 def list_tokens(args: argparse.Namespace) -> int:
     """Print one line for each token."""
-    file = TokenFile(chosen_settings(args).tokens)
+    file = _file(args)
     tokens = file.load()
     shown = [
         {
@@ -104,7 +110,7 @@ def list_tokens(args: argparse.Namespace) -> int:
 
 def revoke(args: argparse.Namespace) -> int:
     """Remove a token."""
-    file = TokenFile(chosen_settings(args).tokens)
+    file = _file(args)
     file.revoke(args.name)
     if args.json:
         _print({"revoked": args.name, "file": str(file.path)})

@@ -8,16 +8,15 @@ arrived, a bounded rest is read so that the client sees the answer; then the con
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import json
-import struct
-import termios
 from collections.abc import Callable
 from functools import partial
 from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from lodestream.operating_system import unacknowledged
 
 from ..operation.least_rate import LeastRate
 from ..operation.pace import Pace
@@ -403,7 +402,6 @@ def _queued(transport: asyncio.Transport) -> int:
     that reads slowly but steadily would seem to read nothing for minutes.
     """
     try:
-        handle = transport.get_extra_info("socket").fileno()
-        return int(struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))[0])
+        return unacknowledged(transport.get_extra_info("socket").fileno())
     except (OSError, ValueError):  # a socket that is closed has no number
         return 0

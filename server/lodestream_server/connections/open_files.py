@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-import resource
+
+from lodestream import operating_system
 
 from ..operation.settings import Settings
 
@@ -28,10 +29,7 @@ def raise_file_limit(settings: Settings) -> None:
     """Raise this process's limit of open files to what it may need, or as far as the system allows."""
     wanted = _MOST if settings.max_connections is None else settings.max_connections
     needed = _FILES_EACH * wanted + _others(settings)
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-    if soft != resource.RLIM_INFINITY and soft < allowed:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+    allowed = operating_system.raise_file_limit(needed)
     if allowed < needed:
         _log.warning(
             "%d connections may need %d open files and this process may open %d, enough for %d: raise the limit "
@@ -47,8 +45,8 @@ def most_connections(settings: Settings) -> int:
     """Return the largest number of connections: that of the settings, or what the limit of open files allows."""
     if settings.max_connections is not None:
         return settings.max_connections
-    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return _MOST if soft == resource.RLIM_INFINITY else _enough_for(soft, settings)
+    limit = operating_system.file_limit()
+    return _MOST if limit is None else _enough_for(limit, settings)
 
 
 def _enough_for(files: int, settings: Settings) -> int:

@@ -15,6 +15,7 @@ from weakref import WeakValueDictionary
 
 from lodestream.container.capacity import memory_limit
 from lodestream.errors import CorruptStreamError, StreamError
+from lodestream.operating_system import read_at, read_cached
 
 from ..problems import BusyError
 from . import damage
@@ -39,9 +40,6 @@ _HEADER_GROWTH = 64
 _PART_BYTES = 4 << 10
 # How often the bytes of masks are in memory while the index is read.
 _COPIES_OF_MASKS = 4
-
-# Linux reads what it has in memory and refuses the rest; elsewhere a thread reads everything.
-_NOWAIT = getattr(os, "RWF_NOWAIT", 0)
 
 
 #: Takes the bytes of memory that there are for indexes, and of these all that are taken and those of the caller, with
@@ -68,15 +66,7 @@ class OpenContainer:
 
     def read_at_once(self, place: ByteRange) -> bytes | None:
         """Read a slice if that needs no disk access; None if it would, or if the system cannot tell."""
-        if not _NOWAIT:
-            return None
-        buffer = bytearray(place.length)
-        try:
-            count = os.preadv(self.file.fileno(), [buffer], place.offset, _NOWAIT)
-        except OSError:
-            return None
-        # Fewer bytes: the rest is not in memory, or the file has been cut.
-        return bytes(buffer) if count == place.length else None
+        return read_cached(self.file.fileno(), place.length, place.offset)
 
     def window_errors(self) -> WindowErrors | None:
         """Read the bounds of the errors of windows; None if the container has none. May be called from any thread.
@@ -321,7 +311,7 @@ def _read_from(handle: int, offset: int, length: int) -> bytes:
     """Read bytes of a file, fewer if it ends; repeats reads that the system cuts short."""
     data = bytearray()
     while len(data) < length:
-        piece = os.pread(handle, length - len(data), offset + len(data))
+        piece = read_at(handle, length - len(data), offset + len(data))
         if not piece:
             break
         data += piece

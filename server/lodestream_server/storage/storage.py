@@ -6,7 +6,6 @@ folder that it finds.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import secrets
@@ -17,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError
+from lodestream.operating_system import lock
 
 from ..problems import BusyError, MissingError
 from . import markers, work
@@ -510,13 +510,11 @@ def claim(root: Path) -> int:
     """
     handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o600)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise LodestreamError(
-            f"expected a folder that no other process uses, got {root}, which another one uses"
-        ) from None
+        free = lock(handle)
     except OSError:
         os.close(handle)
         raise
+    if not free:
+        os.close(handle)
+        raise LodestreamError(f"expected a folder that no other process uses, got {root}, which another one uses")
     return handle

@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError
@@ -29,6 +30,8 @@ from ..conftest import Run
 from .test_program import COMMAND, environment
 
 LITTLE = ("--memory", "1MiB")
+
+signals = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 
 #: Seconds until a build in a process of its own must have come so far.
 
@@ -173,14 +176,15 @@ def test_errors_name_the_file_and_not_the_folder_on_the_way(
     assert names(tmp_path) == {"a.lode", "a.zarr"}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@signals
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
 @pytest.mark.usefixtures("interrupts")
 def test_a_build_that_is_cut_goes_on_in_its_folder(
-    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str], number: signal.Signals
+    run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str], name: str
 ) -> None:
-    scratch, out = tmp_path / "scratch", tmp_path / "a.lode"
+    scratch, out, number = tmp_path / "scratch", tmp_path / "a.lode", signal.Signals[name]
     code, stderr = ended(begun(file, out, scratch, "--scratch", scratch), number)
-    if number == signal.SIGKILL:
+    if name == "SIGKILL":
         assert code == -number
     else:
         assert code == 128 + number
@@ -208,6 +212,7 @@ def test_the_folder_is_named_where_the_command_goes_on(
     assert names(tmp_path) == {"scratch"}
 
 
+@signals
 def test_another_command_in_the_folder_of_a_build_that_was_cut_begins_anew(
     run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
 ) -> None:
@@ -219,6 +224,7 @@ def test_another_command_in_the_folder_of_a_build_that_was_cut_begins_anew(
     assert names(tmp_path) == {"a.npy", "a.lode", "scratch"}
 
 
+@signals
 @pytest.mark.usefixtures("interrupts")
 def test_an_interrupted_build_without_a_folder_leaves_nothing(file: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.lode"

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 from pathlib import Path
 from random import Random
@@ -15,6 +14,8 @@ from lodestream.errors import LodestreamError
 from lodestream.planning.byte_ranges import RangeSet
 from lodestream_client.stream import cache
 from lodestream_client.stream.cache import CacheFile
+
+fcntl = pytest.importorskip("fcntl")  # not on Windows
 
 SIZE = 5000
 FILE = Random(1).randbytes(SIZE)

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 __all__ = ["Refusal", "refusals"]
 
@@ -35,7 +36,9 @@ class Refusal:
 
 
 def refusals(cases: list[tuple[Path, dict[str, Any]]]) -> list[Refusal]:
-    """Read each file in a process of its own."""
+    """Read each file in a process of its own; skips the test where processes cannot be forked and limited."""
+    if sys.platform == "win32":
+        pytest.skip("Windows neither forks processes nor limits them")
     done = subprocess.run(
         [sys.executable, "-m", __name__],
         input=json.dumps([[str(path), options] for path, options in cases]),
@@ -87,6 +90,7 @@ def _load_libraries() -> None:
 
 
 def _read(path: str, options: dict[str, Any]) -> dict[str, str]:
+    import resource
     import warnings
 
     from lodestream import formats

@@ -277,10 +277,12 @@ _GRID = {
 }
 _BEGUN = f"print({json.dumps({'grids': [_GRID]})!r}, flush=True)"
 
+_SIGNALS = ["SIGKILL", "SIGTERM", "SIGXCPU", "SIGABRT", "SIGSEGV", "SIGBUS"]
 _DEATHS = {
     **{
-        number.name: (f"os.kill(os.getpid(), {int(number)})", signal.strsignal(number))
-        for number in (signal.SIGKILL, signal.SIGTERM, signal.SIGXCPU, signal.SIGABRT, signal.SIGSEGV, signal.SIGBUS)
+        name: (f"os.kill(os.getpid(), signal.{name})", signal.strsignal(getattr(signal, name)))
+        for name in _SIGNALS
+        if sys.platform != "win32"
     },
     "no memory": ("raise MemoryError", "exit code 1"),
     "no word": ("pass", "exit code 0"),
