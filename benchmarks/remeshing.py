@@ -58,7 +58,7 @@ def main() -> None:
     note(
         "One pass in a process of its own, with one thread. Seconds of the processor, without reading the file. "
         "Distances in parts of the diagonal, the larger of both ways. The peak is that of the whole process. The torus "
-        f"is generated, with bumps; the others are those of ../shared/data/meshes with {LARGE:,} vertices or more."
+        f"is generated, with bumps; the others are those of shared/data/meshes with {LARGE:,} vertices or more."
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = ["GATES", "LINKS", "LOSSLESS", "MEMORY", "NOT_MEASURED", "RESAMPLED", "RULES", "SECONDS", "SPEED"]
 
 RULES = """\
+- Names that begin with `shared` are files of a folder beside the clone, which is not part of this project.
 - A cell is one error on one surface. Errors are relative to the range of heights; for x, y, z they are distances in
   space, relative to the diagonal of the bounding box. They are measured on the decoded values, for Lodestream (*ours*)
   and for the other coders (*peers*) alike.
@@ -39,7 +40,7 @@ link is calculated, not emulated: no handshake, no round trip, no loss.
 - Decoding is processor time, the least of several runs, since the machine may be shared.
 - A ratio below 1 means that Lodestream is faster. Means are geometric, over all cells. **Bold**: a mean or a worst cell
   that misses its aim, or a cell above 1.
-- `by the script`: the mean by the rules of `../shared/bench/time_to_error.py`, which has fewer peers, no interpolation
+- `by the script`: the mean by the rules of `shared/bench/time_to_error.py`, which has fewer peers, no interpolation
   between their settings, and counts all our decoding as if it happened while bytes arrive. The aims are for the
   stricter figure before it."""
 
@@ -94,5 +95,5 @@ of Draco that reaches the error: for each number of bits, the fewest triangles (
 fast-simplification) are looked for to within 4 %, at level 10. Bytes of Lodestream are interpolated between streams.
 Errors are distances between surfaces, the larger one of both ways, against the input mesh. `for this error` are streams
 of `--rms`, `one exact stream` the layers of a stream that was made without naming an error. The meshes are those of
-`../shared/data/meshes`: two scans, and a CAD model, for which Draco is the better choice.
+`shared/data/meshes`: two scans, and a CAD model, for which Draco is the better choice.
 """

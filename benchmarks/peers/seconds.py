@@ -24,7 +24,7 @@ WORST = {1e8: 1.5}
 #: At most this part of the cells may have an integer or float coder that is both smaller and faster.
 BEATEN = 1 / 50
 
-#: The coders that ``../shared/bench/time_to_error.py`` compares with, lossy and lossless.
+#: The coders that ``shared/bench/time_to_error.py`` compares with, lossy and lossless.
 SCRIPT = (
     ("SPERR", "SZ3", "LERC", "JPEG 2000"),
     ("LERC", "pcodec", "JPEG XL, efforts", "JPEG-LS", "HTJ2K", "JPEG 2000"),
@@ -37,7 +37,7 @@ Choice = tuple[float, float]
 class Moment:
     """One error on one surface over one link: ours, and the best peer.
 
-    ``simple`` is the ratio as ``../shared/bench/time_to_error.py`` counts it, with its peers; NaN without any.
+    ``simple`` is the ratio as ``shared/bench/time_to_error.py`` counts it, with its peers; NaN without any.
     """
 
     surface: str
@@ -76,7 +76,7 @@ def arrival(ends: Sequence[int], feeds: Sequence[float], picture: float, link: f
 
 
 def overlapped(ends: Sequence[int], feeds: Sequence[float], picture: float, link: float) -> float:
-    """The same where decoding and the network overlap wholly, as in ``../shared/bench/time_to_error.py``."""
+    """The same where decoding and the network overlap wholly, as in ``shared/bench/time_to_error.py``."""
     return max(8 * ends[-1] / link, sum(feeds) + picture)
 
 

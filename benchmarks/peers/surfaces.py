@@ -142,17 +142,17 @@ def _of_design(skipped: list[str]) -> Iterator[_Made]:
     groups = {"smooth": "smooth", "knot": "xyz"}
     arrays = load()
     if not arrays:
-        skipped.append("the arrays of ../shared/bench/surfaces.py: there is no such file")
+        skipped.append("the arrays of shared/bench/surfaces.py: there is no such file")
     for array in arrays:
         group = groups.get(array.name, "rough terrain")
-        yield array.name, group, "../shared/bench/surfaces.py", (False, False), array.points
+        yield array.name, group, "shared/bench/surfaces.py", (False, False), array.points
 
 
 def _of_files(skipped: list[str]) -> Iterator[_Made]:
     import lodestream
 
     if not DATA.is_dir():
-        skipped.append("../shared/data: there is no such folder")
+        skipped.append("shared/data: there is no such folder")
         return
     left: dict[str, list[str]] = defaultdict(list)
     for path in sorted(DATA.iterdir()):
@@ -173,7 +173,7 @@ def _of_files(skipped: list[str]) -> Iterator[_Made]:
         if points.ndim == 3 and points.shape[2] != 3:
             left["neither heights nor x, y, z"].append(path.name)
             continue
-        yield path.name, _group(points), f"../shared/data/{path.name}", surface.closed, points
+        yield path.name, _group(points), f"shared/data/{path.name}", surface.closed, points
     skipped += [f"{why}: {', '.join(names)}" for why, names in left.items()]
 
 
