@@ -153,8 +153,8 @@ def upload(
     wait : bool
         Whether to wait until the surface is ready to be streamed.
     progress : callable or None
-        Called as ``progress(stage, fraction)`` with the stages ``remeshing`` and ``encoding`` (of what is encoded
-        here), ``sending`` and ``building``.
+        Called as ``progress(stage, fraction)`` with the stages ``remeshing`` and ``encoding`` (if the file
+        is encoded here), ``sending`` and ``building``.
     token : str or None
         Token, if the server needs one.
     attribute_precision : mapping of str to Tolerance, float or str, or None

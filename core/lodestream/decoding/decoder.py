@@ -49,9 +49,8 @@ class Decoder:
     ----------
     selection : Selection or Target, optional
         A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
-        bounds before it is complete, see `View.bound`. Of a target its region, its attributes and its level count:
-        where to stop, and in which order slices come, is for whoever feeds them to say
-        (`lodestream.planning.planner.plan`).
+        bounds before it is complete, see `View.bound`. Of a target its region, its attributes and its level count.
+        The caller decides in which order slices come and where they end (`lodestream.planning.planner.plan`).
     max_vertices : int or None
         Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
         as fits this process's memory.
