@@ -2,6 +2,8 @@
  * "From coefficients to points", says what a receiver takes for bits that it does not know).
  */
 
+#include <stdbool.h>
+
 #include "band_fields.h"
 #include "copying.h"
 #include "lodestream.h"
@@ -15,23 +17,61 @@ struct sums {
     double unknown[2 * PLANES + 2]; /* of magnitudes, by the pass in which they are found */
 };
 
+static inline int64_t magnitude(int32_t value) {
+    return value < 0 ? -(int64_t)value : value;
+}
+
 static int64_t error_below(int64_t value, int plane) {
     return (value & ((INT64_C(1) << plane) - 1)) - ((INT64_C(7) << plane) >> 4);
 }
 
-static void add_coefficient(int64_t value, int early, int most, struct sums *sums) {
+/* The plane of the highest bit of a magnitude that is not 0, at most `most`. */
+static inline int plane_of(int64_t value, int most) {
     int plane = 63 - __builtin_clzll((uint64_t)value);
-    plane = plane < most ? plane : most;
+    return plane < most ? plane : most;
+}
+
+/* Add so many coefficients of one magnitude, all found in a plane's first pass or all in its second. */
+static void add_coefficients(int64_t value, int first, double times, int most, struct sums *sums) {
+    int plane = plane_of(value, most);
     for (int known = 1; known <= plane; known++) {
         double error = (double)error_below(value, known);
-        sums->refined[known] += error * error;
+        sums->refined[known] += times * (error * error);
     }
-    int first = early == plane + 1;
     if (first) {
         double error = (double)error_below(value, plane);
-        sums->found[plane] += error * error;
+        sums->found[plane] += times * (error * error);
     }
-    sums->unknown[2 * plane + first] += (double)value * (double)value;
+    sums->unknown[2 * plane + first] += times * ((double)value * (double)value);
+}
+
+/* Add all coefficients of a band. Small ones are counted first, where no sum can leave the whole numbers of double:
+ * then the order does not matter. */
+static void add_band(const int32_t *truth, const uint8_t *early, int64_t rows, int64_t columns, int64_t stride,
+                     int most, struct sums *sums) {
+    enum { SMALL = 1024 };
+    uint32_t counts[SMALL][2];
+    uint64_t seen = 0;
+    for (int64_t i = 0; i < rows; i++)
+        for (int64_t j = 0; j < columns; j++)
+            seen |= (uint64_t)magnitude(truth[i * stride + j]);
+    uint64_t most_exact = (UINT64_C(1) << 53) / (uint64_t)(rows * columns + 1);
+    bool exact = seen < UINT64_C(1) << 26 && seen * seen < most_exact;
+    int64_t small = !exact ? 0 : seen < SMALL ? (int64_t)seen + 1 : SMALL;
+    memset(counts, 0, (size_t)small * sizeof *counts);
+    for (int64_t i = 0; i < rows; i++)
+        for (int64_t j = 0; j < columns; j++) {
+            int64_t value = magnitude(truth[i * stride + j]);
+            int first = early[i * stride + j] == plane_of(value | !value, most) + 1;
+            if (value < small)
+                counts[value][first]++;
+            else if (value)
+                add_coefficients(value, first, 1.0, most, sums);
+        }
+    for (int64_t value = 1; value < small; value++)
+        for (int first = 0; first < 2; first++)
+            if (counts[value][first])
+                add_coefficients(value, first, counts[value][first], most, sums);
 }
 
 int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, const double *weights, int64_t weights_count,
@@ -51,15 +91,7 @@ int64_t lode_pass_gains(const int64_t *bands, int64_t bands_count, const double 
             return LODE_REFUSED;
         struct sums sums;
         memset(&sums, 0, sizeof sums);
-        for (int64_t i = 0; i < rows; i++) {
-            const int32_t *row = truth + offset + i * stride;
-            const uint8_t *marks = early + offset + i * stride;
-            for (int64_t j = 0; j < columns; j++) {
-                int64_t value = row[j] < 0 ? -(int64_t)row[j] : row[j];
-                if (value)
-                    add_coefficient(value, marks[j], (int)(passes + 1) >> 1, &sums);
-            }
-        }
+        add_band(truth + offset, early + offset, rows, columns, stride, (int)(passes + 1) >> 1, &sums);
         double unknown = 0.0;
         for (int64_t remaining = 1; remaining <= passes; remaining++) {
             unknown += sums.unknown[remaining - 1];
