@@ -130,7 +130,7 @@ LODE_INLINE struct columns code_flags(bool reads, bool first_pass, struct unit *
         columns.possible |= *flags ? own : 0;
     }
     if (any)
-        adapt(&unit->contexts, CLASS_FLAGS, CLASS_CONTEXTS);
+        adapt(&unit->contexts, CLASS_FLAGS, CLASS_CONTEXTS, 1);
     columns.possible &= columns_of(stripe);
     return columns;
 }
@@ -171,6 +171,13 @@ static const uint8_t SIGN_CASES[2][8][8] = {
     {TURNED_ROW_OF(0), TURNED_ROW_OF(1), TURNED_ROW_OF(2), {0}, {0}, {0}, TURNED_ROW_OF(-2), TURNED_ROW_OF(-1)},
 };
 
+/* Which of the contexts of signs are those of a band, the first and every third one. */
+enum { SIGN_KINDS = 3 };
+
+LODE_INLINE int sign_kind(const struct band *band) {
+    return band->kind > 1 ? band->kind - 1 : 0;
+}
+
 /* Code the sign at a place of a stripe, and mark the coefficient. Contexts are those of the band's kind. */
 LODE_INLINE void code_class_sign(bool reads, int8_t *sign, int64_t stride, const uint8_t cases[8][8],
                                  const uint16_t *coded, uint16_t *counts, uint32_t *state, const uint8_t **bytes,
@@ -189,7 +196,7 @@ LODE_INLINE void code_class_sign(bool reads, int8_t *sign, int64_t stride, const
 /* Code the signs of coefficients found in a stripe, those at even or at odd places. */
 LODE_INLINE void code_signs_in_turn(bool reads, struct unit *unit, const struct band *band, int64_t first,
                                     const uint16_t *places, int many, uint8_t mark) {
-    int base = CLASS_SIGNS + (band->kind > 1 ? band->kind - 1 : 0);
+    int base = CLASS_SIGNS + sign_kind(band);
     const uint16_t *coded = unit->contexts.coded + base;
     uint16_t *counts = unit->contexts.counts[0] + 2 * base, *more = unit->contexts.counts[1] + 2 * base;
     const uint8_t (*cases)[8] = SIGN_CASES[band->kind == 2];
@@ -278,7 +285,12 @@ LODE_INLINE void code_bits(bool reads, bool first_pass, struct unit *unit, const
     if (many == 0)
         return;
     code_decisions(reads, unit, places, many, map->context[0], bits);
-    adapt(&unit->contexts, 0, CLASS_SIGNS);
+    if (!first_pass) /* visits what has no neighbour, and what is refined; others only in fresh blocks */
+        adapt(&unit->contexts, 0, DISTANT, 1);
+    if (first_pass || columns.fresh)
+        adapt(&unit->contexts, DISTANT, CLASS_REFINEMENT, 1);
+    if (!first_pass)
+        adapt(&unit->contexts, CLASS_REFINEMENT, CLASS_SIGNS, 1);
     bool kept = kept_bit(number) != 0;
     for (int i = 0; i < stripe->rows; i++) {
         uint64_t ones = 0;
@@ -304,7 +316,7 @@ LODE_INLINE void code_bits(bool reads, bool first_pass, struct unit *unit, const
     uint8_t mark = (uint8_t)(plane + 1 + (first_pass ? 0 : FOUND_SECOND));
     code_signs(reads, unit, band, stripe->first, found[0], counts[0], mark);
     code_signs(reads, unit, band, stripe->first, found[1], counts[1], mark);
-    adapt(&unit->contexts, CLASS_SIGNS, CLASS_FLAGS);
+    adapt(&unit->contexts, CLASS_SIGNS + sign_kind(band), CLASS_FLAGS, SIGN_KINDS);
 }
 
 /* Code a stripe, of which the number in the pass is given, without the raw bits. */

@@ -28,21 +28,20 @@ static inline void set_coded(struct contexts *contexts, int number) {
     contexts->coded[number] = (uint16_t)(coded ? coded : 1);
 }
 
-/* Move probabilities, from number `first` to the one before `last`, towards the share of 1s among the decisions that
- * were counted, each of which weighs as much as one before. Without a branch: where there were none, nothing changes.
- */
-static inline void adapt(struct contexts *contexts, int first, int last) {
-    const uint16_t *even = contexts->counts[0], *odd = contexts->counts[1];
-    for (int k = first; k < last; k++) {
+/* Move probabilities, from number `first` to the one before `last` by steps, towards the share of 1s among the
+ * decisions that were counted, each of which weighs as much as one before. Without a branch: where there were none,
+ * nothing changes. */
+LODE_INLINE void adapt(struct contexts *contexts, int first, int last, int step) {
+    uint16_t *even = contexts->counts[0], *odd = contexts->counts[1];
+    for (int k = first; k < last; k += step) {
         int32_t ones = even[2 * k + 1] + odd[2 * k + 1], decisions = even[2 * k] + odd[2 * k] + ones;
         int32_t probability = contexts->probability[k], adapted = contexts->adapted[k] + decisions;
         int32_t away = ones * (1 << 16) - decisions * probability;
         contexts->probability[k] = (uint16_t)(probability + (int32_t)(((int64_t)away * ADAPTATION[adapted]) >> 16));
         contexts->adapted[k] = (uint8_t)(adapted < MOST_COUNT ? adapted : MOST_COUNT);
         set_coded(contexts, k);
+        even[2 * k] = even[2 * k + 1] = odd[2 * k] = odd[2 * k + 1] = 0;
     }
-    for (int k = 0; k < 2; k++)
-        memset(contexts->counts[k] + 2 * first, 0, (size_t)(last - first) * 2 * sizeof(uint16_t));
 }
 
 /* Read a bit; `at` moves by a word where the state takes one, which is seldom. */
