@@ -8,18 +8,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lodestream.decoding.decoder import decode
-from lodestream.encoding import build, transform_phases
+from lodestream.container.model import Header
+from lodestream.decoding.decoder import Decoder, decode
+from lodestream.encoding import build, phases, transform_phases
 from lodestream.encoding.build import Build
+from lodestream.encoding.encode import encode
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.phases import Phases
 from lodestream.encoding.prepared import prepare
 from lodestream.quality import Quality
 from lodestream.scratch import FolderScratch
 from lodestream.surface import Surface
+from lodestream.transform.predictors import default_predictors
 
 from .grid_surfaces import SURFACES, heights
 from .test_any_pieces import built
+
+
+def _header(container: bytes) -> Header:
+    decoder = Decoder()
+    decoder.feed(container)
+    header = decoder.header
+    assert header is not None
+    return header
 
 
 def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,6 +55,29 @@ def test_a_late_task_of_fitted_predictors_does_no_harm(monkeypatch: pytest.Monke
     assert len(late) > 10
     assert container == expected
     assert np.array_equal(decode(container).points, surface.points)
+
+
+def test_predictors_give_way_where_their_coefficients_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    surface = SURFACES["integers"][0]
+    fitted = encode(surface)
+    monkeypatch.setattr(transform_phases, "COEFFICIENT_BITS", 0)
+    plain = encode(surface)
+    headers = [_header(container) for container in (fitted, plain)]
+    assert (headers[0].predictors != headers[1].predictors).any()
+    assert (headers[1].predictors == default_predictors(headers[1].layout)).all()
+    assert np.array_equal(decode(plain).points, surface.points)
+
+
+def test_units_are_large_where_that_is_worth_its_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    row, column = np.mgrid[0:200, 0:240]
+    steps = Surface((row // 11 * 29 + column // 7 * 13).astype(np.int16))  # alike in one plane, and not in those above
+    chosen = encode(steps)
+    sizes = []
+    for is_worth in (True, False):
+        monkeypatch.setattr(phases, "worth", lambda large, small, is_worth=is_worth: is_worth)
+        sizes.append(len(encode(steps)))
+    assert sizes[0] > 1.1 * sizes[1]
+    assert len(chosen) == sizes[1]
 
 
 def test_builds_whose_folders_are_gone_are_forgotten(tmp_path: Path) -> None:
