@@ -146,7 +146,7 @@ release-rehearsal: page ## build all that a release has into dist/, and try it i
 	@PATH="$(CURDIR)/$(BIN):$$PATH" PYTHON=$(CURDIR)/$(BIN)/python $(BIN)/python .ci/rehearse.py dist
 
 image-check: ## run every step of docker/Dockerfile in an empty Debian root, and stream from its server; as root, with debootstrap
-	@$(PYTHON) .ci/image.py build/image
+	@$(PYTHON) .ci/image.py build
 
 clean: ## remove the environment and everything else that can be made again
 	rm -rf $(VENV) $(PEERS) build dist core/lodestream/native $(PAGE) $(WEB)/node_modules $(WEB)/dist $(WEB)/src/kernels/module.ts .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

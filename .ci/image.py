@@ -3,7 +3,8 @@
 ``python .ci/image.py FOLDER`` needs root, debootstrap and network, but no engine of containers. It reads the steps from
 the Dockerfile itself; an instruction or option that is not known here is an error. Each stage has a root of its own in
 the folder. The server starts as the user of the image, in namespaces of its own for files, processes and network, with
-a root that is read-only as in ``docker/compose.yaml``. Where this machine cannot do it, one line says so.
+a root that is read-only as in ``docker/compose.yaml``. Where this machine cannot do it, the program fails and says why
+in one line.
 
 One thing differs from the image: ``python:X-slim-SUITE`` is Debian's SUITE with a Python compiled into ``/usr/local``.
 Here it is the same SUITE with Debian's own Python, as a virtual environment in ``/usr/local``. Both versions are
@@ -329,8 +330,8 @@ def lacking() -> str:
 def main(folder: Path) -> None:
     """Follow the Dockerfile, try the server, and remove the roots."""
     if reason := lacking():
-        say(f"The steps of {DOCKERFILE.relative_to(ROOT)} cannot be run on this machine: {reason}")
-        return
+        sys.exit(f"The steps of {DOCKERFILE.relative_to(ROOT)} cannot be run on this machine: {reason}")
+    folder /= "image-roots"  # nothing else in the folder is removed
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     try:

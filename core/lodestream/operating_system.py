@@ -76,8 +76,8 @@ _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG of Linux
 _NEW_PROCESS_GROUP = 0x200  # CREATE_NEW_PROCESS_GROUP of Windows
 
 
-def open_own(path: Path, create: bool = False) -> int:
-    """Open a file of this program to read and write; return its descriptor.
+def open_own(path: Path, create: bool = False, *, write: bool = True) -> int:
+    """Open a file of this program to read and write, or to read it alone; return its descriptor.
 
     Symbolic links are not followed, pipes are not waited for, and child processes do not inherit the file.
 
@@ -86,13 +86,14 @@ def open_own(path: Path, create: bool = False) -> int:
     path : Path
     create : bool
         Create the file, for this user only, if it does not exist.
+    write : bool
 
     Raises
     ------
     OSError
         If it cannot be opened, or is a symbolic link.
     """
-    flags = os.O_RDWR | (os.O_CREAT if create else 0)
+    flags = (os.O_RDWR if write else os.O_RDONLY) | (os.O_CREAT if create else 0)
     if sys.platform == "win32":
         if path.is_symlink():
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
@@ -101,12 +102,12 @@ def open_own(path: Path, create: bool = False) -> int:
 
 
 def lock(handle: int, *, wait: bool = False) -> bool:
-    """Lock an open file against other programs until it is closed; return whether it was free, or could be waited for.
+    """Lock an open file against other programs until it is closed; return whether it was free.
 
     Raises
     ------
     OSError
-        If the file system has no locks (`NO_LOCKS`), or fails.
+        If the file system has no locks (`NO_LOCKS`), or fails; with ``wait`` also if it refuses the lock.
     """
     try:
         if sys.platform == "win32":
@@ -114,7 +115,7 @@ def lock(handle: int, *, wait: bool = False) -> bool:
         else:
             fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except OSError as error:
-        if error.errno not in (errno.EAGAIN, errno.EACCES):  # the latter is what Windows says
+        if wait or error.errno not in (errno.EAGAIN, errno.EACCES):  # the latter is what Windows says
             raise
         return False
     return True

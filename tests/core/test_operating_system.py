@@ -27,6 +27,13 @@ def test_a_lock_that_another_program_has_is_not_free(monkeypatch: pytest.MonkeyP
     assert not operating_system.lock(0)
 
 
+@pytest.mark.parametrize("number", [errno.EAGAIN, errno.EACCES])
+def test_a_lock_that_is_waited_for_is_taken_or_fails(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    monkeypatch.setattr(fcntl, "flock", _refusing(number))
+    with pytest.raises(OSError, match=os.strerror(number)):
+        operating_system.lock(0, wait=True)
+
+
 @pytest.mark.parametrize("number", [errno.EPERM, errno.ENOLCK, errno.EIO])
 def test_a_lock_that_fails_is_not_taken_for_one_that_another_program_has(
     monkeypatch: pytest.MonkeyPatch, number: int

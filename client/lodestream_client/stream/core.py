@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError, TruncatedStreamError
 
+from ..errors import SilenceError, UnreachableError
 from . import over_http, over_websocket
 from .effects import Ahead, Dial, Effect, Flow, Get, HangUp, Hear, Read, Send, Wait
 from .session import Session
@@ -135,7 +136,8 @@ class Core:
                     yield from over_http.receive(session)
                 return
             except LodestreamError as error:
-                session.windows.forget(session.url)
+                if not session.stopped and isinstance(error, UnreachableError | SilenceError | TruncatedStreamError):
+                    session.windows.forget(session.url)
                 if isinstance(error, RemoteError | InputError | NotFoundError):
                     error.args = (f"{error}{session.withheld}", *error.args[1:])
                 yield HangUp(abort=True)

@@ -286,7 +286,7 @@ def may_pass(error: LodestreamError) -> bool:
 def read_progress(folder: Path) -> float:
     """Return the fraction of a build that is done, 0 to 1; safe whatever the build has put into its folder."""
     try:
-        handle = open_own(folder / _PROGRESS)
+        handle = open_own(folder / _PROGRESS, write=False)
     except OSError:
         return 0.0
     try:

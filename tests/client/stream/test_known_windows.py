@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from lodestream import Surface
+from lodestream.errors import RemoteError
 from lodestream.protocol.flow_control import FIRST_WINDOW
 from lodestream.protocol.handshake import from_address
 from lodestream.protocol.messages import BASE_CREDIT, Open
@@ -119,6 +120,20 @@ def test_a_stream_begins_with_what_is_known_and_forgets_it_when_the_link_fails(a
     assert broken.session.download is not None
     assert parse(broken.session.download.opening).credit == FIRST_WINDOW  # type: ignore[union-attr]
     assert windows.first(URL, 1.0) == FIRST_WINDOW
+
+
+def test_a_server_that_refuses_says_nothing_of_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    windows = KnownWindows()
+    windows.remember(URL, 100_000, 0.0)
+    world = World(windows=windows, transport="ws")
+
+    def refused(_: object) -> None:
+        raise RemoteError("no-surface", "there is none")
+
+    monkeypatch.setattr(world, "perform", refused)
+    with pytest.raises(RemoteError):
+        world.run()
+    assert windows.first(URL, 1.0) == 100_000
 
 
 @pytest.mark.parametrize("asynchronous", [False, True])
