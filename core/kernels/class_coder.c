@@ -106,11 +106,14 @@ static bool read_pass(struct unit *unit, const int64_t *bands, int64_t count, in
     if (at->band == 0 && at->stripe == 0)
         begin_pass(unit, number);
     int64_t rounds = first_pass ? count : 2 * count;
+    int64_t before = stripes_before(bands, at->band < count ? at->band : at->band - count);
     for (; at->band < rounds; at->band++, at->stripe = 0) {
         bool raw = at->band >= count;
-        int64_t own = raw ? at->band - count : at->band, before = stripes_before(bands, own);
-        struct band band = band_of(bands + own * BAND_FIELDS);
-        for (int64_t stripes = stripes_in(&band); at->stripe < stripes; at->stripe++) {
+        if (at->band == count)
+            before = 0;
+        struct band band = band_of(bands + (raw ? at->band - count : at->band) * BAND_FIELDS);
+        int64_t stripes = stripes_in(&band);
+        for (; at->stripe < stripes; at->stripe++) {
             if (*budget <= 0)
                 return false;
             struct stripe stripe = stripe_of(&band, at->stripe);
@@ -122,8 +125,10 @@ static bool read_pass(struct unit *unit, const int64_t *bands, int64_t count, in
             else
                 code_stripe(true, false, unit, &band, &stripe, before + at->stripe, plane);
         }
+        before += stripes;
     }
-    unit->rans.at += at->bits > 0;
+    if (at->bits > 0 && unit->rans.at < unit->rans.end)
+        unit->rans.at++;
     at->bits = 0;
     return true;
 }
@@ -216,6 +221,7 @@ int64_t lode_class_write(struct unit *unit, const struct tiles *tiles, const int
     unit->tiles = tiles;
     unit->plane = -1;
     unit->symbols = output->symbols;
+    unit->rans = (struct rans){{0, 0}, 0, 0};
     start_contexts(tiles->model);
     load_contexts(&unit->contexts, tiles->model);
     know_all(tiles, bands, count);

@@ -46,19 +46,20 @@ LODE_INLINE void code_in_turn(bool reads, struct unit *unit, const uint16_t *pla
     uint16_t *counts = unit->contexts.counts[0], *more = unit->contexts.counts[1];
     uint32_t even = unit->rans.states[0], odd = unit->rans.states[1];
     const uint8_t *at = unit->rans.at;
-    symbol_t *symbols = unit->symbols;
+    symbol_t *symbols = reads ? 0 : unit->symbols;
     int i = 0;
     for (; i < many - 1; i += 2) {
         int one = places[i], two = places[i + 1];
-        code_decision(reads, context[one], coded, counts, &even, &at, bits + one, symbols + i);
-        code_decision(reads, context[two], coded, more, &odd, &at, bits + two, symbols + i + 1);
+        code_decision(reads, context[one], coded, counts, &even, &at, bits + one, reads ? 0 : symbols + i);
+        code_decision(reads, context[two], coded, more, &odd, &at, bits + two, reads ? 0 : symbols + i + 1);
     }
     if (i < many)
-        code_decision(reads, context[places[i]], coded, counts, &even, &at, bits + places[i], symbols + i);
+        code_decision(reads, context[places[i]], coded, counts, &even, &at, bits + places[i], reads ? 0 : symbols + i);
     unit->rans.states[0] = many & 1 ? odd : even;
     unit->rans.states[1] = many & 1 ? even : odd;
     unit->rans.at = at;
-    unit->symbols = symbols + (reads ? 0 : many);
+    if (!reads)
+        unit->symbols = symbols + many;
 }
 
 /* These loops need all registers. */
@@ -205,24 +206,25 @@ LODE_INLINE void code_signs_in_turn(bool reads, struct unit *unit, const struct 
     const int32_t *truth = reads ? 0 : unit->tiles->truth + first;
     uint32_t even = unit->rans.states[0], odd = unit->rans.states[1];
     const uint8_t *at = unit->rans.at;
-    symbol_t *symbols = unit->symbols;
+    symbol_t *symbols = reads ? 0 : unit->symbols;
     int64_t stride = band->stride, down = stride - STRIPE_COLUMNS;
     for (int i = 0; i < many; i += 2) {
         int64_t one = places[i] + places[i] / STRIPE_COLUMNS * down;
         marks[one] = mark;
         code_class_sign(reads, sign + one, stride, cases, coded, counts, &even, &at, reads ? 0 : truth[one],
-                        symbols + i);
+                        reads ? 0 : symbols + i);
         if (i + 1 == many)
             break;
         int64_t two = places[i + 1] + places[i + 1] / STRIPE_COLUMNS * down;
         marks[two] = mark;
         code_class_sign(reads, sign + two, stride, cases, coded, more, &odd, &at, reads ? 0 : truth[two],
-                        symbols + i + 1);
+                        reads ? 0 : symbols + i + 1);
     }
     unit->rans.states[0] = many & 1 ? odd : even;
     unit->rans.states[1] = many & 1 ? even : odd;
     unit->rans.at = at;
-    unit->symbols = symbols + (reads ? 0 : many);
+    if (!reads)
+        unit->symbols = symbols + many;
 }
 
 static LODE_ALONE void read_signs(struct unit *unit, const struct band *band, int64_t first, const uint16_t *places,

@@ -56,7 +56,7 @@ static void add_band(const int32_t *truth, const uint8_t *early, int64_t rows, i
         for (int64_t j = 0; j < columns; j++)
             seen |= (uint64_t)magnitude(truth[i * stride + j]);
     uint64_t most_exact = (UINT64_C(1) << 53) / (uint64_t)(rows * columns + 1);
-    bool exact = seen < UINT64_C(1) << 26 && seen * seen < most_exact;
+    bool exact = rows * columns <= UINT32_MAX && seen < UINT64_C(1) << 26 && seen * seen < most_exact;
     int64_t small = !exact ? 0 : seen < SMALL ? (int64_t)seen + 1 : SMALL;
     memset(counts, 0, (size_t)small * sizeof *counts);
     for (int64_t i = 0; i < rows; i++)

@@ -202,6 +202,21 @@ def test_a_late_task_leaves_nothing(tmp_path: Path) -> None:
     remove(tmp_path / "tasks")
 
 
+def test_a_container_that_is_not_finished_leaves_the_one_before_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.lode"
+    path.write_bytes(b"before")
+
+    def interrupted() -> None:
+        with replacing(path) as unfinished:
+            unfinished.write_bytes(b"half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert names(tmp_path) == {"a.lode"}
+    assert path.read_bytes() == b"before"
+
+
 def test_two_that_write_one_file_do_not_mix(tmp_path: Path) -> None:
     path = tmp_path / "a.lode"
     with replacing(path) as first, replacing(path) as second:

@@ -203,6 +203,7 @@ def test_the_calls_that_others_differ_from_are_taken() -> None:
         *((reading, {"run7": value}) for reading in (False, True) for value in (-1, 2, 2**62)),
         *((True, {f"state_{place}": -1}) for place in (1, 2, 3)),
         *((True, {"state_1": 1, f"state_{place}": value}) for place in (5, 7) for value in (-1, 2**50)),
+        (True, {"state_1": 1, "state_5": 8}),
         (True, {"state_1": 1, "state_7": 20_001}),
     ],
 )
