@@ -36,13 +36,20 @@ _CALM = 3
 
 #: The constants of the rule were fitted with these.
 TUNED = (
+    "bigtujunga.tif",
+    "SainteHelens.dem",
+    "topobathy.npz",
+    "uneven_sphere_large.fmt",
+    "capsule.obj",
     "bijou_gully_subset_5m_edit_dx_filled.asc",
     "lidar_dsm_2m.tif",
     "m6_small.fmt",
     "combxyz.bin",
     "bun000.ply",
+    "a knot of 129 x 513",
+    "a plate of 257 x 321 with a speed",
     "two waves with a temperature",
-    "fractal terrain of 601 x 601 as floats and in whole metres",
+    "fractal terrain of 401 x 401, and of 601 x 601 as floats and in whole metres",
 )
 
 _STATES = """
@@ -219,41 +226,47 @@ def _drawn(browser: Any, heard: Any, address: str) -> Any:
 def _surfaces() -> Iterator[tuple[str, ls.Surface, tuple[str, ...]]]:
     """Names, surfaces, and further views of each."""
     slope = "colours: slope"
-    yield "fractal terrain, 401 x 401", ls.Surface(fractal(401).astype(np.float32)), (slope,)
-    yield "knot, 129 x 513", ls.Surface(_knot(129, 513), (True, True)), (slope,)
-    yield "plate with a speed, 257 x 321", _plate(257, 321), ("colours: a:0:speed",)
+    yield "smoother terrain, 513 x 513", ls.Surface(fractal(513, 0.42, rounded=False).astype(np.float32)), (slope,)
+    yield "rippled torus, 129 x 385", ls.Surface(_torus(129, 385), (True, True)), (slope,)
+    yield "wing with a pressure, 193 x 257", _wing(193, 257), ("colours: a:0:pressure",)
     for name, views in (
-        ("uneven_sphere_large.fmt", ()),
-        ("topobathy.npz", ()),
-        ("capsule.obj", ()),
-        ("SainteHelens.dem", (slope,)),
-        ("bigtujunga.tif", (slope,)),
+        ("jacksboro_fault_dem.npz", (slope,)),
+        ("fuji.png", (slope,)),
+        ("mountain.obj", ()),
+        ("wout_li383_low_res_reference.nc", ()),
+        ("capture0001.pcd", ()),
+        ("bamboo_pen.obj", ()),
     ):
         path = DATA / name
-        if not path.exists():
-            continue
-        if path.suffix == ".npz":
-            yield name, ls.Surface(np.load(path)["topo"]), views
-        else:
-            yield name, ls.read(path), views
+        if path.exists():
+            yield name, ls.read(path, encoding="terrain-rgb") if name == "fuji.png" else ls.read(path), views
 
 
-def _knot(rows: int, columns: int) -> NDArray[np.float32]:
-    """Points of a tube along a trefoil, (row, column, xyz)."""
+def _torus(rows: int, columns: int) -> NDArray[np.float32]:
+    """Points of a torus with ripples on one side, (row, column, xyz)."""
     around, along = np.meshgrid(
         np.linspace(0, 2 * np.pi, rows, endpoint=False),
         np.linspace(0, 2 * np.pi, columns, endpoint=False),
         indexing="ij",
     )
-    radius = 2 + np.cos(3 * along) + 0.4 * np.cos(around)
-    height = np.sin(3 * along) + 0.4 * np.sin(around)
-    return np.stack([radius * np.cos(2 * along), radius * np.sin(2 * along), height], axis=2).astype(np.float32)
+    tube = 0.5 + 0.02 * np.exp(2 * np.cos(along) - 2) * np.sin(9 * around) * np.cos(31 * along)
+    radius = 2 + tube * np.cos(around)
+    points = np.stack([radius * np.cos(along), radius * np.sin(along), tube * np.sin(around)], axis=2)
+    return points.astype(np.float32)
 
 
-def _plate(rows: int, columns: int) -> ls.Surface:
-    """A bent plate with an attribute that has finer detail than its shape."""
-    y, x = np.mgrid[0 : 1 : rows * 1j, 0 : 1.25 : columns * 1j]
-    heights = 0.2 * np.sin(4 * x) * np.cos(3 * y)
-    speed = np.exp(-80 * ((x - 0.6) ** 2 + (y - 0.5) ** 2)) + 0.3 * np.sin(60 * x * y)
-    points = np.stack([x, y, heights], axis=2).astype(np.float32)
-    return ls.Surface(points, attributes={"speed": speed.astype(np.float32)})
+def _wing(rows: int, columns: int) -> ls.Surface:
+    """The upper side of a swept wing, with a pressure that jumps along a line of its own."""
+    span, chord = np.mgrid[0 : 1 : rows * 1j, 0 : 1 : columns * 1j]
+    x = 0.5 * span + (1 - 0.6 * span) * chord
+    z = (
+        0.12
+        * (1 - 0.6 * span)
+        * (2.97 * np.sqrt(chord) - 1.26 * chord - 3.52 * chord**2 + 2.84 * chord**3 - 1.04 * chord**4)
+    )
+    shock = 0.55 - 0.1 * span + 0.03 * np.sin(12 * span)
+    pressure = (
+        -1.1 * np.sqrt(chord) * np.exp(-2 * chord) + 0.4 * np.tanh(60 * (chord - shock)) + 0.05 * np.cos(25 * chord)
+    )
+    points = np.stack([x, 2 * span, z], axis=2).astype(np.float32)
+    return ls.Surface(points, attributes={"pressure": pressure.astype(np.float32)})

@@ -23,7 +23,7 @@ def main() -> None:
         change = picture_change(before, now)
         steps = [(0, 1, 1, 5), (1, 3, 3, 3), (3, 4, 4, 5), (1, 2, 2, 5), (4, 6, 5, 5), (2, 1, 1, 5)]
         shares = [
-            remaining_share(change, Stage(first, first, finest), Stage(last, level, finest), layers)
+            remaining_share(change, Stage(first, finest), Stage(last, finest), layers)
             for first, last, level, finest in steps
         ]
         print(

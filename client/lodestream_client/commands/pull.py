@@ -87,7 +87,7 @@ def register(subparsers: Subparsers) -> None:
         "--until-done",
         action="store_true",
         help="with --watch and --picture: stop as soon as the picture looks done, that is, when less than 1 %% of its "
-        "pixels are expected to change visibly",
+        "pixels will still change visibly, by an estimate",
     )
     parser.add_argument(
         "--resume",

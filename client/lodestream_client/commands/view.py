@@ -128,8 +128,8 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--until-done",
         action="store_true",
-        help="with --png: read only until the picture looks done, that is, until less than 1 %% of its pixels are "
-        "expected to change visibly",
+        help="with --png: read only until the picture looks done, that is, until less than 1 %% of its pixels will "
+        "still change visibly, by an estimate",
     )
     parser.add_argument(
         "--roi",

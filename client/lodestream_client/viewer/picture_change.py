@@ -20,15 +20,12 @@ if TYPE_CHECKING:
 
 __all__ = ["DONE", "Judge", "PictureChange", "Stage", "done_text", "picture_change", "remaining_share", "share_above"]
 
-#: A picture looks done if less than this share of its pixels is expected to change visibly.
-DONE = 0.01
+#: A picture looks done if less than this share of its pixels is expected to change visibly. It is below 1 %, since it is
+#: compared with an estimate.
+DONE = 0.008
 
 #: Distance of colours above which they are told apart beside each other.
 VISIBLE = 5.0
-
-# More pixels show what is missing than the last step says, as long as levels are missing that the picture can show:
-# their detail is finer than all of the step.
-_FINER = 1.5
 
 # A step that is so much smaller than what is missing changes colours by less than the 8 bits of a picture show.
 _MOST_RATIO = 50.0
@@ -131,14 +128,11 @@ class Stage:
     ----------
     layer : int
         Number of the layer that has come last.
-    level : int
-        Finest level with data.
     finest : int or None
         The level that is drawn; None: the finest of the surface.
     """
 
     layer: int
-    level: int
     finest: int | None
 
 
@@ -208,5 +202,5 @@ def remaining_share(change: PictureChange, before: Stage, now: Stage, layers: Se
     changed = slopes(before.layer, now.layer)
     if changed == 0:
         return float("nan")
-    ratio = (missing / changed) ** 0.5 * (_FINER if now.level < finest else 1.0)
+    ratio = (missing / changed) ** 0.5
     return share_above(change, VISIBLE / ratio) if ratio <= _MOST_RATIO else float("nan")

@@ -180,7 +180,7 @@ class Picture:
         finest = level
         if finest is not None and not is_height_field(shown):
             finest -= _THINNED
-        stage = Stage(view.number, view.level, finest)
+        stage = Stage(view.number, finest)
         return cls(shown, f"{title}\n{human_size(view.bytes)}, {errors}", stage)
 
     def pixels(self) -> NDArray[np.uint8]:

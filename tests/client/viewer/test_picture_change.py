@@ -64,7 +64,7 @@ def test_what_is_expected_is_a_share_or_unknown(
     before: np.ndarray, now: np.ndarray, first: int, last: int, finest: int
 ) -> None:
     change = picture_change(before, now)
-    stages = [Stage(first, min(first, 4), finest), Stage(last, min(last, 4), finest)]
+    stages = [Stage(first, finest), Stage(last, finest)]
     share = remaining_share(change, stages[0], stages[1], LAYERS)
     if last <= first:
         assert np.isnan(share)
@@ -78,19 +78,19 @@ def test_a_judge_compares_with_the_picture_before() -> None:
     grey, light = np.full((10, 10, 4), 100, np.uint8), np.full((10, 10, 4), 100, np.uint8)
     light[:3] = 140
     judge = Judge(LAYERS)
-    assert np.isnan(judge.remaining(Stage(0, 0, 4), grey))
-    assert judge.remaining(Stage(1, 1, 4), light) == pytest.approx(0.3)
-    assert judge.remaining(Stage(2, 2, 4), light) == 0
-    assert np.isnan(judge.remaining(Stage(3, 3, 4), light[:5])), "another size"
-    assert np.isnan(judge.remaining(Stage(3, 3, 4), light[:5])), "the same state"
+    assert np.isnan(judge.remaining(Stage(0, 4), grey))
+    assert judge.remaining(Stage(1, 4), light) == pytest.approx(0.3)
+    assert judge.remaining(Stage(2, 4), light) == 0
+    assert np.isnan(judge.remaining(Stage(3, 4), light[:5])), "another size"
+    assert np.isnan(judge.remaining(Stage(3, 4), light[:5])), "the same state"
 
 
 def test_nothing_is_known_of_a_picture_of_nothing_and_of_steps_too_small_to_see() -> None:
     nothing = picture_change(np.zeros((2, 2, 4), np.uint8), np.zeros((2, 2, 4), np.uint8))
-    assert np.isnan(remaining_share(nothing, Stage(0, 0, 4), Stage(1, 1, 4), LAYERS))
+    assert np.isnan(remaining_share(nothing, Stage(0, 4), Stage(1, 4), LAYERS))
     grey = np.full((2, 2, 4), 100, np.uint8)
     layers = [Mark(k, 4, 4, k, rms, rms) for k, rms in enumerate((16.0, 15.999, 0.0))]
-    assert np.isnan(remaining_share(picture_change(grey, grey), Stage(0, 4, 4), Stage(1, 4, 4), layers))
+    assert np.isnan(remaining_share(picture_change(grey, grey), Stage(0, 4), Stage(1, 4), layers))
 
 
 @pytest.mark.parametrize("kind", ["waves", "rough", "torus"])

@@ -4,8 +4,11 @@ import type { Field } from "./geometry-messages";
 import { type PictureChange, shareAbove, VISIBLE } from "./picture-change";
 import type { Moment, Price, SurfaceInfo } from "./source";
 
-/** A picture looks done where less than this share of its pixels is expected to change visibly. */
-export const DONE = 0.01;
+/**
+ * A picture looks done where less than this share of its pixels is expected to change visibly: somewhat below 1 %, since
+ * it is estimated. See docs/viewer.md for how it was chosen.
+ */
+export const DONE = 0.008;
 
 /** A stream that has stopped goes on where this share is expected to change: what is just done stays done. */
 export const AGAIN = 1.5 * DONE;
@@ -15,12 +18,6 @@ const MOST_RATIO = 50;
 
 /** Pixels that are compared at most: a hundredth of them is enough to be counted. */
 export const COMPARED = 130_000;
-
-/**
- * What is missing is shown by more pixels than the step before says, as long as levels are missing that the view can
- * show: their detail is finer than all of the step. Fitted, see docs/viewer.md.
- */
-const FINER = 1.5;
 
 /** Two moments of one view, the second drawn after the first. */
 export interface Step {
@@ -50,7 +47,6 @@ export function remainingShare(change: PictureChange, step: Step, info: SurfaceI
   }
   if (change.drawn === 0) return Number.NaN; // nothing of the surface is in the view
   if (ratio === 0) return 0;
-  if (step.now.level < step.finest) ratio *= FINER;
   return ratio <= MOST_RATIO ? shareAbove(change, VISIBLE / ratio) : Number.NaN;
 }
 

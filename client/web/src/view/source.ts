@@ -188,7 +188,7 @@ export interface Source {
    *
    * @param moment - Number of a moment; null: the latest when it comes to computing them, so that whoever draws more
    * slowly than moments come misses those between.
-   * @param level - 0 to `levels`.
+   * @param level - 0 to `levels`; also one finer than the data of the moment, as if what has not come were 0.
    * @param window - Of the only block, a part that the grid shows in more detail; null: none.
    * @throws Error if they cannot be computed, e.g. because the data are damaged.
    */

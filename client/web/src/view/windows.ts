@@ -18,10 +18,11 @@ export interface Drawing {
 }
 
 /**
- * What to draw for a view.
+ * What to draw for a view: up to a level finer than the data, since between the nodes that have come the surface is then
+ * smooth, where triangles would be flat. A part in more detail needs data of its own.
  *
  * @param wanted - The finest level that shows a difference in the view.
- * @param available - The finest level with data.
+ * @param data - The finest level with data.
  * @param region - What is in the view; null: most of it, or that is not known.
  * @param before - The window that is drawn now; kept while the view stays inside.
  */
@@ -29,22 +30,23 @@ export function drawingFor(
   info: SurfaceInfo,
   triangles: number,
   wanted: number,
-  available: number,
+  data: number,
   region: Region | null,
   before: DetailWindow | null,
 ): Drawing {
   const finest = finestDrawn(info, triangles);
-  const level = Math.min(wanted, available, finest);
+  const worthDrawing = Math.min(wanted, data + 1, info.levels);
+  const level = Math.min(worthDrawing, finest);
   const [block] = info.blocks;
   const plain = info.blocks.length === 1 && !info.joined && block !== undefined;
-  if (!plain || region === null || Math.min(wanted, available) <= finest) return { level, window: null };
+  if (!plain || region === null || Math.min(wanted, data) <= finest) return { level, window: null };
   const wide = region.map(([from, to], axis) => {
     const more = Math.ceil((to - from) * MARGIN);
     return [Math.max(0, from - more), Math.min(block.shape[axis as 0 | 1], to + more)];
   }) as unknown as Region;
   const points = wide.reduce((product, [from, to]) => product * (to - from), 1);
   if (points > MOST_DECODED) return { level, window: null };
-  let stride = 2 ** Math.max(0, info.levels - Math.min(wanted, available));
+  let stride = 2 ** Math.max(0, info.levels - worthDrawing);
   while (points / stride ** 2 > MOST_DRAWN) stride *= 2;
   const kept = before !== null && before.stride <= stride && isInside(region, before.region);
   let around = level;

@@ -94,7 +94,14 @@ describe("what is drawn of a large surface", () => {
 
   it("is all of it while it is seen from afar", () => {
     expect(drawingFor(info, 4e6, 9, 13, null, null)).toEqual({ level: 9, window: null });
-    expect(drawingFor(info, 4e6, 13, 8, region, null)).toEqual({ level: 8, window: null });
+    expect(drawingFor(info, 4e6, 8, 13, region, null)).toEqual({ level: 8, window: null });
+  });
+
+  it("is a level finer than the data, and a part in more detail has data of its own", () => {
+    expect(drawingFor(info, 4e6, 13, 8, region, null)).toEqual({ level: 9, window: null });
+    expect(drawingFor(info, 4e6, 13, 11, region, null)).toEqual({ level: 11, window: null });
+    expect(drawingFor(info, 4e6, 13, 12, region, null).window?.stride).toBe(1);
+    expect(drawingFor(info, 4e6, 13, 13, null, null)).toEqual({ level: 11, window: null });
   });
 
   it("is a part in detail close by, the same one while the view stays in it", () => {

@@ -266,3 +266,43 @@ it("without a picture before nothing is known of the step", async () => {
   expect(source.stopped).toBe(0);
   session.close();
 });
+
+it("what is drawn is a level finer than the data, as far as there are levels", async () => {
+  vi.stubGlobal("matchMedia", () => ({ matches: true }));
+  let events!: SourceEvents;
+  const levels: number[] = [];
+  const source = {
+    start: (given: SourceEvents) => {
+      events = given;
+    },
+    grids: (_: number | null, level: number) => {
+      levels.push(level);
+      return Promise.resolve({ moment: levels.length - 1, grids: [] });
+    },
+    close: () => {},
+  } as unknown as Source;
+  const stage = {
+    size: [100, 100],
+    eye: () => ({}),
+    show: (_patches: unknown, _fresh: boolean, _blended: boolean, done: () => void) => done(),
+  } as unknown as Stage;
+  const told = {
+    info: () => {},
+    moment: () => {},
+    progress: () => {},
+    refined: () => {},
+    drawn: () => {},
+    failed: () => {},
+    region: () => {},
+  };
+  const session = new Session(source, stage, told, 1e6);
+  events.info(INFO);
+  for (const [number, level] of [0, 3, 4, 5].entries()) {
+    const errors = { rms: 9 - number, max: 9 - number, attributes: [] };
+    const times = { bytes: number, seconds: 0, complete: false };
+    events.moment({ number, layer: number, region: null, level, ...errors, ...times });
+    await expect.poll(() => session.drawnMoment?.number).toBe(number);
+  }
+  expect(levels).toEqual([1, 4, 5, 5]);
+  session.close();
+});
