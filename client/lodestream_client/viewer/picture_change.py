@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DONE", "Judge", "PictureChange", "Stage", "done_text", "picture_change", "remaining_share", "share_above"]
 
-#: A picture looks done if less than this share of its pixels is expected to change visibly. It is below 1 %, since it is
-#: compared with an estimate.
+#: A picture looks done if less than this share of its pixels is expected to change visibly.
+#: It is below 1 %, since it is compared with an estimate.
 DONE = 0.008
 
 #: Distance of colours above which they are told apart beside each other.
