@@ -160,13 +160,13 @@ def upload(
     attribute_precision : mapping of str to Tolerance, float or str, or None
         Maximum error of attributes, by name; the others are lossless.
     filename : str or None
-        Name of the first file, whose suffix tells formats that content does not (``N37W122.hgt``); None: its own, or
-        none of an open file and of bytes.
+        Name of the first file. Its suffix decides the format if the content does not (``N37W122.hgt``). None: the
+        file's own name; an open file and bytes have none.
     nodata : float, str or None
-        A value, or "nan", that marks holes though the file does not say so, see `lodestream.read`.
+        A value, or "nan", that marks holes in addition to those that the file declares, see `lodestream.read`.
     local : bool
-        Encode files here and send a container. So are files of a format that the server does not read, with a
-        `FormatWarning`.
+        Encode all files here and send containers. Files of a format that the server does not read are always encoded
+        here, with a `FormatWarning`.
 
     Returns
     -------

@@ -92,7 +92,7 @@ class FormatError(InputError):
 
 
 class SwitchedOffError(FormatError):
-    """A file has a format that is switched off here; its contents were not looked at.
+    """A file has a format that is switched off here; its contents were not read.
 
     Examples
     --------

@@ -25,10 +25,10 @@ class Quality:
     precision : Tolerance or None
         Maximum error of the points of the complete surface.
     rms : Tolerance or None
-        The stream is made for one root mean square error instead: the complete surface has at most this error.
+        Encode for one root mean square error instead: the complete surface has at most this error.
     attributes : mapping of str to Tolerance
         Maximum errors of attributes, by name, or of single channels: a coordinate (x, y, z), a component of an
-        attribute (``wind_0``). The others come back bit for bit, but for coordinates that `precision` is for.
+        attribute (``wind_0``). The others are restored bit for bit, except coordinates to which `precision` applies.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class Quality:
         Raises
         ------
         OptionError
-            If one of them is no error of 0 or more, or both a precision and a root mean square error are given.
+            If one of them is not a number of 0 or more, or if both a precision and a root mean square error are given.
         """
         return cls(
             precision=None if precision is None else Tolerance.of(precision),
@@ -74,14 +74,15 @@ class Quality:
         Parameters
         ----------
         precisions : iterable of str
-            ``P`` for the points, ``NAME=P`` for an attribute or a channel. A name may hold an equals sign, a tolerance
-            does not.
+            ``P`` for the points, ``NAME=P`` for an attribute or a channel. A name may contain an equals sign, a
+            tolerance does not.
         rms : str or None
 
         Raises
         ------
         OptionError
-            If a text is no tolerance, one is given twice, or both a precision and a root mean square error are given.
+            If a text is not a tolerance, if one is given twice, or if both a precision and a root mean square error are
+            given.
         """
         tolerances: dict[str | None, Tolerance] = {}
         for text in precisions:

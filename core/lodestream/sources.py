@@ -20,7 +20,7 @@ _AT_ONCE = 1 << 22
 
 @runtime_checkable
 class Source(Protocol):
-    """What `encode` reads by windows: an object of shape (row, column) or (row, column, channel).
+    """An array that `encode` reads window by window, of shape (row, column) or (row, column, channel).
 
     >>> import numpy as np, lodestream
     >>> class Plane:

@@ -40,7 +40,7 @@ class Block:
         ``(rows, columns)``: ``rows`` means that axis 0 wraps around, so that row 0 follows row H - 1.
     mask : bool array of shape (H, W), optional
         True where a point is valid. The other points are holes; their values are not kept. Points with a NaN or
-        infinite coordinate are holes too; those in `kept` are restored as they were. None: only such points are holes.
+        infinite coordinate are holes too; those in `kept` are restored as they were. None: there are no other holes.
     attributes : mapping of str to arrays of shape (H, W) or (H, W, K), optional
         Further values at the points, of one of the types above. NaN and infinities are values. Masked values of a
         masked array become NaN.
@@ -267,8 +267,8 @@ class Surface:
         Heights become a variable over y and x, with coordinates from the geotransform; it is named as the metadata's
         ``variable``, or z. x, y, z become z over row and column with coordinates x and y. Attributes are variables.
         Holes are NaN: integers with holes become floats, whose encoding makes them integers again in a file. CRS and
-        geotransform stand in ``spatial_ref``, as rioxarray has them. Closed axes and other metadata are kept in the
-        attribute ``lodestream``, for `from_xarray`.
+        geotransform are in ``spatial_ref``, as in rioxarray. Closed axes and other metadata are kept in the attribute
+        ``lodestream``, for `from_xarray`.
 
         Raises
         ------
@@ -295,18 +295,18 @@ class Surface:
         Parameters
         ----------
         data : Dataset, DataArray or DataTree
-            What has chunks of dask is computed.
+            Chunks of Dask are computed.
         attributes : str or iterable of str, optional
-            Variables that become attributes, as a list or a text with commas; None: all over the same two dimensions,
-            which reading a file names in a note. Flags (bool) become 0 and 1 of type uint8. What is no number is left
-            out, with a `FormatWarning`.
+            Variables that become attributes, as a list or a text with commas; None: all over the same two dimensions
+            (for a file, `read` only names these in a note). Flags (bool) become 0 and 1 of type uint8. Variables that
+            are not numbers are left out, with a `FormatWarning`.
         closed : (bool, bool), optional
             Which axes are closed; None: as `to_xarray` left it, or those whose longitudes go around the Earth.
         nodata : int, float or str, optional
-            A value that marks holes though the Dataset does not say so, as in `lodestream.read`.
+            A value that marks holes in addition to those that the Dataset declares, as in `lodestream.read`.
         **options
-            Those of reading a NetCDF, which decide alike (docs/formats.md): ``variable``, ``x``, ``y``, ``time`` and
-            ``at``. A Dataset that was opened from a file, decoded or not, gives the surface that its file gives.
+            The options of NetCDF, with the same meaning (docs/formats.md): ``variable``, ``x``, ``y``, ``time`` and
+            ``at``. A Dataset that was opened from a file, decoded or not, becomes the same surface as its file.
 
         Raises
         ------
@@ -322,10 +322,10 @@ class Surface:
     def to_pyvista(self) -> pyvista.StructuredGrid | pyvista.MultiBlock:
         """Convert into pyvista (extra ``pyvista``): a StructuredGrid, or a MultiBlock of them for several blocks.
 
-        Heights stand over their coordinates. Holes are hidden points, and cells without a face or with a hole for a
-        corner are hidden cells. A closed axis repeats its first points at the end; longitudes, and the places of
-        heights, go on there and do not jump. Name, unit and CRS are field data, and so is ``lodestream``, JSON of type,
-        closed axes and metadata for `from_pyvista`.
+        Heights become z over their coordinates. Holes are hidden points, and cells without a face or with a hole at a
+        corner are hidden cells. A closed axis repeats its first points at the end; longitudes and the positions of
+        heights continue there and do not jump. Name, unit and CRS are field data. So is ``lodestream``, a JSON text
+        with type, closed axes and metadata for `from_pyvista`.
 
         Raises
         ------
@@ -346,9 +346,10 @@ class Surface:
         ----------
         data : StructuredGrid, RectilinearGrid, ImageData, MultiBlock or PolyData
             A grid has one point along at least one of its three directions: a volume is not a surface. Hidden points
-            and cells are holes. A last row or column that repeats the first makes a closed axis. Of polygons see
-            `from_trimesh`. Data of cells are left out, with a `FormatWarning`. A grid of `to_pyvista` whose places,
-            holes and cells are as they were becomes heights with their place again, of their type if it holds them.
+            and cells are holes. A last row or column that repeats the first makes a closed axis. For polygons see
+            `from_trimesh`. Data of cells are left out, with a `FormatWarning`. A grid made by `to_pyvista` becomes
+            heights with their position again, if its points, holes and cells are unchanged; they have the original type
+            if it can hold them.
         **remeshing
             For polygons that are no grid, see `from_mesh`.
 
@@ -366,8 +367,9 @@ class Surface:
     def to_trimesh(self) -> trimesh.Trimesh:
         """Convert into trimesh (extra ``trimesh``): the welded mesh, quads cut into two triangles each.
 
-        Blocks are joined where they touch, closed axes by faces, holes left open. Colours, normals and places in a
-        texture go where trimesh has them, other attributes to ``vertex_attributes``, metadata to ``metadata``.
+        Blocks are joined where they touch, closed axes are joined by faces, and holes are left open. Colours, normals
+        and texture coordinates go to their places in trimesh, other attributes to ``vertex_attributes``, metadata to
+        ``metadata``.
 
         Raises
         ------
@@ -394,9 +396,9 @@ class Surface:
         Returns
         -------
         Surface
-            x, y, z in float64, which is what trimesh holds: heights and other types do not come back from `to_trimesh`.
-            The faces are the same, the grids those that are found in them: blocks that touch may come as one, a grid
-            with many holes as several, and rows as columns. Points without a face are left out, with a
+            x, y, z in float64, the type of trimesh: heights and other types are not restored from `to_trimesh`. The
+            faces are the same, but the grids are found again from the faces: blocks that touch may become one, a grid
+            with many holes several, and rows may become columns. Points without a face are left out, with a
             `FormatWarning`.
 
         Raises
@@ -404,7 +406,7 @@ class Surface:
         UnavailableError
             If trimesh is not installed.
         FormatError
-            If the mesh is no structured surface; the message names the first faces that are in the way.
+            If the mesh is not a structured surface; the message names the first faces that prevent it.
         """
         from .interop.trimesh_meshes import from_trimesh
 
@@ -423,28 +425,28 @@ class Surface:
         ----------
         vertices : array of shape (V, 2) or (V, 3)
         faces : int array of shape (F, 3) or (F, 4), or sequence of sequences of 3 or 4 int (with remesh of 3 or more)
-            0-based vertices of each face, going round it.
+            0-based vertices of each face, in order around it.
         attributes : mapping of str to arrays of shape (V,) or (V, K), optional
         **remeshing
             ``remesh=True``: a mesh that is no grid is resampled into watertight blocks of (2^k + 1)^2 points (extra
             ``remesh``; docs/remeshing.md). ``blocks``: about how many; 100 by default, fewer for small meshes.
-            ``remesh_error``: root mean square distance to the mesh that is aimed at, in parts of the diagonal of the
-            bounding box; 2e-4 by default. ``remesh_normals=True``: the attribute "normal" is interpolated; otherwise
-            it is left out.
+            ``remesh_error``: desired root mean square distance to the mesh, relative to the diagonal of the bounding
+            box; 2e-4 by default. ``remesh_normals=True``: the attribute "normal" is interpolated; otherwise it is left
+            out.
 
         Returns
         -------
         Surface
-            Of a mesh that was resampled the metadata have ``remesh``: a map with the measured distances.
+            If the mesh was resampled, the metadata have `remesh`: a map with the measured distances.
 
         Raises
         ------
         InputError
             If the arrays have other shapes, or faces name vertices that do not exist.
         FormatError
-            If the mesh is no structured surface, and shall not be resampled or is no surface at all.
+            If the mesh is not a structured surface and `remesh` is not given, or if it is not a surface at all.
         UnavailableError
-            If it shall be resampled, and the extra ``remesh`` is not installed.
+            If `remesh` is given, and the extra `remesh` is not installed.
 
         Examples
         --------

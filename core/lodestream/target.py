@@ -139,11 +139,11 @@ class Target:
     level : int or None
         Levels up to this one and nothing finer; cannot be combined with the other limits.
     until_rms, until_max : Tolerance, number, text, mapping or None
-        Stop at the first layer with an error of at most this; a number or a text is taken by `Tolerance.of`. Of a
-        region, the error inside counts, as far as its bound tells (`View.bound`). A mapping has errors of single
-        channels: of coordinates (x, y, z), of attributes, and of their components (``wind_0``), in their units. Then
-        the stream stops where all of them are met. The errors of an attribute with components are those of the
-        distance; its maximum is known to be at most the root of the sum of the squares.
+        Stop at the first layer with an error of at most this; a number or a text is taken by `Tolerance.of`. With a
+        region, the bound of the error inside counts (`View.bound`). A mapping has errors of single channels: of
+        coordinates (x, y, z), of attributes, and of their components (``wind_0``), in their units. Then the stream
+        stops where all of them are met. The error of an attribute with components is that of the distance; for its
+        maximum the root of the sum of the squares of the components' maxima is used, which is an upper bound.
     max_bytes : int or None
         Stop at the last layer that ends within so many bytes of the container.
     seconds : float or None
@@ -153,12 +153,12 @@ class Target:
         the end of a level.
     region : ((int, int), (int, int)) or None
         Only this window: rows and columns, half-open, in full-resolution indices. Along a closed axis it may go on
-        across the seam: of 360 columns, 350:370 are the last ten and the first ten. With a level, the window is that of
-        the level: its points that stand in the region, which is the same place at every level.
+        across the seam: of 360 columns, 350:370 are the last ten and the first ten. With a level, the window consists
+        of the points of the level that lie in the region. A region is the same place at every level.
     attributes : tuple of str or None
         Names of the attributes to include, also given as a list or a text with commas; None: all.
     first : ((int, int), (int, int)) or None
-        The data that this region needs come first, then the rest; rows and columns as in `region`.
+        The data of this region come first, then the rest; rows and columns as in `region`.
 
     Raises
     ------

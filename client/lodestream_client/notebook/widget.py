@@ -27,10 +27,11 @@ _THEMES = ("auto", "light", "dark")
 
 
 class Widget(AnyWidget):
-    """A surface in a notebook, which comes into focus while its bytes arrive: the viewer of ``docs/viewer.md``.
+    """A surface in a notebook, shown by the viewer of `docs/viewer.md`; it is refined while its bytes arrive.
 
-    The bytes come from the kernel over the widget's comm; no port is opened, and a token stays in the kernel. Shown in
-    several places, each receives them by itself, and the look of all is one. ``close()`` ends all of them.
+    The bytes come from the kernel over the widget's comm; no port is opened, and a token stays in the kernel. If the
+    widget is shown in several places, each receives the bytes separately, and all have the same appearance. ``close()``
+    ends all of them.
 
     Parameters
     ----------
@@ -43,9 +44,9 @@ class Widget(AnyWidget):
     token : str, optional
         Of the server of a URL.
     quality : Quality, optional
-        How closely what is encoded here is kept; None: exactly.
+        Precision of a surface that is encoded here; None: exact.
     name : str, optional
-        What the surface is called; None: its own name.
+        Name of the surface; None: its own name.
     **look
         Values of the attributes below that can be set.
 
@@ -56,14 +57,14 @@ class Widget(AnyWidget):
     theme : "auto", "light" or "dark"
         "auto" follows the notebook.
     field : str
-        What the surface is coloured by: "height", "slope", "change", "none", or an attribute by its name; of a vector
-        that is its length, and "name[0]" a component.
+        Field that the colours show: "height", "slope", "change", "none", or the name of an attribute. For a vector the
+        name means its length, and "name[0]" a component.
     colour_map : str or None
-        "viridis", "cividis", "terrain", "red-blue" or "grey"; None: what suits the field.
+        "viridis", "cividis", "terrain", "red-blue" or "grey"; None: one that suits the field.
     value_range : (float, float) or None
-        Where colours begin and end; None: the range of the values.
+        Values of the first and the last colour; None: the range of the values.
     exaggeration : float or None
-        What heights are multiplied by, 0.1 to 100; None: a factor that follows the surface.
+        Factor by which heights are multiplied, 0.1 to 100; None: a factor that is chosen from the surface.
     lines : bool
         Whether the quads of the level that is drawn are shown.
     stop_when_done : bool
@@ -71,29 +72,30 @@ class Widget(AnyWidget):
     target : Target or None
         As above; another one can be set at any time.
     state : str
-        What the transmission does: "connecting", "receiving", "resuming", "stopped", "target", "complete" or "failed".
-        This and the following are told by the page, about the place where it was shown last.
+        State of the transmission: "connecting", "receiving", "resuming", "stopped", "target", "complete" or "failed".
+        This attribute and the following ones come from the page, and describe the place where the widget was shown
+        last.
     detail : str
-        A sentence where there is something to say, such as why it failed.
+        Further information in a sentence, such as the reason of a failure; may be empty.
     bytes_received : int
-        Bytes of the surface that have come.
+        Bytes of the surface that have arrived.
     level : int or None
-        Finest level of what is drawn.
+        Finest level of the surface as drawn.
     rms, max_error : float or None
-        Errors of what is drawn, in the surface's unit; None where they are not known.
+        Errors of the surface as drawn, in the surface's unit; None if they are not known.
     region : ((int, int), (int, int)) or None
         Rows and columns, half-open, in the view, when it shows less than half of the surface.
     selected : dict or None
         The node under the pointer: block, row, column, point, attributes (lists by name), rms, max_error.
     fields : list of str
-        What `field` may be.
+        Values that `field` can have.
     bytes_sent : int
-        Bytes of the container that have gone over the comm, to all places.
+        Bytes of the container sent over the comm, to all places.
 
     Raises
     ------
     InputError
-        If the source is something else, an option does not go with it, or the surface has no such field or level.
+        If the source has another type, if an option does not fit it, or if the surface has no such field or level.
     OSError
         If there is no such file.
     StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError

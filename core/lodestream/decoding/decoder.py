@@ -37,26 +37,26 @@ Bytes = bytes  # the name within classes that have a property of this name
 
 
 class Decoder:
-    """Decodes a container as its bytes come, and gives a `View` for each state whose errors are known.
+    """Decodes a container while its bytes arrive, and returns a `View` for each state whose errors are known.
 
-    `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damage raises
-    `CorruptStreamError` with its offset; everything before it stays usable. Segments are decoded when somebody asks for
-    values. What a residual holds is known only when it is applied, so the complete state is verified when it is first
-    asked for: by `view`, `complete`, `finish`, errors or values. If it is damaged this raises, and from then on the
-    state before it is the last one.
+    `feed` takes the bytes in file order; `feed_at` takes slices in the order of a `plan`. Damaged bytes raise
+    `CorruptStreamError` with their offset; the data before them stay usable. Segments are decoded when values are
+    requested. Damage in a residual is found only when the residual is applied, so the complete state is verified when
+    it is first requested: by `view`, `complete`, `finish`, errors or values. If it is damaged, this raises an error,
+    and from then on the state before it is the last one.
 
     Parameters
     ----------
     selection : Selection or Target, optional
         A window of the surface, or some of its attributes. Views then contain nothing else. The errors of a window are
-        bounds before it is complete, see `View.bound`. Of a target its region, its attributes and its level count.
-        The caller decides in which order slices come and where they end (`lodestream.planning.planner.plan`).
+        bounds until it is complete, see `View.bound`. If it is a target, only its region, attributes and level are
+        used. The caller decides in which order slices come and where they end (`lodestream.planning.planner.plan`).
     max_vertices : int or None
         Limit on the memory of the surface, see `capacity.Capacity`; checked before anything is decoded. None: as much
         as fits this process's memory.
     level : int or None
-        The finest level that the caller will use; None: that of the selection, else full resolution. Only memory for
-        this level is then counted, and a window is that of this level.
+        The finest level that the caller will use; None: that of the selection, or full resolution. Only memory for this
+        level is then counted, and a window consists of points of this level.
 
     Raises
     ------
@@ -159,11 +159,11 @@ class Decoder:
         return self.layers[before:]
 
     def focus(self, region: Region | None) -> None:
-        """Announce another order of the bytes: first what a region needs; with None, the plan's own order.
+        """Announce another order of the bytes: the data of a region first; with None, the plan's own order.
 
-        The index must have come before, or be among these bytes. A view is given whenever a layer or level is complete
-        in the region, and when it is complete everywhere. Its errors are NaN if more data have arrived than belong to
-        the layer.
+        The index must have arrived before, or be among these bytes. A view is returned when a layer or level is
+        complete in the region, and again when it is complete everywhere. Its errors are NaN if more data have arrived
+        than belong to the layer.
 
         Raises
         ------
@@ -181,7 +181,7 @@ class Decoder:
         Raises
         ------
         TruncatedStreamError
-            If the surface is not complete. What has come stays usable.
+            If the surface is not complete. The data received so far stay usable.
         CorruptStreamError
             If its end is damaged.
         """
@@ -197,7 +197,7 @@ class Decoder:
 
     @property
     def index(self) -> Index | None:
-        """The index, once it has arrived; None before. It is parsed when it is first asked for.
+        """The index, once it has arrived; None before. It is parsed when it is first used.
 
         Raises
         ------
@@ -212,12 +212,12 @@ class Decoder:
 
     @property
     def arrived(self) -> bool:
-        """Whether the whole surface has arrived, whatever its residual holds; nothing is decoded for that."""
+        """Whether all bytes of the surface have arrived. Nothing is decoded, so a residual may still be damaged."""
         return bool(self.layers) and self.layers[-1].complete
 
     @property
     def complete(self) -> bool:
-        """Whether the whole surface has arrived and is as it should be; metadata and index may still be missing.
+        """Whether the whole surface has arrived and is not damaged; metadata and index may still be missing.
 
         Raises
         ------

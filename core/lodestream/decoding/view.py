@@ -72,14 +72,14 @@ class View:
     rms, max_error : float
         Errors at full resolution, in the surface's unit; NaN where they are not known.
     bound : bool
-        Whether they are bounds, which the errors do not exceed. They are where the view is a window and not exact: a
-        container tells errors of the whole surface, and bounds of those of its parts. Else they were measured.
+        Whether `rms` and `max_error` are upper bounds. This is the case if the view is a window and not exact, because
+        a container has measured errors of the whole surface, but only bounds for its parts.
     complete : bool
-        Whether this is the last state. If it takes a residual, its values are verified when they are first asked for;
-        `CorruptStreamError` then says that the end is damaged, and views before it stay usable.
+        Whether this is the last state. If it has a residual, its values are verified when they are first requested;
+        `CorruptStreamError` then means that the end is damaged, and views before it stay usable.
     channels : tuple of (rms, max_error)
-        Errors of each channel by itself, in its unit and in the order of `Header.channel_names`; empty where there is
-        one channel, in a window, and where they are not known.
+        Errors of each channel, in its unit and in the order of `Header.channel_names`. Empty if there is only one
+        channel, for a window, and if they are not known.
 
     Examples
     --------
@@ -128,15 +128,15 @@ class View:
     def prepare(self) -> None:
         """Decode the bytes received so far in advance, so that the points of this view or a later one come sooner.
 
-        It changes no result, and does nothing where little waits. With two processors or more another thread does it
-        while the caller goes on (``LODESTREAM_THREADS`` says how many threads there are). A program that shows the last
-        view only, and receives more slowly than it decodes, calls it for each view that it does not show: at the end
-        the last layers alone are left. All is decoded once, whenever that is.
+        Does not change any result, and does nothing if few bytes are waiting. With two processors or more, another
+        thread decodes while the caller continues (``LODESTREAM_THREADS`` sets the number of threads). It is meant for a
+        program that shows only the last view, and receives more slowly than it decodes: it calls this for each view
+        that it does not show, so that only the last layers are left at the end. Nothing is decoded twice.
 
         Raises
         ------
         Exception
-            What an earlier call has met in the other thread.
+            An error of an earlier call, from the other thread.
         """
         self._queue.prepare(self._length)
 
@@ -166,12 +166,12 @@ class View:
     def window(self, region: Window, level: int | None = None) -> Surface:
         """Return the points of a window, at full resolution or at a coarser level. Time and memory follow its size.
 
-        Where the complete state is verified (see `complete`), the first window at full resolution computes the whole
-        surface once.
+        If the complete state has to be verified (see `complete`), the first window at full resolution computes the
+        whole surface once.
 
         At full resolution, heights whose values lie on a lattice (integers, decimals) are exact in the window as soon
-        as the data that it needs have arrived. `points` is exact only when everything has arrived. The window of a
-        coarser level is always cut out of that level's grid, bit for bit as `surface` gives it.
+        as its data have arrived. `points` is exact only when everything has arrived. The window of a coarser level is
+        always a part of that level's grid, bit for bit as returned by `surface`.
 
         Parameters
         ----------
@@ -179,8 +179,8 @@ class View:
             Rows and columns, half-open, in full-resolution indices at any level; along a closed axis they may go on
             across the seam, as columns 350:370 of 360.
         level : int, optional
-            Of a coarser level, the window is its points that stand in the region. None: full resolution, or the finest
-            level of a window that was received at a coarser one.
+            A coarser level; the window then consists of its points that lie in the region. None: full resolution, or
+            the finest level of a window that was received at a coarser one.
 
         Raises
         ------
@@ -260,13 +260,13 @@ class View:
     def verify(self) -> None:
         """Verify, once, a complete state that has a residual: its chunks may be damaged.
 
-        The surface is computed and held to its SHA-256, now or as soon as that has come; the next `surface` returns it.
-        Of other states nothing is done.
+        The surface is computed and compared with its SHA-256, now or as soon as that has arrived; the next `surface`
+        returns it. For other states nothing is done.
 
         Raises
         ------
         CorruptStreamError
-            If a chunk of the residual does not hold what it should, or the SHA-256 is wrong; every time.
+            If a chunk of the residual is damaged or the SHA-256 is wrong; at every call.
         """
         if not self._corrected or self._queue.dropped:
             return

@@ -90,17 +90,17 @@ def encode(
     >>> bool((lodestream.decode(container).points == heights).all())
     True
 
-    A surface that does not fit into memory is a memory-mapped array, ``np.load("heights.npy", mmap_mode="r")``, or one
-    that `read` leaves in files (its ``scratch``), and is encoded by bands of rows into a file, ``out``. The bytes are
-    the same for any memory, and any executor.
+    A surface that does not fit into memory can be given as a memory-mapped array, `np.load("heights.npy",
+    mmap_mode="r")`, or as one that `read` keeps in files (`room`). It is encoded by bands of rows into a file, `out`.
+    The bytes are the same for any memory, and any executor.
 
     Parameters
     ----------
     surface : Surface, array, Source, path, or Dataset, DataArray or DataTree of xarray
         An array, shape (row, column) or (row, column, channel), is taken as ``Surface(array)``. Arrays of Zarr, h5py
-        and Dask, and any object with ``shape``, ``dtype`` and ``read(window)``, are read window by window, once. What
-        is of xarray is taken as by `Surface.from_xarray`, with coordinates, CRS, unit and name, by windows too. A path,
-        str or path-like, is that of a file or a Zarr store, which is read as by `read`.
+        and Dask, and any object with ``shape``, ``dtype`` and ``read(window)``, are read window by window, once.
+        Objects of xarray are converted as by `Surface.from_xarray`, with coordinates, CRS, unit and name, also window
+        by window. A path, str or path-like, is that of a file or a Zarr store, which is read as by `read`.
     precision : float, str, Tolerance or None
         Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
         the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
@@ -110,53 +110,55 @@ def encode(
         most this error. Quantization steps are chosen for this error alone, and there are few layers before the last.
     attribute_precision : mapping of str to float, str or Tolerance, optional
         Maximum error of attributes, by name; or of single channels: of a coordinate ("x", "y" or "z"), of a component
-        of an attribute ("wind_0"), relative to the range of that channel. A coordinate that is named keeps to its own
-        precision, whatever `precision` is; if that is None, the other coordinates come back bit for bit.
+        of an attribute ("wind_0"), relative to the range of that channel. A coordinate that is named here has this
+        precision, whatever `precision` is. If `precision` is None, the other coordinates are restored bit for bit.
     quality : Quality, optional
-        In place of the three before, which are a shorthand for ``Quality.of(precision, rms, attribute_precision)``.
+        Replaces the three parameters above, which are a shorthand for ``Quality.of(precision, rms,
+        attribute_precision)``.
     progress : callable, optional
         Called from time to time with the fraction done, 0 to 1.
     out : str or path-like, optional
-        The file to write; it appears when it is whole.
+        The file to write; it appears when it is complete.
     memory : int or str, optional
-        Bytes to work in, a MiB or more, or text such as ``"512MiB"``, beside arrays that are memory-mapped: what takes
-        more in one piece is built by bands. Of a band there is at least one row of tiles, so that 96 MiB and 32 bytes
-        for each value of such a row are taken in any case, and 6 for each point of a surface with holes. A surface of
-        several blocks, or one that touches itself, is built block by block: the largest one is in place of such a row.
-        By default a quarter of the machine's memory, and one piece where there is neither ``out`` nor an executor.
+        Working memory in bytes, 1 MiB or more, or text such as `"512MiB"`; memory-mapped arrays do not count. A surface
+        that needs more is built by bands. A band has at least one row of tiles, so the minimum is 96 MiB, 32 bytes for
+        each value of such a row, and 6 bytes for each point of a surface with holes. A surface of several blocks, or
+        one that touches itself, is built block by block, and its largest block counts in place of the row of tiles.
+        Default: a quarter of the machine's memory. Without `out` and an executor, the surface is encoded in one piece.
     scratch : str or path-like, optional
-        A folder in which a build by bands can continue, with about 12 bytes a value, up to 30 of several blocks. The
-        build has a folder of its own there, which is kept when it is interrupted, even by a power failure, or fails;
-        the same call goes on from there, and after success it is gone. Only one process at a time makes the same
-        container there. By default a temporary folder beside ``out``, which is gone afterwards.
+        A folder in which a build by bands can be continued. Its files take about 12 bytes for each value, up to 30 for
+        several blocks. Each build makes a folder of its own there. It is kept if the build fails or is interrupted,
+        even by a power failure, and the same call continues from it; after success it is removed. Only one process at a
+        time can make the same container there. Default: a temporary folder beside `out`, which is removed at the end.
     executor : concurrent.futures.Executor, optional
-        Carries out the tasks of a build by bands: processes, or machines that all see ``scratch`` and the files of
-        memory-mapped arrays, as ``distributed.Client(...).get_executor()``. By default threads of this process.
+        Executes the tasks of a build by bands, in processes or on machines that all see `scratch` and the files of
+        memory-mapped arrays, for example `distributed.Client(...).get_executor()`. Default: threads of this process.
 
     Returns
     -------
     bytes or None
-        A container, see ``docs/format.md``; nothing where there is an ``out``. Values of attributes at holes of the
-        points are not kept; if there are any, a `FormatWarning` says so.
+        A container, see `docs/format.md`; None if `out` is given. Values of attributes at holes of the points are not
+        kept; if there are any, a `FormatWarning` says so.
 
     Raises
     ------
     InputError
         If the surface cannot be encoded, or not with this precision, if its metadata are larger than
-        `lodestream.container.metadata.MAX_BYTES`, or if the executor is none.
+        `lodestream.container.metadata.MAX_BYTES`, or if `executor` is not an executor.
     InputError
-        Also if another process makes the same container in the scratch folder, or a file that the surface is in is
-        written to meanwhile.
+        Also if another process makes the same container in the scratch folder, or if a file of the surface is changed
+        during encoding.
     TooLargeError
-        If a block has more rows or columns than kernels can count, if ``memory`` is given and is too little for a
-        surface that cannot be built by bands, or if there is not room enough on the disk of the scratch folder.
+        If a block has more rows or columns than kernels can count, if `memory` is given and is too little for a surface
+        that cannot be built by bands, or if the disk of the scratch folder has too little space.
     OptionError
-        If ``memory`` is no size or less than a MiB, there is no attribute or channel of a given name, an error is no
-        number of 0 or more, both a precision and an error are given, or a quality and one of these.
+        If `memory` is not a size or less than 1 MiB, if there is no attribute or channel of a given name, if a
+        tolerance is not a number of 0 or more, if both a precision and an RMS error are given, or a quality and one of
+        these.
     UnavailableError
-        If the compiled kernels are missing; it says how to get them. Also if a worker has another version.
+        If the compiled kernels are missing; the message says how to get them. Also if a worker has another version.
     OSError
-        If a file cannot be written; before all work if there is no folder for it.
+        If a file cannot be written. If its folder does not exist, this is raised before encoding begins.
     """
     require("encoding")
     if executor is not None and not isinstance(executor, Executor):

@@ -85,26 +85,26 @@ def read(
         Which axes are closed. "auto": those that the format declares closed, and those whose last row or column repeats
         the first bit for bit. The repeated one is merged (``seam`` in the metadata) and written again by `write`.
     max_vertices : int, optional
-        Larger surfaces are refused before memory is allocated for them; by default those of more than 2**28 vertices,
-        where there is no `room`.
+        Surfaces with more vertices are refused before memory is allocated for them. Default: 2**28 without `room`, no
+        limit with it.
     filename : str, optional
         The file's original name, if `path` has another, as with uploads. It is used in messages and as ``name`` in the
         metadata; its suffix helps with text.
     allowed : collection of str, optional
         Names (`Format.names`) of the formats that may be read; by default all.
     format_name : str, optional
-        The format that the file must have, or a suffix of it without the dot ("hgt"), for a file whose name does not
-        say so.
+        The format that the file must have, or one of its suffixes without the dot ("hgt"), for a file whose name does
+        not show its format.
     room : Room, optional
-        Where large arrays go: NPY files are memory-mapped; rasters, NetCDF and Zarr are read window by window into
-        files, and so are binary PLOT3D and raw .vts. Other formats are read into memory all the same.
+        Where large arrays are kept: NPY files are memory-mapped; rasters, NetCDF, Zarr, binary PLOT3D and raw .vts are
+        read window by window into files. Other formats are read into memory all the same.
     nodata : float or str, optional
-        A value, or "nan", that marks holes though the file does not say so, in addition to those that it declares. A
-        height with this value becomes a hole, and a point whose coordinates all have it, such as 0, 0, 0 of a depth
-        camera; if no point of x, y, z has it in all, then those whose z has it, whose x and y stay. A `FormatWarning`
-        says how many points it was.
+        A value, or "nan", that marks holes in addition to the values that the file declares. A height with this value
+        becomes a hole, and so does a point whose coordinates all have it, such as 0, 0, 0 of a depth camera. If no
+        point has it in x, y and z, the points that have it in z become holes; their x and y are kept. A `FormatWarning`
+        says how many points were masked.
     progress : callable, optional
-        Is told the part that is done, from 0 to 1, while a mesh is resampled (``remesh``); reading tells none.
+        Called with the fraction done, 0 to 1, while a mesh is resampled (``remesh``); not called while a file is read.
     **options
         Options of the format, see `Format.options`: for example ``array`` of NPZ, ``band`` of GeoTIFF.
 
@@ -115,8 +115,8 @@ def read(
         and, if the file has them, ``crs`` (WKT), ``geotransform`` (six numbers in GDAL's order), ``nodata`` (a number,
         or text if it is not finite), ``unit``, ``scale`` and ``offset`` (for values kept as stored), ``scalars``
         (single numbers beside the array of an NPZ), ``tags``, ``bands`` and others that docs/formats.md lists. A
-        `FormatWarning` tells what was left out; so also if metadata exceed `lodestream.container.metadata.MAX_BYTES`
-        and their largest entries are dropped.
+        `FormatWarning` lists what was left out, also the largest entries of metadata that exceed
+        `lodestream.container.metadata.MAX_BYTES`.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def read(
     SwitchedOffError
         If its format may not be read.
     TooLargeError
-        If it announces more vertices than allowed, or expands implausibly.
+        If the file declares more vertices than allowed, or its compressed data expand implausibly.
     OptionError
         If an option or `format_name` does not exist, or a value is not valid.
     InputError

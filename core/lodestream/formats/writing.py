@@ -66,8 +66,9 @@ def written(name: str) -> Format:
 def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     """Write a surface to a file; the suffix decides the format.
 
-    The file is written under a temporary name and renamed at the end, so it is complete or absent; so are both the
-    file and the folder of a .vtm, and the folder of a .zarr. A `FormatWarning` tells what the format cannot hold.
+    The file is written under a temporary name and renamed at the end, so it is complete or absent. The same holds for
+    the file and the folder of a .vtm, and for the folder of a .zarr. A `FormatWarning` lists what the format cannot
+    hold.
 
     Raises
     ------

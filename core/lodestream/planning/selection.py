@@ -32,8 +32,8 @@ class Selection:
     attributes : tuple of str or None
         Names of attributes, also given as a list or a text with commas. None: all.
     level : int or None
-        The finest level that is wanted; None: full resolution. The window is then that of this level: its points that
-        stand in the region.
+        The finest level to decode; None: full resolution. The window then consists of the points of this level that lie
+        in the region.
 
     Examples
     --------
@@ -60,7 +60,7 @@ class Selection:
         Returns
         -------
         ((int, int), (int, int)) or None
-            The rows and columns of the level that stand in the region, see `region_at`; None without a region.
+            The rows and columns of the level that lie in the region, see `region_at`; None without a region.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class Selection:
         return header.levels if self.level is None else self.level
 
     def check_size(self, header: Header, capacity: Capacity) -> None:
-        """Refuse what takes more memory than there may be.
+        """Refuse a selection that takes more memory than allowed.
 
         Raises
         ------
@@ -133,7 +133,7 @@ class Selection:
     def tiles(self, header: Header, window: Region | None = None) -> NDArray[np.bool_]:
         """Return which tiles are selected: bool, shape (tile,).
 
-        ``window`` is what `check` has returned; None: it is found again.
+        `window` is the result of `check`; None: it is computed again.
         """
         if self.region is None:
             return np.ones(len(header.layout.tiles), np.bool_)
