@@ -41,6 +41,7 @@ __all__ = [
     "give_to_owner",
     "is_of_another_user",
     "is_writable_by_others",
+    "keep_out_of_forks",
     "kill_session",
     "limit_files",
     "limit_memory",
@@ -442,6 +443,12 @@ def run_in_forks(function: Callable[[], Any]) -> None:
     """Have a function called in each process that is forked from this one; Windows has no forks."""
     if sys.platform != "win32":
         os.register_at_fork(after_in_child=function)
+
+
+def keep_out_of_forks(begin: Callable[[], Any], end: Callable[[], Any]) -> None:
+    """Have functions called in this process before each fork of it, and after; Windows has no forks."""
+    if sys.platform != "win32":
+        os.register_at_fork(before=begin, after_in_parent=end)
 
 
 def new_session() -> dict[str, Any]:

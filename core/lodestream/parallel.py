@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from queue import SimpleQueue
-from threading import Thread
+from threading import RLock, Thread
 from typing import Any, Generic, TypeVar
-from weakref import ref
+from weakref import WeakMethod, ref
 
 from .errors import OptionError
-from .operating_system import processors, run_in_forks
+from .operating_system import keep_out_of_forks, processors, run_in_forks
 
 __all__ = ["VARIABLE", "aside", "spread", "threads"]
 
@@ -62,28 +62,64 @@ def spread(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Re
 def aside(work: Callable[[], object]) -> bool:
     """Have another thread do work while the caller goes on; return False, and do nothing, if there is no other thread.
 
-    Nobody waits for the work or hears of its errors: it says by itself what has become of it. It may call `spread`. As
-    many pieces of such work are done at a time as `threads` leaves beside the caller; others wait for them.
+    The work is a method, and is left out if its object is gone by then. Nobody waits for it or hears of its errors: it
+    says by itself what has become of it. It may call `spread`. One piece of such work is done at a time in a process,
+    and a fork waits for its end: pieces are short, and do not wait for others who may fork.
 
     Raises
     ------
     OptionError
         See `threads`.
     """
-    others = threads() - 1
-    return others > 0 and _pool("aside", others).take(_Aside(work))
+    return threads() > 1 and _pool("aside", 1).take(_Aside(work))
 
 
 class _Aside:
     """Work of `aside`."""
 
     def __init__(self, work: Callable[[], object]) -> None:
-        self._work = work
+        self._work = WeakMethod(work)
 
     def help(self) -> None:
-        """Do it."""
-        with suppress(BaseException):  # the thread has other work to do after it
-            self._work()
+        """Do it if its object still exists."""
+        with _forks.kept_out(), suppress(BaseException):  # the thread has other work to do after it
+            if (work := self._work()) is not None:
+                work()
+
+
+class _Forks:
+    """Keeps forks and work of `aside` apart: threads do not survive a fork, and what they have begun would stay so."""
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew, in a process that was forked."""
+        self._next = RLock()  # held by a fork that waits, which comes before any work that has not begun
+        self._one = RLock()
+
+    def begin(self) -> None:
+        """Wait for the work that is being done; called before a fork."""
+        self._next.acquire()
+        self._one.acquire()
+
+    def end(self) -> None:
+        """Let work go on; called after a fork."""
+        try:
+            self._one.release()
+        finally:
+            self._next.release()
+
+    @contextmanager
+    def kept_out(self) -> Iterator[None]:
+        """Let no process be forked by another thread."""
+        with self._next:
+            one = self._one
+            one.acquire()
+        try:
+            yield
+        finally:
+            one.release()
 
 
 class _Spread(Generic[_Item, _Result]):
@@ -217,4 +253,7 @@ def _pool(use: str, most: int) -> _Pool:
     return _pools.get((use, most)) or _pools.setdefault((use, most), _Pool(most))
 
 
+_forks = _Forks()
+keep_out_of_forks(_forks.begin, _forks.end)
+run_in_forks(_forks.clear)
 run_in_forks(_pools.clear)  # threads do not survive a fork

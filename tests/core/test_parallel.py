@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 import weakref
+from collections.abc import Callable
 
 import pytest
 
@@ -97,21 +98,32 @@ def test_without_another_thread_the_caller_does_all(monkeypatch: pytest.MonkeyPa
     assert spread(lambda item: item + 1, range(30)) == list(range(1, 31))
 
 
+class Work:
+    """Work to be done aside."""
+
+    def __init__(self, function: Callable[[], object]) -> None:
+        self._function = function
+
+    def do(self) -> None:
+        self._function()
+
+
 def test_work_aside_is_done_while_the_caller_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "2")
     meeting, over, done = threading.Barrier(2, timeout=PATIENCE), threading.Event(), list[object]()
 
-    def work() -> None:
+    def meet() -> None:
         meeting.wait()
         done.append(spread(abs, [-1, -2]))
         done.append(threading.get_ident())
         over.set()
 
-    def failing() -> None:
+    def fail() -> None:
         raise KeyboardInterrupt
 
-    assert aside(failing)
-    assert aside(work)
+    failing, work = Work(fail), Work(meet)
+    assert aside(failing.do)
+    assert aside(work.do)
     meeting.wait()
     assert spread(abs, range(-3, 0)) == [3, 2, 1]
     assert over.wait(PATIENCE)
@@ -121,15 +133,17 @@ def test_work_aside_is_done_while_the_caller_goes_on(monkeypatch: pytest.MonkeyP
 
 def test_nothing_is_done_aside_where_there_is_no_other_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     done: list[int] = []
+    work = Work(lambda: done.append(1))
     monkeypatch.setenv(VARIABLE, "1")
-    assert not aside(lambda: done.append(1))
-    monkeypatch.setenv(VARIABLE, "201")  # a pool that no other test has started
+    assert not aside(work.do)
+    monkeypatch.setenv(VARIABLE, "2")
+    monkeypatch.setattr(parallel, "_pools", {})
 
     def refused(thread: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", refused)
-    assert not aside(lambda: done.append(2))
+    assert not aside(work.do)
     assert done == []
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 from lodestream.protocol.flow_control import FIRST_WINDOW
 
 from ..requests.addresses import origin
@@ -19,28 +17,25 @@ _MOST_SERVERS = 256
 class KnownWindows:
     """Windows by the origin of the server (scheme, host, port). May be used from any thread.
 
-    Times are seconds of one clock that does not go back.
+    Times are seconds of one clock that does not go back. Each step is one call of a dictionary, so there is no lock,
+    which a forked process might find taken.
     """
 
     def __init__(self) -> None:
         self._windows: dict[str, tuple[int, float]] = {}
-        self._lock = threading.Lock()
 
     def first(self, url: str, now: float) -> int:
         """Return the first window of a stream from this address, in bytes: what is remembered, or `FIRST_WINDOW`."""
-        with self._lock:
-            size, since = self._windows.get(origin(url), (FIRST_WINDOW, now))
+        size, since = self._windows.get(origin(url), (FIRST_WINDOW, now))
         return size if now - since < _REMEMBERED_SECONDS else FIRST_WINDOW
 
     def remember(self, url: str, size: int, now: float) -> None:
         """Remember the window that a stream from this address has measured."""
-        with self._lock:
-            self._windows.pop(origin(url), None)
-            self._windows[origin(url)] = size, now
-            if len(self._windows) > _MOST_SERVERS:
-                del self._windows[next(iter(self._windows))]
+        self._windows.pop(origin(url), None)
+        self._windows[origin(url)] = size, now
+        for first in list(self._windows)[:-_MOST_SERVERS]:
+            self._windows.pop(first, None)
 
     def forget(self, url: str) -> None:
         """Forget the window of this address's server, because its link has failed and may be another one now."""
-        with self._lock:
-            self._windows.pop(origin(url), None)
+        self._windows.pop(origin(url), None)

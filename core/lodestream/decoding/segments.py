@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from threading import Lock
@@ -24,6 +25,8 @@ __all__ = ["SegmentQueue", "StoredSegments"]
 
 #: Bytes of segments that are worth decoding before anybody asks for points.
 _WORTH_PREPARING_BYTES = 1 << 13
+#: Bytes of segments that are decoded in advance at a time: a caller, or a fork, waits for so much.
+_PREPARED_AT_ONCE_BYTES = 1 << 18
 
 
 class SegmentQueue:
@@ -39,10 +42,11 @@ class SegmentQueue:
         self._waiting: dict[int, Coded] = {}  # segments that are not decoded yet, by number
         self._added = self._decoded = self._forgotten = 0
         self._begun: tuple[int, list[list[Reading]]] = 0, []  # the batch on its way: the number after it, its rounds
-        self._lock = Lock()
+        self._calling = Lock()  # held by a caller who has the other lock or waits for it: who prepares gives way
+        self._lock = Lock()  # held by whoever decodes
         self._wanted = 0  # segments to decode in advance
-        self._preparing = False  # another thread does it
-        self._failure: BaseException | None = None  # what it has met
+        self._asked_in = 0  # the process whose other thread was asked to do it and has not begun; 0: none
+        self._failure: BaseException | None = None  # what that thread has met at the next segment
         self._chunks: dict[int, tuple[bytes | memoryview, int]] = {}
         self._channels: list[Tiles] = []
         #: Whether what was added is forgotten, see `drop`.
@@ -65,7 +69,7 @@ class SegmentQueue:
 
     def drop(self) -> None:
         """Drop all that was added and is not decoded, because no values will be asked for."""
-        with self._lock:
+        with self._calling, self._lock:
             self._waiting.clear()
             self._chunks.clear()
             self.dropped = True
@@ -74,51 +78,59 @@ class SegmentQueue:
         """Decode the first ``length`` segments, if there are enough of them to be worth the calls.
 
         Where there are several threads, another one does it while the caller goes on. What that one raises, the next
-        call raises.
+        call raises, once, unless the segments have been decoded since.
         """
         if self._failure is not None:
             failure, self._failure = self._failure, None
             raise failure
         self._wanted = max(self._wanted, length)
-        if self._preparing:
-            return
-        with self._lock:
-            if not self._worth_decoding():
-                return
-        self._preparing = True
-        if not aside(self._prepare_aside):
-            self._preparing = False
-            with self._lock:
+        if not self._ask():
+            with self._calling, self._lock:
                 self._decode(self._wanted)
 
-    def _prepare_aside(self) -> None:
-        """Decode in advance as long as there is enough of it."""
+    def _ask(self) -> bool:
+        """Have another thread decode in advance, if enough waits; return False if it does and there is no thread."""
+        if self._asked_in == os.getpid() or not self._after(_WORTH_PREPARING_BYTES):
+            return True
+        asked = False
         try:
-            while True:
-                with self._lock:
-                    if not self._worth_decoding():
-                        return
-                    self._decode(self._wanted)
+            self._asked_in = os.getpid()  # before the other thread can begin
+            asked = aside(self._prepare_aside)
+        finally:
+            if not asked:
+                self._asked_in = 0
+        return asked
+
+    def _prepare_aside(self) -> None:
+        """Decode in advance what is decoded at a time, and ask for the rest. Callers that come between ask for it."""
+        self._asked_in = 0  # what is wanted from now on is asked for anew
+        if self._calling.locked() or not self._lock.acquire(blocking=False):
+            return
+        try:
+            if self._after(_WORTH_PREPARING_BYTES):
+                self._decode(self._after(_PREPARED_AT_ONCE_BYTES) or self._wanted)
         except BaseException as error:
             self._failure = error
+            return
         finally:
-            self._preparing = False
+            self._lock.release()
+        self._ask()
 
-    def _worth_decoding(self) -> bool:
-        """Return whether as much waits as is worth the calls; the lock is held."""
-        size = 0
+    def _after(self, size: int) -> int:
+        """Return after how many segments as many bytes as ``size`` are decoded in advance; 0 if fewer wait."""
         for number in range(self._decoded, 0 if self.dropped else self._wanted):
-            size += len(self._waiting[number].data)
-            if size >= _WORTH_PREPARING_BYTES:
-                return True
-        return False
+            coded = self._waiting.get(number)  # without the lock, it may have been decoded just now
+            size -= len(coded.data) if coded else 0
+            if size <= 0:
+                return number + 1
+        return 0
 
     def keep_last(self, state: NDArray[np.int8]) -> None:
         """Decode all segments, and drop the data that only states before the last one need.
 
         ``state`` is the last one, int8, shape (tile, channel). Where it has passes left, as much is needed for it.
         """
-        with self._lock:
+        with self._calling, self._lock:
             self._decode(self._added)
             if not state.any():
                 for tiles in self._channels:
@@ -149,9 +161,10 @@ class SegmentQueue:
         CorruptStreamError
             If ``corrected`` is asked for and a chunk of the residual section does not fit.
         """
-        with self._lock:
+        with self._calling, self._lock:
             self._decode(length)
             blocks = values_of(self.header, region, self._channels, state, chosen)
+        self._ask()
         if corrected:
             restore(self.header, region, blocks, self._chunks.get, chosen)
         mark_holes(self.header, region, blocks, corrected)
@@ -159,7 +172,7 @@ class SegmentQueue:
 
     def channels(self, length: int) -> list[Tiles]:
         """Return the decoded tiles of each channel after the first ``length`` segments, or more."""
-        with self._lock:
+        with self._calling, self._lock:
             self._decode(length)
             return self._channels
 
@@ -175,7 +188,7 @@ class SegmentQueue:
             end, rounds = self._begun
             for readings in rounds:
                 spread(Reading.run, readings)
-            self._decoded = end
+            self._decoded, self._failure = end, None
             while self._forgotten < end:  # and any that an interruption has left
                 self._waiting.pop(self._forgotten, None)
                 self._forgotten += 1

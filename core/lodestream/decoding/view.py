@@ -136,7 +136,7 @@ class View:
         Raises
         ------
         Exception
-            An error of an earlier call, from the other thread.
+            An error of an earlier call, from the other thread; once, unless the bytes were decoded since.
         """
         self._queue.prepare(self._length)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
 import threading
 import time
 from typing import Any
@@ -17,9 +20,10 @@ from lodestream.protocol.wire import parse
 from lodestream_client import sync
 from lodestream_client.errors import SilenceError
 from lodestream_client.requests import addresses
-from lodestream_client.stream import session
+from lodestream_client.stream import known_windows, session
 from lodestream_client.stream.known_windows import KnownWindows
 from tests.links import Fault, linked
+from tests.patience import PATIENCE
 
 from ..conftest import make_terrain
 from .test_resume import follow
@@ -98,12 +102,42 @@ def test_threads_may_use_it_together() -> None:
             failed.append(repr(error))
 
     threads = [threading.Thread(target=use, args=(101 * number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
     assert failed == []
     assert len(known._windows) <= 256
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_process_may_be_forked_while_another_thread_uses_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    known, busy, go = KnownWindows(), threading.Event(), threading.Event()
+
+    def slow(url: str) -> str:
+        if threading.current_thread() is thread:
+            busy.set()
+            assert go.wait(PATIENCE)
+        return addresses.origin(url)
+
+    monkeypatch.setattr(known_windows, "origin", slow)
+    thread = threading.Thread(target=known.remember, args=(URL, 70_000, 0.0))
+    thread.start()
+    assert busy.wait(PATIENCE)
+    child = os.fork()
+    if not child:
+        signal.alarm(int(PATIENCE))  # kills a child that hangs
+        known.remember(URL, 60_000, 0.0)
+        os._exit(0 if known.first(URL, 0.0) == 60_000 else 1)
+    go.set()
+    thread.join()
+    assert os.waitpid(child, 0)[1] == 0
 
 
 @pytest.mark.parametrize("act", ["break", "silence"])

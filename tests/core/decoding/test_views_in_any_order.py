@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import os
+import signal
 import threading
 import time
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Sequence
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -15,6 +20,8 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.decoding import pieces, segments
+from lodestream.decoding.segments import SegmentQueue
+from lodestream.errors import OptionError
 from lodestream.parallel import VARIABLE
 from tests.core.surfaces import all_large
 from tests.examples import examples
@@ -102,7 +109,7 @@ def test_what_is_prepared_waits_no_more(monkeypatch: pytest.MonkeyPatch, count: 
     assert queue._decoded == 0
     views[-1].prepare()
     if count == "2":
-        wait_until(lambda: not queue._preparing)
+        wait_until(lambda: queue._decoded == queue.length and not queue._lock.locked())
     assert queue._decoded == queue.length
     assert not queue._waiting
     np.testing.assert_array_equal(views[-1].points, fresh(container, views[-1].bytes).points)
@@ -114,6 +121,12 @@ def wait_until(done: Callable[[], bool]) -> None:
     while not done():
         assert time.monotonic() < deadline
         time.sleep(0.001)
+
+
+def enough_waits(queue: SegmentQueue) -> bool:
+    """Whether so much waits that it is prepared."""
+    waiting = [coded for number, coded in queue._waiting.copy().items() if queue._decoded <= number < queue._wanted]
+    return sum(len(coded.data) for coded in waiting) >= segments._WORTH_PREPARING_BYTES
 
 
 def rough() -> bytes:
@@ -140,10 +153,9 @@ def test_another_thread_prepares_while_the_caller_goes_on(monkeypatch: pytest.Mo
     for view in views:
         view.prepare()
     go.set()
-    wait_until(lambda: not queue._preparing)
+    wait_until(lambda: not enough_waits(queue))
     assert seen
     assert threading.get_ident() not in seen
-    assert sum(len(coded.data) for coded in queue._waiting.values()) < segments._WORTH_PREPARING_BYTES
     np.testing.assert_array_equal(views[-1].points, ls.decode(container).points)
 
 
@@ -163,7 +175,7 @@ def test_an_error_of_preparing_comes_from_preparing_and_from_points(
     monkeypatch.setattr(queue, "_decode", failing)
     if count == "2":
         view.prepare()
-        wait_until(lambda: not queue._preparing)
+        wait_until(lambda: queue._failure is not None)
     with pytest.raises(MemoryError, match=f"{queue.length} segments"):
         view.prepare()
     with pytest.raises(MemoryError):
@@ -173,13 +185,169 @@ def test_an_error_of_preparing_comes_from_preparing_and_from_points(
     np.testing.assert_array_equal(view.points, ls.decode(container).points)
 
 
-def test_what_is_dropped_is_not_prepared(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(VARIABLE, "2")
+@pytest.mark.parametrize("count", ["1", "2"])
+def test_what_is_dropped_is_not_prepared(monkeypatch: pytest.MonkeyPatch, count: str) -> None:
+    monkeypatch.setenv(VARIABLE, count)
     decoder = ls.Decoder()
     view = decoder.feed(rough())[-1]
+    queue = decoder._queue
     view.prepare()
-    decoder._queue.drop()
+    queue.drop()
+    decoded = queue._decoded
     view.prepare()
-    wait_until(lambda: not decoder._queue._preparing)
+    wait_until(lambda: not queue._asked_in)
+    assert queue._failure is None
+    assert not queue._waiting
+    assert queue._decoded == decoded
+
+
+class Slow:
+    """Other threads decode in advance one piece for each `step`; callers are not held up."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.pieces, self._steps = list[int](), threading.Semaphore(0)
+        monkeypatch.setenv(VARIABLE, "2")
+        monkeypatch.setattr(segments, "_WORTH_PREPARING_BYTES", 1 << 10)
+        monkeypatch.setattr(segments, "_PREPARED_AT_ONCE_BYTES", 1 << 10)
+        decode, test = SegmentQueue._decode, self
+
+        def slow(queue: SegmentQueue, length: int) -> None:
+            if threading.current_thread().name.startswith("lodestream_"):
+                test.pieces.append(length)
+                assert test._steps.acquire(timeout=PATIENCE)
+            decode(queue, length)
+
+        monkeypatch.setattr(SegmentQueue, "_decode", slow)
+
+    def step(self, count: int = 1) -> None:
+        self._steps.release(count)
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
+    return Slow(monkeypatch)
+
+
+def called(function: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
+    """Call a function in a thread of its own; return that and where the result will be."""
+    found = list[Any]()
+    thread = threading.Thread(target=lambda: found.append(function()))
+    thread.start()
+    return thread, found
+
+
+def test_points_wait_for_one_piece_of_preparing_and_the_rest_goes_on(slow: Slow) -> None:
+    container, decoder = rough(), ls.Decoder()
+    views = decoder.feed(container)
+    queue, first = decoder._queue, views[0].points
+    views[-1].prepare()
+    for number in range(1, 4):
+        wait_until(lambda: len(slow.pieces) == number)  # noqa: B023
+        thread, found = called(lambda: views[0].points)
+        wait_until(queue._calling.locked)
+        slow.step()
+        thread.join(PATIENCE)
+        np.testing.assert_array_equal(found[0], first)
+    assert enough_waits(queue)
+    slow.step(1000)
+    wait_until(lambda: not enough_waits(queue))  # though nobody has called `prepare` again
+    assert len(slow.pieces) > 3
+    np.testing.assert_array_equal(views[-1].points, ls.decode(container).points)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
+def test_a_fork_waits_for_one_piece_of_preparing_and_the_child_goes_on(slow: Slow) -> None:
+    container, decoder = rough(), ls.Decoder()
+    expected, views = ls.decode(container).points, decoder.feed(container)
+    queue, half = decoder._queue, len(views) // 2
+    views[-1].prepare()
+    wait_until(lambda: len(slow.pieces) == 1)
+    timer = threading.Timer(0.1, slow.step)
+    timer.start()
+    child = os.fork()
+    if not child:
+        signal.alarm(int(PATIENCE))  # kills a child that hangs
+        good = len(slow.pieces) == 1 and enough_waits(queue)
+        slow.step(1000)
+        good &= np.array_equal(views[half].points, fresh(container, views[half].bytes).points)
+        views[-1].prepare()
+        wait_until(lambda: not enough_waits(queue))  # by a thread of the child
+        good &= len(slow.pieces) > 1 and np.array_equal(views[-1].points, expected)
+        os._exit(0 if good else 1)
+    timer.join()
+    slow.step(1000)
+    np.testing.assert_array_equal(views[-1].points, expected)
+    assert os.waitpid(child, 0)[1] == 0
+
+
+def test_what_nobody_holds_any_more_is_not_prepared(slow: Slow) -> None:
+    busy, decoder = ls.Decoder(), ls.Decoder()
+    busy.feed(rough())[-1].prepare()
+    wait_until(lambda: len(slow.pieces) == 1)
+    decoder.feed(rough())[-1].prepare()
+    gone = weakref.ref(decoder._queue)
+    assert decoder._queue._asked_in
+    del decoder
+    gc.collect()
+    assert gone() is None
+    gone = weakref.ref(busy._queue)
+    del busy  # in the midst
+    slow.step(1)
+    wait_until(lambda: not gc.collect() and gone() is None)
+    assert len(slow.pieces) == 1
+
+
+def test_a_failure_is_not_told_once_it_is_no_longer_true(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "2")
+    container, decoder = rough(), ls.Decoder()
+    view = decoder.feed(container)[-1]
+
+    def failing(work: Callable[[Any], object], items: Sequence[Any]) -> list[object]:
+        raise MemoryError("no memory")
+
+    with monkeypatch.context() as context:
+        context.setattr(segments, "spread", failing)
+        view.prepare()
+        wait_until(lambda: decoder._queue._failure is not None)
+    np.testing.assert_array_equal(view.points, ls.decode(container).points)
+    view.prepare()
     assert decoder._queue._failure is None
-    assert not decoder._queue._waiting
+
+
+def test_an_error_of_asking_does_not_end_preparing(monkeypatch: pytest.MonkeyPatch) -> None:
+    decoder = ls.Decoder()
+    view = decoder.feed(rough())[-1]
+    monkeypatch.setenv(VARIABLE, "x")
+    for _ in range(2):
+        with pytest.raises(OptionError, match=VARIABLE):
+            view.prepare()
+    monkeypatch.setenv(VARIABLE, "2")
+    view.prepare()
+    wait_until(lambda: not enough_waits(decoder._queue))
+
+
+def test_what_is_asked_for_at_the_end_of_a_piece_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "2")
+    container, decoder = rough(), ls.Decoder()
+    views = decoder.feed(container[: len(container) // 2])
+    queue, ended, go = decoder._queue, threading.Event(), threading.Event()
+    lock = queue._lock
+
+    class Paused:
+        """The lock of the queue. The thread that prepares stops where it has given it back."""
+
+        acquire, locked, __enter__, __exit__ = lock.acquire, lock.locked, lock.__enter__, lock.__exit__
+
+        def release(self) -> None:
+            lock.release()
+            ended.set()
+            assert go.wait(PATIENCE)
+
+    monkeypatch.setattr(queue, "_lock", Paused())
+    views[-1].prepare()
+    assert ended.wait(PATIENCE)
+    views += decoder.feed(container[len(container) // 2 :])
+    views[-1].prepare()
+    go.set()
+    wait_until(lambda: not enough_waits(queue))
