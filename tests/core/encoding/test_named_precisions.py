@@ -141,3 +141,24 @@ def test_components_are_named_in_streams_for_one_error_too() -> None:
     assert 0 < found["wind_1"] <= 0.5
     assert found["wind_0"] == found["wind_2"] == 0
     assert found["z"] > 0
+
+
+def test_errors_are_0_at_the_end_where_attributes_alone_have_a_precision() -> None:
+    random = np.random.default_rng(3)
+    values = random.normal(size=(2, 90, 90)).astype(np.float32)
+    surface = ls.Surface(values[0], attributes={"t": values[1]})
+    decoder = ls.Decoder()
+    decoder.feed(ls.encode(surface, attribute_precision={"t": 0.05}))
+    view = decoder.view()
+    assert view.complete
+    assert view.rms == view.max_error == 0
+
+
+def test_a_container_is_exact_only_if_all_of_it_is() -> None:
+    noise = np.random.default_rng(3).integers(-500, 500, (40, 40)).astype(np.int16)
+    met = np.full((40, 40), -2, np.int16)  # the second block has a value of the lattice
+    blocks = [ls.Surface(points).blocks[0] for points in (noise, met)]
+    container = ls.encode(ls.Surface(blocks=blocks), precision=3)
+    back = [block.points.astype(int) for block in ls.decode(container).blocks]
+    assert np.abs(back[0] - noise).max() == 3
+    assert (back[1] == met).all()
