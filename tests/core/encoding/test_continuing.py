@@ -326,3 +326,12 @@ def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path) -> None:
     folder.chmod(0o770)
     with pytest.raises(ls.InputError, match="writable by this user alone"):
         _build(_heights(), tmp_path)
+
+
+@pytest.mark.parametrize("options", [{"precision": 7}, {"memory": "40MiB"}], ids=str)
+def test_another_request_begins_anew(tmp_path: Path, options: dict[str, Any]) -> None:
+    left = _left(_heights(), _in_measuring, tmp_path)
+    with ThreadPoolExecutor(1) as executor:
+        ls.encode(_heights(), out=tmp_path / "a.lode", scratch=tmp_path / "scratch", executor=executor, **options)
+    assert (tmp_path / "a.lode").read_bytes() == ls.encode(_heights(), options.get("precision"))
+    assert all((tmp_path / "scratch" / name).exists() for name in left), "the other build may still go on"
