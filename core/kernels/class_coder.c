@@ -106,7 +106,7 @@ static bool read_pass(struct unit *unit, const int64_t *bands, int64_t count, in
     if (at->band == 0 && at->stripe == 0)
         begin_pass(unit, number);
     int64_t rounds = first_pass ? count : 2 * count;
-    int64_t before = stripes_before(bands, at->band < count ? at->band : at->band - count);
+    int64_t before = at->band < rounds ? stripes_before(bands, at->band % count) : 0; /* forged: any band */
     for (; at->band < rounds; at->band++, at->stripe = 0) {
         bool raw = at->band >= count;
         if (at->band == count)
