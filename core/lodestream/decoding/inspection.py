@@ -368,7 +368,7 @@ def _check_errors(walked: Walked, measurements: Iterable[Measured], progress: Ca
     ----------
     walked : Walked
         Of an exact container.
-    found : iterable of (Errors, list)
+    measurements : iterable of (Errors, list)
         What was measured of each of `_states_of`.
     progress : callable
         Called with the fraction done.

@@ -95,7 +95,7 @@ def kept_layers(header: Header, states: Sequence[State], measured: Sequence[Meas
     header : Header
     states : sequence of int8 arrays, shape (tile, channel)
         Passes still to come after each layer.
-    found : sequence of (Errors, list of float64 arrays)
+    measured : sequence of (Errors, list of float64 arrays)
         Of each: its errors, and the distances in cells, see `coordinate_distances`.
     """
     kept: list[int] = []

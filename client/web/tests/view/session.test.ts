@@ -27,6 +27,17 @@ vi.mock("../../src/view/geometry-worker?worker&inline", () => ({ default: geomet
 
 afterEach(() => vi.unstubAllGlobals());
 
+/** Hears of failures alone. */
+const UNHEARD = {
+  info: () => {},
+  moment: () => {},
+  progress: () => {},
+  refined: () => {},
+  drawn: () => {},
+  failed: (detail: string) => expect.fail(detail),
+  region: () => {},
+};
+
 const INFO = { blocks: [{ shape: [33, 33], closed: [false, false] }], levels: 5 } as unknown as SurfaceInfo;
 
 it("moments that come while another is drawn are left out, but for the last", async () => {
@@ -148,16 +159,7 @@ function judged(region: Region | null = null): Judged {
     pictures: () => [picture(0), picture(changed)],
     show: (_patches: unknown, _fresh: boolean, _blended: boolean, done: () => void) => done(),
   } as unknown as Stage;
-  const told = {
-    info: () => {},
-    moment: () => {},
-    progress: () => {},
-    refined: () => {},
-    drawn: () => {},
-    failed: (detail: string) => expect.fail(detail),
-    region: () => {},
-  };
-  const session = new Session(source, stage, told, 1e6);
+  const session = new Session(source, stage, UNHEARD, 1e6);
   const prices = [16, 8, 4, 2, 1].map((rms, k) => ({ bytes: k, level: 5, rms, max: 3 * rms }));
   events.info({ ...INFO, attributes: [], exact: true, prices });
   events.progress({ state: "receiving", bytes: 1, planned: 9, rate: 0, detail: "" });
@@ -286,16 +288,7 @@ it("what is drawn is a level finer than the data, as far as there are levels", a
     eye: () => ({}),
     show: (_patches: unknown, _fresh: boolean, _blended: boolean, done: () => void) => done(),
   } as unknown as Stage;
-  const told = {
-    info: () => {},
-    moment: () => {},
-    progress: () => {},
-    refined: () => {},
-    drawn: () => {},
-    failed: () => {},
-    region: () => {},
-  };
-  const session = new Session(source, stage, told, 1e6);
+  const session = new Session(source, stage, UNHEARD, 1e6);
   events.info(INFO);
   for (const [number, level] of [0, 3, 4, 5].entries()) {
     const errors = { rms: 9 - number, max: 9 - number, attributes: [] };
