@@ -60,6 +60,7 @@ __all__ = [
     "remove_closed",
     "remove_folder",
     "run_in_forks",
+    "synchronise_file",
     "synchronise_folder",
     "touch",
     "unacknowledged",
@@ -242,16 +243,46 @@ def give_to_owner(path: Path, status: os.stat_result) -> None:
             os.chown(path, status.st_uid, status.st_gid)
 
 
-def synchronise_folder(folder: Path) -> None:
-    """Put the names in a folder on disk, where folders can be opened; Windows does so by itself."""
+def synchronise_file(handle: int) -> None:
+    """Put the bytes of an open file on disk; on macOS that includes the memory of the disk.
+
+    Raises
+    ------
+    OSError
+        If the disk fails: bytes that were written may be lost, and synchronising again does not tell.
+    """
+    if sys.platform == "darwin":
+        with suppress(OSError):  # not every file system can
+            fcntl.fcntl(handle, fcntl.F_FULLFSYNC)
+            return
+    os.fsync(handle)
+
+
+def synchronise_folder(folder: Path, *, must: bool = False) -> None:
+    """Put the names in a folder on disk, where folders can be opened; Windows does so by itself.
+
+    Parameters
+    ----------
+    folder : Path
+    must : bool
+        Whether a failure is an error; otherwise the names are put there as far as possible.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be opened or the disk fails, with ``must``.
+    """
     if sys.platform == "win32":
         return
-    with suppress(OSError):  # a process that is confined, or a file system that cannot
+    try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(handle)
         finally:
             os.close(handle)
+    except OSError as error:  # a process that is confined, or a file system that cannot
+        if must and error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def allocate(path: Path) -> None:

@@ -1,0 +1,34 @@
+"""Stores: a folder or a bucket under one interface, for the server and for `lodestream publish`."""
+
+from __future__ import annotations
+
+from .addresses import open_store
+from .errors import (
+    AbsentError,
+    ConflictError,
+    ExistsError,
+    FullError,
+    StoreError,
+    UnacknowledgedError,
+    UnfitStoreError,
+)
+from .folder import Folder
+from .interface import SMALL, Blob, Entry, Progress, Store, Tag
+
+__all__ = [
+    "SMALL",
+    "AbsentError",
+    "Blob",
+    "ConflictError",
+    "Entry",
+    "ExistsError",
+    "Folder",
+    "FullError",
+    "Progress",
+    "Store",
+    "StoreError",
+    "Tag",
+    "UnacknowledgedError",
+    "UnfitStoreError",
+    "open_store",
+]

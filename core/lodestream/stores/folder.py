@@ -1,0 +1,387 @@
+"""A folder as a store: what a write returned for survives a power failure, and no reader sees half of anything."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from hashlib import sha256
+from pathlib import Path
+from typing import BinaryIO, NoReturn, Self
+
+from ..errors import InputError
+from ..operating_system import (
+    NO_LOCKS,
+    lock,
+    open_own,
+    read_at,
+    read_cached,
+    synchronise_file,
+    synchronise_folder,
+)
+from .errors import AbsentError, ConflictError, ExistsError, FullError, StoreError, UnacknowledgedError
+from .interface import SMALL, Entry, Progress, Tag
+from .keys import checked_key, checked_prefix, checked_small
+from .probe import try_out
+
+__all__ = ["OWN", "Folder"]
+
+#: The folder inside a store that is the store's own: its lock, and files that are being written. No key leads there.
+OWN = ".lodestream"
+
+#: Seconds after which a file that is being written is the rest of a crash.
+_DEAD = 24 * 3600.0
+#: Bytes copied at once.
+_PIECE = 1 << 20
+#: Folders that are remembered to be on disk.
+_FOLDERS_KNOWN = 10_000
+
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
+# Of file systems without hard links: FAT, some of a network.
+_NO_LINKS = (errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EMLINK)
+_ABSENT = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+
+
+class Folder:
+    """A store in a folder. See `Store` for what the methods do.
+
+    Each object is a file of the name of its key, which other programs may read at any time, and never write. It is
+    written in a folder of the store's own, synchronised, and then linked or renamed to its name. Tags of `get` are
+    hashes of the bytes.
+
+    Parameters
+    ----------
+    root : Path
+        It need not exist: the first write makes it.
+    """
+
+    def __init__(self, root: str | os.PathLike[str]) -> None:
+        self.root = Path(root).absolute()
+        self._own = self.root / OWN
+        self._one_at_a_time = threading.Lock()
+        self._on_disk: set[Path] = set()  # folders whose names are
+
+    def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
+        """Read a small object and its tag."""
+        path = self._path(key)
+        try:
+            with path.open("rb") as file:
+                data = file.read(most + 1)
+        except _ABSENT:
+            raise self._absent(key) from None
+        except OSError as error:
+            self._refuse(key, error)
+        if len(data) > most:
+            raise StoreError(f"{self.describe()}: {key}: expected at most {most:,} bytes")
+        return data, _tag(data)
+
+    def create(self, key: str, data: bytes) -> Tag:
+        """Write a small object if there is none, and return its tag."""
+        path = self._path(key)
+        new = self._written(key, lambda file: file.write(checked_small(key, data)))
+        try:
+            self._name(key, path, lambda: self._link(new, path))
+        finally:
+            _discard(new)
+        return _tag(data)
+
+    def replace(self, key: str, data: bytes, tag: Tag) -> Tag:
+        """Write a small object in place of the one that was read with a tag, and return the new tag."""
+        path = self._path(key)
+        new = self._written(key, lambda file: file.write(checked_small(key, data)))
+        try:
+            with self._locked(key):
+                if (there := self._tag_of(key)) != tag:
+                    what = "gone" if there is None else "changed"
+                    raise ConflictError(f"{self.describe()}: {key} has {what} meanwhile: read it again")
+                self._name(key, path, lambda: new.replace(path))
+        finally:
+            _discard(new)
+        return _tag(data)
+
+    def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
+        """Write a large object from a file."""
+        final = self._path(key)
+        with open(path, "rb") as source:
+            new = self._written(key, lambda file: _copy(source, file, progress))
+        try:
+            self._name(key, final, lambda: new.replace(final))
+        finally:
+            _discard(new)
+
+    def open(self, key: str, size: int | None = None) -> FileBlob:
+        """Open an object for reading; it stays readable if it is deleted meanwhile."""
+        path = self._path(key)
+        try:
+            return FileBlob(path, path.open("rb", buffering=0))
+        except _ABSENT:
+            raise self._absent(key) from None
+        except OSError as error:
+            self._refuse(key, error)
+
+    @contextmanager
+    def local(self, key: str) -> Iterator[Path]:
+        """Give the file of an object for the length of a block; it must not be changed."""
+        path = self._path(key)
+        try:
+            regular = path.is_file()
+        except OSError as error:
+            self._refuse(key, error)
+        if not regular:
+            raise self._absent(key)
+        yield path
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Delete objects, as far as there are any."""
+        paths = {key: self._path(key) for key in keys}
+        for key, path in paths.items():
+            try:
+                path.unlink()
+            except _ABSENT:
+                pass
+            except OSError as error:
+                self._refuse(key, error)
+        for folder, key in {path.parent: key for key, path in paths.items()}.items():
+            # Also for what was gone already: it may be gone in memory alone.
+            try:
+                synchronise_folder(folder, must=True)
+            except _ABSENT:
+                continue
+            except OSError as error:
+                self._refuse(key, error)
+
+    def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
+        """List objects in the order of their keys."""
+        yield from self._below(self.root / checked_prefix(prefix), prefix, after)
+
+    def _below(self, folder: Path, prefix: str, after: str) -> Iterator[Entry]:
+        try:
+            with os.scandir(folder) as found:
+                names = {each.name + ("/" if each.is_dir(follow_symlinks=False) else ""): each for each in found}
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        except OSError as error:
+            self._refuse(prefix, error)
+        for name in sorted(names):
+            key = prefix + name
+            if name.startswith(".") or (key <= after and not after.startswith(key)):
+                continue
+            if name.endswith("/"):
+                yield from self._below(folder / name, key, after)
+            elif key > after and (entry := self._entry(key, names[name])):
+                yield entry
+
+    def _entry(self, key: str, found: os.DirEntry[str]) -> Entry | None:
+        try:
+            checked_key(key)
+            if not found.is_file(follow_symlinks=False):
+                return None
+            status = os.lstat(found.path)
+        except (InputError, FileNotFoundError):  # of another program, or deleted meanwhile
+            return None
+        except OSError as error:
+            self._refuse(key, error)
+        tag = Tag(f"{status.st_mtime_ns:x}-{status.st_size:x}-{status.st_ino:x}")
+        return Entry(key, status.st_size, tag, status.st_mtime)
+
+    def room(self) -> int | None:
+        """Return the free bytes of the disk."""
+        there = next(folder for folder in (self.root, *self.root.parents) if folder.exists())
+        try:
+            return shutil.disk_usage(there).free
+        except OSError as error:
+            self._refuse("", error)
+
+    def probe(self) -> None:
+        """Try out whether the folder can be written, read and listed."""
+        try_out(self)
+
+    def describe(self) -> str:
+        """Return the path."""
+        return str(self.root)
+
+    def __repr__(self) -> str:
+        return f"Folder({self.describe()!r})"
+
+    def _path(self, key: str) -> Path:
+        return self.root.joinpath(*checked_key(key).split("/"))
+
+    def _tag_of(self, key: str) -> Tag | None:
+        try:
+            return self.get(key)[1]
+        except AbsentError:
+            return None
+
+    def _written(self, key: str, write: Callable[[BinaryIO], object]) -> Path:
+        """Write a new file and synchronise it; return its path, from where it is given its name."""
+        new = self._own / f"{secrets.token_hex(8)}.new"
+        try:
+            self._make(self._own)
+            with new.open("xb") as file:
+                write(file)
+                file.flush()
+                synchronise_file(file.fileno())
+        except OSError as error:
+            _discard(new)
+            self._refuse(key, error)
+        except BaseException:
+            _discard(new)
+            raise
+        return new
+
+    def _name(self, key: str, path: Path, give: Callable[[], object]) -> None:
+        """Make the folder of an object, call what gives its file the name, and synchronise the folder."""
+        try:
+            self._make(path.parent)
+            try:
+                give()
+            except FileNotFoundError:  # another program has removed folders
+                self._on_disk.clear()
+                self._make(path.parent)
+                give()
+        except FileExistsError:
+            # Whoever is told that it is there may rely on it: it may be of another process that is about to do this.
+            self._synchronise(key, path.parent)
+            raise ExistsError(f"{self.describe()}: {key} exists already") from None
+        except OSError as error:
+            self._refuse(key, error)
+        self._synchronise(key, path.parent)
+
+    def _synchronise(self, key: str, folder: Path) -> None:
+        try:
+            synchronise_folder(folder, must=True)
+        except OSError as error:
+            raise UnacknowledgedError(
+                f"{self.describe()}: {key} may be lost if the power fails: {error.strerror}; check the disk, try again"
+            ) from error
+
+    def _link(self, new: Path, path: Path) -> None:
+        try:
+            os.link(new, path)
+        except OSError as error:
+            if error.errno not in _NO_LINKS:
+                raise
+            with self._locked(str(path)):
+                if path.exists():
+                    raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
+                new.rename(path)
+
+    @contextmanager
+    def _locked(self, key: str) -> Iterator[None]:
+        """Keep others from replacing objects: threads of this process, and other processes where there are locks."""
+        with self._one_at_a_time:
+            try:
+                handle = open_own(self._own / "lock", create=True)
+            except OSError as error:
+                self._refuse(key, error)
+            try:
+                try:
+                    lock(handle, wait=True)
+                except OSError as error:
+                    if error.errno not in NO_LOCKS:
+                        self._refuse(key, error)
+                yield
+            finally:
+                os.close(handle)
+
+    def _make(self, folder: Path) -> None:
+        """Make a folder of the store and put its name on disk, once for each process."""
+        if folder in self._on_disk:
+            return
+        if folder == self.root:
+            self._make_root()
+        else:
+            self._make(folder.parent)
+            with suppress(FileExistsError):
+                folder.mkdir(0o700 if folder == self._own else 0o777)
+            synchronise_folder(folder.parent, must=True)
+            if folder == self._own:
+                self._clear()
+        if len(self._on_disk) >= _FOLDERS_KNOWN:
+            self._on_disk.clear()
+        self._on_disk.add(folder)
+
+    def _make_root(self) -> None:
+        missing = [self.root, *self.root.parents]
+        missing = missing[: next(count for count, folder in enumerate(missing) if folder.exists())]
+        for folder in reversed(missing):
+            folder.mkdir(exist_ok=True)
+            synchronise_folder(folder.parent, must=True)
+        if not missing:
+            synchronise_folder(self.root.parent)  # which may be nobody's to read
+
+    def _clear(self) -> None:
+        """Remove what crashes have left of files that were being written."""
+        for new in self._own.glob("*.new"):
+            with suppress(OSError):
+                if new.stat().st_mtime < time.time() - _DEAD:
+                    new.unlink()
+
+    def _absent(self, key: str) -> AbsentError:
+        return AbsentError(f"{self.describe()}: there is no {key}")
+
+    def _refuse(self, key: str, error: OSError) -> NoReturn:
+        """Raise what an error of the system is here."""
+        place = f"{self.describe()}: {key}" if key else self.describe()
+        if error.errno in _NO_SPACE:
+            raise FullError(f"{place}: {error.strerror}: delete something, or use another disk") from error
+        raise StoreError(f"{place}: {error.strerror or error}") from error
+
+
+class FileBlob:
+    """An object in a folder that is open for reading. On Windows one thread at a time may read. See `Blob`."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path = path
+        self.size = os.fstat(file.fileno()).st_size
+        self._file = file
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Read bytes; fewer where the object ends."""
+        length = min(length, self.size - offset)
+        pieces: list[bytes] = []
+        try:
+            while length > 0 and (piece := read_at(self._file.fileno(), length, offset)):
+                pieces.append(piece)
+                offset, length = offset + len(piece), length - len(piece)
+        except OSError as error:
+            raise StoreError(f"{self.path}: {error.strerror}") from error
+        return b"".join(pieces)
+
+    def read_at_once(self, offset: int, length: int) -> bytes | None:
+        """Read exactly so many bytes without waiting for the disk; None if that is not possible."""
+        return read_cached(self._file.fileno(), length, offset)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _tag(data: bytes) -> Tag:
+    return Tag(sha256(data).hexdigest()[:32])
+
+
+def _copy(source: BinaryIO, target: BinaryIO, progress: Progress | None) -> None:
+    done = 0
+    while piece := source.read(_PIECE):
+        target.write(piece)
+        done += len(piece)
+        if progress is not None:
+            progress(done)
+
+
+def _discard(new: Path) -> None:
+    """Remove a file that was being written; if that fails, it is removed after a day."""
+    with suppress(OSError):
+        new.unlink(missing_ok=True)

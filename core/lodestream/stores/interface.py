@@ -1,0 +1,240 @@
+"""The interface of a store: objects by key, small ones changed under conditions, large ones written once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NewType, Protocol, Self
+
+__all__ = ["SMALL", "Blob", "Entry", "Progress", "Store", "Tag"]
+
+#: Bytes that a small object may have, which is read and written as a whole.
+SMALL = 16 << 20
+
+#: Tells one state of an object from others; nothing else is to be read into it. It is no hash of the bytes.
+Tag = NewType("Tag", str)
+
+#: Takes the bytes that were written so far; may raise an error to stop.
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An object as a store lists it.
+
+    Attributes
+    ----------
+    key : str
+    size : int
+        In bytes.
+    tag : Tag
+        Another one when the object has changed. In a folder it is not the tag that `Store.get` returns.
+    modified : float
+        Seconds since 1970 by the clock of the store: to be compared with other times of this store alone.
+    """
+
+    key: str
+    size: int
+    tag: Tag
+    modified: float
+
+
+class Blob(Protocol):
+    """An object that is open for reading. Its methods may be called from any thread."""
+
+    @property
+    def size(self) -> int:
+        """Its bytes."""
+        ...
+
+    @property
+    def path(self) -> Path | None:
+        """The file that holds it, if it is one on this machine."""
+        ...
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Read bytes; fewer where the object ends.
+
+        Raises
+        ------
+        AbsentError
+            If it was deleted meanwhile; in a folder it stays readable.
+        StoreError
+            If it cannot be read.
+        """
+        ...
+
+    def read_at_once(self, offset: int, length: int) -> bytes | None:
+        """Read exactly so many bytes if they are in memory; otherwise return None."""
+        ...
+
+    def close(self) -> None:
+        """Let go of it."""
+        ...
+
+    def __enter__(self) -> Self:
+        """Return the blob itself."""
+        ...
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        ...
+
+
+class Store(Protocol):
+    """Objects by key. Its methods may be called from any thread, and each waits for the store.
+
+    A key is a path of a few parts, such as ``containers/0a1b.lode``; `lodestream.stores.keys` says what it may have.
+    A write that returned survives a power failure, and no reader ever sees half of it. *Small objects* are changed by
+    `create` and `replace` alone: each body has to hold an id of its own write, so that one whose answer is lost is told
+    from one of another writer. *Large objects* never change, and are named by their hash.
+
+    A process that forks must do so before it opens a store; see `docs/stores.md`.
+    """
+
+    def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
+        """Read a small object and its tag.
+
+        Parameters
+        ----------
+        key : str
+        most : int
+            Bytes that it may have.
+
+        Raises
+        ------
+        AbsentError
+            If there is none.
+        StoreError
+            If it is larger, or the store cannot be read.
+        InputError
+            If the key cannot be one; so do all methods below.
+        """
+        ...
+
+    def create(self, key: str, data: bytes) -> Tag:
+        """Write a small object if there is none, and return its tag.
+
+        Raises
+        ------
+        ExistsError
+            If there is one.
+        UnacknowledgedError
+            If it is not known whether it was written.
+        StoreError
+            If it was not written.
+        """
+        ...
+
+    def replace(self, key: str, data: bytes, tag: Tag) -> Tag:
+        """Write a small object in place of the one that was read with a tag, and return the new tag.
+
+        Raises
+        ------
+        ConflictError
+            If there is another one, or none.
+        UnacknowledgedError
+            If it is not known whether it was written.
+        StoreError
+            If it was not written.
+        """
+        ...
+
+    def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
+        """Write a large object from a file, whatever is there: until the end there is what was before.
+
+        It may be repeated, and must be if it fails.
+
+        Raises
+        ------
+        StoreError
+            If it was not written, or it is not known whether it was.
+        OSError
+            If the file cannot be read.
+        """
+        ...
+
+    def open(self, key: str, size: int | None = None) -> Blob:
+        """Open an object for reading.
+
+        Parameters
+        ----------
+        key : str
+        size : int, optional
+            Its bytes if they are known, which saves a request; it must be right.
+
+        Raises
+        ------
+        AbsentError
+            If there is none; with ``size`` it may be the first `Blob.read` that says so.
+        StoreError
+            If the store cannot be read.
+        """
+        ...
+
+    def local(self, key: str) -> AbstractContextManager[Path]:
+        """Give an object as a file on this machine for the length of a block; it must not be changed.
+
+        Raises
+        ------
+        AbsentError
+            If there is none.
+        StoreError
+            If it cannot be read.
+        """
+        ...
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Delete objects, as far as there are any.
+
+        Raises
+        ------
+        StoreError
+            If the store does not answer: then it is not known which of them are left.
+        """
+        ...
+
+    def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
+        """List objects in the order of their keys.
+
+        Parameters
+        ----------
+        prefix : str
+            ``""`` for all, or the first parts of their keys with a slash at the end.
+        after : str
+            Only keys behind this one, whether there is such an object or not.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be listed.
+        """
+        ...
+
+    def room(self) -> int | None:
+        """Return the bytes that can still be written; None where that has no limit or is unknown.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read.
+        """
+        ...
+
+    def probe(self) -> None:
+        """Try out whether the store heeds conditions, and reads and lists what was written.
+
+        Raises
+        ------
+        UnfitStoreError
+            If it does not.
+        StoreError
+            If it cannot be used.
+        """
+        ...
+
+    def describe(self) -> str:
+        """Return the address, without any credential."""
+        ...
