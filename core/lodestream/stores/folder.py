@@ -197,9 +197,9 @@ class Folder:
         except OSError as error:
             self._refuse("", error)
 
-    def probe(self) -> None:
-        """Try out whether the folder can be written, read and listed."""
-        try_out(self)
+    def probe(self) -> float:
+        """Try out whether the folder can be written, read and listed; return the time by its clock."""
+        return try_out(self)
 
     def describe(self) -> str:
         """Return the path."""

@@ -223,8 +223,13 @@ class Store(Protocol):
         """
         ...
 
-    def probe(self) -> None:
+    def probe(self) -> float:
         """Try out whether the store heeds conditions, and reads and lists what was written.
+
+        Returns
+        -------
+        float
+            The time by the clock of the store, in seconds since 1970.
 
         Raises
         ------

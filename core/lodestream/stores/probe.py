@@ -16,8 +16,13 @@ __all__ = ["PROBES", "try_out"]
 PROBES = "probe/"
 
 
-def try_out(store: Store) -> None:
+def try_out(store: Store) -> float:
     """Create, replace, list, read and delete two objects of a store, also where that must be refused.
+
+    Returns
+    -------
+    float
+        The time by the clock of the store, in seconds since 1970.
 
     Raises
     ------
@@ -29,7 +34,7 @@ def try_out(store: Store) -> None:
     small, large = (f"{PROBES}{secrets.token_hex(8)}" for _ in "12")
     try:
         _try_conditions(store, small)
-        _try_lists(store, small, large)
+        return _try_lists(store, small, large)
     finally:
         with suppress(StoreError):
             store.delete([small, large])
@@ -51,7 +56,7 @@ def _try_conditions(store: Store, key: str) -> None:
         raise _unfit(store, "does not read what was just replaced")
 
 
-def _try_lists(store: Store, small: str, large: str) -> None:
+def _try_lists(store: Store, small: str, large: str) -> float:
     data = secrets.token_bytes(1000)
     with TemporaryDirectory(prefix="lodestream-") as folder:
         path = Path(folder) / "probe"
@@ -60,8 +65,8 @@ def _try_lists(store: Store, small: str, large: str) -> None:
     with store.open(large) as blob:
         if blob.size != len(data) or blob.read(100, 200) != data[100:300]:
             raise _unfit(store, "does not read the part of an object that was asked for")
-    listed = {entry.key: entry.size for entry in store.entries(PROBES)}
-    if listed.get(large) != len(data) or small not in listed:
+    listed = {entry.key: entry for entry in store.entries(PROBES)}
+    if large not in listed or listed[large].size != len(data) or small not in listed:
         raise _unfit(store, "does not list what was just written")
     store.delete([small, large])
     with suppress(AbsentError):
@@ -69,6 +74,7 @@ def _try_lists(store: Store, small: str, large: str) -> None:
         raise _unfit(store, "reads what was just deleted")
     if {small, large} & {entry.key for entry in store.entries(PROBES)}:
         raise _unfit(store, "lists what was just deleted")
+    return listed[large].modified
 
 
 def _unfit(store: Store, what: str) -> UnfitStoreError:
