@@ -13,6 +13,9 @@
  * Sums are taken in 32 bits where their terms are so small that nothing can overflow, nearly always, and in 64
  * otherwise. Both are exact for samples within +-2^27 and coefficients below 2^29; beyond, all is modulo 2^32.
  */
+#ifdef __AVX2__
+#include <immintrin.h>
+#endif
 #include <stdbool.h>
 
 #include "copying.h"
@@ -36,6 +39,7 @@ enum {
      * to 2896 and 3500, so that neither weighted sum of details of at most 2^18 leaves int32. */
     SMALL = 1 << 18,
     BIAS = 3 << 21,
+    MOST = CHUNK + 6 * REACH * STRIP, /* values of a chunk, the last one of a line being the longest, and around it */
 };
 
 static const int32_t TAPS[REACH] = {4913933, -843098, 144653, -24818, 4258, -731, 125, -21, 4, -1};
@@ -52,6 +56,7 @@ struct bundle {
     int32_t a, b;
     int32_t *nodes, *details; /* where number 0 of each stands */
     bool bare;                /* all details are 0, whatever stands in their places */
+    int32_t *room;            /* for MOST numbers, which a function leaves to nobody */
 };
 
 LODE_INLINE int32_t plus(int32_t a, int32_t b) {
@@ -197,15 +202,12 @@ static void put(const struct bundle *w, int64_t sample, int32_t *buffer) {
     move(w, false, sample, buffer, 1);
 }
 
-/* Something at least as large as every magnitude, and less than twice the largest: of values, or of differences of
- * values `apart`. */
-LODE_INLINE int64_t magnitude(const int32_t *values, struct spans of, int64_t gap, int64_t apart) {
+/* Something at least as large as the magnitude of every value, and less than twice the largest. */
+LODE_INLINE int64_t magnitude(const int32_t *values, struct spans of, int64_t gap) {
     int32_t bits = 0;
     for (int64_t k = 0; k < of.spans; k++)
-        for (int64_t i = k * gap; i < k * gap + of.count; i++) {
-            int32_t value = apart ? minus(values[i + apart], values[i]) : values[i];
-            bits |= value ^ (value >> 31);
-        }
+        for (int64_t i = k * gap; i < k * gap + of.count; i++)
+            bits |= values[i] ^ (values[i] >> 31);
     return (int64_t)bits + 1;
 }
 
@@ -252,76 +254,87 @@ static void update_wide(const int32_t *restrict details, int32_t *restrict nodes
 
 #ifdef __AVX2__
 
-/* Where details fit 16 bits, two neighbours along the line stand in each word: one operation multiplies both by their
- * taps and adds the products. Half of a word's taps sum to at most 7596 in magnitude, so that no sum leaves int32. */
-typedef int32_t words __attribute__((vector_size(32)));
-typedef int16_t halves __attribute__((vector_size(32)));
-
+/* Where details are below 2^14, sums of two of them, which have the same tap, fit 16 bits, and one operation multiplies
+ * two such sums by their taps and adds the products. Half of the taps' magnitudes sum to at most 7596, so that no sum
+ * leaves int32. */
 enum {
-    WORDS = sizeof(words) / sizeof(int32_t),
-    SHORT = 1 << 15,
-    MOST_PAIRS = CHUNK + 6 * REACH * STRIP, /* of a chunk, the last one of a line being the longest */
+    SHORT = 1 << 14,
+    SHORTS = 16, /* of a register */
 };
 
-/* The taps of a word, as the low and the high halves of the coefficients: of d_i and d_{i + 1}. */
+/* The taps of two neighbouring sums, as the low and the high halves of the coefficients. */
 #define TAP_WORD(first, second) ((int32_t)((uint32_t)((first) & 0xFFFF) | (uint32_t)(second) << 16))
 
-static const int32_t LOW_TAPS[REACH] = {
-    TAP_WORD(-1, 4),    TAP_WORD(-21, 125),   TAP_WORD(-731, 4258), TAP_WORD(-242, -755), TAP_WORD(678, 781),
-    TAP_WORD(781, 678), TAP_WORD(-755, -242), TAP_WORD(4258, -731), TAP_WORD(125, -21),   TAP_WORD(4, -1),
+static const int32_t LOW_TAPS[REACH / 2] = {
+    TAP_WORD(781, 678), TAP_WORD(-755, -242), TAP_WORD(4258, -731), TAP_WORD(125, -21), TAP_WORD(4, -1),
 };
-static const int32_t HIGH_TAPS[4] = {TAP_WORD(-12, 71), TAP_WORD(-412, 2399), TAP_WORD(2399, -412), TAP_WORD(71, -12)};
+static const int32_t HIGH_TAPS[2] = {TAP_WORD(2399, -412), TAP_WORD(71, -12)};
 
-/* Details and those `gap` behind them in pairs; whether the former all fit. */
-LODE_INLINE bool pair_up(const int32_t *restrict details, int32_t *restrict pairs, int64_t count, int64_t gap) {
+/* Details in 16 bits; whether they all are so short. */
+LODE_INLINE bool shorten(const int32_t *restrict details, int16_t *restrict shorts, int64_t count) {
     int32_t bits = 0;
     for (int64_t i = 0; i < count; i++) {
-        int32_t own = details[i];
-        bits |= own ^ (own >> 31);
-        pairs[i] = (int32_t)(((uint32_t)own & 0xFFFF) | (uint32_t)details[i + gap] << 16);
+        bits |= details[i] ^ (details[i] >> 31);
+        shorts[i] = (int16_t)details[i];
     }
     return bits < SHORT;
 }
 
-LODE_INLINE words times_taps(const int32_t *pairs, int32_t taps) {
-    words pair, tap = {taps, taps, taps, taps, taps, taps, taps, taps};
-    memcpy(&pair, pairs, sizeof pair);
-    return (words)__builtin_ia32_pmaddwd256((halves)pair, (halves)tap);
+LODE_INLINE __m256i load_shorts(const int16_t *from) {
+    return _mm256_loadu_si256((const __m256i *)(const void *)from);
 }
 
-/* `update_small` of values from `first` on, so many that they fill whole registers; `pairs` begins REACH lines before
- * their details. Returns how many. */
-LODE_INLINE int64_t update_pairs(const int32_t *pairs, int32_t *nodes, int64_t count, int64_t gap, bool inverse) {
+LODE_INLINE __m256i times_taps(__m256i sums, int32_t taps) {
+    return _mm256_madd_epi16(sums, _mm256_set1_epi32(taps));
+}
+
+LODE_INLINE __m256i rise_of(__m256i low, __m256i high) {
+    return _mm256_srai_epi32(_mm256_add_epi32(high, _mm256_srai_epi32(low, 11)), 13);
+}
+
+LODE_INLINE void raise(int32_t *nodes, __m256i rise, bool inverse) {
+    __m256i *place = (__m256i *)(void *)nodes, node = _mm256_loadu_si256(place);
+    _mm256_storeu_si256(place, inverse ? _mm256_sub_epi32(node, rise) : _mm256_add_epi32(node, rise));
+}
+
+/* `update_small` of so many nodes that they fill whole registers; returns how many. */
+LODE_INLINE int64_t update_shorts(const int16_t *d, int32_t *nodes, int64_t count, int64_t gap, bool inverse) {
     int64_t i = 0;
-    for (; i + WORDS <= count; i += WORDS) {
-        words low = {BIAS, BIAS, BIAS, BIAS, BIAS, BIAS, BIAS, BIAS}, high = {0};
-        for (int64_t j = 0; j < REACH; j++)
-            low += times_taps(pairs + i + 2 * j * gap, LOW_TAPS[j]);
-        for (int64_t j = 0; j < 4; j++)
-            high += times_taps(pairs + i + (2 * j + 6) * gap, HIGH_TAPS[j]);
-        words rise = (high + (low >> 11)) >> 13, node;
-        memcpy(&node, nodes + i, sizeof node);
-        node = inverse ? node - rise : node + rise;
-        memcpy(nodes + i, &node, sizeof node);
+    for (; i + SHORTS <= count; i += SHORTS) {
+        /* Neighbouring sums are brought together in halves of registers: of nodes 0 to 3 and 8 to 11, and the others.
+         */
+        __m256i low[2] = {_mm256_set1_epi32(BIAS), _mm256_set1_epi32(BIAS)}, high[2] = {{0}};
+        for (int64_t j = 0; j < REACH; j += 2) {
+            __m256i even = _mm256_add_epi16(load_shorts(d + i + j * gap), load_shorts(d + i - (j + 1) * gap));
+            __m256i odd = _mm256_add_epi16(load_shorts(d + i + (j + 1) * gap), load_shorts(d + i - (j + 2) * gap));
+            __m256i sums[2] = {_mm256_unpacklo_epi16(even, odd), _mm256_unpackhi_epi16(even, odd)};
+            for (int k = 0; k < 2; k++) {
+                low[k] = _mm256_add_epi32(low[k], times_taps(sums[k], LOW_TAPS[j / 2]));
+                if (j < 4)
+                    high[k] = _mm256_add_epi32(high[k], times_taps(sums[k], HIGH_TAPS[j / 2]));
+            }
+        }
+        __m256i rises[2] = {rise_of(low[0], high[0]), rise_of(low[1], high[1])};
+        raise(nodes + i, _mm256_permute2x128_si256(rises[0], rises[1], 0x20), inverse);
+        raise(nodes + i + SHORTS / 2, _mm256_permute2x128_si256(rises[0], rises[1], 0x31), inverse);
     }
     return i;
 }
 
 /* `update_small` of nodes `from` to `to` - 1 of a chunk; whether their details were short enough. */
 LODE_INLINE bool update_short(const struct bundle *w, int64_t from, int64_t to, int64_t gap, bool inverse) {
-    int32_t pairs[MOST_PAIRS];
-    int64_t lines = to - from, above = 2 * REACH - 2;
-    struct spans all = spans_of(w, from, to + above), own = spans_of(w, from, to);
+    int16_t *shorts = (int16_t *)(void *)w->room;
+    int64_t lines = to - from, beyond = 2 * REACH - 1;
+    struct spans all = spans_of(w, from, to + beyond), own = spans_of(w, from, to);
     const int32_t *d = w->details + (from - REACH) * gap;
-    struct spans last = {1, w->width};
-    if (lines < 1 || (lines + above) * gap > MOST_PAIRS || magnitude(d + (lines + above) * gap, last, gap, 0) > SHORT)
+    if (lines < 1)
         return false;
     for (int64_t k = 0; k < all.spans; k++)
-        if (!pair_up(d + k * gap, pairs + k * gap, all.count, gap))
+        if (!shorten(d + k * gap, shorts + k * gap, all.count))
             return false;
     for (int64_t k = 0; k < own.spans; k++) {
         int32_t *c = w->nodes + (from + k) * gap;
-        int64_t done = update_pairs(pairs + k * gap, c, own.count, gap, inverse);
+        int64_t done = update_shorts(shorts + (REACH + k) * gap, c, own.count, gap, inverse);
         struct spans rest = {1, own.count - done};
         update_small(w->details + (from + k) * gap + done, c + done, rest, gap, inverse);
     }
@@ -343,7 +356,7 @@ LODE_INLINE void update_at(const struct bundle *w, int64_t from, int64_t to, int
     const int32_t *d = w->details + from * gap;
     int32_t *c = w->nodes + from * gap;
     struct spans of = spans_of(w, from, to);
-    if (magnitude(d - REACH * gap, spans_of(w, from - REACH, to + REACH - 1), gap, 0) <= SMALL)
+    if (magnitude(d - REACH * gap, spans_of(w, from - REACH, to + REACH - 1), gap) <= SMALL)
         update_small(d, c, of, gap, inverse);
     else
         update_wide(d, c, of, gap, inverse);
@@ -398,16 +411,27 @@ static void surround(const struct bundle *w, bool after) {
         }
 }
 
-LODE_INLINE void surplus_small(const int32_t *restrict nodes, int32_t *restrict details, struct spans of, int64_t gap,
+/* Rises from each of some nodes to the next one; something at least as large as their magnitudes and less than twice
+ * the largest is returned. */
+LODE_INLINE int64_t rise_between(const int32_t *restrict nodes, int32_t *restrict rises, struct spans of, int64_t gap) {
+    int32_t bits = 0;
+    for (int64_t k = 0; k < of.spans; k++)
+        for (int64_t i = k * gap; i < k * gap + of.count; i++) {
+            int32_t rise = minus(nodes[i + gap], nodes[i]);
+            rises[i] = rise;
+            bits |= rise ^ (rise >> 31);
+        }
+    return (int64_t)bits + 1;
+}
+
+LODE_INLINE void surplus_small(const int32_t *restrict rises, int32_t *restrict details, struct spans of, int64_t gap,
                                int32_t a, int32_t b, bool inverse) {
     for (int64_t k = 0; k < of.spans; k++) {
-        const int32_t *n = nodes + k * gap;
+        const int32_t *r = rises + k * gap;
         int32_t *d = details + k * gap;
         for (int64_t i = 0; i < of.count; i++) {
-            int32_t near = plus(n[i], n[i + gap]);
-            int32_t inner = minus(near, plus(n[i - gap], n[i + 2 * gap]));
-            int32_t outer = minus(near, plus(n[i - 2 * gap], n[i + 3 * gap]));
-            int32_t rise = plus(plus(times(a, inner), times(b, outer)), 128) >> 8;
+            int32_t inner = minus(r[i - gap], r[i + gap]), outer = minus(r[i - 2 * gap], r[i + 2 * gap]);
+            int32_t rise = plus(plus(times(a + b, inner), times(b, outer)), 128) >> 8;
             d[i] = inverse ? within(plus(d[i], rise), LARGEST_DETAIL) : minus(d[i], rise);
         }
     }
@@ -453,8 +477,8 @@ LODE_INLINE void surplus_at(const struct bundle *w, int64_t from, int64_t to, in
     /* Sums modulo 2^32 are right where v fits int32: two rises make up an inner sum, four an outer. A rise beyond an
      * end is at most five times as large as those inside, so that none has left int32 where all are below 2^28. */
     int64_t weight = 2 * (w->a < 0 ? -w->a : w->a) + 4 * (w->b < 0 ? -w->b : w->b);
-    if (magnitude(n - BEFORE * gap, rises, gap, gap) * (weight < 8 ? 8 : weight) < INT32_MAX - 127) {
-        surplus_small(n, d, spans_of(w, from, to), gap, w->a, w->b, inverse);
+    if (rise_between(n - BEFORE * gap, w->room, rises, gap) * (weight < 8 ? 8 : weight) < INT32_MAX - 127) {
+        surplus_small(w->room + BEFORE * gap, d, spans_of(w, from, to), gap, w->a, w->b, inverse);
         return;
     }
     int64_t inner = from, outer = to;
@@ -609,9 +633,11 @@ int64_t lode_lift(int64_t inverse, int64_t axis, const struct lode_lift *argumen
             return LODE_REFUSED;
     int64_t shift = (int64_t)(-(uintptr_t)call.work / sizeof *call.work % ALIGNED);
     int32_t *nodes = call.work + shift + BEFORE * gap;
+    _Alignas(64) int32_t room[MOST];
     struct bundle w = {
         .along = along_rows ? 1 : call.pitch, .length = length, .midpoints = call.midpoints, .run = call.run};
-    w.bare = inverse == LODE_LIFT_BARE, w.table = call.table, w.a = (int32_t)call.a, w.b = (int32_t)call.b;
+    w.room = room, w.bare = inverse == LODE_LIFT_BARE, w.table = call.table, w.a = (int32_t)call.a,
+    w.b = (int32_t)call.b;
     w.nodes = nodes, w.details = nodes + (call.run + AFTER + REACH) * gap;
     int64_t end = across > gap ? call.run : call.from + AT_ONCE / gap, reached = call.run;
     for (int64_t i = 0; i < across; i += w.width) {
