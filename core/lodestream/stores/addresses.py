@@ -6,16 +6,14 @@ import os
 import re
 from pathlib import Path
 
-from ..errors import InputError, UnavailableError
+from ..errors import InputError
+from .bucket import SCHEMES, Bucket
 from .folder import Folder
 from .interface import Store
 
-__all__ = ["BUCKETS", "open_store"]
+__all__ = ["open_store"]
 
-#: Schemes of buckets.
-BUCKETS = ("s3", "az", "abfss")
-
-_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):/", re.ASCII)  # one letter is a drive of Windows
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://", re.ASCII)  # one letter is a drive of Windows
 
 
 def open_store(address: str | os.PathLike[str]) -> Store:
@@ -37,14 +35,14 @@ def open_store(address: str | os.PathLike[str]) -> Store:
     StoreError
         If credentials, region or account of a bucket are missing.
     """
+    if not os.fspath(address):
+        raise InputError("expected a folder or the address of a bucket, got nothing")
     scheme = _SCHEME.match(address) if isinstance(address, str) else None
-    if scheme is None:
-        if not os.fspath(address):
-            raise InputError("expected a folder or the address of a bucket, got nothing")
+    if not isinstance(address, str) or scheme is None:
         return Folder(Path(address))
-    if scheme[1].lower() not in BUCKETS:
+    if scheme[1].lower() not in SCHEMES:
         raise InputError(
-            f"expected a folder or an address that begins with {', '.join(f'{name}://' for name in BUCKETS)}, got one "
+            f"expected a folder or an address that begins with {', '.join(f'{name}://' for name in SCHEMES)}, got one "
             f"that begins with {scheme[1].lower()}://"
         )
-    raise UnavailableError("expected a folder: stores in buckets are not there yet")
+    return Bucket(address)

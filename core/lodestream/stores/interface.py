@@ -30,7 +30,7 @@ class Entry:
     size : int
         In bytes.
     tag : Tag
-        Another one when the object has changed. In a folder it is not the tag that `Store.get` returns.
+        Another one when the object has changed: to be compared with that of another entry, not of `Store.get`.
     modified : float
         Seconds since 1970 by the clock of the store: to be compared with other times of this store alone.
     """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
-from .places import folder
+from tests.stores.emulators import azure, azurite, ministack, s3
 
-__all__ = ["folder"]
+from .places import bucket_of_azure, bucket_of_s3, folder
+
+__all__ = ["azure", "azurite", "bucket_of_azure", "bucket_of_s3", "folder", "ministack", "s3"]

@@ -22,13 +22,13 @@ from lodestream.stores import (
     StoreError,
 )
 
-from .places import PLACES
+from .places import PLACES, Place
 
 
 @pytest.fixture(params=PLACES)
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
     """An empty store of each kind."""
-    make: Callable[[], Store] = request.getfixturevalue(request.param)
+    make: Place = request.getfixturevalue(request.param)
     return make()
 
 

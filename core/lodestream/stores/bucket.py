@@ -1,0 +1,453 @@
+"""A bucket as a store: Amazon S3 and what is compatible with it, and Azure Blob Storage, by the library obstore.
+
+This module and what it uses are the only part of the core that does network I/O. The library is imported on use.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import random
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, Self, TypeVar
+
+from ..errors import InputError, UnavailableError
+from .answers import RequestError, ask
+from .blocks import Blocks, Extent
+from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
+from .headers import headers
+from .interface import SMALL, Entry, Progress, Tag
+from .keys import checked_key, checked_prefix, checked_small
+from .probe import try_out
+
+if TYPE_CHECKING:
+    from obstore.store import ClientConfig, ObjectStore, RetryConfig
+
+__all__ = ["SCHEMES", "Bucket", "Limits"]
+
+_T = TypeVar("_T")
+
+#: Schemes of addresses, and how each is written.
+SCHEMES = {
+    "s3": "s3://bucket/prefix",
+    "az": "az://container/prefix",
+    "abfss": "abfss://container@account.dfs.core.windows.net/prefix",
+}
+
+_S3_BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]", re.ASCII)
+_CONTAINER = re.compile(r"[a-z0-9](?:[a-z0-9-]{1,61})[a-z0-9]|\$web", re.ASCII)
+# The first one that is set.
+_S3_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
+_AZURE_ENDPOINTS = ("AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT")
+#: Characters of a prefix: with the longest key below what stores allow.
+_LONGEST_PREFIX = 300
+_ACCOUNT = re.compile(r"([a-z0-9]{3,24})\.(?:dfs|blob)\.core\.windows\.net", re.ASCII)
+
+#: Bytes of a part of a large object, and what more parts than this a store does not take.
+_PART = 8 << 20
+_MOST_PARTS = 9_000
+#: Parts that are on their way at once.
+_PARTS_AT_ONCE = 3
+#: Objects that are deleted at once; threads that read ahead.
+_THREADS = 8
+#: Bytes that `local` asks for at once.
+_PIECE = 2 << 20
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long a store is waited for.
+
+    Attributes
+    ----------
+    stalled : float
+        Seconds until the answer to a request begins, or continues.
+    request : float
+        Seconds of a whole request, also the time in which a request that failed is made again.
+    part : float
+        Seconds of a request that writes a part of a large object.
+    retries : int
+        How often a request that failed is made again.
+    write : float
+        Seconds after which a small object that was not written is not tried again.
+    """
+
+    stalled: float = 10.0
+    request: float = 20.0
+    part: float = 120.0
+    retries: int = 3
+    write: float = 30.0
+
+
+class Bucket:
+    """A store in a bucket. See `Store` for what the methods do.
+
+    Credentials, region and endpoint are those of the environment: ``AWS_ACCESS_KEY_ID``, ``AWS_REGION``,
+    ``AWS_ENDPOINT_URL``; ``AZURE_STORAGE_ACCOUNT_NAME``, ``AZURE_STORAGE_SAS_KEY`` and so on; or of the machine's role.
+    Plain HTTP is used only if the endpoint says so.
+
+    Parameters
+    ----------
+    address : str
+        One of `SCHEMES`.
+    limits : Limits
+
+    Raises
+    ------
+    InputError
+        If it is no such address, or has more in it than bucket and prefix.
+    UnavailableError
+        If obstore is not installed.
+    StoreError
+        If settings in the environment are missing or cannot be used.
+    """
+
+    def __init__(self, address: str, limits: Limits | None = None) -> None:
+        place = _parsed(address)
+        try:
+            import obstore
+        except ModuleNotFoundError:
+            raise UnavailableError(
+                "expected obstore, which is not installed: pip install 'lodestream[stores]'"
+            ) from None
+        self._library = obstore
+        self._address = place.address
+        self._prefix = place.prefix
+        self._limits = limits = limits or Limits()
+        try:
+            self._store = ask(lambda: _connected(place, limits, limits.stalled, limits.request))
+            self._parts = ask(lambda: _connected(place, limits, limits.part, limits.part))
+        except RequestError as failure:
+            self._refuse("", failure)
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lodestream-store")
+        self._blocks = Blocks(self._range, self._threads)
+
+    def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
+        """Read a small object and its tag."""
+        data, tag = self._ask(key, partial(self._read, self._at(key), most))
+        if data is None:
+            raise StoreError(f"{self._named(key)}: expected at most {most:,} bytes")
+        return data, self._tag(tag)
+
+    def create(self, key: str, data: bytes) -> Tag:
+        """Write a small object if there is none, and return its tag."""
+        return self._write(key, data, None)
+
+    def replace(self, key: str, data: bytes, tag: Tag) -> Tag:
+        """Write a small object in place of the one that was read with a tag, and return the new tag."""
+        return self._write(key, data, tag)
+
+    def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
+        """Write a large object from a file, in parts. After a failure it begins again, and so does what is told."""
+        at = self._at(key)
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            part = max(_PART, -(-size // _MOST_PARTS))
+            for wait in (*_waits(self._limits.retries), None):
+                file.seek(0)
+                pieces = _Pieces(file, part, progress)
+                try:
+                    ask(partial(self._send, at, key, pieces, part, whole=size <= part))
+                    return
+                except RequestError as failure:
+                    if pieces.error is not None:
+                        raise pieces.error from None
+                    if failure.kind == "refused" or wait is None:
+                        self._refuse(key, failure)
+                # A conflict with another upload of the same bytes, or no answer: what does not change may be repeated.
+                time.sleep(wait)
+
+    def open(self, key: str, size: int | None = None) -> BucketBlob:
+        """Open an object for reading."""
+        at = self._at(key)
+        if size is None:
+            size = self._ask(key, lambda: self._library.head(self._store, at))["size"]
+        return BucketBlob(self._blocks, Extent(key, size))
+
+    @contextmanager
+    def local(self, key: str) -> Iterator[Path]:
+        """Fetch an object into a temporary file for the length of a block."""
+        with TemporaryDirectory(prefix="lodestream-") as folder, self.open(key) as blob:
+            path = Path(folder) / key.rpartition("/")[2]
+            try:
+                with path.open("wb") as file:
+                    for offset in range(0, blob.size, _PIECE):
+                        file.write(blob.read(offset, _PIECE))
+            except OSError as error:
+                raise StoreError(f"{self._named(key)} cannot be kept in {folder}: {error.strerror}") from error
+            yield path
+
+    def delete(self, keys: Iterable[str]) -> None:
+        """Delete objects, as far as there are any."""
+        # One by one: not every store has a request for many, and that of Azure fails for those that are gone.
+        for _ in self._threads.map(self._delete, [(key, self._at(key)) for key in keys]):
+            pass
+
+    def _delete(self, place: tuple[str, str]) -> None:
+        key, at = place
+        try:
+            ask(lambda: self._library.delete(self._store, at))
+        except RequestError as failure:
+            if failure.kind != "absent":
+                self._refuse(key, failure)
+
+    def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
+        """List objects in the order of their keys."""
+        where = self._prefix + checked_prefix(prefix)
+        offset = self._prefix + after if after else None
+        listed = self._ask(prefix, lambda: self._library.list(self._store, where or None, offset=offset))
+        while (chunk := self._ask(prefix, partial(next, listed, None))) is not None:
+            for found in chunk:
+                key = found["path"][len(self._prefix) :]
+                if key > after and _is_key(key):
+                    tag = Tag((found["e_tag"] or "").strip('"'))
+                    yield Entry(key, found["size"], tag, found["last_modified"].timestamp())
+
+    def room(self) -> int | None:
+        """Return None: a bucket has no end."""
+        return None
+
+    def probe(self) -> None:
+        """Try out whether the store heeds conditions, and reads and lists what was written."""
+        try_out(self)
+
+    def describe(self) -> str:
+        """Return the address."""
+        return self._address
+
+    def __repr__(self) -> str:
+        return f"Bucket({self.describe()!r})"
+
+    def _at(self, key: str) -> str:
+        return self._prefix + checked_key(key)
+
+    def _named(self, key: str) -> str:
+        return f"{self.describe()}: {key}" if key else self.describe()
+
+    def _ask(self, key: str, call: Callable[[], _T]) -> _T:
+        try:
+            return ask(call)
+        except RequestError as failure:
+            self._refuse(key, failure)
+
+    def _refuse(self, key: str, failure: RequestError) -> NoReturn:
+        """Raise what a failure is for whoever reads, or writes what may be repeated."""
+        if failure.kind == "absent":
+            raise AbsentError(f"{self.describe()}: there is no {key}") from None
+        raise StoreError(f"{self._named(key)}: {failure.words}") from None
+
+    def _read(self, at: str, most: int) -> tuple[bytes | None, str | None]:
+        """Return the bytes of an object, or None if they are too many, and its tag."""
+        answer = self._library.get(self._store, at)
+        return bytes(answer.bytes()) if answer.meta["size"] <= most else None, answer.meta["e_tag"]
+
+    def _tag(self, tag: str | None) -> Tag:
+        if not tag:
+            raise UnfitStoreError(f"{self.describe()} gives no tags (ETag), so nothing can be changed in it safely")
+        return Tag(tag)
+
+    def _range(self, key: str, offset: int, length: int) -> bytes:
+        call = partial(self._library.get_range, self._store, self._at(key), start=offset, length=length)
+        return bytes(self._ask(key, call))
+
+    def _write(self, key: str, data: bytes, tag: Tag | None) -> Tag:
+        """Create an object, or replace the one with a tag; look what is there whenever it is not known to be done."""
+        at = self._at(key)
+        put = partial(
+            self._library.put,
+            self._store if len(data) <= _PIECE else self._parts,
+            at,
+            checked_small(key, data),
+            attributes=headers(key),
+            mode="create" if tag is None else {"e_tag": tag},
+            use_multipart=False,
+        )
+        end = time.monotonic() + self._limits.write
+        for wait in _waits():
+            try:
+                return self._tag(ask(put)["e_tag"])
+            except RequestError as failure:
+                unmade = failure
+            # Of a lost answer, a time-out, a conflict with a write on its way (409 of S3), and a lost race (412, and
+            # 409 of Azure), the latter two may also be those of this write, which was made before in this very call.
+            try:
+                there, its_tag = ask(partial(self._read, at, SMALL))
+            except RequestError as failure:
+                if failure.kind != "absent":
+                    break
+                there, its_tag = None, None
+            if there == data:
+                return self._tag(its_tag)
+            if unmade.kind == "refused":
+                self._refuse(key, unmade)
+            if its_tag != tag:
+                raise self._lost(key, tag, its_tag)
+            if time.monotonic() + wait > end:
+                break
+            time.sleep(wait)
+        if unmade.kind == "refused":
+            self._refuse(key, unmade)
+        raise UnacknowledgedError(
+            f"{self._named(key)}: it is not known whether it was written: {unmade.words}. It may be written again"
+        )
+
+    def _lost(self, key: str, tag: Tag | None, its_tag: str | None) -> StoreError:
+        if tag is None:
+            return ExistsError(f"{self.describe()}: {key} exists already")
+        what = "gone" if its_tag is None else "changed"
+        return ConflictError(f"{self.describe()}: {key} has {what} meanwhile: read it again")
+
+    def _send(self, at: str, key: str, pieces: _Pieces, part: int, *, whole: bool) -> None:
+        self._library.put(
+            self._parts,
+            at,
+            b"".join(pieces) if whole else pieces,
+            attributes=headers(key),
+            use_multipart=not whole,
+            chunk_size=part,
+            max_concurrency=_PARTS_AT_ONCE,
+        )
+
+
+class BucketBlob:
+    """An object in a bucket that is open for reading, through the blocks of its store. See `Blob`."""
+
+    path = None
+
+    def __init__(self, blocks: Blocks, extent: Extent) -> None:
+        self.size = extent.size
+        self._blocks = blocks
+        self._extent = extent
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Read bytes; fewer where the object ends."""
+        return self._blocks.read(self._extent, offset, length)
+
+    def read_at_once(self, offset: int, length: int) -> bytes | None:
+        """Read exactly so many bytes if they are in memory; otherwise return None."""
+        return self._blocks.read_at_once(self._extent, offset, length)
+
+    def close(self) -> None:
+        """Do nothing: blocks stay as long as there is memory for them."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Pieces:
+    """The parts of a file, one after the other; remembers what the file or the caller objected."""
+
+    def __init__(self, file: BinaryIO, part: int, progress: Progress | None) -> None:
+        self._file = file
+        self._part = part
+        self._progress = progress
+        self.error: BaseException | None = None
+
+    def __iter__(self) -> Iterator[bytes]:
+        done = 0
+        try:
+            while piece := self._file.read(self._part):
+                done += len(piece)
+                if self._progress is not None:
+                    self._progress(done)
+                yield piece
+        except BaseException as error:
+            self.error = error
+            raise
+
+
+@dataclass(frozen=True)
+class _Place:
+    scheme: str
+    bucket: str
+    account: str | None
+    prefix: str  # with a slash at the end, or nothing
+
+    @property
+    def address(self) -> str:
+        account = f"@{self.account}.dfs.core.windows.net" if self.account else ""
+        return f"{self.scheme}://{self.bucket}{account}/{self.prefix}".rstrip("/")
+
+
+def _parsed(address: str) -> _Place:
+    """Take an address apart; what is refused is not repeated, since it may be a credential."""
+    scheme, _, rest = address.partition("://")
+    scheme = scheme.lower()
+    host, _, prefix = rest.partition("/")
+    if "?" in rest or "#" in rest:
+        raise InputError(f"expected an address such as {SCHEMES[scheme]}, got one with a query or fragment")
+    user, at, host = host.rpartition("@")
+    account = None
+    if scheme == "abfss":
+        bucket, known = user, _ACCOUNT.fullmatch(host)
+        account = known[1] if known else None
+        right = account is not None and _CONTAINER.fullmatch(bucket) is not None
+    elif at or ":" in host:
+        raise InputError(
+            f"expected an address such as {SCHEMES[scheme]}, got one with credentials or a port: credentials come from "
+            "the environment (AWS_..., AZURE_...), and so does the endpoint"
+        )
+    else:
+        bucket, right = host, (_S3_BUCKET if scheme == "s3" else _CONTAINER).fullmatch(host) is not None
+    if not right:
+        raise InputError(f"expected an address such as {SCHEMES[scheme]}, got another bucket, container or account")
+    prefix = prefix.strip("/")
+    if len(prefix) > _LONGEST_PREFIX:
+        raise InputError(f"expected a prefix of at most {_LONGEST_PREFIX} characters, got {len(prefix):,}")
+    return _Place(scheme, bucket, account, checked_prefix(f"{prefix}/" if prefix else ""))
+
+
+def _connected(place: _Place, limits: Limits, stalled: float, seconds: float) -> ObjectStore:
+    """Connect to a bucket with what the environment says; nothing is asked yet."""
+    from obstore.store import AzureStore, S3Store
+
+    names = _S3_ENDPOINTS if place.scheme == "s3" else _AZURE_ENDPOINTS
+    endpoint = next((os.environ[name] for name in names if os.environ.get(name)), None)
+    client: ClientConfig = {
+        "timeout": timedelta(seconds=seconds),
+        "read_timeout": timedelta(seconds=stalled),
+        "connect_timeout": timedelta(seconds=min(limits.stalled, 5.0)),
+        "allow_http": endpoint is not None and endpoint.lower().startswith("http://"),
+    }
+    retry: RetryConfig = {
+        "max_retries": limits.retries,
+        "retry_timeout": timedelta(seconds=seconds),
+        "backoff": {
+            "init_backoff": timedelta(milliseconds=100),
+            "max_backoff": timedelta(seconds=2),
+            "base": 2,
+        },
+    }
+    settings: dict[str, Any] = {"client_options": client, "retry_config": retry}
+    if endpoint is not None:
+        settings["endpoint"] = endpoint
+    if place.scheme == "s3":
+        return S3Store(place.bucket, **settings)
+    if place.account is not None:
+        settings["account_name"] = place.account
+    return AzureStore(place.bucket, **settings)
+
+
+def _waits(count: int | None = None) -> Iterator[float]:
+    """Seconds between attempts, so many or without end: longer and longer, and never those of other writers."""
+    numbers = itertools.count() if count is None else range(count)
+    return (min(2.0, 0.05 * 2**number) * random.uniform(0.5, 1.5) for number in numbers)
+
+
+def _is_key(key: str) -> bool:
+    try:
+        return bool(checked_key(key))
+    except InputError:  # of another program
+        return False
