@@ -216,9 +216,9 @@ class Bucket:
         """Return None: a bucket has no end."""
         return None
 
-    def probe(self) -> None:
-        """Try out whether the store heeds conditions, and reads and lists what was written."""
-        try_out(self)
+    def probe(self) -> float:
+        """Try out whether the store heeds conditions, and reads and lists; return the time by its clock."""
+        return try_out(self)
 
     def describe(self) -> str:
         """Return the address."""
