@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from ..errors import RemoteError, RemoteProtocolError, TruncatedStreamError
 from ..planning.byte_ranges import RangeSet
 from ..protocol.messages import BASE_CREDIT, MIN_WINDOW
+from ..target import Target
 from .receiver_state import ReceiverState
 
 if TYPE_CHECKING:
@@ -24,13 +25,15 @@ __all__ = ["CutShortError", "RangeDownload", "RangeRequest"]
 
 # The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
 # reconstructions come with them, and more where it is known that more is wanted. The last ones, some and a share of the
-# file, hold index and metadata of most. Where they do not, one more request brings the rest.
+# file, hold index and metadata of most. Where they do not, one more request brings the rest: a round trip, which costs
+# more than some bytes too many. For the same reason all the rest is asked for at once where it is short.
 _HEAD = 4096
 _FIRST = MIN_WINDOW
 _FIRST_MOST = BASE_CREDIT
-_TAIL_SHARE = 512
-_TAIL_LEAST = 2048
+_TAIL_SHARE = 100
+_TAIL_LEAST = 4096
 _TAIL_MOST = 64 * 1024
+_REST = 64 * 1024
 
 _CONTENT_RANGE = re.compile(r"\s*bytes\s+(\d{1,18})-(\d{1,18})/(\d{1,18})\s*")
 _CONTAINER_TAG = re.compile(r'"([0-9a-f]{64})"')
@@ -314,11 +317,19 @@ class RangeDownload:
         if size is None:
             return 0, self._beginning()
         tail = min(_TAIL_LEAST + size // _TAIL_SHARE, _TAIL_MOST, size)
+        rest = size - cached.run(0)
+        if rest <= (_REST if self._wants_all() else tail + _REST // 4):
+            tail = max(tail, rest)
         for start, length in ((0, min(_HEAD, size)), (size - tail, tail)):
             gap = next(cached.missing(start, length), None)
             if gap is not None:
                 return gap
         return None
+
+    def _wants_all(self) -> bool:
+        """Return whether the target is the whole file, as far as its order and its limits tell."""
+        target = self.reception.target
+        return target == Target(order=target.order)
 
     def _beginning(self) -> int:
         """Return the bytes of the first request, for a file of which nothing is known."""

@@ -16,13 +16,15 @@ import { inFileOrder } from "./safe-prefix";
 
 // The first bytes hold the header; of a target in the file's order they are asked for in such numbers that the first
 // reconstructions come with them, and more where it is known that more is wanted. The last ones, some and a share of
-// the file, hold index and metadata of most. Where they do not, one more request brings the rest.
+// the file, hold index and metadata of most. Where they do not, one more request brings the rest: a round trip, which
+// costs more than some bytes too many. For the same reason all the rest is asked for at once where it is short.
 const HEAD = 4096;
 const FIRST = MIN_WINDOW;
 const FIRST_MOST = BASE_CREDIT;
-const TAIL_SHARE = 512;
-const TAIL_LEAST = 2048;
+const TAIL_SHARE = 100;
+const TAIL_LEAST = 4096;
 const TAIL_MOST = 64 * 1024;
+const REST = 64 * 1024;
 
 /** The most requests under way at once: while one answer arrives, the next one is on its way. */
 export const MOST_REQUESTS = 2;
@@ -265,12 +267,21 @@ export class RangeDownload<View extends ViewInfo> {
 
   /** Where header and index of most containers are, and what was found to be missing beside them. */
   private ends(size: number): Place[] {
-    const tail = Math.min(TAIL_LEAST + Math.floor(size / TAIL_SHARE), TAIL_MOST, size);
+    const least = Math.min(TAIL_LEAST + Math.floor(size / TAIL_SHARE), TAIL_MOST, size);
+    const [open] = this.open(0, size);
+    const rest = open === undefined ? 0 : size - open[0];
+    const tail = rest <= (this.wantsAll() ? REST : least + REST / 4) ? Math.max(least, rest) : least;
     const places: Place[] = [
       [0, Math.min(HEAD, size)],
       [size - tail, tail],
     ];
     return this.needed === undefined ? places : [...places, this.needed];
+  }
+
+  /** Whether the target is the whole file, as far as its order and its limits tell. */
+  private wantsAll(): boolean {
+    const { order: _, ...limits } = this.reception.target;
+    return Object.values(limits).every((limit) => limit === undefined);
   }
 
   private endsCached(): boolean {
