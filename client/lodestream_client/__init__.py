@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         fetch_range,
         identify,
         list_surfaces,
+        locate,
         retry,
         upload,
     )
@@ -42,6 +43,7 @@ _HOMES = {
     "identify": ("aio", "identify"),
     "list": ("aio", "list_surfaces"),
     "list_surfaces": ("aio", "list_surfaces"),
+    "locate": ("aio", "locate"),
     "retry": ("aio", "retry"),
     "upload": ("aio", "upload"),
 }
@@ -61,6 +63,7 @@ __all__ = [
     "identify",
     "list",
     "list_surfaces",
+    "locate",
     "retry",
     "upload",
 ]

@@ -39,6 +39,7 @@ __all__ = [
     "fetch_range",
     "identify",
     "list_surfaces",
+    "locate",
     "retry",
     "upload",
 ]
@@ -182,6 +183,19 @@ async def delete(url: str, *, token: str | None = None) -> None:
     >>> asyncio.run(lodestream_client.delete(description.url))
     """
     await _run(api.delete(url), url, token)
+
+
+async def locate(url: str, *, token: str | None = None) -> str:
+    """Return the URL of the container of a name on a published page; see `lodestream_client.sync.locate`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
+    >>> asyncio.run(lodestream_client.locate(url)) == url
+    True
+    """
+    return await _run(api.locate(url), url, token)
 
 
 async def fetch_range(

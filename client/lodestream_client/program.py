@@ -11,7 +11,21 @@ from typing import TYPE_CHECKING
 import lodestream
 from lodestream.errors import LodestreamError
 
-from .commands import completion, convert, decode, demo, encode, formats, info, pull, push, retry, surfaces, view
+from .commands import (
+    completion,
+    convert,
+    decode,
+    demo,
+    encode,
+    formats,
+    info,
+    publish,
+    pull,
+    push,
+    retry,
+    surfaces,
+    view,
+)
 from .commands.arguments import Subparsers, add_command
 from .starting import EndingAtOnce
 from .terminal.interrupts import exit_code, unwrapping
@@ -22,7 +36,7 @@ if TYPE_CHECKING:
 
 __all__ = ["build_parser", "main"]
 
-_MODULES = (demo, encode, decode, convert, info, push, retry, pull, view, surfaces, formats, completion)
+_MODULES = (demo, encode, decode, convert, info, push, retry, pull, view, publish, surfaces, formats, completion)
 
 
 def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:

@@ -39,6 +39,7 @@ __all__ = [
     "identify",
     "list",
     "list_surfaces",
+    "locate",
     "retry",
     "upload",
 ]
@@ -324,6 +325,31 @@ def identify(url: str, *, token: str | None = None) -> Identity:
     64
     """
     return _run(api.identify(url), url, token)
+
+
+def locate(url: str, *, token: str | None = None) -> str:
+    """Return the URL of the container to which a name on a published page leads now; any other URL as it is.
+
+    `connect` does this itself. A program that makes several requests makes them of one container this way, whatever is
+    published meanwhile.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such page, or no such name on it.
+    RemoteError, RemoteProtocolError
+        If the host refuses, or its list cannot be read.
+    UnreachableError
+        If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> sync.locate(url) == url  # it is no PAGE#NAME
+    True
+    """
+    return _run(api.locate(url), url, token)
 
 
 def delete(url: str, *, token: str | None = None) -> None:

@@ -37,7 +37,7 @@ from lodestream.planning.selection import region_at, selection_of
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target, check_integer
 
-from .requests.addresses import is_surface, is_url
+from .requests.addresses import is_surface, is_url, published_name
 from .viewer.sources import FileSource, RemoteSource, Source
 
 __all__ = ["Container", "LodeBackend"]
@@ -92,7 +92,7 @@ class LodeBackend(BackendEntrypoint):
         Parameters
         ----------
         filename_or_obj : str or path-like
-            A file, the URL of a file, or the URL of a surface of a server.
+            A file, the URL of a file, of a surface of a server, or of a name on a published page.
         mask_and_scale, decode_times, concat_characters, decode_coords, use_cftime, decode_timedelta : optional
             As of `xarray.decode_cf`, which applies those that are given and not false. None: holes are NaN, and other
             values as the container has them: numbers of a raster as stored, dates as numbers.
@@ -153,14 +153,14 @@ class LodeBackend(BackendEntrypoint):
         return {f"/block_{number}": block_dataset for number, block_dataset in enumerate(datasets)}
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Return whether a name ends in ``.lode`` or is the URL of a surface."""
+        """Return whether a name ends in ``.lode``, or is the URL of a surface or of a name on a published page."""
         if not isinstance(filename_or_obj, str | os.PathLike):
             return False
         name = os.fspath(filename_or_obj)
         if not isinstance(name, str):
             return False
         if is_url(name):
-            return name.partition("?")[0].endswith(".lode") or is_surface(name)
+            return name.partition("?")[0].endswith(".lode") or is_surface(name) or published_name(name) is not None
         return name.endswith(".lode")
 
 
@@ -200,14 +200,15 @@ class Container:
     """
 
     def __init__(self, place: str, token: str | None = None, max_vertices: int | None = None) -> None:
-        self._given = place, token, max_vertices
         self._source: Source
         if is_url(place):
             self._source = remote = RemoteSource(place, token)
+            place = remote.url  # a pickled one is of the same container, whatever a name leads to by then
             self.close = weakref.finalize(self, remote.close)
         else:
             self._source = FileSource(Path(place))
             self.close = weakref.finalize(self, lambda: None)
+        self._given = place, token, max_vertices
         self._kept: list[tuple[int, bytes]] = []  # header and index, which every window needs
         self._lock = threading.Lock()
         self._windows: OrderedDict[Any, Surface] = OrderedDict()

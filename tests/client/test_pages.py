@@ -46,6 +46,7 @@ RUN = {
     ("docs/operating.md", "console"): "tests/server/routes/test_operating_page.py",
     ("docs/operating.md", "python"): "not run: it needs a cluster, as the page says",
     ("docs/protocol.md", "python"): "tests/client/stream/test_streams.py",
+    ("docs/publishing.md", "indented"): "not run: the bucket is an example; tests/client/publishing runs the same",
     ("docs/python.md", "python"): "tests/client/test_python_page.py",
     ("docs/tutorial.md", "console"): "tests/test_tutorial.py",
     ("docs/tutorial.md", "indented"): "not run: pip needs the network; the test installs the wheel",

@@ -33,16 +33,15 @@ def test_a_host_of_files_serves_five_surfaces_of_different_kinds(tmp_path: Path)
     with ranged(folder) as host:
         assert "<title>page</title>" in httpx.get(f"{host.url}/index.html", trust_env=False).text
         config = httpx.get(f"{host.url}/view.json", trust_env=False).json()
-        assert config["live"] is False
-        assert [entry["src"] for entry in config["surfaces"]] == list(site.SURFACES)
+        assert [entry["name"] for entry in config["surfaces"]] == list(site.SURFACES)
         for entry in config["surfaces"]:
             assert (folder / entry["src"]).stat().st_size == entry["bytes"]
-            with sync.connect(f"{host.url}/{entry['src']}") as stream:
+            with sync.connect(f"{host.url}/#{entry['name']}") as stream:
                 views = list(stream)
             assert len(views) > 5
             assert views[-1].complete
-            arrived, generated = views[-1].surface(), site.SURFACES[entry["src"]]()
-            assert entry["name"] == generated.metadata["name"]
+            arrived, generated = views[-1].surface(), site.SURFACES[entry["name"]]()
+            assert entry["title"] == generated.metadata["name"]
             for block, original in zip(arrived.blocks, generated.blocks, strict=True):
                 assert np.array_equal(block.points, original.points, equal_nan=True)
                 assert block.points.dtype == original.points.dtype
@@ -60,7 +59,7 @@ def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, capsys: pytest.
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "view.json").write_text('{"zoom": 3}')
     assert site.main([str(tmp_path / "out")]) == 1
-    assert "new, empty, or written by this command" in capsys.readouterr().err
+    assert "expected a view.json that lodestream publish has written" in capsys.readouterr().err
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["view.json"]
 
 

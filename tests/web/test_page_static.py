@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -39,8 +38,8 @@ def container(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def host(outside: Path, container: Path) -> Path:
-    """The page and a container, as `lodestream view --static` writes them."""
-    assert main(["view", str(container), "--static", str(outside)]) == 0
+    """The page and a container, as `lodestream publish` writes them."""
+    assert main(["publish", str(container), str(outside)]) == 0
     return outside
 
 
@@ -56,22 +55,36 @@ def test_a_host_of_files_is_enough(tabs: Tabs, host: Path) -> None:
 
 
 def test_of_several_containers_one_is_chosen(tabs: Tabs, host: Path) -> None:
-    (host / "torus.lode").write_bytes(ls.encode(surface("torus")))
-    both = [{"name": "hills", "src": "surface.lode", "bytes": 7}, {"name": "a torus", "src": "torus.lode"}]
-    (host / "view.json").write_text(json.dumps({"surfaces": both}))
+    torus = host.parent / "a torus & more.lode"
+    torus.write_bytes(ls.encode(surface("torus")))
+    assert main(["publish", str(torus), str(host)]) == 0
     with ranged(host) as server:
         tab = tabs(f"{server.url}/index.html")
-        tab.page.get_by_role("link", name="a torus").click()
+        tab.page.get_by_role("link", name="torus").click()  # what the surface is called
         tab.everything()
-        expect(tab.page.get_by_role("heading", name="a torus")).to_be_visible()
+        expect(tab.page.get_by_role("heading", name="torus")).to_be_visible()
+        assert tab.page.url.partition("#")[2].startswith("a%20torus%20%26%20more")
         tab.page.go_back()
-        tab.page.get_by_role("link", name="hills").click()
+        tab.page.get_by_role("link", name="terrain").click()
         tab.everything("m")
+
+
+def test_a_name_leads_to_what_was_published_last(tabs: Tabs, host: Path) -> None:
+    other = host.parent / "other.lode"
+    other.write_bytes(ls.encode(surface("torus")))
+    with ranged(host) as server:
+        assert main(["publish", str(other), str(host), "--name", "terrain"]) == 0
+        tab = tabs(f"{server.url}/index.html#terrain&l=1")
+        tab.everything()
+        tab.page.goto(f"{server.url}/index.html#nowhere")
+        expect(tab.page.get_by_role("alert")).to_contain_text(
+            "nothing is published here under the name nowhere", ignore_case=True
+        )
 
 
 @pytest.mark.parametrize("where", [0.02, 0.3, 0.9])
 def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, host: Path, where: float) -> None:
-    path = host / "surface.lode"
+    (path,) = host.glob("containers/*.lode")
     data = bytearray(path.read_bytes())
     place = int(where * len(data))
     data[place : place + 4] = bytes(byte ^ 0xFF for byte in data[place : place + 4])
@@ -93,7 +106,7 @@ def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, h
 
 @pytest.mark.parametrize("tags", [False, True], ids=["no tags", "tags"])
 def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tabs, host: Path, tags: bool) -> None:
-    path = host / "surface.lode"
+    (path,) = host.glob("containers/*.lode")
     whole = path.read_bytes()
     path.write_bytes(whole[:-5000])
     with ranged(host) as server:
@@ -118,7 +131,7 @@ def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tab
 
 
 def test_what_is_chosen_before_the_surface_is_known_holds_for_its_first_picture(tabs: Tabs, host: Path) -> None:
-    path = host / "surface.lode"
+    (path,) = host.glob("containers/*.lode")
     whole = path.read_bytes()
     path.write_bytes(whole[:10])
     with ranged(host) as server:

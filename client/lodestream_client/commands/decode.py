@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lodestream.container import Index
     from lodestream.decoding.decoder import Decoder, View
 
-__all__ = ["DecodeOptions", "register", "run"]
+__all__ = ["DecodeOptions", "decode_file", "register", "run"]
 
 _CHUNK = 256 * 1024
 
@@ -84,12 +84,25 @@ def _options(args: argparse.Namespace) -> DecodeOptions:
 def run(args: argparse.Namespace) -> int:
     """Decode a container, write OUT, and report."""
     options = _options(args)
+    decode_file(options).report(options.json)
+    return 0
+
+
+def decode_file(options: DecodeOptions) -> Outcome:
+    """Decode a container, by bands where it does not fit into memory, and write OUT.
+
+    Raises
+    ------
+    LodestreamError, OSError
+        From reading, decoding and writing.
+    """
     check_out(options.out)
     target, started = options.target, time.monotonic()
     with input_files([options.container]) as files, files.paths[0].open("rb") as file, progress_bar(LONG) as bar:
         task = bar.add_task("decoding", total=1.0, figures="")
-        if by_rows(files.paths[0], options, started, lambda done: bar.update(task, completed=done)):
-            return 0
+        by_bands = by_rows(files.paths[0], options, started, lambda done: bar.update(task, completed=done))
+        if by_bands is not None:
+            return by_bands
         job = _Job(file, options, started, lambda done: bar.update(task, completed=done))
         try:
             job.decode()
@@ -118,8 +131,7 @@ def run(args: argparse.Namespace) -> int:
         channel_errors(view, job.decoder.header, target),
     )
     outcome.write(options.out)
-    outcome.report(options.json)
-    return 0
+    return outcome
 
 
 def _advice(partial: bool, job: _Job, error: StreamError) -> str:

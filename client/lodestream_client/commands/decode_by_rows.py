@@ -31,15 +31,15 @@ _PART = 16
 _VALUES, _FILE = "values", "file"
 
 
-def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callable[[float], None]) -> bool:
+def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callable[[float], None]) -> Outcome | None:
     """Decode a surface, or a level of it, by bands, if it takes more memory than there is.
 
     It is decoded into files beside OUT, from which OUT is written.
 
     Returns
     -------
-    bool
-        Whether it was done; otherwise nothing was.
+    Outcome or None
+        None: it takes no more than there is, or cannot be decoded by bands, and nothing was done.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
         From decoding and writing.
     """
     if options.target.region is not None:
-        return False
+        return None
     from lodestream.container.capacity import Capacity, default_memory
     from lodestream.container.reader import read_index
     from lodestream.decoding.piecewise import PiecewiseDecoder
@@ -71,26 +71,25 @@ def by_rows(path: Path, options: DecodeOptions, started: float, progress: Callab
             index = read_index(read, size, capacity)
             header, level = index.header, options.target.level
             if level is not None and level > header.levels:
-                return False  # decoding in one piece tells so
+                return None  # decoding in one piece tells so
             decoder = PiecewiseDecoder(read, index, level)
         except (CorruptStreamError, TruncatedStreamError, TooLargeError):
-            return False  # decoding in one piece tells what is wrong with it, and what is left
+            return None  # decoding in one piece tells what is wrong with it, and what is left
         check_grid(options.out, header)
         needs = _Needs(decoder, options, memory)
         try:
             needs.check(memory)
             if needs.whole(memory):
-                return False
+                return None
             capacity.promise(needs.points, (), masked=0, tables=header.tables)
         except TooLargeError as error:
             raise named(error, options.container) from None
         # Or GDAL would take a twentieth of the machine's memory for what it writes; in megabytes.
         os.environ.setdefault("GDAL_CACHEMAX", str(max(memory >> 22, 32)))
         try:
-            _decode(decoder, Path(options.out), memory, options, started, progress, seen)
+            return _decode(decoder, Path(options.out), memory, started, progress, seen)
         except StreamError as error:
             raise named(error, options.container) from None
-    return True
 
 
 class _Needs:
@@ -177,11 +176,10 @@ def _decode(
     decoder: PiecewiseDecoder,
     out: Path,
     memory: int,
-    options: DecodeOptions,
     started: float,
     progress: Callable[[float], None],
     seen: RangeSet,
-) -> None:
+) -> Outcome:
     from lodestream.encoding.folders import temporary_folder
     from lodestream.scratch import FolderScratch, Room
 
@@ -203,7 +201,7 @@ def _decode(
             dict(zip(decoder.header.channel_names, last.channels, strict=False)),
         )
         _write(outcome, out, folder / _FILE)
-        outcome.report(options.json)
+        return outcome
 
 
 def _write(outcome: Outcome, out: Path, folder: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -204,8 +204,14 @@ def run(args: argparse.Namespace) -> int:
         check_watched(options.out)
     if options.picture is not None:
         check_picture(options.picture)
-    with interruptible(), Kept(options.resume) as kept, _drawing(options) as drawing:
-        return _pull(options, kept, drawing)
+    with interruptible(), Kept(options.resume) as kept:
+        if addresses.published_name(options.url) is not None:
+            from .. import sync
+
+            # Once: all requests are of one container, whatever is published meanwhile.
+            options = replace(options, url=sync.locate(options.url, token=options.token))
+        with _drawing(options) as drawing:
+            return _pull(options, kept, drawing)
 
 
 def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:

@@ -6,6 +6,7 @@ import argparse
 import math
 import re
 from collections.abc import Callable
+from datetime import timedelta
 from typing import TypeVar
 
 from lodestream import sizes
@@ -17,6 +18,8 @@ from ..requests import addresses
 
 __all__ = [
     "parse_count",
+    "parse_days",
+    "parse_http",
     "parse_level",
     "parse_limit",
     "parse_memory",
@@ -40,6 +43,7 @@ __all__ = [
 T = TypeVar("T")
 
 _AMOUNT = re.compile(r"\s*([0-9]*\.?[0-9]+(?:[eE][+-]?[0-9]+)?)\s*([a-zA-Z]*)(/s)?\s*")
+_MOST_DAYS = 36_500
 _PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
 
 
@@ -202,6 +206,29 @@ def _checked(parse: Callable[[str], T]) -> Callable[[str], T]:
     return checked
 
 
+def parse_days(text: str) -> timedelta:
+    """Read a number of days, 0 or more.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If it is something else.
+    """
+    try:
+        days = float(text)
+        if not 0 <= days <= _MOST_DAYS:
+            raise ValueError
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number of days, 0 to {_MOST_DAYS}, got {text!r}") from None
+    return timedelta(days=days)
+
+
+def _http(text: str) -> str:
+    if not addresses.is_url(text):
+        raise OptionError(f"expected an address that begins with http:// or https://, got {text}")
+    return text
+
+
 def _limit(text: str) -> tuple[str | None, Tolerance]:
     # A name may hold an equals sign, a number does not.
     name, equals, error = text.rpartition("=")
@@ -233,6 +260,7 @@ parse_limit = _checked(_limit)
 parse_precision = _checked(_precision)
 parse_memory = _checked(_memory)
 parse_scheduler = _checked(_scheduler)
+parse_http = _checked(_http)
 parse_server = _checked(addresses.surfaces_url)
 parse_surface = _checked(addresses.surface_url)
 parse_source = _checked(addresses.source_url)

@@ -1,4 +1,4 @@
-"""``lodestream view``: a surface in a browser, as a folder of files for any host, or as pictures."""
+"""``lodestream view``: a surface in a browser, or as pictures."""
 
 from __future__ import annotations
 
@@ -36,9 +36,6 @@ __all__ = ["ViewOptions", "register", "run"]
 # The first bytes of a container, see docs/format.md.
 _MAGIC = b"\xf5LODE\r\n"
 
-# The container in a folder of --static.
-_SURFACE = "surface.lode"
-
 
 @dataclass(frozen=True)
 class ViewOptions:
@@ -54,8 +51,6 @@ class ViewOptions:
         Whether a browser is asked to open the page.
     port : int
         Of the page; 0: any free one.
-    static : Path or None
-        Folder to write in place of serving.
     png : Path or None
         Picture to draw in place of serving.
     at : tuple of (str, int or None), or None
@@ -74,7 +69,6 @@ class ViewOptions:
     surface: SurfaceOptions
     browser: bool
     port: int
-    static: Path | None
     png: Path | None
     at: tuple[tuple[str, int | None], ...] | None
     until_done: bool
@@ -115,9 +109,6 @@ def register(subparsers: Subparsers) -> None:
         metavar="P",
         help="port of the page (default: any free one)",
     )
-    parser.add_argument(
-        "--static", type=Path, metavar="DIR", help="write the page and the container into DIR, for any host of files"
-    )
     parser.add_argument("--png", type=Path, metavar="OUT.png", help="write a picture, without a browser")
     parser.add_argument(
         "--at",
@@ -143,8 +134,6 @@ def register(subparsers: Subparsers) -> None:
 
 
 def _options(args: argparse.Namespace) -> ViewOptions:
-    if args.png is not None and args.static is not None:
-        args.parser.error("argument --png: not allowed with argument --static")
     if args.at is not None and args.png is None:
         args.parser.error("argument --at: needs --png")
     if args.until_done and (args.png is None or args.at is not None or args.roi is not None):
@@ -160,7 +149,6 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         surface_options(args),
         not args.no_browser,
         args.port,
-        args.static,
         args.png,
         args.at,
         args.until_done,
@@ -172,27 +160,15 @@ def _options(args: argparse.Namespace) -> ViewOptions:
 
 @interruptible()
 def run(args: argparse.Namespace) -> int:
-    """Show the surface until Ctrl-C, or write pictures or a folder."""
+    """Show the surface until Ctrl-C, or write pictures."""
     options = _options(args)
     if options.png is not None:
         _draw(options, options.png)
         return 0
     if not assets():
         raise UnavailableError(HOW_TO_BUILD)
-    if options.static is not None:
-        _write(options, options.static)
-    else:
-        _serve(options)
+    _serve(options)
     return 0
-
-
-def _write(options: ViewOptions, folder: Path) -> None:
-    from ..viewer.static import write_static
-
-    with _source(options) as source, progress_bar() as bar:
-        task = bar.add_task("writing", total=1.0, figures="")
-        write_static(folder, assets(), {_SURFACE: source}, lambda done: bar.update(task, completed=done))
-    note(f"{folder} can be put on any host of files that answers Range; open its index.html there")
 
 
 def _serve(options: ViewOptions) -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,10 +16,10 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import LodestreamError, UnavailableError
 from lodestream.page import HOW_TO_BUILD, assets
+from lodestream.stores import open_store
 
+from ..publishing.publisher import Publication, publish
 from ..terminal.output import cell, console, human_size, note, progress_bar
-from ..viewer.sources import MemorySource
-from ..viewer.static import write_static
 from .terrain import CELL, terrain
 
 __all__ = ["SURFACES", "write_site"]
@@ -103,47 +104,48 @@ def wind() -> ls.Surface:
     return ls.Surface(np.round(heights, 1).astype(np.float32), attributes=attributes, metadata=metadata)
 
 
-#: The surfaces by the names of their files, in the order in which the page lists them.
+#: The surfaces by their names, in the order in which the page lists them.
 SURFACES: dict[str, Callable[[], ls.Surface]] = {
-    "mountains.lode": mountains,
-    "ocean.lode": ocean,
-    "knot.lode": knot,
-    "moon.lode": moon,
-    "wind.lode": wind,
+    "mountains": mountains,
+    "ocean": ocean,
+    "knot": knot,
+    "moon": moon,
+    "wind": wind,
 }
 
 
 def write_site(folder: Path) -> None:
-    """Write the page, the containers of `SURFACES` and ``view.json`` into a folder.
+    """Publish `SURFACES` in a folder.
 
     Parameters
     ----------
     folder : Path
-        New, empty, or written by this function before.
+        New, empty, or published before.
 
     Raises
     ------
     UnavailableError
         If the page is not built.
     LodestreamError
-        If the folder holds other files.
+        If the folder holds another site, or cannot be written.
     OSError
-        If something cannot be written.
+        If there is no room for the containers.
     """
     pages = assets()
     if not pages:
         raise UnavailableError(HOW_TO_BUILD)
-    sources = {}
-    with progress_bar() as bar:
+    publications = []
+    with progress_bar() as bar, tempfile.TemporaryDirectory(prefix="lodestream-site-") as temporary:
         task = bar.add_task("encoding", total=float(len(SURFACES)), figures="")
         for name, make in SURFACES.items():
             surface = make()
-            sources[name] = MemorySource(ls.encode(surface), str(surface.metadata["name"]))
-            bar.update(task, completed=float(len(sources)), figures=name)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        write_static(folder, pages, sources)
-    for name, source in sources.items():
-        console().print(cell(f"{folder / name}: {human_size(source.size)}"))
+            container = Path(temporary) / f"{name}.lode"
+            ls.encode(surface, out=container)
+            publications.append(Publication(name, str(surface.metadata["name"]), container, {}))
+            bar.update(task, completed=float(len(publications)), figures=name)
+        published = publish(open_store(folder), publications, pages)
+    for it in published.surfaces:
+        console().print(cell(f"{it.name}: {human_size(it.bytes)}"))
 
 
 def _unit(latitude: Floats, longitude: Floats) -> Floats:

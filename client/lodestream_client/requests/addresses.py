@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from urllib.parse import urljoin, urlsplit, urlunsplit
+from urllib.parse import unquote, urljoin, urlsplit, urlunsplit
 
 from lodestream.errors import OptionError, RemoteProtocolError
 
@@ -16,6 +16,7 @@ __all__ = [
     "is_surface",
     "is_url",
     "origin",
+    "published_name",
     "resolved",
     "same_origin",
     "source_url",
@@ -70,22 +71,38 @@ def surface_url(url: str) -> str:
 
 
 def source_url(url: str) -> str:
-    """Return the URL of something that can be pulled: a surface on a server, or a container file on any web server.
+    """Return the URL of something that can be pulled.
+
+    That is a surface on a server, a container file on any web server, or a name on a published page: ``PAGE#NAME``.
 
     Raises
     ------
     OptionError
-        If this is neither.
+        If this is none of them.
     """
     base = _clean(url)
+    if is_surface(base):
+        return base
+    if published_name(url) is not None:
+        return url
     path = urlsplit(base).path
     if not path or path.endswith(_SURFACES):
         raise OptionError(
-            f"expected a surface's address such as http://HOST/v1/surfaces/ID, or a container's such as "
-            f"http://HOST/NAME.lode, got {url}"
+            f"expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as "
+            f"http://HOST/NAME.lode, or a published name's such as http://HOST/#NAME, got {url}"
         )
     # The query may be what allows reading a file.
-    return base if is_surface(base) else urlunsplit(urlsplit(url)._replace(fragment=""))
+    return urlunsplit(urlsplit(url)._replace(fragment=""))
+
+
+def published_name(url: str) -> tuple[str, str] | None:
+    """Return the URL of the list of a published page, and the name on it that ``PAGE#NAME`` asks for.
+
+    None if the URL asks for no name. What the page adds to its address after ``&`` tells how a surface is looked at.
+    """
+    page, _, fragment = url.partition("#")
+    name = unquote(fragment.partition("&")[0])
+    return (urljoin(page.partition("?")[0], "view.json"), name) if name and not is_surface(page) else None
 
 
 def is_surface(url: str) -> bool:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import hashlib
 import itertools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-from lodestream.errors import CorruptStreamError, RemoteError, RemoteProtocolError
+from lodestream.errors import CorruptStreamError, NotFoundError, RemoteError, RemoteProtocolError
 from lodestream.target import Target
 
 from . import addresses, problems
@@ -34,6 +34,8 @@ __all__ = [
     "identify",
     "identity_of_file",
     "list_surfaces",
+    "locate",
+    "published_surfaces",
     "retry",
     "upload",
 ]
@@ -54,6 +56,9 @@ _LARGEST_FILE = 2**62
 # Of all the pages of a list together.
 _LONGEST_LIST = 64 * 1024 * 1024
 _MOST_PAGES = 10_000
+
+# Of a published page, in an error.
+_NAMES_TOLD = 20
 
 _MOVED = (301, 302, 303, 307, 308)
 
@@ -216,6 +221,7 @@ def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str
     from lodestream.transfer.range_download import RangeDownload
     from lodestream.transfer.receiver_state import ReceiverState
 
+    url = yield from locate(url)
     # Of the coarsest level nothing needs to come before the index.
     reception = ReceiverState(Target(level=0), max_vertices=max_vertices)
     download = RangeDownload(reception)
@@ -240,6 +246,7 @@ def identify(url: str) -> Flow[Identity]:
     RemoteProtocolError
         If the server does not tell the container's SHA-256 and size.
     """
+    url = yield from locate(url)
     if addresses.is_surface(url):
         surface = yield from describe(url)
         container, size = surface.details.get("container"), surface.details.get("bytes")
@@ -263,6 +270,53 @@ def identity_of_file(url: str, version: str | None, size: int | None) -> Identit
     return Identity(hashlib.sha256(f"{url}\n{version}\n{size}".encode()).hexdigest(), None, size)
 
 
+def locate(url: str) -> Flow[str]:
+    """Return the URL of the container to which a name on a published page leads now; any other URL as it is.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such page, or no such name on it.
+    RemoteProtocolError
+        If the page's list cannot be read, or leads to another host.
+    """
+    place = addresses.published_name(url)
+    if place is None:
+        return url
+    page, name = place
+    surfaces = yield from published_surfaces(url)
+    entry = next((entry for entry in surfaces if entry["name"] == name), None)
+    if entry is None:
+        names = ", ".join(str(entry["name"]) for entry in surfaces[:_NAMES_TOLD])
+        raise NotFoundError(f"expected a name that is published at {page}, got {name!a:.300}; there are: {names:.1000}")
+    container = addresses.resolved(page, entry["src"])
+    if not addresses.same_origin(container, page):
+        raise RemoteProtocolError(f"expected a container on {addresses.origin(page)}, got {container:.300}")
+    return container
+
+
+def published_surfaces(url: str) -> Flow[Sequence[Mapping[str, Any]]]:
+    """Return the entries of the list of a published page; each has a ``name`` and a ``src``.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no list.
+    RemoteProtocolError
+        If it cannot be read.
+    """
+    page, _ = addresses.published_name(url) or (addresses.resolved(url, "view.json"), "")
+    document = _checked((yield Call("GET", page)), page)
+    surfaces = document.get("surfaces")
+    if not isinstance(surfaces, list) or not all(map(_is_entry, surfaces)):
+        raise RemoteProtocolError(f"expected the surfaces of a published page from {page}, got something else")
+    return surfaces
+
+
+def _is_entry(entry: Any) -> bool:
+    return isinstance(entry, dict) and all(isinstance(entry.get(key), str) for key in ("name", "src"))
+
+
 def delete(url: str) -> Flow[None]:
     """Delete one surface from its server."""
     address = addresses.surface_url(url)
@@ -284,7 +338,7 @@ def fetch_range(url: str, offset: int, length: int, identity: Identity | None = 
     CorruptStreamError
         If there are fewer bytes.
     """
-    address = addresses.container_url(url)
+    address = addresses.container_url((yield from locate(url)))
     headers = {"Range": f"bytes={offset}-{offset + length - 1}", "Accept-Encoding": "identity"}
     response = _refuse((yield Call("GET", address, headers=headers, partial=True, most=length)), address)
     if response.status != 206:

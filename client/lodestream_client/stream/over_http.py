@@ -10,8 +10,9 @@ from lodestream.protocol.messages import MIN_WINDOW
 from lodestream.transfer.range_download import RangeDownload
 
 from ..errors import SilenceError
-from ..requests import addresses, problems
-from ..requests.answers import LONGEST_PROBLEM, Head, Incoming
+from ..requests import addresses, api, problems
+from ..requests.answers import LONGEST_PROBLEM, Answer, Head, Incoming
+from ..requests.calls import Call
 from .effects import Ahead, Flow, Get, HangUp, Read
 
 if TYPE_CHECKING:
@@ -36,6 +37,9 @@ def receive(session: Session) -> Flow[None]:
     LodestreamError
         What the server refuses, or what is wrong with what it sent.
     """
+    if addresses.published_name(session.url) is not None:
+        # Once: the stream ends on the container that it begins, whatever the name leads to by then.
+        session.url = yield from _located(session)
     if session.ranges is None:
         session.ranges = RangeDownload(session.reception)
     download, url = session.ranges, addresses.container_url(session.url)
@@ -73,6 +77,36 @@ def receive(session: Session) -> Flow[None]:
         else:
             download.finish(session.clock())
     yield HangUp()
+
+
+def _located(session: Session) -> Flow[str]:
+    """Return the URL of the container to which a name on a published page leads."""
+    steps = api.locate(session.url)
+    answer: Answer | None = None
+    while True:
+        try:
+            call = steps.send(answer)
+        except StopIteration as end:
+            url: str = end.value
+            return url
+        assert isinstance(call, Call), "it waits for nothing but answers"
+        answer = yield from _read(session, call)
+
+
+def _read(session: Session, call: Call) -> Flow[Answer]:
+    """Return a short answer."""
+    import httpx
+
+    try:
+        headers = {"Accept-Encoding": "identity", **call.headers, **session.authorization(call.url)}
+        head: Head = yield Get(call.url, headers, session.patience(session.tick()))
+        session.landed(call.url, head.url)
+        incoming = Incoming(head, call.most, call.url, session.url, None)
+        while (chunk := (yield Read())) and incoming.take(chunk):
+            pass
+    except httpx.HTTPError as error:
+        raise problems.from_connection(error, session.url) from error
+    return incoming.answer()
 
 
 def _get(session: Session, url: str, request: RangeRequest, left: float | None) -> Get:

@@ -120,8 +120,13 @@ class RemoteSource:
     Parameters
     ----------
     url : str
-        Of a surface of a server, or of a container file.
+        Of a surface of a server, of a container file, or of a name on a published page.
     token : str or None
+
+    Attributes
+    ----------
+    url : str
+        Of the surface or the container itself.
 
     Raises
     ------
@@ -132,13 +137,14 @@ class RemoteSource:
     def __init__(self, url: str, token: str | None) -> None:
         import httpx
 
+        url = sync.locate(url, token=token)
         identity = sync.identify(url, token=token)
         if identity.size is None or identity.name is None:
             raise RemoteProtocolError(f"expected the length and the version of {url}, got neither")
         self.name = _name(url, token) or url.rstrip("/").rpartition("/")[2].removesuffix(".lode")
         self.size = identity.size
         self.tag = identity.name
-        self._url, self._token, self._identity = url, token, identity
+        self.url, self._token, self._identity = url, token, identity
         self._lock = threading.Lock()
         self._open = ExitStack()
         self._client = self._open.enter_context(httpx.Client(**calls.client_options(url, calls.TIMEOUT)))
@@ -158,8 +164,8 @@ class RemoteSource:
         """
         wanted = min(length, _AT_ONCE, self.size - offset)
         with self._lock:
-            call = api.fetch_range(self._url, offset, wanted, self._identity)
-            return sync.run(self._client, call, self._url, self._token)
+            call = api.fetch_range(self.url, offset, wanted, self._identity)
+            return sync.run(self._client, call, self.url, self._token)
 
 
 def _name(url: str, token: str | None) -> str | None:

@@ -22,6 +22,7 @@ import lodestream as ls
 from lodestream.encoding import cluster, tasks
 from lodestream_client.commands import decode_by_rows, values
 from lodestream_client.commands.building_options import BuildingOptions, reading_folder
+from lodestream_client.commands.outcome import Outcome
 from tests.clusters import local_cluster
 from tests.core.surfaces import terrain
 from tests.patience import PATIENCE
@@ -129,9 +130,9 @@ def test_decode_with_little_memory_writes_the_same_file(
     (tmp_path / "a.lode").write_bytes(expected)
     by_bands, decode = list[str](), decode_by_rows._decode
 
-    def counted(decoder: object, path: Path, *rest: object) -> None:
+    def counted(decoder: object, path: Path, *rest: object) -> Outcome:
         by_bands.append(path.name)
-        decode(decoder, path, *rest)  # type: ignore[arg-type]
+        return decode(decoder, path, *rest)  # type: ignore[arg-type]
 
     monkeypatch.setattr(decode_by_rows, "_decode", counted)
     assert run("decode", tmp_path / "a.lode", tmp_path / f"whole-{out}")[0] == 0

@@ -1,8 +1,7 @@
-"""``lodestream view``: its folder of files, its pictures, and the page until Ctrl-C."""
+"""``lodestream view``: its pictures, and the page until Ctrl-C."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -20,8 +19,7 @@ from lodestream import page
 from lodestream_client.program import main
 from lodestream_client.viewer.picture_change import DONE, VISIBLE, picture_change, share_above
 from lodestream_client.viewer.pictures import Picture, view_after, view_when_done
-from lodestream_client.viewer.sources import FileSource, RemoteSource
-from lodestream_client.viewer.static import write_static
+from lodestream_client.viewer.sources import FileSource, RemoteSource, read_fully
 from tests.client.files import ranged
 from tests.patience import PATIENCE
 
@@ -54,59 +52,6 @@ def test_a_page_that_is_not_built_is_told(
     monkeypatch.setattr("lodestream_client.commands.view.assets", dict)
     assert main(["view", str(container)]) == 1
     assert "make page" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("built")
-def test_a_folder_for_any_host(tmp_path: Path, container: Path) -> None:
-    out = tmp_path / "out"
-    for _ in range(2):  # a second time it replaces its own files
-        assert main(["view", str(container), "--static", str(out)]) == 0
-    assert sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()) == [
-        "assets/main-1.js",
-        "index.html",
-        "surface.lode",
-        "view.json",
-    ]
-    assert (out / "surface.lode").read_bytes() == container.read_bytes()
-    config = json.loads((out / "view.json").read_text())
-    surface = {"name": "hills", "src": "surface.lode", "bytes": container.stat().st_size}
-    assert config == {"surfaces": [surface], "live": False}
-
-
-@pytest.mark.usefixtures("built")
-def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, container: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mine").write_text("mine")
-    assert main(["view", str(container), "--static", str(tmp_path / "out")]) == 1
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["mine"]
-
-
-@pytest.mark.usefixtures("built")
-def test_a_folder_that_was_interrupted_is_written_again(
-    tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out, source, pages = tmp_path / "out", FileSource(container), page.assets()
-
-    def interrupted(done: float) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_static(out, pages, {"surface.lode": source}, interrupted)
-    assert not (out / page.INDEX).exists()
-    with monkeypatch.context() as patched:
-        patched.setattr("lodestream_client.viewer.static.shutil.copyfile", lambda *_: interrupted(1))
-        with pytest.raises(KeyboardInterrupt):
-            write_static(out, pages, {"surface.lode": source})
-    write_static(out, pages, {"surface.lode": source})
-    assert (out / page.INDEX).is_file()
-
-
-@pytest.mark.usefixtures("built")
-def test_other_files_are_encoded_first(tmp_path: Path) -> None:
-    np.save(tmp_path / "hills.npy", HILLS)
-    assert main(["view", str(tmp_path / "hills.npy"), "--name", "my hills", "--static", str(tmp_path / "out")]) == 0
-    assert json.loads((tmp_path / "out" / "view.json").read_text())["surfaces"][0]["name"] == "my hills"
-    assert np.array_equal(ls.decode((tmp_path / "out" / "surface.lode").read_bytes()).points, HILLS)
 
 
 @pytest.mark.usefixtures("built")
@@ -245,7 +190,6 @@ def test_pictures_of_every_kind(tmp_path: Path, surface: ls.Surface) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--png", "a.png", "--static", "b"],
         ["--at", "1kB"],
         ["--roi", "0:9,0:9"],
         ["--until-done"],
@@ -268,9 +212,9 @@ def test_of_what_is_encoded_already_nothing_is_chosen(
     tmp_path: Path, container: Path, capsys: pytest.CaptureFixture[str], option: list[str]
 ) -> None:
     for shown, what in ((str(container), "a container"), ("http://127.0.0.1:1/a.lode", "an address")):
-        assert main(["view", shown, "--static", str(tmp_path / "out"), *option]) == 1
+        assert main(["view", shown, "--png", str(tmp_path / "out.png"), *option]) == 1
         assert f"got {what}, which is shown as it is" in capsys.readouterr().err
-        assert not (tmp_path / "out").exists()
+        assert not (tmp_path / "out.png").exists()
 
 
 def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Path) -> None:
@@ -279,10 +223,9 @@ def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Pat
         try:
             assert (source.name, source.size) == ("hills", container.stat().st_size)
             assert source.read(10, 30) == container.read_bytes()[10:40]
-            write_static(tmp_path / "out", {}, {"surface.lode": source})
+            assert read_fully(source, 0, source.size) == container.read_bytes()
         finally:
             source.close()
-    assert (tmp_path / "out" / "surface.lode").read_bytes() == container.read_bytes()
 
 
 @pytest.mark.parametrize("replace", [False, True])

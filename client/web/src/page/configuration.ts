@@ -4,7 +4,10 @@
 export interface ShownSurface {
   /** Address of the container, relative to the page. */
   readonly src: string;
+  /** What follows # in the address of this surface; it stays when the container changes. */
   readonly name: string;
+  /** What it is called on the page. */
+  readonly title: string;
   readonly bytes: number | null;
   /** 0 to 1 while the container is still being made; null: it is there. */
   readonly progress: number | null;
@@ -18,12 +21,19 @@ export function parseConfiguration(value: unknown): ShownSurface[] {
   const { surfaces } = (typeof value === "object" && value !== null ? value : {}) as Record<string, unknown>;
   if (!Array.isArray(surfaces)) throw new TypeError(`expected a list of surfaces in ${CONFIGURATION}, got none`);
   return surfaces.map((surface: unknown) => {
-    const { src, name, bytes, progress } = (surface ?? {}) as Record<string, unknown>;
+    const { src, name, title, bytes, progress } = (surface ?? {}) as Record<string, unknown>;
     if (typeof src !== "string" || src === "")
       throw new TypeError(`expected the "src" of a surface in ${CONFIGURATION}`);
     const number = (given: unknown): number | null =>
       typeof given === "number" && Number.isFinite(given) ? given : null;
-    return { src, name: typeof name === "string" ? name : src, bytes: number(bytes), progress: number(progress) };
+    const called = typeof name === "string" && name !== "" ? name : src;
+    return {
+      src,
+      name: called,
+      title: typeof title === "string" && title !== "" ? title : called,
+      bytes: number(bytes),
+      progress: number(progress),
+    };
   });
 }
 

@@ -147,24 +147,41 @@ function fail(error: unknown): void {
   );
 }
 
-/** Shows the surfaces of a static host: the only one, or the one whose number is asked for, or a list. */
+/** The name of a published surface in the part of the address after #; null: none is asked for. */
+function askedName(): string | null {
+  const [name] = location.hash.slice(1).split("&", 1);
+  if (!name || name.includes("=")) return null; // what has a value tells how a surface is looked at
+  try {
+    return decodeURIComponent(name);
+  } catch {
+    return name;
+  }
+}
+
+/** Shows the surfaces of a published page: the one whose name is asked for, the only one, or a list. */
 async function showConfigured(surfaces: readonly ShownSurface[]): Promise<void> {
-  const asked = /(?:^#|&)f=(\d+)/.exec(location.hash)?.[1];
-  const only = surfaces.length === 1 ? surfaces[0] : surfaces[Number(asked ?? -1)];
+  const asked = askedName();
+  const only = surfaces.length === 1 && asked === null ? surfaces[0] : surfaces.find(({ name }) => name === asked);
+  if (asked !== null && only === undefined) throw new Error(`Nothing is published here under the name ${asked}.`);
   if (only === undefined) return showChoice(surfaces);
-  const { src, name, progress } = only;
-  if (progress !== null) return showMaking(surfaces, name, progress);
+  const { src, title, progress } = only;
+  if (progress !== null) return showMaking(surfaces, title, progress);
   const address = new URL(src, document.baseURI);
   if (address.origin !== location.origin)
     throw new Error(`expected a container of this host, got one of ${address.host}`);
-  open(address.href, name, surfaces.length > 1);
+  open(address.href, title, surfaces.length > 1);
 }
 
 function showChoice(surfaces: readonly ShownSurface[]): void {
   closeAll();
   header.replaceChildren(mark(false));
-  const items = surfaces.map(({ name, bytes }, k) =>
-    html("li", {}, html("a", { href: `#f=${k}` }, name), bytes === null ? null : ` ${formatBytes(bytes)}`),
+  const items = surfaces.map(({ name, title, bytes }) =>
+    html(
+      "li",
+      {},
+      html("a", { href: `#${encodeURIComponent(name)}` }, title),
+      bytes === null ? null : ` ${formatBytes(bytes)}`,
+    ),
   );
   document.body.replaceChildren(
     header,
@@ -206,7 +223,7 @@ function start(surfaces: ShownSurface[] | null): void {
     void route();
     return;
   }
-  if (surfaces.length > 1) addEventListener("hashchange", () => void showConfigured(surfaces).catch(fail));
+  addEventListener("hashchange", () => void showConfigured(surfaces).catch(fail));
   showConfigured(surfaces).catch(fail);
 }
 

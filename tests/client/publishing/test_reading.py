@@ -1,0 +1,176 @@
+"""Names on a published page: the command, streams, xarray and pictures read what they lead to, over Range."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lodestream as ls
+import lodestream_client
+from lodestream.errors import NotFoundError, RemoteProtocolError
+from lodestream_client import sync
+from lodestream_client.program import main
+from lodestream_client.viewer.sources import RemoteSource
+from tests.client.files import Ranged, ranged
+
+HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
+
+
+pytestmark = pytest.mark.usefixtures("pages")
+
+
+def write(tmp_path: Path, factor: float = 1.0) -> str:
+    path = tmp_path / "hills & dales.npy"
+    np.save(path, HILLS * np.float32(factor))
+    return str(path)
+
+
+@pytest.fixture
+def host(tmp_path: Path, pages: object) -> Iterator[Ranged]:
+    """A host of files with two published surfaces, one with a name that an address has to escape."""
+    np.save(tmp_path / "plain.npy", HILLS[:9, :9])
+    store = tmp_path / "store"
+    with ranged(store) as server:
+        assert main(["publish", write(tmp_path), str(tmp_path / "plain.npy"), str(store)]) == 0
+        server.requests.clear()
+        yield server
+
+
+NAME = "hills%20%26%20dales"
+
+
+@pytest.mark.parametrize("begin", ["/", "/index.html", "/index.html?a=b"])
+def test_pull_receives_what_a_name_leads_to(tmp_path: Path, host: Ranged, begin: str) -> None:
+    out = tmp_path / "out.npy"
+    assert main(["pull", f"{host.url}{begin}#{NAME}&v=1,2,3", str(out)]) == 0
+    assert np.array_equal(np.load(out), HILLS)
+
+
+def test_pull_goes_on_with_what_it_has(tmp_path: Path, host: Ranged, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LODESTREAM_CACHE", str(tmp_path / "cache"))
+    out = tmp_path / "out.npy"
+    for limit in (["--max-bytes", "3000"], []):
+        assert main(["pull", "--resume", f"{host.url}/#{NAME}", str(out), *limit]) == 0
+    assert np.array_equal(np.load(out), HILLS)
+
+
+def test_a_stream_ends_on_the_container_that_it_began(tmp_path: Path, host: Ranged) -> None:
+    url = f"{host.url}/#{NAME}"
+    with sync.connect(url) as stream:
+        first = next(iter(stream))
+        assert not first.complete
+        assert main(["publish", write(tmp_path, 2.0), str(tmp_path / "store")]) == 0
+        *_, last = stream
+    assert last.complete
+    assert np.array_equal(last.surface().points, HILLS)
+    with sync.connect(url) as stream:
+        *_, last = stream
+    assert np.array_equal(last.surface().points, HILLS * np.float32(2))
+
+
+def test_the_asyncio_client_reads_names_too(host: Ranged) -> None:
+    async def received() -> Any:
+        async with lodestream_client.connect(f"{host.url}/#plain") as stream:
+            views = [view async for view in stream]
+        return views[-1].surface().points
+
+    assert np.array_equal(asyncio.run(received()), HILLS[:9, :9])
+    located = asyncio.run(lodestream_client.locate(f"{host.url}/#plain"))
+    assert located == sync.locate(f"{host.url}/#plain")
+
+
+def test_info_and_pictures(tmp_path: Path, host: Ranged, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", f"{host.url}/#plain", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["shape"] == [9, 9]
+    source = RemoteSource(f"{host.url}/#plain", None)
+    try:
+        assert source.url == sync.locate(f"{host.url}/#plain")
+        assert source.read(1, 4) == b"LODE"
+    finally:
+        source.close()
+
+
+def test_xarray_opens_a_name_and_stays_with_its_container(tmp_path: Path, host: Ranged) -> None:
+    xarray = pytest.importorskip("xarray")
+    dataset = xarray.open_dataset(f"{host.url}/#{NAME}")
+    (name,) = dataset.data_vars
+    assert main(["publish", write(tmp_path, 2.0), str(tmp_path / "store")]) == 0
+    again = pickle.loads(pickle.dumps(dataset))
+    assert np.array_equal(dataset[name][10:20, 30:40], HILLS[10:20, 30:40])
+    assert np.array_equal(again[name], HILLS)
+
+
+def test_a_whole_read_takes_few_requests(tmp_path: Path, host: Ranged) -> None:
+    with sync.connect(f"{host.url}/#{NAME}") as stream:
+        list(stream)
+    assert len(host.requests) <= 3, "the list, the beginning, and the rest"
+
+
+def test_what_is_published_is_listed(tmp_path: Path, host: Ranged, capsys: pytest.CaptureFixture[str]) -> None:
+    for place in (str(tmp_path / "store"), f"{host.url}/", f"{host.url}/index.html"):
+        assert main(["published", place]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split("  ")[0].strip() for line in lines] == ["hills & dales", "plain"]
+        assert main(["published", place, "--json"]) == 0
+        assert len(json.loads(capsys.readouterr().out)["surfaces"]) == 2
+
+
+def test_a_name_that_is_not_there(host: Ranged) -> None:
+    with pytest.raises(NotFoundError, match="got 'dales'; there are: hills & dales, plain"):
+        sync.locate(f"{host.url}/#dales")
+    with pytest.raises(NotFoundError, match="dales"), sync.connect(f"{host.url}/#dales") as stream:
+        list(stream)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"surfaces": [{"name": "plain", "src": "http://other.example/a.lode"}]}', "expected a container on"),
+        ('{"surfaces": [{"name": "plain", "src": 3}]}', "the surfaces of a published page"),
+        ('{"surfaces": {}}', "the surfaces of a published page"),
+        ("{}", "the surfaces of a published page"),
+        ("no", "is this a Lodestream server"),
+    ],
+)
+def test_a_list_that_cannot_be_followed(tmp_path: Path, host: Ranged, text: str, words: str) -> None:
+    (tmp_path / "store" / "view.json").write_text(text)
+    with pytest.raises(RemoteProtocolError, match=words):
+        sync.locate(f"{host.url}/#plain")
+    with pytest.raises(RemoteProtocolError, match=words), sync.connect(f"{host.url}/#plain") as stream:
+        list(stream)
+
+
+def test_a_page_that_is_no_published_one(tmp_path: Path, host: Ranged) -> None:
+    with pytest.raises(NotFoundError):
+        sync.locate(f"{host.url}/elsewhere/#plain")
+
+
+def test_a_token_goes_to_the_host_of_the_page(tmp_path: Path, host: Ranged) -> None:
+    assert sync.locate(f"{host.url}/#plain", token="t").startswith(host.url)
+
+
+def test_levels_are_files_that_gdal_opens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    surface = ls.Surface(HILLS, metadata={"geotransform": [500_000.0, 30.0, 0.0, 4_200_000.0, 0.0, -30.0]})
+    (tmp_path / "hills.lode").write_bytes(ls.encode(surface))
+    store = tmp_path / "store"
+    with ranged(store) as server:
+        given = ["publish", str(tmp_path / "hills.lode"), str(store), "--levels", "--public-url", f"{server.url}/"]
+        assert main([*given, "--json"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert report["page"] == f"{server.url}/index.html"
+        (entry,) = report["surfaces"]
+        finest = entry["levels"][-1]
+        gdal = rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR", NO_PROXY="127.0.0.1")
+        with gdal, rasterio.open(f"/vsicurl/{server.url}/{finest['src']}") as dataset:
+            assert np.array_equal(dataset.read(1), HILLS)
+            assert dataset.transform.c == 500_000.0
+        for level in entry["levels"]:
+            assert (store / level["src"]).stat().st_size == level["bytes"]
