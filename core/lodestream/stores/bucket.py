@@ -12,7 +12,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -77,15 +77,15 @@ class Limits:
         Seconds of a request that writes a part of a large object.
     retries : int
         How often a request that failed is made again.
-    write : float
-        Seconds after which a small object that was not written is not tried again.
+    again : float
+        Seconds after which a call that failed, with its retries, is not made once more.
     """
 
     stalled: float = 10.0
     request: float = 20.0
     part: float = 120.0
     retries: int = 3
-    write: float = 30.0
+    again: float = 30.0
 
 
 class Bucket:
@@ -152,7 +152,8 @@ class Bucket:
         with open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
             part = max(_PART, -(-size // _MOST_PARTS))
-            for wait in (*_waits(self._limits.retries), None):
+            end = self._end()
+            for wait in _waits():
                 file.seek(0)
                 pieces = _Pieces(file, part, progress)
                 try:
@@ -161,10 +162,8 @@ class Bucket:
                 except RequestError as failure:
                     if pieces.error is not None:
                         raise pieces.error from None
-                    if failure.kind == "refused" or wait is None:
-                        self._refuse(key, failure)
-                # A conflict with another upload of the same bytes, or no answer: what does not change may be repeated.
-                time.sleep(wait)
+                    # A conflict with another upload of the same bytes, or no answer: it never changes, so once more.
+                    self._pause(key, failure, wait, end)
 
     def open(self, key: str, size: int | None = None) -> BucketBlob:
         """Open an object for reading."""
@@ -194,30 +193,36 @@ class Bucket:
 
     def _delete(self, place: tuple[str, str]) -> None:
         key, at = place
-        try:
-            ask(lambda: self._library.delete(self._store, at))
-        except RequestError as failure:
-            if failure.kind != "absent":
-                self._refuse(key, failure)
+        with suppress(AbsentError):
+            self._ask(key, lambda: self._library.delete(self._store, at))
 
     def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
         """List objects in the order of their keys."""
         where = self._prefix + checked_prefix(prefix)
-        offset = self._prefix + after if after else None
-        listed = self._ask(prefix, lambda: self._library.list(self._store, where or None, offset=offset))
-        while (chunk := self._ask(prefix, partial(next, listed, None))) is not None:
-            for found in chunk:
-                key = found["path"][len(self._prefix) :]
-                if key > after and _is_key(key):
-                    tag = Tag((found["e_tag"] or "").strip('"'))
-                    yield Entry(key, found["size"], tag, found["last_modified"].timestamp())
+        end, waits = self._end(), _waits()
+        while True:
+            offset = self._prefix + after if after else None
+            try:
+                listed = ask(partial(self._library.list, self._store, where or None, offset=offset))
+                while (chunk := ask(partial(next, listed, None))) is not None:
+                    for found in chunk:
+                        key = found["path"][len(self._prefix) :]
+                        if key > after and _is_key(key):
+                            after = key
+                            tag = Tag((found["e_tag"] or "").strip('"'))
+                            yield Entry(key, found["size"], tag, found["last_modified"].timestamp())
+                    end, waits = self._end(), _waits()
+                return
+            except RequestError as failure:
+                # A list that failed ends as if there were no more: another one goes on behind the last key.
+                self._pause(prefix, failure, next(waits), end)
 
     def room(self) -> int | None:
         """Return None: a bucket has no end."""
         return None
 
     def probe(self) -> float:
-        """Try out whether the store heeds conditions, and reads and lists; return the time by its clock."""
+        """Try out whether the store heeds conditions, and reads and lists what was written; return its time."""
         return try_out(self)
 
     def describe(self) -> str:
@@ -234,10 +239,23 @@ class Bucket:
         return f"{self.describe()}: {key}" if key else self.describe()
 
     def _ask(self, key: str, call: Callable[[], _T]) -> _T:
-        try:
-            return ask(call)
-        except RequestError as failure:
+        """Make a call that may be repeated: the library repeats not every request, and none whose answer is cut."""
+        end = self._end()
+        for wait in _waits():
+            try:
+                return ask(call)
+            except RequestError as failure:
+                self._pause(key, failure, wait, end)
+        raise AssertionError("there is always another attempt")
+
+    def _end(self) -> float:
+        return time.monotonic() + self._limits.again
+
+    def _pause(self, key: str, failure: RequestError, wait: float, end: float) -> None:
+        """Wait before a call is made once more, or raise what its failure is if that does not help."""
+        if failure.kind in ("absent", "refused") or time.monotonic() + wait > end:
             self._refuse(key, failure)
+        time.sleep(wait)
 
     def _refuse(self, key: str, failure: RequestError) -> NoReturn:
         """Raise what a failure is for whoever reads, or writes what may be repeated."""
@@ -271,7 +289,7 @@ class Bucket:
             mode="create" if tag is None else {"e_tag": tag},
             use_multipart=False,
         )
-        end = time.monotonic() + self._limits.write
+        end = self._end()
         for wait in _waits():
             try:
                 return self._tag(ask(put)["e_tag"])
@@ -440,10 +458,9 @@ def _connected(place: _Place, limits: Limits, stalled: float, seconds: float) ->
     return AzureStore(place.bucket, **settings)
 
 
-def _waits(count: int | None = None) -> Iterator[float]:
-    """Seconds between attempts, so many or without end: longer and longer, and never those of other writers."""
-    numbers = itertools.count() if count is None else range(count)
-    return (min(2.0, 0.05 * 2**number) * random.uniform(0.5, 1.5) for number in numbers)
+def _waits() -> Iterator[float]:
+    """Seconds between attempts, without end: longer and longer, and never those of other writers."""
+    return (min(2.0, 0.05 * 2**number) * random.uniform(0.5, 1.5) for number in itertools.count())
 
 
 def _is_key(key: str) -> bool:
