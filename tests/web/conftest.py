@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.server.programs import server as program
+from tests.stores.emulators import ministack, s3
+
+__all__ = ["ministack", "s3"]
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

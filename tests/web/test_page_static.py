@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 from playwright.sync_api import expect
@@ -20,6 +22,7 @@ import lodestream as ls
 from lodestream_client.program import main
 from lodestream_client.sync import upload
 from tests.client.files import ranged
+from tests.stores.emulators import BUCKET, Emulator
 
 from .browser import WAIT, Heard
 from .conftest import Tabs
@@ -173,6 +176,35 @@ def test_ten_lines_of_html_show_a_container(tabs: Tabs, outside: Path, library: 
         assert float(values["height"].removesuffix(" m")) == pytest.approx(float(height), rel=1e-7)
         tab.press("ArrowLeft")
         tab.until(lambda: "#v=" in tab.page.url)
+
+
+def test_a_page_of_another_origin_shows_what_a_bucket_has(
+    tabs: Tabs, outside: Path, library: Path, container: Path, s3: Emulator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["publish", str(container), s3.address(), "--name", "hills & dales", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    allow(report["page"].partition(f"/{BUCKET}/")[0] + f"/{BUCKET}", report["cors"])
+    (surface,) = report["surfaces"]
+    example = (WEB / "examples" / "static.html").read_text()
+    (outside / "index.html").write_text(example.replace("./surface.lode", surface["page"]))
+    (outside / "favicon.ico").write_bytes(b"")
+    for path in (*library.glob("*.js"), *(WEB / "node_modules/three/build").glob("three.*.js")):
+        shutil.copy(path, outside)
+    with ranged(outside) as server:
+        tab = tabs(f"{server.url}/index.html")
+        tab.everything("m")
+        assert all(asked is None for _, asked in server.requests), "the surface came from the bucket"
+
+
+def allow(bucket: str, command: str) -> None:
+    """Set the rule that `publish` prints, as `aws s3api put-bucket-cors` does."""
+    (rule,) = json.loads(command.partition("'")[2].rstrip("'"))["CORSRules"]
+    names = {"AllowedOrigins": "AllowedOrigin", "AllowedMethods": "AllowedMethod", "AllowedHeaders": "AllowedHeader"}
+    names["ExposeHeaders"] = "ExposeHeader"
+    inner = "".join(f"<{tag}>{value}</{tag}>" for name, tag in names.items() for value in rule[name])
+    inner += f"<MaxAgeSeconds>{rule['MaxAgeSeconds']}</MaxAgeSeconds>"
+    body = f"<CORSConfiguration><CORSRule>{inner}</CORSRule></CORSConfiguration>"
+    assert httpx.put(f"{bucket}?cors", content=body, trust_env=False).status_code == 200
 
 
 @contextmanager

@@ -5,24 +5,25 @@ import { OptionError } from "../errors";
 const SURFACES = "/v1/surfaces";
 
 /**
- * The URL of something that can be received: a surface on a server, or a container file on any web server.
+ * The URL of something that can be received: a surface on a server, a container file on any web server, or a name on a
+ * published page, `PAGE#NAME`.
  *
  * @param base What a relative URL refers to; in a page the page's own address.
- * @throws OptionError if this is neither.
+ * @throws OptionError if this is none of them.
  */
 export function sourceUrl(given: string | URL, base?: string): string {
   const url = parsed(given, base);
-  url.hash = "";
   if (isSurface(url.href)) {
-    url.search = "";
+    url.hash = url.search = "";
     url.pathname = url.pathname.replace(/\/+$/, "");
     return url.href;
   }
   // The query may be what allows reading a file.
+  if (url.hash.length > 1) return url.href;
   if (url.pathname === "/" || url.pathname.replace(/\/+$/, "").endsWith(SURFACES)) {
     throw new OptionError(
-      "expected a surface's address such as http://HOST/v1/surfaces/ID, or a container's such as " +
-        `http://HOST/NAME.lode, got ${url.href}`,
+      "expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as " +
+        `http://HOST/NAME.lode, or a published name's such as http://HOST/#NAME, got ${url.href}`,
     );
   }
   return url.href;

@@ -3,6 +3,7 @@
 import { LodestreamError, SilenceError, TruncatedStreamError, UnreachableError } from "../errors";
 import { sameOrigin } from "./addresses";
 import { fromResponse } from "./problems";
+import { locate, publishedName } from "./published";
 import type { AnswerHeaders, RangeRequest } from "./range-download";
 
 /** The answer to a request for a range. */
@@ -31,10 +32,12 @@ const LONGEST_PROBLEM = 64 * 1024;
 
 /** A container on a server of Lodestream or on any web server that knows Range. */
 export class HttpRanges implements RangeSource {
+  /** Where the container is; until there is an answer, the name on a published page that leads to it. */
+  located: string;
   private address: string;
 
   /**
-   * @param url Where the container is; a redirect is followed, and its target is asked from then on.
+   * @param url Where the container is, or a name on a published page that leads to it; a redirect is followed, and its target is asked from then on.
    * @param home The address that the token is for: it goes to no other origin.
    */
   constructor(
@@ -43,13 +46,19 @@ export class HttpRanges implements RangeSource {
     private readonly token: string | undefined,
     private readonly fetch: typeof globalThis.fetch,
   ) {
-    this.address = url;
+    this.located = this.address = url;
   }
 
   async ask(request: RangeRequest, patience: () => number, signal: AbortSignal): Promise<RangeAnswer> {
     const timer = new Patience(patience, signal);
-    const headers: Record<string, string> = { ...request.headers };
-    if (this.token !== undefined && sameOrigin(this.address, this.home)) headers.Authorization = `Bearer ${this.token}`;
+    const own: Record<string, string> = {};
+    if (this.token !== undefined && sameOrigin(this.address, this.home)) own.Authorization = `Bearer ${this.token}`;
+    if (publishedName(this.located) !== undefined) {
+      // Once: the stream ends on the container that it begins, whatever the name leads to by then.
+      const found = await timer.wait(this.located, () => locate(this.located, own, this.fetch, timer.signal));
+      this.located = this.address = found;
+    }
+    const headers = { ...request.headers, ...own };
     const asked = this.address;
     // No cache comes between: browsers lock an address in theirs while one part of it is under way.
     const options: RequestInit = { headers, cache: "no-store", credentials: "same-origin", signal: timer.signal };

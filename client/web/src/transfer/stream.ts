@@ -8,7 +8,7 @@ import { LodestreamError, OptionError, RemoteError } from "../errors";
 import type { Ended } from "../planning/plan";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Target, ViewInfo } from "../types";
-import { containerUrl } from "./addresses";
+import { containerUrl, isSurface } from "./addresses";
 import { RangeTransport } from "./by-ranges";
 import { SocketTransport } from "./by-socket";
 import type { StreamDecoder } from "./decoding";
@@ -38,6 +38,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   private readonly socket: SocketTransport<View> | undefined;
   private readonly makeRanges: () => RangeTransport<View>;
   private made: RangeTransport<View> | undefined;
+  private readonly address: () => string | undefined;
   private link: Link | undefined;
   private readonly silence: number;
   private readonly closeTimeout: number;
@@ -73,10 +74,12 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
       const http = new HttpRanges(containerUrl(transports.url), transports.url, token, fetch);
       this.makeRanges = () => new RangeTransport(this, http, options.version);
+      this.address = () => (isSurface(transports.url) ? transports.url : http.located);
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
       this.socket = new SocketTransport(this, transports.url, { token, window }, sockets);
       this.transports = transports;
     } else {
+      this.address = () => undefined;
       const ranges = source instanceof Blob ? new BlobRanges(source) : source;
       this.makeRanges = () => new RangeTransport(this, ranges);
     }
@@ -89,9 +92,12 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
     this.current = { phase: "idle", transport: this.transport };
   }
 
-  /** The URL of the surface or file; undefined for a file of this machine. */
+  /**
+   * The URL of the surface or file; undefined for a file of this machine. Of a name on a published page it is that of
+   * the container, once it is known.
+   */
   get url(): string | undefined {
-    return this.transports?.url;
+    return this.address();
   }
 
   /** What tells this version of a file from others, as far as its server says: its entity tag, or else its date. */

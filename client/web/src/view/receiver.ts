@@ -9,6 +9,7 @@ import { makeTarget, type TargetOptions } from "../planning/target";
 import type { WindowErrors } from "../planning/window-errors";
 import { PartRanges, type PartReader } from "../transfer/parts";
 import { CutShortError } from "../transfer/problems";
+import { publishedName } from "../transfer/published";
 import { Stream } from "../transfer/stream";
 import type { Surface } from "../types";
 import { composed, thinned } from "./compose";
@@ -54,7 +55,10 @@ export class Receiver {
       this.description ??= description;
       this.tell();
     };
-    describe(url, token, header).then(described, () => described(NO_DESCRIPTION));
+    // Of a name on a published page the stream learns which container it leads to.
+    const named = typeof url === "string" && publishedName(url) !== undefined;
+    const place = named ? header.then(() => this.stream?.url ?? url) : Promise.resolve(url);
+    place.then((known) => describe(known, token, header)).then(described, () => described(NO_DESCRIPTION));
     void header.then(() => setTimeout(() => described(NO_DESCRIPTION), PATIENCE));
     try {
       this.decoder = new Decoder(await loadKernels());

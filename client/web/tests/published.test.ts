@@ -1,0 +1,105 @@
+/** Names on published pages: `PAGE#NAME` leads to a container, once for a stream. */
+import { createServer, type Server } from "node:http";
+import type { AddressInfo } from "node:net";
+import { afterAll, beforeAll, beforeEach, describe, expect, it } from "vitest";
+import { connect } from "../src/connect";
+import { NotFoundError, RemoteProtocolError } from "../src/errors";
+import { sourceUrl } from "../src/transfer/addresses";
+import { locate, publishedName } from "../src/transfer/published";
+import { containerOf } from "./golden";
+
+const PLAIN = containerOf("attributes");
+const OTHER = containerOf("attributes-wide");
+
+let server: Server;
+let url: string;
+let list: unknown;
+let asked: string[];
+let authorized: (string | undefined)[];
+
+beforeAll(async () => {
+  server = createServer((request, response) => {
+    asked.push(request.url!);
+    authorized.push(request.headers.authorization);
+    if (request.url === "/maps/view.json") {
+      response.end(typeof list === "string" ? list : JSON.stringify(list));
+      return;
+    }
+    const data = { "/maps/containers/one.lode": PLAIN, "/maps/containers/two.lode": OTHER }[request.url!];
+    const range = /bytes=(\d+)-(\d+)/.exec(request.headers.range ?? "");
+    if (data === undefined || range === null) {
+      response.writeHead(404).end();
+      return;
+    }
+    const [start, end] = [Number(range[1]), Math.min(Number(range[2]) + 1, data.length)];
+    response.writeHead(206, { "content-range": `bytes ${start}-${end - 1}/${data.length}` });
+    response.end(data.subarray(start, end));
+  });
+  await new Promise<void>((resolve) => server.listen(0, "127.0.0.1", resolve));
+  url = `http://127.0.0.1:${(server.address() as AddressInfo).port}`;
+});
+
+afterAll(() => new Promise((resolve) => server.close(resolve)));
+
+beforeEach(() => {
+  asked = [];
+  authorized = [];
+  list = { surfaces: [{ name: "hills & dales", src: "containers/one.lode" }] };
+});
+
+const find = (place: string): Promise<string> => locate(place, {}, fetch, new AbortController().signal);
+
+describe("the name of an address", () => {
+  it.each([
+    ["http://host/#hills", { list: "http://host/view.json", name: "hills" }],
+    [
+      "http://host/a/index.html?b#hills%20%26%20dales&v=1,2",
+      { list: "http://host/a/view.json", name: "hills & dales" },
+    ],
+    ["http://host/a/#100%", { list: "http://host/a/view.json", name: "100%" }],
+    ["http://host/a.lode", undefined],
+    ["http://host/v1/surfaces/ab#hills", undefined],
+  ])("%s", (address, expected) => expect(publishedName(address)).toEqual(expected));
+
+  it("is kept by connect, and none of a surface's", () => {
+    expect(sourceUrl("http://host/#hills")).toBe("http://host/#hills");
+    expect(sourceUrl("http://host/v1/surfaces/ab/#hills")).toBe("http://host/v1/surfaces/ab");
+    expect(() => sourceUrl("http://host/#")).toThrow("#NAME");
+  });
+});
+
+describe("a name", () => {
+  it("leads to its container", async () => {
+    expect(await find(`${url}/maps/#hills%20%26%20dales`)).toBe(`${url}/maps/containers/one.lode`);
+    expect(await find(`${url}/a.lode`)).toBe(`${url}/a.lode`);
+  });
+
+  it("that is not there is told", async () => {
+    await expect(find(`${url}/maps/#dales`)).rejects.toThrow(NotFoundError);
+    await expect(find(`${url}/#dales`)).rejects.toThrow(NotFoundError);
+  });
+
+  it.each([
+    "no list",
+    "null",
+    { surfaces: 3 },
+    { surfaces: [{ name: "hills & dales" }] },
+    { surfaces: [{ name: "hills & dales", src: "http://127.0.0.1:1/one.lode" }] },
+  ])("is not followed from a list like %j", async (given) => {
+    list = given;
+    await expect(find(`${url}/maps/#hills%20%26%20dales`)).rejects.toThrow(RemoteProtocolError);
+  });
+
+  it("is asked for once, and the stream ends on what it began", async () => {
+    const stream = connect(`${url}/maps/#hills%20%26%20dales`, {}, { worker: false, token: "secret" });
+    let complete = false;
+    for await (const view of stream) {
+      list = { surfaces: [{ name: "hills & dales", src: "containers/two.lode" }] };
+      complete = view.complete;
+    }
+    expect(complete).toBe(true);
+    expect(asked.filter((path) => path === "/maps/view.json")).toHaveLength(1);
+    expect(asked).not.toContain("/maps/containers/two.lode");
+    expect(new Set(authorized)).toEqual(new Set(["Bearer secret"]));
+  });
+});
