@@ -18,7 +18,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from typing import Any, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 from lodestream.target import Tolerance
 
@@ -29,6 +29,9 @@ from .requests.bodies import Asked, Body, Closure, Parcel, Source, are_files, ch
 from .requests.calls import Flow
 from .stream.aio_stream import Stream
 from .stream.options import ConnectKeywords, ConnectOptions
+
+if TYPE_CHECKING:
+    from lodestream.quality import Effort
 
 __all__ = [
     "Stream",
@@ -82,6 +85,7 @@ async def upload(
     filename: str | None = None,
     nodata: float | str | None = None,
     local: bool = False,
+    effort: Effort = "default",
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
@@ -93,7 +97,7 @@ async def upload(
     >>> asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy", precision=0.01)).state
     'ready'
     """
-    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata, effort)
     check_asked(asked)
     ask = not local and are_files(sources)
     read_there = await _run(api.formats_read(url), url, token) if ask else None

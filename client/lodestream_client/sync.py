@@ -29,6 +29,8 @@ from .stream.sync_stream import Stream
 if TYPE_CHECKING:
     import httpx
 
+    from lodestream.quality import Effort
+
 __all__ = [
     "Stream",
     "connect",
@@ -130,6 +132,7 @@ def upload(
     filename: str | None = None,
     nodata: float | str | None = None,
     local: bool = False,
+    effort: Effort = "default",
 ) -> Description:
     """Upload a surface.
 
@@ -168,6 +171,8 @@ def upload(
     local : bool
         Encode all files here and send containers. Files of a format that the server does not read are always encoded
         here, with a `FormatWarning`.
+    effort : "fast", "default" or "small"
+        What the encoding takes, see `lodestream.encode`; values do not depend on it.
 
     Returns
     -------
@@ -196,7 +201,7 @@ def upload(
     >>> sync.upload("http://127.0.0.1:8000", surface, precision=0.01).details["shape"]
     [2, 2]
     """
-    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata)
+    asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata, effort)
     check_asked(asked)
     ask = not local and are_files(sources)
     read_there = _run(api.formats_read(url), url, token) if ask else None

@@ -1,19 +1,24 @@
-"""How closely a container keeps a surface, as a caller, the command line, or the query of an upload requests it."""
+"""What an encoding is to be: how close, and with how much effort; as a caller, a command or a query requests it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal, cast, get_args
 
 from .errors import OptionError
 from .target import Limit, Tolerance
 
-__all__ = ["Limit", "Quality"]
+__all__ = ["EFFORTS", "Effort", "Limit", "Quality"]
+
+#: What an encoder spends its time on, see `lodestream.encoding.effort`.
+Effort = Literal["fast", "default", "small"]
+EFFORTS: tuple[Effort, ...] = get_args(Effort)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quality:
-    """How closely a container keeps a surface; by default bit for bit.
+    """How closely a container keeps a surface, by default bit for bit; and with how much effort it is made.
 
     >>> Quality.of("1e-4d").precision
     Tolerance(value=0.0001, relative=True)
@@ -29,18 +34,24 @@ class Quality:
     attributes : mapping of str to Tolerance
         Maximum errors of attributes, by name, or of single channels: a coordinate (x, y, z), a component of an
         attribute (``wind_0``). The others are restored bit for bit, except coordinates to which `precision` applies.
+    effort : "fast", "default" or "small"
+        It changes bytes and time, never values. "fast": at least twice as fast, in few layers. "small": as few bytes as
+        the format allows, in few layers; a window takes more bytes, since tiles and chunks are large.
 
     Raises
     ------
     OptionError
-        If both a precision and a root mean square error are given.
+        If both a precision and a root mean square error are given, or if there is no such effort.
     """
 
     precision: Tolerance | None = None
     rms: Tolerance | None = None
     attributes: Mapping[str, Tolerance] = field(default_factory=dict, hash=False)
+    effort: Effort = "default"
 
     def __post_init__(self) -> None:
+        if self.effort not in EFFORTS:
+            raise OptionError(f"expected effort to be one of {', '.join(EFFORTS)}, got {str(self.effort)[:80]!a}")
         if self.precision is not None and self.rms is not None:
             raise OptionError("expected either a precision or a root mean square error, got both")
 
@@ -50,22 +61,25 @@ class Quality:
         precision: Limit | None = None,
         rms: Limit | None = None,
         attributes: Mapping[str, Limit] | None = None,
+        effort: Effort = "default",
     ) -> Quality:
         """Make a quality from tolerances, numbers in the surface's unit, or texts.
 
         Raises
         ------
         OptionError
-            If one of them is not a number of 0 or more, or if both a precision and a root mean square error are given.
+            If one of them is not a number of 0 or more, if both a precision and a root mean square error are given, or
+            if there is no such effort.
         """
         return cls(
             precision=None if precision is None else Tolerance.of(precision),
             rms=None if rms is None else Tolerance.of(rms),
             attributes={name: Tolerance.of(limit) for name, limit in (attributes or {}).items()},
+            effort=effort,
         )
 
     @classmethod
-    def parse(cls, precisions: Iterable[str] = (), rms: str | None = None) -> Quality:
+    def parse(cls, precisions: Iterable[str] = (), rms: str | None = None, effort: str = "default") -> Quality:
         """Parse a quality from the texts of a command line or a query, which `texts` returns.
 
         >>> Quality.parse(["1e-4d", "depth=0.5"]) == Quality.of("1e-4d", attributes={"depth": 0.5})
@@ -77,12 +91,13 @@ class Quality:
             ``P`` for the points, ``NAME=P`` for an attribute or a channel. A name may contain an equals sign, a
             tolerance does not.
         rms : str or None
+        effort : str
 
         Raises
         ------
         OptionError
-            If a text is not a tolerance, if one is given twice, or if both a precision and a root mean square error are
-            given.
+            If a text is not a tolerance, if one is given twice, if both a precision and a root mean square error are
+            given, or if there is no such effort.
         """
         tolerances: dict[str | None, Tolerance] = {}
         for text in precisions:
@@ -93,10 +108,11 @@ class Quality:
             tolerances[key] = Tolerance.parse(tolerance)
         points = tolerances.pop(None, None)
         attributes = {name: tolerance for name, tolerance in tolerances.items() if name is not None}
-        return cls(precision=points, rms=None if rms is None else Tolerance.parse(rms), attributes=attributes)
+        error = None if rms is None else Tolerance.parse(rms)
+        return cls(precision=points, rms=error, attributes=attributes, effort=cast("Effort", effort))
 
     def texts(self) -> tuple[list[str], str | None]:
-        """Return the texts that `parse` reads: the precisions and the RMS error, in canonical spelling.
+        """Return the texts of errors that `parse` reads: the precisions and the RMS error, in canonical spelling.
 
         >>> Quality.of(attributes={"depth": 0.5}, rms="0.10d").texts()
         (['depth=0.5'], '0.1d')

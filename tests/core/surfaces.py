@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import cache
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +17,7 @@ import lodestream as ls
 from lodestream.container import Index, read_index
 from lodestream.container.fields import told
 from lodestream.decoding.decoder import Decoder, View
-from lodestream.encoding import large_units
+from lodestream.encoding.effort import CHOICES
 from lodestream.planning.plan import Plan
 from lodestream.planning.selection import Selection
 
@@ -83,12 +86,9 @@ SAMPLES = _samples()
 @contextmanager
 def all_large() -> Iterator[None]:
     """Units of all levels but the coarsest are large, whatever that costs."""
-    kept = large_units._LARGE, large_units._MOST
-    large_units._LARGE, large_units._MOST = 1, float("inf")
-    try:
+    large = replace(CHOICES["default"], large_points=1, large_growth=math.inf)
+    with mock.patch.dict(CHOICES, default=large):
         yield
-    finally:
-        large_units._LARGE, large_units._MOST = kept
 
 
 @cache

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import itertools
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,9 +21,10 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream.encoding import forward, large_units, phases, prepared, streams, transform_phases
+from lodestream.encoding import forward, phases, prepared, streams, transform_phases
 from lodestream.encoding.allocation import assign_layers
 from lodestream.encoding.curves import Curves
+from lodestream.encoding.effort import CHOICES
 from lodestream.encoding.tiling import WHOLE_TILE, square
 from lodestream.entropy.tile_coder import TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather
@@ -99,8 +101,8 @@ class Crafted:
 
         with pytest.MonkeyPatch.context() as patch:
             if self.large:
-                patch.setattr(large_units, "_LARGE", 1)
-                patch.setattr(large_units, "_MOST", float("inf"))
+                large = replace(CHOICES["default"], large_points=1, large_growth=math.inf)
+                patch.setitem(CHOICES, "default", large)
             if self.tile:
                 patch.setattr(prepared, "tile_exponents", lambda *_: self.tile)
                 patch.setattr(prepared, "square", lambda bits: self.tile if bits == WHOLE_TILE else square(bits))

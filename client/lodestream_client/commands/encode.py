@@ -42,6 +42,7 @@ from .values import parse_pair
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from lodestream.quality import Effort
     from lodestream.surface import Surface
 
 __all__ = ["EncodeOptions", "encode_files", "read_surface", "register", "run"]
@@ -168,7 +169,7 @@ def encode_files(
         if part is not None:
             part.mark(surface)
         if options.surface.quality.rms is None:  # a stream for one error is refused instead
-            _note_memory(surface, options.building.memory, show)
+            _note_memory(surface, options.building.memory, options.surface.quality.effort, show)
         container = _made(surface, options, executor)
         size = len(container) if container is not None else Path(options.out).stat().st_size
         if container is not None:
@@ -259,11 +260,11 @@ def _made(surface: Surface, options: EncodeOptions, executor: Executor | None) -
         return encoded(None if options.out == "-" else Path(options.out))
 
 
-def _note_memory(surface: Surface, memory: int | None, show: Callable[[str], None]) -> None:
+def _note_memory(surface: Surface, memory: int | None, effort: Effort, show: Callable[[str], None]) -> None:
     """Note that the encoding takes more memory than was asked for, if it cannot take less."""
     from lodestream.encoding.memory import least_memory, whole_memory
 
-    least = min(least_memory(surface), whole_memory(surface))
+    least = min(least_memory(surface, effort), whole_memory(surface))
     if memory is not None and memory < least:
         show(
             f"--memory {human_size(memory)} is exceeded, and encoding goes on: "

@@ -238,6 +238,7 @@ def _uploaded(options: PushOptions) -> Description:
             precision=wanted.quality.precision,
             rms=wanted.quality.rms,
             attribute_precision=wanted.quality.attributes,
+            effort=wanted.quality.effort,
             closed=wanted.closed,
             nodata=wanted.nodata,
             local=options.local,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lodestream.errors import OptionError
-from lodestream.quality import Quality
+from lodestream.quality import EFFORTS, Quality
 
 from .values import parse_pair, parse_precision, parse_tolerance
 
@@ -72,6 +72,13 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         help="encode for one root mean square error: a container as small as possible whose complete surface has an "
         "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
         "with a --precision of the points",
+    )
+    group.add_argument(
+        "--effort",
+        choices=EFFORTS,
+        default="default",
+        help="fast: half the time; small: the fewest bytes, of which a window then takes more; both in few layers "
+        "(default: default)",
     )
     add_remeshing_options(group)
     add_reading_options(group)
@@ -175,12 +182,12 @@ def _remeshing(args: argparse.Namespace) -> dict[str, str]:
 
 
 def quality_of(args: argparse.Namespace) -> Quality:
-    """Return the quality of ``--precision`` and ``--rms``.
+    """Return the quality of ``--precision``, ``--rms`` and ``--effort``.
 
     Ends the program if a precision is given twice, or one of the points together with ``--rms``.
     """
     try:
-        return Quality.parse(args.precisions, None if args.rms is None else str(args.rms))
+        return Quality.parse(args.precisions, None if args.rms is None else str(args.rms), args.effort)
     except OptionError as error:
         args.parser.error(f"argument --precision: {error}")
         raise  # not reached: the parser has ended the program

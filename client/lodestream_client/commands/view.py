@@ -274,7 +274,8 @@ def _refuse_options(options: SurfaceOptions, what: str) -> None:
     """Refuse options of encoding for a container, which would have no effect."""
     if options.quality != Quality() or options.closed != "auto" or options.format_options:
         raise OptionError(
-            f"expected a file to encode with --precision, --rms, --closed or -o, got {what}, which is shown as it is"
+            f"expected a file to encode with --precision, --rms, --effort, --closed or -o, got {what}, which is shown "
+            "as it is"
         )
 
 

@@ -224,6 +224,8 @@ def _parameters(asked: Asked) -> dict[str, str | list[str]]:
         parameters["precision"] = precisions
     if rms is not None:
         parameters["rms"] = rms
+    if asked.effort != "default":
+        parameters["effort"] = asked.effort
     if asked.closed != "auto":
         parameters["closed"] = asked.closed
     if asked.nodata is not None:
@@ -231,7 +233,7 @@ def _parameters(asked: Asked) -> dict[str, str | list[str]]:
     if asked.name:
         parameters["name"] = asked.name
     for key, value in asked.options.items():
-        if key in ("precision", "rms", "closed", "nodata", "name", "filename"):
+        if key in ("precision", "rms", "effort", "closed", "nodata", "name", "filename"):
             raise OptionError(f"{key} is not an option of a format")
         # A list, as of attributes, is a text with commas in a query.
         parameters[key] = value if isinstance(value, str) or not isinstance(value, Iterable) else ",".join(value)

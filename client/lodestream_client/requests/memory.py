@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from lodestream.errors import InputError, OptionError
-from lodestream.quality import Quality
+from lodestream.quality import Effort, Quality
 from lodestream.target import Tolerance
 
 if TYPE_CHECKING:
@@ -43,17 +43,19 @@ class Asked:
     attribute_precision: Mapping[str, Tolerance | float | str] = field(default_factory=dict)
     filename: str | None = None
     nodata: float | str | None = None
+    effort: Effort = "default"
 
     @property
     def quality(self) -> Quality:
-        """How closely the surface is to be kept.
+        """How closely the surface is to be kept, and with how much effort it is encoded.
 
         Raises
         ------
         OptionError
-            If an error is no number of 0 or more, or both a precision and a root mean square error are asked for.
+            If an error is no number of 0 or more, if both a precision and a root mean square error are asked for, or if
+            there is no such effort.
         """
-        return Quality.of(self.precision, self.rms, self.attribute_precision)
+        return Quality.of(self.precision, self.rms, self.attribute_precision, self.effort)
 
 
 def in_memory(source: object) -> bool:

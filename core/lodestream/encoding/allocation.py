@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..container import limits
 from ..grid.layout import Layout
 from .curves import Curves, Worth
+from .effort import FewLayers
 
 __all__ = ["assign_layers"]
 
@@ -32,14 +33,15 @@ _OFTEN = 3800
 _EARLY_GROWTH = 1.4, 1.8
 _EARLY_STEP = 160
 _FIRST_LAYER = 48  # bytes of coefficients, at least where there are more layers
-# Of streams made for one error; one of fewer bytes than the first is one layer.
+# Of streams of few layers; one of fewer bytes than the first is one layer.
 _BRIEF = 6000
-_FEWEST, _MOST = 3, 24
+_FEWEST = 3
 _SECOND = 16.0  # times the first layer
-_BYTES_FOR_A_LAYER = 12000
 
 
-def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = False) -> list[NDArray[np.int8]]:
+def assign_layers(
+    curves: Curves, layout: Layout, channels: int, few: FewLayers | None = None
+) -> list[NDArray[np.int8]]:
     """Return the state after each layer.
 
     Parameters
@@ -48,8 +50,8 @@ def assign_layers(curves: Curves, layout: Layout, channels: int, few: bool = Fal
     layout : Layout
     channels : int
         Of the surface; one whose coefficients are all 0 has no curve.
-    few : bool
-        Only so many layers that their frames are a small part of the bytes.
+    few : FewLayers, optional
+        Only so many layers.
 
     Returns
     -------
@@ -88,7 +90,7 @@ def _worth(curves: Curves) -> Worth:
 
 
 def _layer_ends(
-    sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: bool, most: int
+    sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: FewLayers | None, most: int
 ) -> list[int]:
     """Return the number of passes that are known after each of at most ``most`` layers.
 
@@ -123,11 +125,11 @@ def _layer_ends(
     return [end + 1 for end in reversed(ends)]
 
 
-def _range_before(size: float, total: float, few: bool) -> tuple[float, float]:
+def _range_before(size: float, total: float, few: FewLayers | None) -> tuple[float, float]:
     """Return the fewest and the most bytes of the stream after the layer before one that ends at ``size``."""
     if few:
         second = _SECOND * _FIRST_LAYER
-        count = min(max(int(total / _BYTES_FOR_A_LAYER), _FEWEST), _MOST)
+        count = min(max(int(total / few.bytes), _FEWEST), few.most)
         growth = max(total / second, 1.0) ** (1 / (count - 2))
         if size > second * growth**0.5:
             return size / growth**1.5, size / growth**0.5

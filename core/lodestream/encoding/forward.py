@@ -172,7 +172,12 @@ def sampled_rows(stepped: Sequence[NDArray[np.int32]], layout: Layout, piece: Pi
 
 
 def fit_rows(
-    stored: Sequence[NDArray[np.int32]], pieces: Sequence[Sequence[Rows]], layout: Layout, level: int, rule: int
+    stored: Sequence[NDArray[np.int32]],
+    pieces: Sequence[Sequence[Rows]],
+    layout: Layout,
+    level: int,
+    rule: int,
+    search: bool,
 ) -> tuple[int, int] | None:
     """Fit the (a, b) of the rows' axis of all patches, or of all interfaces; None where the level has none.
 
@@ -185,6 +190,8 @@ def fit_rows(
     layout, level
     rule : int
         0, or `INTERFACES`.
+    search : bool
+        See `fitted_predictor`.
     """
     if (level - 1, rule) not in fitted_steps(layout):
         return None
@@ -195,11 +202,12 @@ def fit_rows(
         for rows, array in zip(strides, _separated(flat, shapes), strict=True):
             if layout.grids[rows.grid].interface == (rule == INTERFACES):
                 columns[rows.grid].append(array)
-    return fitted_to_columns([(np.concatenate(c), layout.steps(grid, level)[0]) for grid, c in columns.items()])
+    sampled = [(np.concatenate(c), layout.steps(grid, level)[0]) for grid, c in columns.items()]
+    return fitted_to_columns(sampled, search)
 
 
 def fit_columns(
-    stored: Sequence[NDArray[np.int32]], pieces: Sequence[Piece], layout: Layout, level: int
+    stored: Sequence[NDArray[np.int32]], pieces: Sequence[Piece], layout: Layout, level: int, search: bool
 ) -> tuple[int, int] | None:
     """Fit the (a, b) of the columns' axis of all patches; None where the level has none.
 
@@ -210,6 +218,8 @@ def fit_columns(
     pieces : sequence of Piece
         Of the level.
     layout, level
+    search : bool
+        See `fitted_predictor`.
     """
     if (level - 1, 1) not in fitted_steps(layout):
         return None
@@ -224,7 +234,7 @@ def fit_columns(
             nodes[part.grid].append(upper)
             details[part.grid].append(lower)
     lines = {grid: np.concatenate([*nodes[grid], *details[grid]]).T for grid in nodes}
-    return fitted_to_columns([(array, layout.steps(grid, level)[1]) for grid, array in lines.items()])
+    return fitted_to_columns([(array, layout.steps(grid, level)[1]) for grid, array in lines.items()], search)
 
 
 # Steps.

@@ -13,24 +13,26 @@ import numpy as np
 from ..entropy.tile_coder import Channel, TileCoder
 from ..grid.layout import Layout
 
-__all__ = ["candidate", "unit_size", "worth"]
-
-#: Points that all grids have together at the coarsest level whose units are large.
-_LARGE = 1 << 15
-#: By how much larger than others large units may be, and of how many tiles of a channel that is tried.
-_MOST, _TRIED = 1.05, 2
+__all__ = ["candidate", "tried_tiles", "unit_size", "worth"]
 
 
-def candidate(layout: Layout) -> tuple[int, list[int]]:
-    """Return the coarsest level whose units may be large, 0 if there is none, and the tiles on which to try it."""
-    level = next((level for level in range(1, layout.levels + 1) if layout.points(level) >= _LARGE), 0)
+def candidate(layout: Layout, points: int) -> int:
+    """Return the coarsest level at which all grids have so many points together, 0 if there is none.
+
+    Its units may be large.
+    """
+    return next((level for level in range(1, layout.levels + 1) if layout.points(level) >= points), 0)
+
+
+def tried_tiles(layout: Layout, count: int) -> list[int]:
+    """Return the tiles on which large units are tried, at most ``count``, spread over the finest level."""
     tiles = layout.tiles_of(layout.levels)
-    return level, sorted({tiles[len(tiles) * (2 * i + 1) // (2 * _TRIED)] for i in range(_TRIED)})
+    return sorted({tiles[len(tiles) * (2 * i + 1) // (2 * count)] for i in range(count)})
 
 
-def worth(large: Sequence[int], small: Sequence[int]) -> bool:
-    """Return whether large units are worth their bytes, given the bytes as large ones and as small ones."""
-    return sum(large) <= _MOST * sum(small)
+def worth(large: Sequence[int], small: Sequence[int], growth: float) -> bool:
+    """Return whether large units are at most ``growth`` times as large as small ones, given the bytes of both."""
+    return sum(large) <= growth * sum(small)
 
 
 def unit_size(coder: TileCoder, tile: int, parent: int, number: int, channel: Channel) -> int:

@@ -75,10 +75,8 @@ def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_
         prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions, named=errors
     )
     whole = prepared.precision is None and bits is None and not errors
-    if whole and prepared.point_channels == 1 and prepared.arrangement is None:
-        offset = offset_lattice(prepared.arrays[0][0][..., 0])
-        if offset is not None and find_lattice(prepared.valid) is None:
-            lattices[0] = offset
+    if whole and prepared.point_channels == 1 and prepared.arrangement is None and find_lattice(prepared.valid) is None:
+        lattices[0] = offset_lattice(prepared.arrays[0][0][..., 0]) or lattices[0]
     for number, kind in enumerate(prepared.kinds, 1):
         values = _joined([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays], room)
         errors = {part: named[first + part] for part in range(kind.channels) if first + part in named}

@@ -10,9 +10,12 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..errors import OptionError
+from ..quality import Effort
 from ..sizes import parse_size
 from ..surface import Surface
 from .arranging import may_share
+from .effort import CHOICES
+from .tiling import square
 
 __all__ = [
     "BESIDE",
@@ -36,8 +39,6 @@ _CHOICE, _LOOP = 28, 18
 _MASKS = 6
 #: What a process takes besides, and the least that may be asked for.
 BESIDE, LEAST = 96 << 20, 1 << 20
-#: Rows of a tile.
-_ROWS = 64
 
 
 def checked_memory(memory: int | str) -> int:
@@ -78,15 +79,18 @@ def _arrays(surface: Surface) -> Iterator[NDArray[Any]]:
     return (array for block in surface.blocks for array in (block.points, *block.attributes.values()))
 
 
-def least_memory(surface: Surface) -> int:
+def least_memory(surface: Surface, effort: Effort = "default") -> int:
     """Estimate the fewest bytes in which a surface can be encoded by bands: the program, and a row of tiles.
+
+    Tiles have as many rows as the effort gives them.
 
     A surface of several blocks, and one that touches itself, takes its largest block in place of a row.
     """
     values, first = largest_block(surface), surface.blocks[0]
     in_space = first.points.ndim == 3 and first.points.shape[2] > 1
     if len(surface.blocks) == 1 and not (in_space and first.mask is None and may_share(first, first.points)):
-        values = values * _ROWS // max(surface.blocks[0].shape[0], _ROWS)
+        rows = 1 << square(CHOICES[effort].tile_bits)[0]
+        values = values * rows // max(surface.blocks[0].shape[0], rows)
     return BESIDE + masks_memory(surface) + OF_BAND * values
 
 

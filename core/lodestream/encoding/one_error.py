@@ -97,7 +97,7 @@ def closed_loop(
     for fit in (True, False):
         arrays: Sequence[NDArray[np.int32]] = lattice_coordinates(prepared, channel, lattices.channels[channel])
         originals = [copied(array) for array in arrays]
-        predictors = forward(arrays, prepared.layout, fit)
+        predictors = forward(arrays, prepared.layout, fit, search=prepared.choices.search)
         # Fitted predictors can let coefficients grow beyond what a container holds; the default ones never do.
         if max(max(int(array.max()), -int(array.min())) for array in arrays) < 1 << COEFFICIENT_BITS:
             break

@@ -22,9 +22,10 @@ from .assembling import Chunks, coded_layers, returned_digest, window_section_of
 from .build import Build
 from .coding import parents_of, sizes_of_unit
 from .curves import Curves, band_weights
+from .effort import FOR_ONE_ERROR
 from .executing import Execution, Task
 from .header import header_of
-from .large_units import candidate, worth
+from .large_units import candidate, tried_tiles, worth
 from .layers import (
     MeasuredLayer,
     all_passes,
@@ -115,11 +116,12 @@ class Phases:
 
     def _large_level(self) -> int:
         """Return the coarsest level whose units should be large; 0 if none should be."""
-        level, tried = candidate(self._layout)
+        choices = self._build.prepared.choices
+        level = candidate(self._layout, choices.large_points) if choices.large_growth else 0
         if not level or all(self._build.quantiser_of(channel) for channel in range(self._build.channels)):
             return 0
         sizes = []
-        for tile in tried:
+        for tile in tried_tiles(self._layout, choices.large_tried):
             for channel, tops in enumerate(self._tops):
                 if not tops[tile] or self._build.quantiser_of(channel):
                     continue
@@ -129,7 +131,8 @@ class Phases:
                 above = read_tiles(self._build, kind, channel, parents) if parents else np.zeros(0, np.int32)
                 true = read_tiles(self._build, kind, channel, range(tile, tile + 1))
                 sizes.append(sizes_of_unit(table, tile, true, above, int(tops[tile]), level))
-        return level if worth([large for large, _ in sizes], [small for _, small in sizes]) else 0
+        large, small = [large for large, _ in sizes], [small for _, small in sizes]
+        return level if worth(large, small, choices.large_growth) else 0
 
     @property
     def _large(self) -> int:
@@ -167,7 +170,8 @@ class Phases:
         if self._scratch.has("layers"):
             return
         curves = self._curves()
-        layers = assign_layers(curves, self._layout, self._build.channels, self._build.quantiser is not None)
+        few = self._build.prepared.choices.layers or (FOR_ONE_ERROR if self._build.quantiser is not None else None)
+        layers = assign_layers(curves, self._layout, self._build.channels, few)
         shown = shown_states(self._header, layers, all_passes(self._tops))
         self._scratch.write("states", np.stack([*shown, *level_states(self._header)]))
         self._scratch.write("last-state", shown[-1])
@@ -248,7 +252,7 @@ class Phases:
             metadata[DIGEST] = returned_digest(build.prepared.given, header.hole)
         writer.metadata(metadata)
         codes = [layer.window_codes for layer in layers if layer.window_codes is not None]
-        if len(codes) == len(layers):
+        if len(codes) == len(layers) and build.prepared.choices.window_errors:
             payload = window_section_of(codes, total)
             if payload is not None:
                 writer.optional(WINDOW_ERRORS, payload)

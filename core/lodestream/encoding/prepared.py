@@ -33,9 +33,10 @@ from ..surface import Block, Surface
 from ..target import Tolerance
 from ..transform.pyramid import PADDING
 from .arranging import arranged, may_share, unshared
+from .effort import CHOICES, Choices
 from .holes import Arrays, filled, given_arrays, valid_points
 from .named_precisions import named_errors
-from .tiling import SMALL, SMALL_TILE, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE, chunk_exponents, square, tile_exponents
+from .tiling import SMALL, SMALL_CHUNK, SMALL_TILE, WHOLE_CHUNK, chunk_exponents, square, tile_exponents
 
 __all__ = ["Prepared", "prepare"]
 
@@ -73,6 +74,8 @@ class Prepared:
         Largest error allowed of single channels, by number, in their unit.
     divisions : float
         Into how many lattice steps the widest extent is divided where the points lie on no lattice.
+    choices : Choices
+        Of the effort.
     arrangement : Arrangement or None
         None where the surface is one block that shares no side.
     patches : tuple of Patch
@@ -97,6 +100,7 @@ class Prepared:
     attribute_precisions: Mapping[str, Tolerance]
     named: Mapping[int, float]
     divisions: float
+    choices: Choices
     arrangement: Arrangement | None
     patches: tuple[Patch, ...]
     layout: Layout
@@ -177,7 +181,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
 
     Large arrays that are needed beside the surface's own go where there is ``room``.
     """
-    given, (surface, plane) = surface, _heights(surface)
+    given, (surface, plane), choices = surface, _heights(surface), CHOICES[quality.effort]
     blocks, first = surface.blocks, surface.blocks[0]
     arrays = tuple(filled(block, room) for block in blocks)
     points = [block_arrays[0] for block_arrays in arrays]
@@ -201,11 +205,12 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
             lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions, named=errors)
             arrangement = arranged(blocks, points, lattices[:geometric], room)
     if arrangement is None:
-        small = absolute is None and rms is None and _takes_small_tiles(surface, valid)
-        layout, chunks = _of_one_grid(first, geometric, small)
+        exact = absolute is None and rms is None
+        small = exact and choices.small_surfaces and _takes_small_tiles(surface, valid)
+        layout, chunks = _of_one_grid(first, geometric, small, choices)
     else:
         # It is never read in windows: tiles and chunks may be as large as costs the fewest bytes.
-        layout, chunks = Layout(grids_of(arrangement), square(WHOLE_TILE)), [square(WHOLE_CHUNK)]
+        layout, chunks = Layout(grids_of(arrangement), square(choices.whole_tile_bits)), [square(WHOLE_CHUNK)]
     prepared = Prepared(
         given=given,
         surface=surface,
@@ -223,6 +228,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
         },
         named=named,
         divisions=divisions,
+        choices=choices,
         arrangement=arrangement,
         patches=(whole_patch(0, first.shape, first.closed),) if arrangement is None else arrangement.patches,
         layout=layout,
@@ -292,11 +298,13 @@ def _takes_small_tiles(surface: Surface, valid: NDArray[Any]) -> bool:
     return few and surface.dtype.kind == "f" and find_lattice(valid) is None
 
 
-def _of_one_grid(block: Block, geometric: int, small: bool) -> tuple[Layout, Sequence[tuple[int, int]]]:
+def _of_one_grid(
+    block: Block, geometric: int, small: bool, choices: Choices
+) -> tuple[Layout, Sequence[tuple[int, int]]]:
     """Return the layout of a surface of one block that shares no side, and the sizes that its chunks may have."""
-    bits = SMALL_TILE if small else TILE_BITS if geometric == 1 else WHOLE_TILE
+    bits = SMALL_TILE if small else choices.tile_bits if geometric == 1 else choices.whole_tile_bits
     layout = Layout.single(block.shape, block.closed, tile_exponents(block.shape, bits))
-    return layout, chunk_exponents(block.shape, small)
+    return layout, chunk_exponents(block.shape, (SMALL_CHUNK,) * small + choices.chunk_bits)
 
 
 def _joint_changes(given: Surface, arrangement: Arrangement | None) -> JointChanges | None:

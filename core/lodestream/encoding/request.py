@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from ..container import limits, metadata
 from ..container.shape import LONGEST_AXIS
 from ..errors import OptionError, TooLargeError
-from ..quality import Limit, Quality
+from ..quality import Effort, Limit, Quality
 from ..surface import Surface
 from .named_precisions import check_names
 
@@ -18,13 +18,17 @@ _Progress = Callable[[float], None]
 
 
 def chosen_quality(
-    quality: Quality | None, precision: Limit | None, rms: Limit | None, attributes: Mapping[str, Limit] | None
+    quality: Quality | None,
+    precision: Limit | None,
+    rms: Limit | None,
+    attributes: Mapping[str, Limit] | None,
+    effort: Effort | None,
 ) -> Quality:
     """Return the quality, given or from the shorthand; `OptionError` is raised if there are both."""
     if quality is None:
-        return Quality.of(precision, rms, attributes)
-    if precision is not None or rms is not None or attributes:
-        raise OptionError("expected either a quality or single errors, got both")
+        return Quality.of(precision, rms, attributes, "default" if effort is None else effort)
+    if precision is not None or rms is not None or attributes or effort is not None:
+        raise OptionError("expected either a quality or single errors and an effort, got both")
     return quality
 
 

@@ -107,7 +107,7 @@ def core(build: Build, channel: int, fit: int) -> None:
     if build.is_whole:
         build.scratch.remove(name_of_fit("samples", channel, fit, level))
     del samples
-    predictors = pyramid.forward(arrays, layout, bool(fit), level)
+    predictors = pyramid.forward(arrays, layout, bool(fit), level, build.prepared.choices.search)
     coefficients = forward.coefficients_of(arrays, build.table(channel), build.pieces.core_tiles)
     _write_coefficients(build, (channel, fit, level, CORE), coefficients)
     build.scratch.write(name_of_fit("largest", channel, fit, level, CORE), np.array(forward.largest_of(arrays)))

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 __all__ = [
     "CHUNK_BITS",
+    "SMALL",
+    "SMALL_CHUNK",
+    "SMALL_TILE",
     "TILE_BITS",
     "VAST",
     "WHOLE_CHUNK",
@@ -21,12 +26,14 @@ SMALL_TILE, SMALL_CHUNK, SMALL = 11, 10, 1 << 19
 VAST = 1 << 28
 #: Of x, y, z, where no window is wanted, or small chunks would take many more bytes.
 WHOLE_TILE, WHOLE_CHUNK = 14, 16
+#: What a container gives a tile at most, see `docs/format.md`.
+_MOST = 16
 
 
 def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, int]:
     """Return rows and columns of a tile of 2**bits coefficients, as exponents of two, for a surface of one grid.
 
-    They are counted in nodes, half of the points.
+    They are counted in nodes, half of the points. Very many points have larger tiles, as far as a container holds them.
 
     >>> tile_exponents((1000, 1000))
     (6, 6)
@@ -36,18 +43,15 @@ def tile_exponents(shape: tuple[int, int], bits: int = TILE_BITS) -> tuple[int, 
     (6, 8)
     """
     rows, columns = _fitting((shape[0] + 1) // 2, (shape[1] + 1) // 2, bits)
-    return rows, columns + 2 if shape[0] * shape[1] >= VAST else columns
+    return rows, columns + min(2, _MOST - bits) if shape[0] * shape[1] >= VAST else columns
 
 
-def chunk_exponents(shape: tuple[int, int], small: bool = False) -> list[tuple[int, int]]:
-    """Return the sizes, rows and columns as exponents of two, that chunks of a surface of one grid may have.
-
-    The smallest first; ``small``: of a surface that takes small ones, since a window needs a larger share of it.
+def chunk_exponents(shape: tuple[int, int], sizes: Sequence[int] = (CHUNK_BITS, WHOLE_CHUNK)) -> list[tuple[int, int]]:
+    """Return the sizes, rows and columns as exponents of two, of chunks of 2**bits points of a surface of one grid.
 
     >>> chunk_exponents((1000, 1000))
     [(6, 6), (8, 8)]
     """
-    sizes = [SMALL_CHUNK] * small + [CHUNK_BITS, WHOLE_CHUNK]
     return [_fitting(*shape, bits) for bits in sizes]
 
 

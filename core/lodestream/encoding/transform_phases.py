@@ -140,11 +140,11 @@ class TransformPhases:
         fitted = None
         if fit and (level - 1, rule) in fitted_steps(self._layout):
             lines = [self._scratch.read(sampled) for sampled in names]
-            pieces = self._build.pieces
+            pieces, search = self._build.pieces, self._build.prepared.choices.search
             if rule == 1:
-                fitted = fit_columns(lines, pieces.of(level), self._layout, level)
+                fitted = fit_columns(lines, pieces.of(level), self._layout, level, search)
             else:
-                fitted = fit_rows(lines, pieces.samples(level), self._layout, level, rule)
+                fitted = fit_rows(lines, pieces.samples(level), self._layout, level, rule, search)
         self._scratch.write(name, np.array(fitted or (0, 0), np.int8))
 
     def _predictors(self, channel: int) -> NDArray[np.int8]:

@@ -58,16 +58,19 @@ class _Sample(NamedTuple):
         return moments
 
 
-def fitted_predictor(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
+def fitted_predictor(grids: Sequence[tuple[NDArray[np.int32], AxisStep]], search: bool = True) -> tuple[int, int]:
     """Return the (a, b) with which the details along axis 0 of a sample of the columns take the fewest bits.
 
     Parameters
     ----------
     grids : sequence of (int32 array of shape (row, column), AxisStep)
         Samples of each grid, and the step along axis 0; one of them at least is long enough to be fitted.
+    search : bool
+        Not only among a few fixed ones.
     """
     lines = sum(corner.shape[1] for corner, _ in grids)
-    return fitted_to_columns([(corner[:, :: sample_stride(corner.shape[1], lines)], step) for corner, step in grids])
+    sampled = [(corner[:, :: sample_stride(corner.shape[1], lines)], step) for corner, step in grids]
+    return fitted_to_columns(sampled, search)
 
 
 def sample_stride(columns: int, lines: int | None = None) -> int:
@@ -78,7 +81,7 @@ def sample_stride(columns: int, lines: int | None = None) -> int:
     return max(1, min((columns if lines is None else lines) // _MAX_SAMPLE_LINES, columns))
 
 
-def fitted_to_columns(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tuple[int, int]:
+def fitted_to_columns(grids: Sequence[tuple[NDArray[np.int32], AxisStep]], search: bool) -> tuple[int, int]:
     """Do what `fitted_predictor` does, given the sampled columns, int32, shape (row, column), see `sample_stride`."""
     sample = _sample(grids)
     costs: dict[tuple[int, int], float] = {}
@@ -92,6 +95,8 @@ def fitted_to_columns(grids: Sequence[tuple[NDArray[np.int32], AxisStep]]) -> tu
             costs.update(zip(new, spread(lambda ab: sample.bits(*ab), new), strict=True))
         return min(tried, key=costs.__getitem__)
 
+    if not search:
+        return best_of(_START_PREDICTORS)
     # Bits are not convex in (a, b), and bumpy from rounding: several starts, then a search in steps that get smaller.
     best = best_of([*_START_PREDICTORS, *_least_squares(sample)])
     for reach in (4, 2, 1):

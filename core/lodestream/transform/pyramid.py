@@ -78,7 +78,7 @@ def copied(array: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def forward(
-    arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True, top: int | None = None
+    arrays: Sequence[NDArray[np.int32]], layout: Layout, fit: bool = True, top: int | None = None, search: bool = True
 ) -> NDArray[np.int8]:
     """Turn a channel's lattice coordinates into its coefficients, in place.
 
@@ -91,6 +91,8 @@ def forward(
         Choose the third step's (a, b) by size for each level and axis that is long enough; otherwise (0, 0) there.
     top : int, optional
         The arrays hold, and have the shape of, the grids of this level; by default of the finest one.
+    search : bool
+        See `fitted_predictor`.
 
     Returns
     -------
@@ -110,7 +112,7 @@ def forward(
                         for k, corner in enumerate(corners)
                         if layout.grids[k].interface == (which == INTERFACES)
                     ]
-                    predictors[level - 1, which] = fitted_predictor(lines)
+                    predictors[level - 1, which] = fitted_predictor(lines, search)
             for k, grid in enumerate(layout.grids):
                 step = layout.steps(k, level)[axis]
                 if step.midpoints:

@@ -36,8 +36,8 @@ class SurfaceOptions:
         Name of the file, if the body has none.
     chosen : mapping of str to str
         The options that distinguish surfaces made from the same bytes: ``precision`` and ``rms`` in canonical spelling,
-        ``precision=NAME`` of attributes, ``closed`` unless it is auto, ``nodata`` as a number, and options of the
-        format as given.
+        ``precision=NAME`` of attributes, ``effort`` unless it is default, ``closed`` unless it is auto, ``nodata`` as a
+        number, and options of the format as given.
     """
 
     name: str | None
@@ -68,7 +68,7 @@ class SurfaceOptions:
             if key in values:
                 raise OptionError(f"expected {key[:80]!a} once, got it twice")
             values[key] = value
-        values |= stored(Quality.parse(precisions, values.pop("rms", None)))
+        values |= stored(Quality.parse(precisions, values.pop("rms", None), values.pop("effort", Quality.effort)))
         name, filename = plain_name(values.pop("name", "")), plain_name(values.pop("filename", ""))
         closed = values.pop("closed", "auto")
         if closed not in CLOSED:
@@ -115,9 +115,10 @@ def check(
         return finished.check_upload(files, options.chosen)
     sniffed = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
     _check_allowed(sniffed[0].names, names[0], allowed)
+    ours = ("precision", "rms", "effort", "closed", "nodata")
     for key in options.chosen:
-        if key not in ("precision", "rms", "closed", "nodata", *sniffed[0].options) and not key.startswith(ATTRIBUTE):
-            known = ", ".join(("precision", "rms", "closed", "nodata", "name", "filename", *sniffed[0].options))
+        if key not in (*ours, *sniffed[0].options) and not key.startswith(ATTRIBUTE):
+            known = ", ".join((*ours, "name", "filename", *sniffed[0].options))
             raise OptionError(f"expected one of {known} for format {sniffed[0].name}, got {key[:80]!a}")
     if options.chosen.get("remesh") is not None:
         _check_allowed(("remesh",), names[0], allowed)

@@ -19,7 +19,11 @@ def stored(quality: Quality) -> dict[str, str]:
     for text in precisions:
         attribute, equals, tolerance = text.rpartition("=")
         chosen[f"precision{equals}{attribute}"] = tolerance
-    return chosen if rms is None else {**chosen, "rms": rms}
+    if rms is not None:
+        chosen["rms"] = rms
+    if quality.effort != Quality.effort:
+        chosen["effort"] = quality.effort
+    return chosen
 
 
 def without_quality(chosen: Mapping[str, str]) -> tuple[Quality, dict[str, str]]:
@@ -36,4 +40,4 @@ def without_quality(chosen: Mapping[str, str]) -> tuple[Quality, dict[str, str]]
             precisions.append(others.pop(key))
         elif key.startswith(ATTRIBUTE):
             precisions.append(f"{key.removeprefix(ATTRIBUTE)}={others.pop(key)}")
-    return Quality.parse(precisions, others.pop("rms", None)), others
+    return Quality.parse(precisions, others.pop("rms", None), others.pop("effort", Quality.effort)), others

@@ -50,9 +50,9 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
 async def upload(request: Request, parts: Parts) -> Response:
     """Upload a file, as a raw body or as parts called ``file`` of a form; the surface is built in the background.
 
-    Parameters in the query other than precision, rms, closed, nodata, name and filename are options of the file's
-    format. If the caller has already uploaded the same bytes with the same options and name, the answer is the existing
-    surface, even if the server has no room for new ones.
+    Parameters in the query other than precision, rms, effort, closed, nodata, name and filename are options of the
+    file's format. If the caller has already uploaded the same bytes with the same options and name, the answer is the
+    existing surface, even if the server has no room for new ones.
 
     A container (.lode) is checked and decoded once, and kept unchanged. It takes no options but name and filename.
     """

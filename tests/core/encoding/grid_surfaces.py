@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import cache
 from typing import Any
 from unittest import mock
@@ -10,7 +11,7 @@ from unittest import mock
 import numpy as np
 from numpy.typing import NDArray
 
-from lodestream.encoding import large_units
+from lodestream.encoding.effort import CHOICES
 from lodestream.encoding.encode import encode
 from lodestream.surface import Surface
 
@@ -76,7 +77,7 @@ SURFACES = _surfaces()
 
 def some_large() -> AbstractContextManager[object]:
     """Units of the finest levels are large, as they are of larger surfaces."""
-    return mock.patch.object(large_units, "_LARGE", 1 << 12)
+    return mock.patch.dict(CHOICES, default=replace(CHOICES["default"], large_points=1 << 12))
 
 
 @cache

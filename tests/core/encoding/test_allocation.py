@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lodestream.container.limits import LAYERS
 from lodestream.encoding.allocation import _layer_ends, assign_layers
 from lodestream.encoding.curves import Worth
+from lodestream.encoding.effort import FOR_ONE_ERROR, FewLayers
 from lodestream.grid.layout import Layout
 
 from .tile_curves import TileCurve, joined
@@ -130,7 +131,7 @@ def test_a_layer_ends_where_the_error_has_just_fallen() -> None:
     step = np.log(sizes) / np.log(1.02) % 1
     left: NDArray[np.float64] = sizes**-1.5 * np.exp(-0.5 * np.where(step < 0.2, step / 0.2, (1 - step) / 0.8))
     last = np.ones(sizes.size, np.bool_)
-    ends = np.array(_layer_ends(sizes, left[0] - left, last, False, LAYERS), np.int64)
+    ends = np.array(_layer_ends(sizes, left[0] - left, last, None, LAYERS), np.int64)
     inner = ends[(sizes[ends - 1] > 20_000) & (ends < 15_000)]
     assert len(inner) > 10
     assert np.abs(step[inner - 1] - 0.2).max() < 0.05
@@ -141,12 +142,12 @@ def test_a_layer_ends_with_a_step_where_one_ends_in_its_range() -> None:
     rng = np.random.default_rng(3)
     last = rng.random(sizes.size) < 0.1
     last[-1] = True
-    ends = np.array(_layer_ends(sizes, np.sqrt(sizes), last, False, LAYERS), np.int64)
+    ends = np.array(_layer_ends(sizes, np.sqrt(sizes), last, None, LAYERS), np.int64)
     assert last[ends[sizes[ends - 1] > 20_000] - 1].all()
 
 
-@given(st.integers(1, 300), st.booleans(), st.integers(0, 2**32))
-def test_layers_end_one_after_another_and_with_the_last_pass(passes: int, few: bool, seed: int) -> None:
+@given(st.integers(1, 300), st.sampled_from([None, FOR_ONE_ERROR, FewLayers(3, 50)]), st.integers(0, 2**32))
+def test_layers_end_one_after_another_and_with_the_last_pass(passes: int, few: FewLayers | None, seed: int) -> None:
     rng = np.random.default_rng(seed)
     sizes = np.cumsum(rng.random(passes) * 10 ** rng.uniform(-3, 4, passes))
     ends = _layer_ends(sizes, np.cumsum(rng.normal(size=passes)), rng.random(passes) < 0.5, few, LAYERS)
@@ -157,9 +158,11 @@ def test_layers_end_one_after_another_and_with_the_last_pass(passes: int, few: b
 def test_streams_for_one_error_have_few_layers() -> None:
     layout, curves = many_tiles()
     total = 1600 * len(curves)
-    assert len(assign_layers(joined(curves), layout, 1, few=True)) <= total / 12_000 + 2
-    assert len(assign_layers(joined(curves[:4]), layout, 1, few=True)) == 3
-    assert len(assign_layers(joined([TileCurve(0, 0, np.full(4, 100.0), np.ones(4))]), layout, 1, few=True)) == 1
+    assert len(assign_layers(joined(curves), layout, 1, few=FOR_ONE_ERROR)) <= total / 12_000 + 2
+    assert len(assign_layers(joined(curves[:4]), layout, 1, few=FOR_ONE_ERROR)) == 3
+    assert (
+        len(assign_layers(joined([TileCurve(0, 0, np.full(4, 100.0), np.ones(4))]), layout, 1, few=FOR_ONE_ERROR)) == 1
+    )
 
 
 def test_nothing_to_send_is_one_layer() -> None:

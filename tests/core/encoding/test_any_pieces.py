@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -20,9 +21,10 @@ from lodestream.container.reader import read_index
 from lodestream.decoding import inspection
 from lodestream.decoding.inspection import inspect
 from lodestream.decoding.piecewise import PiecewiseDecoder
-from lodestream.encoding import folder_build, large_units, memory
+from lodestream.encoding import folder_build, memory
 from lodestream.encoding import prepared as preparing
 from lodestream.encoding.build import Build
+from lodestream.encoding.effort import CHOICES
 from lodestream.encoding.executing import Execution
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.phases import Phases
@@ -55,8 +57,8 @@ def built(prepared: Prepared, points: int, core_points: int, threads: int = 1, f
 @pytest.mark.parametrize("name", SURFACES)
 def test_any_pieces_of_a_grid_give_the_container(name: str) -> None:
     surface, quality = SURFACES[name]
-    prepared = prepare(surface, Quality.of(**quality))
     with some_large():
+        prepared = prepare(surface, Quality.of(**quality))
         assert built(prepared, 1, 600, threads=2) == container_of(name)
         assert built(prepared, 12_000, 600, folder=False) == container_of(name)
 
@@ -106,7 +108,7 @@ def _check(
         if tile is not None:
             patch.setattr(preparing, "tile_exponents", lambda *_: tile)
             patch.setattr(preparing, "square", lambda bits: tile)
-            patch.setattr(large_units, "_LARGE", 200)
+            patch.setitem(CHOICES, "default", replace(CHOICES["default"], large_points=200))
         try:
             prepared = prepare(surface, Quality.of(precision))
             container = built(prepared, WHOLE, WHOLE, folder=False)

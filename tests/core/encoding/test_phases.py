@@ -74,7 +74,7 @@ def test_units_are_large_where_that_is_worth_its_bytes(monkeypatch: pytest.Monke
     chosen = encode(steps)
     sizes = []
     for is_worth in (True, False):
-        monkeypatch.setattr(phases, "worth", lambda large, small, is_worth=is_worth: is_worth)
+        monkeypatch.setattr(phases, "worth", lambda large, small, growth, is_worth=is_worth: is_worth)
         sizes.append(len(encode(steps)))
     assert sizes[0] > 1.1 * sizes[1]
     assert len(chosen) == sizes[1]

@@ -1,0 +1,92 @@
+"""What each effort chooses: all that an encoder may choose without a change of what readers must do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from ..quality import Effort
+from .tiling import CHUNK_BITS, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE
+
+__all__ = ["CHOICES", "FOR_ONE_ERROR", "Choices", "FewLayers"]
+
+
+class FewLayers(NamedTuple):
+    """How many layers a stream has whose frames are a small part of the bytes.
+
+    Attributes
+    ----------
+    most : int
+        Layers, at most; 3 or more.
+    bytes : int
+        About so many to a layer.
+    """
+
+    most: int
+    bytes: int
+
+
+#: Of streams made for one error.
+FOR_ONE_ERROR = FewLayers(most=24, bytes=12_000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choices:
+    """What an encoder chooses. Values do not depend on it, nor whether errors are measured.
+
+    Attributes
+    ----------
+    tile_bits, whole_tile_bits : int
+        Coefficients of a tile in a band, as exponents of two: of heights, and of surfaces that are not read in windows.
+    chunk_bits : tuple of int
+        Points that a chunk of residual may have, as exponents of two, the fewest first; several are tried.
+    small_surfaces : bool
+        Surfaces of few points, of many bytes each, have smaller tiles and chunks.
+    window_errors : bool
+        The container tells errors of windows, where they take few bytes.
+    layers : FewLayers or None
+        None: so many that one is not much longer than the one before.
+    search : bool
+        The predictors of details are sought; otherwise they are the best of a few.
+    large_points : int
+        Points that all grids have together at the coarsest level whose units are large.
+    large_growth : float
+        By how much larger than others large units may be; 0: none are large.
+    large_tried : int
+        On how many tiles of a channel that is tried.
+    """
+
+    tile_bits: int = TILE_BITS
+    whole_tile_bits: int = WHOLE_TILE
+    chunk_bits: tuple[int, ...] = (CHUNK_BITS, WHOLE_CHUNK)
+    small_surfaces: bool = True
+    window_errors: bool = True
+    layers: FewLayers | None = None
+    search: bool = True
+    large_points: int = 1 << 15
+    large_growth: float = 1.05
+    large_tried: int = 2
+
+
+#: Tiles and chunks of "small" have as many points as a container may give them.
+CHOICES: dict[Effort, Choices] = {
+    "fast": Choices(
+        chunk_bits=(CHUNK_BITS,),
+        small_surfaces=False,
+        layers=FewLayers(most=5, bytes=50_000),
+        search=False,
+        large_points=1 << 11,
+        large_growth=1.06,
+        large_tried=1,
+    ),
+    "default": Choices(),
+    "small": Choices(
+        tile_bits=16,
+        whole_tile_bits=16,
+        chunk_bits=(16,),
+        small_surfaces=False,
+        window_errors=False,
+        layers=FewLayers(most=8, bytes=30_000),
+        large_growth=0.0,
+    ),
+}
