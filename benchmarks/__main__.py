@@ -15,6 +15,7 @@ SECTIONS = (
     "solver",
     "rate",
     "windows",
+    "effort",
     "coder",
     "throughput",
     "prefix",

@@ -17,7 +17,7 @@ class FewLayers(NamedTuple):
     Attributes
     ----------
     most : int
-        Layers, at most; 3 or more.
+        About so many layers at most; 3 or more.
     bytes : int
         About so many to a layer.
     """

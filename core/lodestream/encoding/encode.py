@@ -116,9 +116,9 @@ def encode(
         of an attribute ("wind_0"), relative to the range of that channel. A coordinate that is named here has this
         precision, whatever `precision` is. If `precision` is None, the other coordinates are restored bit for bit.
     effort : "fast", "default" or "small", optional
-        It changes bytes and time, never values. "fast" takes at most half the time of "default" for heights, and has
-        few layers. "small" takes the fewest bytes, also in few layers; a window of such a container takes more bytes,
-        up to those of a tile with four times as many rows and columns, and errors of windows are not told.
+        It changes bytes and time, never values. "fast" takes about half the time of "default", and has few layers.
+        "small" takes the fewest bytes, also in few layers. A window of it takes more bytes, since tiles and chunks have
+        four times as many rows and columns, and its errors on the way are bounded by those of the whole surface.
     quality : Quality, optional
         Replaces the four parameters above, which are a shorthand for ``Quality.of(precision, rms,
         attribute_precision, effort)``.

@@ -146,6 +146,16 @@ def test_a_store_is_written_into_an_empty_folder_and_into_no_other(
     assert fetch(out="out.zarr/sub.zarr")[0] == 0, "a group of a store that is there"
 
 
+def test_an_effort_is_taken_from_the_command_line(run: Run, terrain_file: Path, tmp_path: Path) -> None:
+    for effort in ("fast", "small"):
+        out = tmp_path / f"{effort}.lode"
+        assert run("encode", terrain_file, out, "--effort", effort)[0] == 0
+        assert out.read_bytes() == ls.encode(ls.read(terrain_file), effort=effort)
+    code, _, stderr = run("encode", terrain_file, tmp_path / "out.lode", "--effort", "best")
+    assert code == 2
+    assert "argument --effort: invalid choice: best" in stderr.replace("'", "")
+
+
 def test_a_limit_out_of_reach_is_complete_with_a_note(run: Run, terrain_file: Path, tmp_path: Path) -> None:
     lossy = tmp_path / "lossy.lode"
     assert run("encode", terrain_file, lossy, "--precision", "2")[0] == 0

@@ -107,12 +107,18 @@ def test_a_surface_in_memory_goes_whole(server: str, kind: str, asynchronous: bo
 def test_what_is_asked_for_is_done_before_it_is_sent(server: str) -> None:
     given = ls.Surface(blocks=[block(4, (False, False))], metadata={"name": "given"})
     made = sync.upload(
-        server, given, precision="1e-3d", attribute_precision={"heat": 0.5}, name="asked for", closed="cols"
+        server,
+        given,
+        precision="1e-3d",
+        attribute_precision={"heat": 0.5},
+        effort="small",
+        name="asked for",
+        closed="cols",
     )
     before = given.blocks[0]
     closed = ls.Block(before.points, (False, True), mask=before.mask, attributes=before.attributes)
     wanted = ls.Surface(blocks=[closed], metadata={"name": "asked for"})
-    assert container_of(made) == ls.encode(wanted, "1e-3d", attribute_precision={"heat": 0.5})
+    assert container_of(made) == ls.encode(wanted, "1e-3d", attribute_precision={"heat": 0.5}, effort="small")
     assert (made.details["name"], made.details["errors"]) == ("asked for", "told")
     assert (made.details["options"], made.details["closed"]) == ({}, [False, True])
     assert (given.metadata, given.closed) == ({"name": "given"}, (False, False))
@@ -217,6 +223,7 @@ def test_options_that_have_no_place(terrain_file: Path) -> None:
             {"options": {"band": "1"}},
         ),
         (OptionError, "got both", [heights], {"precision": 1, "rms": 1}),
+        (OptionError, "'best'", [heights], {"effort": "best"}),
         (OptionError, "'maybe'", [heights], {"closed": "maybe"}),
         (OptionError, "closed=auto", [ls.Surface(blocks=[block(0), block(1)])], {"closed": "rows"}),
         (OptionError, "'colour'", [heights], {"attribute_precision": {"colour": 1}}),
@@ -294,6 +301,7 @@ def test_info_says_whose_word_the_errors_are(run: Run, server: str, tmp_path: Pa
         (("--precision", "1"), "precision"),
         (("--precision", "kind=1"), "precision"),
         (("--rms", "1"), "rms"),
+        (("--effort", "small"), "effort"),
         (("--closed", "none"), "closed"),
         (("-o", "band=1"), "band"),
     ],

@@ -100,7 +100,15 @@ def test_a_file_and_its_container_have_one_container(http: httpx.Client, exact: 
 
 @pytest.mark.parametrize(
     "query",
-    [{"precision": "1"}, {"rms": "1"}, {"precision": "kind=1"}, {"closed": "rows"}, {"band": "1"}, {"array": "a"}],
+    [
+        {"precision": "1"},
+        {"rms": "1"},
+        {"effort": "fast"},
+        {"precision": "kind=1"},
+        {"closed": "rows"},
+        {"band": "1"},
+        {"array": "a"},
+    ],
     ids=repr,
 )
 def test_options_have_no_place_beside_a_container(

@@ -68,7 +68,13 @@ def _without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "name"), [({}, "heights.npy"), ({"precision": "0.5"}, "heights.npy"), ({}, "blocks.p3d")]
+    ("options", "name"),
+    [
+        ({}, "heights.npy"),
+        ({"precision": "0.5"}, "heights.npy"),
+        ({"effort": "small"}, "heights.npy"),
+        ({}, "blocks.p3d"),
+    ],
 )
 def test_a_build_by_bands_has_the_same_bytes(
     options: dict[str, str], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

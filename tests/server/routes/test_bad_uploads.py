@@ -59,6 +59,8 @@ def test_a_look_at_the_first_bytes_refuses_at_once(
         ({"precision": "-1"}, "'-1'"),
         ({"precision": "nan"}, "'nan'"),
         ({"rms": "fine"}, "'fine'"),
+        ({"effort": "best"}, "one of fast, default, small, got 'best'"),
+        ([("effort", "fast"), ("effort", "fast")], "twice"),
         ({"rms": "a=1"}, "'a=1'"),
         ({"rms": "1", "precision": "1"}, "got both"),
         ([("rms", "1"), ("rms", "2")], "twice"),

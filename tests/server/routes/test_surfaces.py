@@ -75,6 +75,18 @@ def test_a_root_mean_square_error_is_part_of_the_surface(http: httpx.Client) -> 
     assert len({first["id"], *others}) == 3
 
 
+def test_an_effort_is_part_of_the_surface(http: httpx.Client) -> None:
+    heights = hills(seed=4)
+    first = push(http, npy(heights), effort="small")
+    assert first["options"] == {"effort": "small"}
+    container = http.get(first["url"] + "/container", follow_redirects=True).content
+    assert container == ls.encode(ls.decode(container), effort="small") != ls.encode(ls.decode(container))
+    plain = push(http, npy(heights))
+    again = http.post("/v1/surfaces", content=npy(heights), params={"effort": "default"})
+    assert (again.status_code, again.json()["id"]) == (200, plain["id"])
+    assert len({first["id"], plain["id"], push(http, npy(heights), effort="fast")["id"]}) == 3
+
+
 def test_options_reach_the_surface(http: httpx.Client) -> None:
     surface = push(http, npy(hills(seed=3)), closed="both", precision="1e-2d")
     assert surface["closed"] == [True, True]
@@ -245,7 +257,14 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
     }
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
-    assert {parameter["name"] for parameter in post["parameters"]} >= {"precision", "rms", "closed", "name", "filename"}
+    assert {parameter["name"] for parameter in post["parameters"]} >= {
+        "precision",
+        "rms",
+        "effort",
+        "closed",
+        "name",
+        "filename",
+    }
     assert set(post["responses"]) == {"200", "202", "401", "403", "408", "413", "422", "429", "503", "507"}
     example = post["responses"]["202"]["content"]["application/json"]["example"]
     real = http.post("/v1/surfaces", content=npy(hills(seed=13))).json()
