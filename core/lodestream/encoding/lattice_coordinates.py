@@ -71,12 +71,16 @@ def exact_lattices(prepared: Prepared, bits: int | None = None, room: Room = IN_
     """
     named, first = prepared.named, prepared.point_channels
     errors = {channel: error for channel, error in named.items() if channel < first}
+    heights = prepared.point_channels == 1 and prepared.arrangement is None
     lattices = choose_lattices(
-        prepared.valid, prepared.geometric, prepared.precision, bits, divisions=prepared.divisions, named=errors
+        prepared.valid,
+        prepared.geometric,
+        prepared.precision,
+        bits,
+        divisions=lambda: prepared.divisions,
+        offset=lambda: offset_lattice(prepared.channel(0, 0)) if heights else None,
+        named=errors,
     )
-    whole = prepared.precision is None and bits is None and not errors
-    if whole and prepared.point_channels == 1 and prepared.arrangement is None and find_lattice(prepared.valid) is None:
-        lattices[0] = offset_lattice(prepared.arrays[0][0][..., 0]) or lattices[0]
     for number, kind in enumerate(prepared.kinds, 1):
         values = _joined([arrays[number].reshape(-1, kind.channels) for arrays in prepared.arrays], room)
         errors = {part: named[first + part] for part in range(kind.channels) if first + part in named}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -72,8 +72,6 @@ class Prepared:
     attribute_precisions : mapping of str to Tolerance
     named : mapping of int to float
         Largest error allowed of single channels, by number, in their unit.
-    divisions : float
-        Into how many lattice steps the widest extent is divided where the points lie on no lattice.
     choices : Choices
         Of the effort.
     arrangement : Arrangement or None
@@ -99,7 +97,6 @@ class Prepared:
     rms: float | None
     attribute_precisions: Mapping[str, Tolerance]
     named: Mapping[int, float]
-    divisions: float
     choices: Choices
     arrangement: Arrangement | None
     patches: tuple[Patch, ...]
@@ -112,6 +109,12 @@ class Prepared:
         """The values with which the coordinates of each patch are compared."""
         masks = [block.mask for block in self.surface.blocks]
         return tuple(originals_of(self.arrangement, [arrays[0] for arrays in self.arrays], masks))
+
+    @cached_property
+    def divisions(self) -> float:
+        """Into how many lattice steps the widest extent is divided where the points lie on no lattice."""
+        points, exact = [arrays[0] for arrays in self.arrays], self.precision is None and self.rms is None
+        return _divisions(points, self.geometric, exact)
 
     def comparisons(self, region: Region) -> list[Comparison]:
         """Return the values with which the channels of a region are compared.
@@ -196,13 +199,13 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
     if quality.rms is not None and extent:
         rms = quality.rms.absolute(extent) or None  # 0: every value is exact, as of a surface that is one point
     kinds, named = _kinds(first), named_errors(surface, arrays, quality)
-    divisions = _divisions(points, geometric) if absolute is None and rms is None else DEFAULT_DIVISIONS
     arrangement = None
     if len(blocks) > 1 or (geometric > 1 and may_share(first, points[0])):
         arrangement = unshared(blocks)
         if geometric > 1:  # sides are shared by points, not by heights
             errors = {channel: error for channel, error in named.items() if channel < point_channels}
-            lattices = choose_lattices(valid, geometric, absolute, None, divisions=divisions, named=errors)
+            finer = partial(_divisions, points, geometric, absolute is None and rms is None)
+            lattices = choose_lattices(valid, geometric, absolute, None, divisions=finer, named=errors)
             arrangement = arranged(blocks, points, lattices[:geometric], room)
     if arrangement is None:
         exact = absolute is None and rms is None
@@ -227,7 +230,6 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
             kind.name: quality.attributes[kind.name] for kind in kinds if kind.name in quality.attributes
         },
         named=named,
-        divisions=divisions,
         choices=choices,
         arrangement=arrangement,
         patches=(whole_patch(0, first.shape, first.closed),) if arrangement is None else arrangement.patches,
@@ -286,8 +288,13 @@ def _kinds(block: Block) -> tuple[AttributeKind, ...]:
     )
 
 
-def _divisions(points: Sequence[NDArray[Any]], geometric: int) -> float:
-    """Choose the number of lattice steps of the widest extent where all values come back bit for bit."""
+def _divisions(points: Sequence[NDArray[Any]], geometric: int, exact: bool) -> float:
+    """Choose the number of lattice steps of the widest extent where the points lie on no lattice.
+
+    ``exact``: all values come back bit for bit.
+    """
+    if not exact:
+        return DEFAULT_DIVISIONS
     largest = max(points, key=lambda array: array.size)
     return default_divisions([largest[..., channel] for channel in range(geometric)])
 

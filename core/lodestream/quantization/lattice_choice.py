@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,8 @@ def choose_lattices(
     precision: float | None,
     bits: int | None = None,
     *,
-    divisions: float = DEFAULT_DIVISIONS,
+    divisions: Callable[[], float] = lambda: DEFAULT_DIVISIONS,
+    offset: Callable[[], Lattice | None] = lambda: None,
     named: Mapping[int, float] | None = None,
 ) -> list[Lattice]:
     """Choose a lattice for each channel.
@@ -47,8 +48,10 @@ def choose_lattices(
         stores the rest.
     bits : int, optional
         Bits of its range that are kept of a channel that is not in ``named``.
-    divisions : float
-        Lattice steps of the widest extent where there is neither a lattice nor a precision.
+    divisions : callable
+        Returns the lattice steps of the widest extent where there is neither a lattice nor a precision.
+    offset : callable
+        Returns what lattice a coordinate has there all the same, if any.
     named : mapping of int to float, optional
         Largest errors allowed of single channels, by channel.
 
@@ -77,7 +80,7 @@ def choose_lattices(
     furthest = max(max(abs(low), abs(high)) for low, high in spans)
     if furthest > LARGEST_VALUE:
         raise InputError(f"expected values of at most {LARGEST_VALUE} in magnitude, got {furthest}")
-    wanted = widest / divisions if precision is None else _step_for(points.dtype, precision, geometric, spans)
+    wanted = None if precision is None else _step_for(points.dtype, precision, geometric, spans)
     lattices = []
     for channel in range(count):
         low, high = spans[channel]
@@ -87,10 +90,12 @@ def choose_lattices(
             lattices.append(exact if exact is not None and coarse else precision_lattice(low, high, steps[channel]))
         elif channel >= geometric:
             lattices.append(exact or precision_lattice(low, high, (high - low) / DEFAULT_DIVISIONS))
-        elif exact is not None and (precision is None or exact.spacing >= wanted):
+        elif exact is not None and (wanted is None or exact.spacing >= wanted):
             lattices.append(exact)
-        else:
+        elif wanted is not None:
             lattices.append(precision_lattice(low, high, wanted))
+        else:
+            lattices.append(offset() or precision_lattice(low, high, widest / divisions()))
     return lattices
 
 
