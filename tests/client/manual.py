@@ -74,6 +74,13 @@ What all commands have in common:
   several: the RMS and maximum error of each channel that is written, by name), `seconds` and `ended`: complete, level,
   rms, max, channels, bytes, seconds, stopped or truncated.
 
+`encode` and `push`:
+
+- `--effort` changes bytes and time, never values. *fast* takes about half the time, *small* the fewest bytes. Both have
+  few layers, so there are few errors at which a stream can stop. A window of a *small* container takes up to 2.5 times
+  the bytes, and its errors on the way are bounded by those of the whole surface
+  ([measured](measurements.md#what-an-effort-costs-and-gains)). A stream for one error (`--rms`) hardly gains.
+
 `pull --watch`:
 
 - OUT and the picture of `--picture` are replaced, never changed in place, so a program that opens them finds a complete

@@ -73,7 +73,7 @@ CHOICES: dict[Effort, Choices] = {
     "fast": Choices(
         chunk_bits=(CHUNK_BITS,),
         small_surfaces=False,
-        layers=FewLayers(most=5, bytes=50_000),
+        layers=FewLayers(most=5, bytes=16_000),
         search=False,
         large_points=1 << 11,
         large_growth=1.06,
@@ -86,7 +86,7 @@ CHOICES: dict[Effort, Choices] = {
         chunk_bits=(16,),
         small_surfaces=False,
         window_errors=False,
-        layers=FewLayers(most=8, bytes=30_000),
+        layers=FewLayers(most=8, bytes=16_000),
         large_growth=0.0,
     ),
 }
