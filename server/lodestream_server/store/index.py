@@ -1,0 +1,334 @@
+"""The index of the surfaces, in SQLite on a local disk: what `sync` makes again from the store.
+
+It holds what listings, searches, shares and the queue ask for, and no descriptions. It can be deleted while the server
+is stopped. If it is damaged, or taken away, while the server runs, `IndexLostError` says so, and it is made anew.
+
+Reads take a connection of their own for each thread; changes take one after the other.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lodestream.errors import LodestreamError
+
+from .layout import Built, Manifest
+from .states import State
+
+__all__ = ["Index", "IndexLostError", "Known", "Position", "Surface"]
+
+#: When a surface was made, in seconds since 1970, and its id: the order of a listing.
+Position = tuple[float, str]
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS surface (
+    id TEXT PRIMARY KEY,
+    created REAL NOT NULL,
+    owner TEXT,
+    name TEXT,
+    filenames TEXT NOT NULL,
+    options TEXT NOT NULL,
+    upload TEXT NOT NULL,
+    upload_bytes INTEGER NOT NULL,
+    write TEXT NOT NULL,
+    state TEXT NOT NULL,
+    reason TEXT,
+    attempts INTEGER NOT NULL DEFAULT 0,
+    container TEXT,
+    container_bytes INTEGER,
+    built_tag TEXT,
+    seen TEXT,
+    built_seen TEXT
+) STRICT;
+CREATE INDEX IF NOT EXISTS by_time ON surface (created, id);
+CREATE INDEX IF NOT EXISTS by_upload ON surface (upload);
+CREATE INDEX IF NOT EXISTS by_container ON surface (container) WHERE container IS NOT NULL;
+CREATE INDEX IF NOT EXISTS by_owner ON surface (owner);
+CREATE INDEX IF NOT EXISTS by_turn ON surface (attempts, created) WHERE state = 'queued';
+CREATE TABLE IF NOT EXISTS source (identity TEXT NOT NULL) STRICT;
+"""
+
+_COLUMNS = (
+    "id, created, owner, name, filenames, options, upload, upload_bytes, write, state, reason, attempts, container, "
+    "container_bytes, built_tag"
+)
+
+
+# Rows that are in memory at a time where all are asked for.
+_AT_ONCE = 500
+
+
+class IndexLostError(LodestreamError):
+    """The index is damaged or gone, and is being made again from the store."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface as the index knows it.
+
+    Attributes
+    ----------
+    manifest : Manifest
+    state : str
+    reason : str or None
+        Why it failed or waits, or is not built yet.
+    attempts : int
+        Builds that began and did not end because the server itself died.
+    container : str or None
+        SHA-256 of its container.
+    container_bytes : int or None
+    built_tag : str or None
+        Tag of its object ``built`` in the store; None if there is none of this manifest.
+    """
+
+    manifest: Manifest
+    state: State
+    reason: str | None = None
+    attempts: int = 0
+    container: str | None = None
+    container_bytes: int | None = None
+    built_tag: str | None = None
+
+    @property
+    def id(self) -> str:
+        """Its id."""
+        return self.manifest.id
+
+    @property
+    def position(self) -> Position:
+        """Its place in a listing."""
+        return self.manifest.created, self.manifest.id
+
+
+@dataclass(frozen=True)
+class Known:
+    """What of the objects of a surface the index has read, by the tags of a listing of the store."""
+
+    id: str
+    write: str
+    seen: str | None
+    built_seen: str | None
+
+
+class Index:
+    """The index in a file; safe to use from several threads.
+
+    Parameters
+    ----------
+    path : Path
+        Made if it is not there.
+    identity : str
+        Of the data that it is of; an index of other data is made anew.
+
+    Raises
+    ------
+    IndexLostError
+        If the file cannot be used.
+    """
+
+    def __init__(self, path: Path, identity: str) -> None:
+        self._path = path
+        self._local = threading.local()
+        self._opened: list[sqlite3.Connection] = []
+        self._writing = threading.RLock()
+        self._identity = identity
+        try:
+            with self._translated():
+                self._prepare()
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare(self) -> None:
+        connection = self._connection()
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.executescript(_SCHEMA)
+        with self._change() as change:
+            found = [row[0] for row in change.execute("SELECT identity FROM source")]
+            if found != [self._identity]:
+                change.execute("DELETE FROM surface")
+                change.execute("DELETE FROM source")
+                change.execute("INSERT INTO source VALUES (?)", (self._identity,))
+
+    def close(self) -> None:
+        """Close all connections."""
+        for connection in self._opened:
+            with suppress(sqlite3.Error):
+                connection.close()
+
+    @staticmethod
+    def remove(path: Path) -> None:
+        """Remove an index that is closed, with the files beside it."""
+        for suffix in ("", "-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+    # Reading.
+
+    def __len__(self) -> int:
+        return int(self._one("SELECT count(*) FROM surface")[0])
+
+    def find(self, surface: str) -> Surface | None:
+        """Return a surface, if there is one."""
+        rows = self._rows(f"SELECT {_COLUMNS} FROM surface WHERE id = ?", surface)
+        return _surface(rows[0]) if rows else None
+
+    def page(self, after: Position, most: int) -> list[Surface]:
+        """Return at most `most` surfaces behind a position, oldest first."""
+        where = "WHERE (created, id) > (?, ?) ORDER BY created, id LIMIT ?"
+        return [_surface(row) for row in self._rows(f"SELECT {_COLUMNS} FROM surface {where}", *after, most)]
+
+    def of_upload(self, sha256: str) -> list[Surface]:
+        """Return the surfaces of an upload."""
+        return [_surface(row) for row in self._rows(f"SELECT {_COLUMNS} FROM surface WHERE upload = ?", sha256)]
+
+    def of_container(self, sha256: str) -> list[Surface]:
+        """Return the surfaces that have a container."""
+        return [_surface(row) for row in self._rows(f"SELECT {_COLUMNS} FROM surface WHERE container = ?", sha256)]
+
+    def has_size(self, size: int | None) -> bool:
+        """Return whether there is an upload of so many bytes; None: of any."""
+        where, given = ("", ()) if size is None else (" WHERE upload_bytes = ?", (size,))
+        return bool(self._rows(f"SELECT 1 FROM surface{where} LIMIT 1", *given))
+
+    def next_build(self, busy: Iterable[str] = ()) -> Surface | None:
+        """Return the queued surface with the fewest attempts, and of those the oldest; none of these ids."""
+        held = json.dumps(list(busy))
+        where = (
+            "WHERE state = 'queued' AND id NOT IN (SELECT value FROM json_each(?)) ORDER BY attempts, created LIMIT 1"
+        )
+        rows = self._rows(f"SELECT {_COLUMNS} FROM surface {where}", held)
+        return _surface(rows[0]) if rows else None
+
+    def count_of(self, owner: str | None) -> int:
+        """Return the number of an owner's surfaces."""
+        return int(self._one("SELECT count(*) FROM surface WHERE owner IS ?", owner)[0])
+
+    def kept(self, owner: str | None) -> int:
+        """Return the bytes of an owner's uploads and containers; those that several surfaces share count once."""
+        found = self._one(
+            "SELECT coalesce(sum(size), 0) FROM ("
+            "SELECT DISTINCT upload, upload_bytes AS size FROM surface WHERE owner IS ?1 UNION ALL "
+            "SELECT DISTINCT container, container_bytes FROM surface WHERE owner IS ?1 AND container IS NOT NULL)",
+            owner,
+        )
+        return int(found[0])
+
+    def known(self) -> Iterator[Known]:
+        """Return what is known of each surface's objects, in the order of their ids, some at a time."""
+        last = ""
+        while rows := self._rows(
+            "SELECT id, write, seen, built_seen FROM surface WHERE id > ? ORDER BY id LIMIT ?", last, _AT_ONCE
+        ):
+            yield from (Known(*row) for row in rows)
+            last = rows[-1][0]
+
+    # Changing.
+
+    def put(self, surface: Surface, seen: str | None = None, built_seen: str | None = None) -> None:
+        """Add a surface, or replace what is known of it; `seen` and `built_seen` are tags of a listing."""
+        it = surface.manifest
+        values = (
+            it.id,
+            it.created,
+            it.owner,
+            it.name,
+            json.dumps(it.filenames, ensure_ascii=False),
+            json.dumps(it.options, ensure_ascii=False),
+            it.upload,
+            it.upload_bytes,
+            it.write,
+            surface.state,
+            surface.reason,
+            surface.attempts,
+            surface.container,
+            surface.container_bytes,
+            surface.built_tag,
+            seen,
+            built_seen,
+        )
+        with self._change() as change:
+            change.execute(f"INSERT OR REPLACE INTO surface VALUES ({', '.join('?' * len(values))})", values)
+
+    def drop(self, surface: str) -> None:
+        """Remove a surface, if it is there."""
+        with self._change() as change:
+            change.execute("DELETE FROM surface WHERE id = ?", (surface,))
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Make the changes of a block one: all of them or none."""
+        with self._change():
+            yield
+
+    @contextmanager
+    def _change(self) -> Iterator[sqlite3.Connection]:
+        with self._writing, self._translated():
+            connection = self._connection()
+            if connection.in_transaction:
+                yield connection
+                return
+            connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield connection
+            except BaseException:
+                with suppress(sqlite3.Error):
+                    connection.execute("ROLLBACK")
+                raise
+            connection.execute("COMMIT")
+
+    def _rows(self, query: str, *given: Any) -> list[tuple[Any, ...]]:
+        with self._translated():
+            return self._connection().execute(query, given).fetchall()
+
+    def _one(self, query: str, *given: Any) -> tuple[Any, ...]:
+        return self._rows(query, *given)[0]
+
+    def _connection(self) -> sqlite3.Connection:
+        connection: sqlite3.Connection | None = getattr(self._local, "connection", None)
+        if connection is None:
+            # It is used by its thread alone, and closed by whoever closes the index.
+            connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
+            connection.execute("PRAGMA synchronous = NORMAL")
+            connection.execute("PRAGMA busy_timeout = 10000")
+            self._local.connection = connection
+            self._opened.append(connection)
+        if not self._path.exists():
+            raise sqlite3.DatabaseError("its file is gone")
+        return connection
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            raise IndexLostError(f"the index of the surfaces cannot be used, and is made again: {error}") from error
+
+
+def _surface(row: tuple[Any, ...]) -> Surface:
+    surface, created, owner, name, filenames, options, upload, upload_bytes, write = row[:9]
+    manifest = Manifest(
+        surface,
+        name,
+        owner,
+        created,
+        tuple(json.loads(filenames)),
+        json.loads(options),
+        upload,
+        upload_bytes,
+        write,
+    )
+    return Surface(manifest, *row[9:])
+
+
+def state_of(built: Built | None) -> State:
+    """Return the state that follows from what became of a build."""
+    if built is None:
+        return "queued"
+    return "failed" if built.container is None else "ready"

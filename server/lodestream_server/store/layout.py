@@ -1,0 +1,219 @@
+"""Where the server's data are in a store, and the small objects that say what there is.
+
+::
+
+    lodestream.json               version of this layout and identity of the data; created once
+    uploads/<sha256>/<n>          the files of an upload, written once
+    surfaces/<id>.json            the manifest; created if absent: it *is* the surface
+    containers/<sha256>.lode      written once
+    built/<id>.json               what became of the build: a container, or the reason of a final failure
+
+Bytes come first, then the small object that refers to them; a delete goes the other way. What no small object refers to
+is a *stray*: it is of no harm, and of no use after a day. A start moves and deletes nothing.
+
+Each small object holds the id of its own write, which tells it from that of another writer (`lodestream.stores`). An
+object ``built`` names the write of its manifest: after a delete and another upload of the same bytes it belongs to
+nobody, and counts as absent.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from lodestream.errors import InputError, LodestreamError
+
+__all__ = [
+    "BUILT",
+    "CONTAINERS",
+    "IDENTITY",
+    "MOST_REASON",
+    "MOST_TEXT",
+    "SURFACES",
+    "UPLOADS",
+    "Built",
+    "DamagedObjectError",
+    "Identity",
+    "Manifest",
+    "built_key",
+    "container_key",
+    "dump",
+    "id_of",
+    "manifest_key",
+    "new_write",
+    "parse",
+    "upload_key",
+]
+
+IDENTITY = "lodestream.json"
+UPLOADS, SURFACES, CONTAINERS, BUILT = "uploads/", "surfaces/", "containers/", "built/"
+
+#: Bytes of text that a surface may have: its name, names of files and options; and the reason of a failure.
+MOST_TEXT, MOST_REASON = 3072, 1024
+
+VERSION = 1
+
+_ID = re.compile(r"(?:surfaces|built)/([0-9a-f]{20})\.json")
+T = TypeVar("T")
+
+
+class DamagedObjectError(LodestreamError):
+    """A small object of the store cannot be read."""
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Version and identity of the data of a server."""
+
+    version: int
+    identity: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What was uploaded.
+
+    Attributes
+    ----------
+    id : str
+        20 hexadecimal digits, made of the bytes and options of the upload, its name and its owner.
+    name : str or None
+    owner : str or None
+        Name of the token that it was uploaded with; None without one.
+    created : float
+        Seconds since 1970.
+    filenames : tuple of str
+        Names of the uploaded files.
+    options : mapping of str to str
+        ``precision`` or ``rms``, ``precision=NAME`` of attributes, ``closed``, options of the format.
+    upload : str
+        SHA-256 over the files and their lengths.
+    upload_bytes : int
+    write : str
+        Id of this write.
+
+    Raises
+    ------
+    InputError
+        If its texts are longer than `MOST_TEXT`.
+    """
+
+    id: str
+    name: str | None
+    owner: str | None
+    created: float
+    filenames: tuple[str, ...]
+    options: dict[str, str]
+    upload: str
+    upload_bytes: int
+    write: str
+
+    def __post_init__(self) -> None:
+        length = len(json.dumps([self.name, self.filenames, self.options], ensure_ascii=False).encode())
+        if length > MOST_TEXT:
+            raise InputError(
+                f"expected at most {MOST_TEXT} bytes of names and options for a surface, got {length}: shorter names "
+                "of files, or fewer files, will do"
+            )
+
+
+@dataclass(frozen=True)
+class Built:
+    """What became of the build of a surface.
+
+    Attributes
+    ----------
+    manifest : str
+        Id of the write of its manifest.
+    container : str or None
+        SHA-256 of the container; None if the build failed for good.
+    bytes : int
+        Of the container.
+    reason : str or None
+        Why it failed for good, in one line.
+    info : mapping
+        What ``lodestream info --json`` prints of the container.
+    write : str
+        Id of this write.
+    """
+
+    manifest: str
+    container: str | None
+    bytes: int
+    reason: str | None
+    write: str
+    info: dict[str, Any] = field(repr=False, default_factory=dict)
+
+
+def new_write() -> str:
+    """Return the id of a new write."""
+    return secrets.token_hex(16)
+
+
+def upload_key(sha256: str, number: int) -> str:
+    """Return the key of a file of an upload."""
+    return f"{UPLOADS}{sha256}/{number}"
+
+
+def manifest_key(surface: str) -> str:
+    """Return the key of the manifest of a surface."""
+    return f"{SURFACES}{surface}.json"
+
+
+def built_key(surface: str) -> str:
+    """Return the key of what became of the build of a surface."""
+    return f"{BUILT}{surface}.json"
+
+
+def container_key(sha256: str) -> str:
+    """Return the key of a container."""
+    return f"{CONTAINERS}{sha256}.lode"
+
+
+def id_of(key: str) -> str | None:
+    """Return the id of the surface to which a manifest or a ``built`` belongs; None of another key."""
+    found = _ID.fullmatch(key)
+    return None if found is None else found[1]
+
+
+@cache
+def _adapters() -> dict[type[Any], TypeAdapter[Any]]:
+    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built)}
+
+
+def dump(small: Identity | Manifest | Built) -> bytes:
+    """Return a small object as bytes.
+
+    Raises
+    ------
+    ValueError
+        If JSON cannot express a value.
+    """
+    return json.dumps(asdict(small), ensure_ascii=False, allow_nan=False).encode()
+
+
+def parse(kind: type[T], key: str, data: bytes) -> T:
+    """Read a small object; what later versions add is ignored.
+
+    Raises
+    ------
+    DamagedObjectError
+        If it is none of this kind, or that of another surface; in one line.
+    """
+    try:
+        small: T = _adapters()[kind].validate_json(data)
+    except (ValidationError, InputError) as error:
+        words = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors(include_url=False, include_input=False)[0]
+            words = f"{'.'.join(map(str, first['loc'])) or 'object'}: {first['msg']}"
+        raise DamagedObjectError(f"{key} cannot be read: {words}") from None
+    if isinstance(small, Manifest) and manifest_key(small.id) != key:
+        raise DamagedObjectError(f"{key} holds the surface {small.id[:80]!a}")
+    return small

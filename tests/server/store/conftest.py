@@ -1,0 +1,8 @@
+"""Stores of each kind."""
+
+from __future__ import annotations
+
+from tests.core.stores.places import PLACES, Place, bucket_of_azure, bucket_of_s3, folder
+from tests.stores.emulators import azure, azurite, ministack, s3
+
+__all__ = ["PLACES", "Place", "azure", "azurite", "bucket_of_azure", "bucket_of_s3", "folder", "ministack", "s3"]

@@ -1,0 +1,528 @@
+"""Surfaces over a store: accepted, built, deleted; cut at every step; an index that is lost."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sqlite3
+import tempfile
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
+
+from lodestream.errors import InputError, NotFoundError
+from lodestream.stores import Folder, Store
+from lodestream_server.store import layout
+from lodestream_server.store.index import Index, IndexLostError
+from lodestream_server.store.layout import MOST_TEXT, Manifest
+from lodestream_server.store.states import EDGES, STATES, Event, WrongTurnError, after
+from lodestream_server.store.surfaces import Surfaces, establish
+
+from .conftest import PLACES, Place
+from .world import CutError, Failing, container, upload
+
+
+@pytest.fixture
+def surfaces(tmp_path: Path) -> Surfaces:
+    return Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+
+
+def build(surfaces: Surfaces, manifest: Manifest, folder: Path) -> None:
+    surfaces.begin(manifest.id)
+    surfaces.built(manifest.id, *container(folder, manifest))
+
+
+def keys(store: Store, prefix: str = "") -> list[str]:
+    return [entry.key for entry in store.entries(prefix)]
+
+
+def scenario(surfaces: Surfaces, folder: Path, acked: dict[str, bytes], deleted: set[str], begun: set[str]) -> None:
+    """Uploads, builds and deletes of two owners; each is noted before it begins and after it was acknowledged."""
+    for number in range(6):
+        manifest, files = upload(folder, number, "ann" if number % 2 else "ben")
+        surfaces.accept(manifest, files)
+        acked[manifest.id] = files[0].read_bytes()
+        if number == 4:
+            surfaces.begin(manifest.id)
+            surfaces.refused(manifest.id, "no surface")
+        else:
+            build(surfaces, manifest, folder)
+        if number >= 2:
+            old = f"{number - 2:020x}"
+            begun.add(old)
+            surfaces.delete(old)
+            deleted.add(old)
+
+
+def check(store: Store, index: Path, acked: dict[str, bytes], deleted: set[str], begun: set[str]) -> int:
+    """Start anew, as after a power failure; return the number of strays that were collected."""
+    surfaces = Surfaces(store, index)
+    surfaces.sync()
+    for id_, body in acked.items():
+        found = surfaces.index.find(id_)
+        assert found is None or id_ not in deleted, "it came back"
+        if found is None:
+            assert id_ in begun, "it is lost"
+            continue
+        with store.open(layout.upload_key(found.manifest.upload, 0)) as blob:
+            assert blob.read(0, blob.size) == body
+        if found.state == "ready":
+            assert found.container is not None
+            with store.open(layout.container_key(found.container)) as blob:
+                assert hashlib.sha256(blob.read(0, blob.size)).hexdigest() == found.container
+            assert surfaces.info(found)["shape"] == [5, 7]
+        else:
+            assert found.state == ("failed" if surfaces.index.find(id_) and found.reason else "queued")
+    collected = len(surfaces.collect(older=-3600))
+    for id_ in acked:
+        if (found := surfaces.index.find(id_)) is not None:
+            with store.open(layout.upload_key(found.manifest.upload, 0)):
+                pass
+            if found.container is not None:
+                with store.open(layout.container_key(found.container)):
+                    pass
+    assert not surfaces.collect(older=-3600)
+    surfaces.close()
+    return collected
+
+
+@pytest.mark.parametrize("kind", PLACES)
+def test_a_cut_at_every_step_loses_nothing_and_brings_nothing_back(
+    kind: str, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    place: Place = request.getfixturevalue(kind)
+    stride = 1 if kind == "folder" else 5  # each step of a bucket takes requests
+    at = strays = 0
+    while True:
+        store = place()
+        establish(store)
+        failing: Any = Failing(store, at)
+        acked, deleted, begun = dict[str, bytes](), set[str](), set[str]()
+        surfaces = Surfaces(failing, tmp_path / f"{at}.sqlite")
+        done = False
+        with suppress(CutError):
+            scenario(surfaces, tmp_path, acked, deleted, begun)
+            done = True
+        surfaces.close()
+        # With the index as it was left, and without one.
+        index = tmp_path / f"{at}.sqlite" if at % 2 else tmp_path / f"{at}-new.sqlite"
+        strays += check(store, index, acked, deleted, begun)
+        if done:
+            break
+        at += stride
+    assert at > 30
+    assert strays > 0, "cuts leave strays"
+
+
+def test_what_failed_for_good_stays_so_without_an_index(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    surfaces.begin(manifest.id)
+    surfaces.refused(manifest.id, "x" * 5000)
+    found = surfaces.get(manifest.id)
+    assert (found.state, found.reason) == ("failed", "x" * 1024)
+    surfaces.restore()
+    assert surfaces.get(manifest.id) == found
+    assert surfaces.retry(manifest.id).state == "queued"
+    surfaces.restore()
+    assert surfaces.get(manifest.id).state == "queued", "a retry takes the failure back"
+
+
+def test_what_waits_and_was_tried_stays_so_over_a_start(surfaces: Surfaces, tmp_path: Path) -> None:
+    waits, tried = upload(tmp_path, 1), upload(tmp_path, 2)
+    for manifest, files in (waits, tried):
+        surfaces.accept(manifest, files)
+        surfaces.begin(manifest.id)
+    surfaces.stuck(waits[0].id, "a library is missing")
+    surfaces.close()  # and of the other one the server died
+    again = Surfaces(surfaces.store, tmp_path / "index.sqlite")
+    again.sync()
+    found = again.get(waits[0].id)
+    assert (found.state, found.reason) == ("waiting", "a library is missing")
+    found = again.get(tried[0].id)
+    assert (found.state, found.attempts) == ("queued", 1)
+    again.restore()  # without the index they are tried again
+    assert [again.get(it[0].id).state for it in (waits, tried)] == ["queued", "queued"]
+
+
+def test_the_same_upload_again(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    assert surfaces.accept(manifest, files)[1]
+    again, new = surfaces.accept(*upload(tmp_path, 1))
+    assert (again.manifest.write, new) == (manifest.write, False)
+    build(surfaces, manifest, tmp_path)
+    assert surfaces.accept(*upload(tmp_path, 1)) == (surfaces.get(manifest.id), False)
+    surfaces.lose(manifest.id)
+    surfaces.stuck(manifest.id, "its upload is damaged")
+    surfaces.store.delete([layout.upload_key(manifest.upload, 0)])
+    assert surfaces.accept(*upload(tmp_path, 1))[1], "it is built again, from the bytes that came"
+    with surfaces.store.open(layout.upload_key(manifest.upload, 0)) as blob:
+        assert blob.read(0, blob.size) == files[0].read_bytes()
+
+
+def test_an_id_of_other_bytes_is_refused(surfaces: Surfaces, tmp_path: Path) -> None:
+    surfaces.accept(*upload(tmp_path, 1))
+    for other in ({"upload": "f" * 64}, {"owner": "ann"}):
+        with pytest.raises(InputError, match="another name"):
+            surfaces.accept(*upload(tmp_path, 1, **other))
+    Index.remove(tmp_path / "index.sqlite")
+    surfaces.restore()
+    surfaces.index.drop(f"{1:020x}")  # as if another server had taken it
+    with pytest.raises(InputError, match="another name"):
+        surfaces.accept(*upload(tmp_path, 1, upload="f" * 64))
+
+
+def test_a_build_of_a_deleted_surface_is_dropped(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    surfaces.begin(manifest.id)
+    surfaces.delete(manifest.id)
+    assert surfaces.built(manifest.id, *container(tmp_path, manifest)) is None
+    assert surfaces.refused(manifest.id, "x") is None
+    assert surfaces.stuck(manifest.id, "x") is surfaces.later(manifest.id) is surfaces.begin(manifest.id) is None
+    assert surfaces.lose(manifest.id) is None
+    assert not keys(surfaces.store, "built/")
+    with pytest.raises(NotFoundError):
+        surfaces.get(manifest.id)
+    with pytest.raises(NotFoundError):
+        surfaces.delete(manifest.id)
+
+
+def test_what_was_built_of_another_manifest_counts_as_absent(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    build(surfaces, manifest, tmp_path)
+    # A delete that was cut between its two steps, and another upload of the same.
+    surfaces.store.delete([layout.manifest_key(manifest.id)])
+    surfaces.sync()
+    again, new = surfaces.accept(*upload(tmp_path, 1))
+    assert (again.state, new) == ("queued", True)
+    surfaces.sync()
+    assert surfaces.get(manifest.id).state == "queued"
+    build(surfaces, again.manifest, tmp_path)
+    assert surfaces.get(manifest.id).state == "ready"
+    surfaces.restore()
+    assert surfaces.get(manifest.id).state == "ready"
+
+
+def test_shared_files_stay_until_the_last_surface_is_deleted(surfaces: Surfaces, tmp_path: Path) -> None:
+    ids = []
+    for number in (0, 3):  # of the same bytes
+        manifest, files = upload(tmp_path, number)
+        surfaces.accept(manifest, files)
+        build(surfaces, manifest, tmp_path)
+        ids.append(manifest.id)
+    surfaces.delete(ids[0])
+    assert not surfaces.collect(older=-3600)
+    surfaces.delete(ids[1])
+    assert not surfaces.collect(), "strays are left for a day"
+    assert len(surfaces.collect(older=-3600)) == 2
+    assert keys(surfaces.store) == ["lodestream.json"]
+
+
+def test_files_that_become_strays_are_put_again(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 0)
+    surfaces.accept(manifest, files)
+    surfaces.delete(manifest.id)
+    (stray,) = surfaces.store.entries("uploads/")
+    os.utime(tmp_path / "data" / stray.key, (1, 1))
+    surfaces.accept(*upload(tmp_path, 3))
+    assert not surfaces.collect()
+    assert keys(surfaces.store, "uploads/") == [stray.key]
+
+
+def test_bytes_of_an_owner_count_once(surfaces: Surfaces, tmp_path: Path) -> None:
+    for number in (0, 3, 1):
+        manifest, files = upload(tmp_path, number, "ann")
+        surfaces.accept(manifest, files)
+    one = manifest.upload_bytes
+    assert surfaces.index.kept("ann") == 2 * one
+    build(surfaces, manifest, tmp_path)
+    size = surfaces.get(manifest.id).container_bytes
+    assert size is not None
+    assert surfaces.index.kept("ann") == 2 * one + size
+    assert surfaces.index.kept("ben") == surfaces.index.kept(None) == 0
+    assert (surfaces.index.count_of("ann"), len(surfaces.index)) == (3, 3)
+
+
+def test_pages_and_the_queue(surfaces: Surfaces, tmp_path: Path) -> None:
+    for number in (4, 2, 9):
+        surfaces.accept(*upload(tmp_path, number))
+    first = surfaces.index.page((0.0, ""), 2)
+    assert [it.manifest.name for it in first] == ["surface 2", "surface 4"]
+    assert [it.manifest.name for it in surfaces.index.page(first[-1].position, 2)] == ["surface 9"]
+    queued = surfaces.index.next_build()
+    assert queued is not None
+    assert queued.manifest.name == "surface 2"
+    surfaces.begin(queued.id)
+    surfaces.later(queued.id, "waits for space")
+    assert surfaces.get(queued.id).reason == "waits for space"
+    assert surfaces.index.next_build() == surfaces.get(queued.id), "an attempt that lacked something does not count"
+    nearly = surfaces.index.next_build([queued.id])
+    assert nearly is not None
+    assert nearly.manifest.name == "surface 4"
+    assert surfaces.index.has_size(queued.manifest.upload_bytes)
+    assert surfaces.index.has_size(None)
+    assert not surfaces.index.has_size(7)
+
+
+def test_texts_are_bounded(tmp_path: Path) -> None:
+    upload(tmp_path, 1, name="x" * (MOST_TEXT - 100))
+    with pytest.raises(InputError, match="names"):
+        upload(tmp_path, 1, filenames=tuple("x" * 255 for _ in range(13)))
+
+
+@pytest.mark.parametrize("kind", ["surfaces", "built"])
+@pytest.mark.parametrize("data", [b"", b"{}", b"\xff", b'{"id": 3}', b"[" * 10_000])
+def test_small_objects_that_are_damaged_are_told_and_left(
+    surfaces: Surfaces, tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str, data: bytes
+) -> None:
+    good, bad = upload(tmp_path, 1), upload(tmp_path, 2)
+    for manifest, files in (good, bad):
+        surfaces.accept(manifest, files)
+        build(surfaces, manifest, tmp_path)
+    path = tmp_path / "data" / kind / f"{bad[0].id}.json"
+    path.write_bytes(data)
+    surfaces.restore()
+    assert surfaces.get(good[0].id).state == "ready"
+    assert f"{kind}/{bad[0].id}.json cannot be read" in caplog.text
+    assert path.read_bytes() == data
+    found = surfaces.index.find(bad[0].id)
+    assert found is None if kind == "surfaces" else found is not None
+    if found is not None:
+        assert found.state == "queued"
+        build(surfaces, bad[0], tmp_path)
+        surfaces.restore()
+        assert surfaces.get(bad[0].id).state == "ready"
+
+
+def test_objects_of_others_are_left_alone(surfaces: Surfaces, tmp_path: Path) -> None:
+    (tmp_path / "data" / "surfaces").mkdir(exist_ok=True)
+    (tmp_path / "data" / "surfaces" / "notes.json").write_text("mine")
+    (tmp_path / "data" / "README").write_text("mine")
+    assert surfaces.sync() == 0
+    assert not surfaces.collect(older=-3600)
+    assert (tmp_path / "data" / "README").exists()
+
+
+@pytest.mark.parametrize("how", ["removed", "damaged", "truncated", "another version"])
+def test_an_index_that_is_lost_while_the_server_runs(surfaces: Surfaces, tmp_path: Path, how: str) -> None:
+    accepted = [upload(tmp_path, number) for number in range(5)]
+    for manifest, files in accepted:
+        surfaces.accept(manifest, files)
+    build(surfaces, accepted[0][0], tmp_path)
+    before = surfaces.index.page((0.0, ""), 10)
+    surfaces.begin(accepted[1][0].id)
+    path = tmp_path / "index.sqlite"
+    if how == "removed":
+        Index.remove(path)
+    elif how == "another version":
+        with sqlite3.connect(path) as other:
+            other.execute("DROP TABLE surface")
+        other.close()
+    else:
+        wal = path.with_name("index.sqlite-wal")
+        for file in (path, wal):
+            size = file.stat().st_size
+            with file.open("r+b") as opened:
+                opened.write(b"\x5a" * size)
+                opened.truncate(size if how == "damaged" else 100)
+    # By a thread that has no pages of it in memory, as most have not.
+    with ThreadPoolExecutor(1) as threads, pytest.raises(IndexLostError):
+        threads.submit(surfaces.accept, *upload(tmp_path, 7)).result()
+    surfaces.restore()
+    assert surfaces.index.page((0.0, ""), 10) == before
+    assert surfaces.built(accepted[1][0].id, *container(tmp_path, accepted[1][0])), "its build goes on"
+    assert surfaces.get(accepted[1][0].id).state == "ready"
+
+
+def test_an_index_of_other_data_is_not_used(surfaces: Surfaces, tmp_path: Path) -> None:
+    surfaces.accept(*upload(tmp_path, 1))
+    surfaces.close()
+    other = Surfaces(Folder(tmp_path / "other"), tmp_path / "index.sqlite")
+    assert len(other.index) == 0
+
+
+@pytest.mark.parametrize("data", [b"no index at all", b""])
+def test_a_start_with_a_file_that_is_no_index(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "index.sqlite").write_bytes(data)
+    surfaces = Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+    surfaces.accept(*upload(tmp_path, 1))
+    assert len(surfaces.index) == 1
+
+
+def test_what_is_there_decides_what_a_store_may_be(tmp_path: Path) -> None:
+    published = tmp_path / "published"
+    published.mkdir()
+    (published / "view.json").write_text("{}")
+    with pytest.raises(InputError, match="published"):
+        establish(Folder(published))
+    newer = tmp_path / "newer"
+    newer.mkdir()
+    (newer / "lodestream.json").write_text(json.dumps({"version": 2, "identity": "x"}))
+    with pytest.raises(InputError, match="version 2"):
+        establish(Folder(newer))
+    store = Folder(tmp_path / "new")
+    assert establish(store) == establish(store)
+
+
+def test_threads_read_while_others_change(surfaces: Surfaces, tmp_path: Path) -> None:
+    failed: list[BaseException] = []
+    begun = threading.Event()
+
+    def read() -> None:
+        try:
+            begun.wait()
+            for _ in range(200):
+                names = [it.manifest.name for it in surfaces.index.page((0.0, ""), 100)]
+                assert len(names) == len(set(names))
+                surfaces.index.kept(None)
+        except BaseException as error:  # seen below
+            failed.append(error)
+
+    threads = [threading.Thread(target=read) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    begun.set()
+    for number in range(40):
+        surfaces.accept(*upload(tmp_path, number))
+        if number % 3 == 0:
+            surfaces.delete(f"{number:020x}")
+    for thread in threads:
+        thread.join()
+    assert not failed
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_an_edge_that_is_not_in_the_table_raises(state: Any) -> None:
+    for event in get_args(Event):
+        if (state, event) in EDGES:
+            assert after(state, event) == EDGES[state, event]
+        else:
+            with pytest.raises(WrongTurnError, match=f"{state} cannot be {event}"):
+                after(state, event)
+
+
+def test_a_turn_that_cannot_be_changes_nothing(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    build(surfaces, manifest, tmp_path)
+    before = keys(surfaces.store), surfaces.get(manifest.id)
+    with pytest.raises(WrongTurnError):
+        surfaces.begin(manifest.id)
+    with pytest.raises(WrongTurnError):
+        surfaces.refused(manifest.id, "x")
+    assert (keys(surfaces.store), surfaces.get(manifest.id)) == before
+
+
+class Model(RuleBasedStateMachine):
+    """Whatever happens in whatever order, the surfaces are those that a dict would hold."""
+
+    folder: Path
+
+    @initialize()
+    def begin(self) -> None:
+        self.root = Path(tempfile.mkdtemp(dir=self.folder))
+        self.surfaces = Surfaces(Folder(self.root / "data"), self.root / "index.sqlite")
+        self.expected: dict[str, str] = {}
+        self.manifests: dict[str, Manifest] = {}
+
+    @rule(number=st.integers(0, 5))
+    def accept(self, number: int) -> None:
+        found, new = self.surfaces.accept(*upload(self.root, number))
+        before = self.expected.get(found.id)
+        assert new == (before in (None, "waiting", "failed"))
+        if new:
+            self.expected[found.id] = "queued"
+            self.manifests[found.id] = found.manifest
+        assert found.state == self.expected[found.id]
+
+    def _one_of(self, *states: str) -> str | None:
+        return next((id_ for id_, state in sorted(self.expected.items()) if state in states), None)
+
+    @precondition(lambda self: self._one_of("queued"))
+    @rule(end=st.sampled_from(["built", "refused", "stuck", "later", "death"]))
+    def work(self, end: str) -> None:
+        queued = self.surfaces.index.next_build()
+        assert queued is not None
+        id_ = queued.id
+        self.surfaces.begin(id_)
+        if end == "built":
+            self.surfaces.built(id_, *container(self.root, self.manifests[id_]))
+            self.expected[id_] = "ready"
+        elif end == "refused":
+            self.surfaces.refused(id_, "no surface")
+            self.expected[id_] = "failed"
+        elif end == "stuck":
+            self.surfaces.stuck(id_, "not here")
+            self.expected[id_] = "waiting"
+        elif end == "later":
+            self.surfaces.later(id_, "no room")
+        else:
+            self.restart(keep=True)
+
+    @rule(number=st.integers(0, 5))
+    def delete(self, number: int) -> None:
+        id_ = f"{number:020x}"
+        if self.expected.pop(id_, None) is None:
+            with pytest.raises(NotFoundError):
+                self.surfaces.delete(id_)
+        else:
+            self.surfaces.delete(id_)
+
+    @rule(number=st.integers(0, 5))
+    def retry(self, number: int) -> None:
+        id_ = f"{number:020x}"
+        if id_ not in self.expected:
+            return
+        if self.expected[id_] in ("failed", "waiting"):
+            self.expected[id_] = "queued"
+        assert self.surfaces.retry(id_).state == self.expected[id_]
+
+    @rule(keep=st.booleans())
+    def restart(self, keep: bool) -> None:
+        self.surfaces.close()
+        if not keep:
+            Index.remove(self.root / "index.sqlite")
+            self.expected = {id_: "queued" if state == "waiting" else state for id_, state in self.expected.items()}
+        self.surfaces = Surfaces(Folder(self.root / "data"), self.root / "index.sqlite")
+        self.surfaces.sync()
+
+    @rule()
+    def collect(self) -> None:
+        self.surfaces.collect(older=-3600)
+        assert not self.surfaces.strays(older=-3600)
+
+    @invariant()
+    def same(self) -> None:
+        found = {it.id: it.state for it in self.surfaces.index.page((0.0, ""), 100)}
+        assert found == self.expected
+        for it in self.surfaces.index.page((0.0, ""), 100):
+            with self.surfaces.store.open(layout.upload_key(it.manifest.upload, 0)):
+                pass
+            if it.container is not None:
+                with self.surfaces.store.open(layout.container_key(it.container)):
+                    pass
+
+    def teardown(self) -> None:
+        self.surfaces.close()
+
+
+def test_surfaces_are_those_that_a_dict_would_hold(tmp_path: Path) -> None:
+    Model.folder = tmp_path
+    run_state_machine_as_test(Model, settings=settings(max_examples=30, stateful_step_count=25, deadline=None))
