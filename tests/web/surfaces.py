@@ -23,6 +23,7 @@ from lodestream.planning.plan import Plan
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import Selection, selection_of
 from lodestream.planning.window_errors import read_window_errors
+from lodestream.quality import EFFORTS
 from lodestream.target import Order
 from tests.core.decoding.test_every_state import unnamed_interface, unnamed_tile
 from tests.core.surfaces import all_large, follow, index_of, terrain, torus
@@ -61,6 +62,7 @@ def encoded(chance: Random, number: int) -> bytes:
             options = chance.choice(
                 [{"precision": "1e-3d"}, {"rms": "1e-3d"}, {"rms": "1e-2d"}, {"precision": "1e-2d"}]
             )
+        options["effort"] = chance.choice(EFFORTS)
         try:
             made = surface(chance, number)
             with all_large() if chance.random() < 0.3 else nullcontext():
