@@ -140,6 +140,7 @@ def test_chunks_of_narrow_surfaces_are_long(shape: tuple[int, int], chunks: list
 
 def test_small_surfaces_take_small_tiles_where_points_have_many_bytes() -> None:
     assert tile_exponents((512, 512), 11) == (5, 6)
+    assert tile_exponents((20_000, 20_000), 16) == (8, 8)  # as large as a container holds: none has more columns
     assert chunk_exponents((512, 512), (10, 12, 16)) == [(5, 5), (6, 6), (8, 8)]
     noise = np.random.default_rng(4).normal(size=(70, 150)).astype(np.float32)
     for values, tile in ((noise, (5, 6)), (np.rint(100 * noise), (6, 6)), (noise > 0, (6, 6))):

@@ -219,6 +219,16 @@ def _alone(job: worker.Job) -> worker.Job:
     return worker.Job(job.files, None, None, "auto", {}, job.max_vertices, folder)
 
 
+@pytest.mark.usefixtures("at_once")
+def test_a_cluster_builds_with_the_effort_that_is_asked_for(job: worker.Job) -> None:
+    heights = terrain((300, 300)).astype(np.float32)
+    job.options["effort"] = "small"
+    assert isinstance(cluster_build.build(task_of(job)), worker.Built)
+    made = job.container.read_bytes()
+    assert made == ls.encode(ls.decode(made), effort="small") != ls.encode(ls.decode(made))
+    assert np.array_equal(ls.decode(made).points, heights)
+
+
 def test_an_option_that_does_not_fit_is_not_laid_on_the_cluster(
     job: worker.Job, monkeypatch: pytest.MonkeyPatch
 ) -> None:
