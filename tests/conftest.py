@@ -55,6 +55,7 @@ LONGEST = (
     "tests/core/grid/test_watertight.py",
     "tests/client/stream/test_interrupted.py",
     "tests/core/decoding/test_decoder.py",
+    "tests/core/stores/test_faults.py",
     "tests/core/grid/test_topology.py",
     "tests/core/encoding/test_any_pieces.py",
     "tests/core/encoding/test_dask.py",

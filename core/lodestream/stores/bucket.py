@@ -85,7 +85,7 @@ class Limits:
     request: float = 20.0
     part: float = 120.0
     retries: int = 3
-    again: float = 30.0
+    again: float = 10.0
 
 
 class Bucket:

@@ -148,12 +148,8 @@ class Folder:
                 self._refuse(key, error)
         for folder, key in {path.parent: key for key, path in paths.items()}.items():
             # Also for what was gone already: it may be gone in memory alone.
-            try:
-                synchronise_folder(folder, must=True)
-            except _ABSENT:
-                continue
-            except OSError as error:
-                self._refuse(key, error)
+            if folder.is_dir():
+                self._synchronise(key, folder)
 
     def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
         """List objects in the order of their keys."""
@@ -257,7 +253,8 @@ class Folder:
             synchronise_folder(folder, must=True)
         except OSError as error:
             raise UnacknowledgedError(
-                f"{self.describe()}: {key} may be lost if the power fails: {error.strerror}; check the disk, try again"
+                f"{self.describe()}: {key}: the change may be lost if the power fails: {error.strerror}; check the disk, "
+                "and try again"
             ) from error
 
     def _link(self, new: Path, path: Path) -> None:

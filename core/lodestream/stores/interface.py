@@ -192,7 +192,7 @@ class Store(Protocol):
         Raises
         ------
         StoreError
-            If the store does not answer: then it is not known which of them are left.
+            If the store fails: then it is not known which of them are left.
         """
         ...
 

@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lodestream.errors import InputError, UnavailableError
+from lodestream.stores import Folder, Store, StoreError, open_store
+from lodestream.stores.bucket import Bucket, Limits
+from tests.patience import PATIENCE
+from tests.stores.emulators import Emulator
+
+
+@pytest.fixture(autouse=True)
+def _environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in os.environ:
+        if name.startswith(("AWS_", "AZURE_")):
+            monkeypatch.delenv(name)
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
+
+
+@pytest.mark.parametrize("address", ["store", "a/b", ".", "s3:bucket", "c:\\store", "C:/store", "a:b"])
+def test_whatever_has_no_scheme_is_a_folder(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    store = open_store(address)
+    assert isinstance(store, Folder)
+    assert store.describe() == os.path.join(tmp_path, address) if address != "." else str(tmp_path)
+    assert open_store(Path("s3://bucket")).describe() == str(tmp_path / "s3:" / "bucket")
+
+
+def test_a_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    store = open_store("store")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    store.create("a", b"1")
+    assert (tmp_path / "store" / "a").read_bytes() == b"1"
+
+
+@pytest.mark.parametrize(
+    ("address", "described"),
+    [
+        ("s3://bucket", "s3://bucket"),
+        ("s3://my.bucket-1/", "s3://my.bucket-1"),
+        ("S3://bucket/a/b/", "s3://bucket/a/b"),
+        ("az://container/a", "az://container/a"),
+        ("az://$web/a", "az://$web/a"),
+        (
+            "abfss://container@account.dfs.core.windows.net/a/b",
+            "abfss://container@account.dfs.core.windows.net/a/b",
+        ),
+        ("abfss://container@account.blob.core.windows.net", "abfss://container@account.dfs.core.windows.net"),
+    ],
+)
+def test_a_bucket_says_its_address(address: str, described: str) -> None:
+    store = open_store(address)
+    assert store.describe() == described
+    assert repr(store) == f"Bucket({described!r})"
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("", "got nothing"),
+        ("gs://bucket/a", r"begins with s3://, az://, abfss://, got one that begins with gs://"),
+        ("http://SECRET@host/a", "got one that begins with http://"),
+        ("file:///store", "got one that begins with file://"),
+        ("memory://store", "got one that begins with memory://"),
+        ("s3://", "got another bucket"),
+        ("s3:///a", "got another bucket"),
+        ("s3://key:SECRET@bucket/a", "credentials come from the environment"),
+        ("s3://SECRET@bucket/a", "credentials come from the environment"),
+        ("s3://bucket:9000/a", "credentials or a port"),
+        ("az://account:SECRET@container/a", "credentials come from the environment"),
+        ("abfss://container:SECRET@account.dfs.core.windows.net/a", "got another bucket, container or account"),
+        ("abfss://container@account.example.org/a", "got another bucket, container or account"),
+        ("abfss://container/a", "got another bucket, container or account"),
+        ("s3://bucket/a?SECRET=1", "query or fragment"),
+        ("az://container/a?sv=1&sig=SECRET", "query or fragment"),
+        ("az://container?sig=SECRET", "query or fragment"),
+        ("s3://bucket/a#SECRET", "query or fragment"),
+        ("s3://bu/a", "got another bucket"),
+        ("s3://bucket_/a", "got another bucket"),
+        ("az://Container/a", "got another bucket"),
+        ("s3://bucket/a//b", "expected a key"),
+        ("s3://bucket/../b", "expected a key"),
+        ("s3://bucket/a%2fb", "expected a key"),
+        ("s3://bucket/a b", "expected a key"),
+        ("s3://bucket/" + "a/" * 200, "at most 300 characters"),
+    ],
+)
+def test_other_addresses_are_refused_and_no_credential_is_repeated(address: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        open_store(address)
+    assert "SECRET" not in str(caught.value)
+
+
+def test_an_account_that_is_missing_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME")
+    with pytest.raises(StoreError, match="set AZURE_STORAGE_ACCOUNT_NAME"):
+        open_store("az://container/a")
+
+
+def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    with pytest.raises(UnavailableError, match=re.escape("pip install 'lodestream[stores]'")):
+        open_store("s3://bucket")
+
+
+def test_the_library_is_imported_on_use() -> None:
+    script = "import sys, lodestream.stores; lodestream.stores.open_store('x'); print('obstore' in sys.modules)"
+    ran = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True, timeout=PATIENCE)
+    assert ran.stdout == "False\n"
+
+
+def test_plain_http_needs_an_endpoint_that_says_so(s3: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    store: Store = open_store(s3.address())
+    store.create("a", b"1")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", f"https://127.0.0.1:{s3.port}")
+    with pytest.raises(StoreError, match="does not answer"):
+        Bucket(store.describe(), Limits(retries=0, again=0.0)).get("a")
+    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", f"HTTP://127.0.0.1:{s3.port}")
+    assert open_store(store.describe()).get("a")[0] == b"1"

@@ -1,0 +1,248 @@
+"""What a bucket adds to the contract: requests, headers, parts, and the traps of its library."""
+
+from __future__ import annotations
+
+import http.client
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import obstore
+import pytest
+from obstore.store import S3Store
+
+from lodestream.stores import AbsentError, Store, StoreError, Tag, UnfitStoreError, open_store
+from lodestream.stores.answers import ask
+from lodestream.stores.bucket import Bucket, Limits
+from lodestream.stores.headers import headers
+from tests.patience import PATIENCE
+from tests.stores.emulators import Emulator
+from tests.stores.faults import FaultProxy, fault_proxy
+
+
+@pytest.fixture
+def proxy(s3: Emulator, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultProxy]:
+    """What counts the requests to S3."""
+    with fault_proxy(s3.port) as proxy:
+        monkeypatch.setenv(s3.endpoint, s3.at(proxy.port)[s3.endpoint])
+        yield proxy
+
+
+def put(store: Store, key: str, data: bytes, folder: Path) -> None:
+    (folder / "source").write_bytes(data)
+    store.put_file(key, folder / "source")
+
+
+def test_a_whole_read_by_small_slices_takes_at_most_four_requests_for_each_megabyte(
+    s3: Emulator, proxy: FaultProxy, tmp_path: Path
+) -> None:
+    data = bytes(range(256)) * (5_100_000 // 256)
+    store = open_store(s3.address())
+    put(store, "containers/a.lode", data, tmp_path)
+    proxy.seen.clear()
+    with store.open("containers/a.lode", len(data)) as blob:
+        read = b"".join(blob.read(offset, 16 << 10) for offset in range(0, len(data), 16 << 10))
+    assert read == data
+    assert len(proxy.seen) <= 4 * len(data) / 1e6
+
+
+def test_streams_of_one_object_share_its_blocks(s3: Emulator, proxy: FaultProxy, tmp_path: Path) -> None:
+    data = bytes(2_350_000)
+    store = open_store(s3.address())
+    put(store, "containers/a.lode", data, tmp_path)
+    proxy.seen.clear()
+    for _ in range(50):
+        with store.open("containers/a.lode", len(data)) as blob:
+            for offset in range(0, len(data), 100_000):
+                assert len(blob.read(offset, 100_000)) == min(100_000, len(data) - offset)
+    assert len(proxy.seen) == 9
+
+
+def test_a_write_is_one_request_and_a_large_file_several(s3: Emulator, proxy: FaultProxy, tmp_path: Path) -> None:
+    store = open_store(s3.address())
+    tag = store.create("a", b"1")
+    store.replace("a", b"2", tag)
+    put(store, "b", bytes(8 << 20), tmp_path)
+    assert [each.partition(" ")[0] for each in proxy.seen] == ["PUT"] * 3
+    proxy.seen.clear()
+    put(store, "c", bytes((16 << 20) + 1), tmp_path)
+    assert sorted(each.partition(" ")[0] for each in proxy.seen) == ["POST"] * 2 + ["PUT"] * 3
+
+
+def test_an_upload_that_is_stopped_leaves_no_parts(s3: Emulator, tmp_path: Path) -> None:
+    store = open_store(s3.address())
+    (tmp_path / "source").write_bytes(bytes(30 << 20))
+
+    def stop(done: int) -> None:
+        if done > 20 << 20:
+            raise ValueError("stopped")
+
+    with pytest.raises(ValueError, match="stopped"):
+        store.put_file("a", tmp_path / "source", stop)
+    assert b"<Upload>" not in answer(s3, "/tests?uploads")[1]
+    assert list(store.entries("")) == []
+
+
+def answer(s3: Emulator, target: str) -> tuple[dict[str, str], bytes]:
+    """Headers and body of what S3 answers to a GET without credentials, as browsers ask."""
+    connection = http.client.HTTPConnection("127.0.0.1", s3.port, timeout=PATIENCE)
+    connection.request("GET", target)
+    response = connection.getresponse()
+    found = {name.lower(): value for name, value in response.getheaders()}, response.read()
+    connection.close()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("key", "kind", "kept"),
+    [
+        ("containers/0a.lode", "application/vnd.lodestream.container", "public, max-age=31536000, immutable"),
+        ("other/0a.lode", "application/vnd.lodestream.container", "no-cache"),
+        ("view.json", "application/json", "no-cache"),
+        ("index.html", "text/html; charset=utf-8", "no-cache"),
+        ("assets/page-1a.js", "text/javascript; charset=utf-8", "no-cache"),
+        ("assets/page-1a.css", "text/css; charset=utf-8", "no-cache"),
+        ("assets/kernels.wasm", "application/wasm", "no-cache"),
+        ("a.svg", "image/svg+xml", "no-cache"),
+        ("a.png", "image/png", "no-cache"),
+        ("levels/3.tif", "image/tiff", "no-cache"),
+        ("a.gz", "application/octet-stream", "no-cache"),
+        ("uploads/0a/1", "application/octet-stream", "no-cache"),
+        ("a.b/c", "application/octet-stream", "no-cache"),
+    ],
+)
+def test_headers_follow_from_the_key(key: str, kind: str, kept: str) -> None:
+    assert headers(key) == {"Content-Type": kind, "Cache-Control": kept}
+
+
+@pytest.mark.parametrize("size", [10, 9 << 20])
+def test_headers_are_kept_by_the_store_and_there_is_no_encoding(s3: Emulator, size: int, tmp_path: Path) -> None:
+    store = open_store(s3.address())
+    put(store, "containers/0a.lode", bytes(size), tmp_path)
+    found, body = answer(s3, f"/tests/{store.describe().removeprefix('s3://tests/')}/containers/0a.lode")
+    assert found["content-type"] == "application/vnd.lodestream.container"
+    assert found["cache-control"] == "public, max-age=31536000, immutable"
+    assert not found.get("content-encoding")
+    assert len(body) == size
+
+
+def test_objects_of_other_programs_are_not_listed(s3: Emulator) -> None:
+    store = open_store(s3.address())
+    store.create("a/b", b"1")
+    prefix = store.describe().removeprefix("s3://tests/")
+    for name in ("", "marker/", "with space", ".hidden", "a/.b"):
+        connection = http.client.HTTPConnection("127.0.0.1", s3.port, timeout=PATIENCE)
+        connection.request("PUT", f"/tests/{prefix}/{name.replace(' ', '%20')}", body=b"")
+        assert connection.getresponse().status == 200
+        connection.close()
+    assert [entry.key for entry in store.entries("")] == ["a/b", "marker"]
+    assert [entry.key for entry in store.entries("a/")] == ["a/b"]
+
+
+def test_stores_of_one_bucket_do_not_see_each_other(s3: Emulator) -> None:
+    inner = open_store(s3.address())
+    outer = open_store(inner.describe().rpartition("/")[0])
+    beside = open_store(inner.describe() + "2")
+    inner.create("a", b"1")
+    assert [entry.key for entry in outer.entries("")] == ["store/a"]
+    assert list(beside.entries("")) == []
+    with pytest.raises(AbsentError):
+        beside.get("a")
+
+
+def test_more_objects_than_a_page_of_a_list_are_listed(s3: Emulator) -> None:
+    store = open_store(s3.address())
+    own = S3Store("tests", prefix=store.describe().removeprefix("s3://tests/"), client_options={"allow_http": True})
+    keys = [f"{number:04}" for number in range(1100)]
+    for key in keys:
+        obstore.put(own, key, b"")
+    assert [entry.key for entry in store.entries("")] == keys
+    assert [entry.key for entry in store.entries("", "1050")] == keys[1051:]
+    store.delete(keys)
+    assert list(store.entries("")) == []
+
+
+@pytest.mark.parametrize("scheme", ["s3", "azure"])
+def test_a_bucket_that_is_not_there_is_not_an_absent_object(scheme: str, request: pytest.FixtureRequest) -> None:
+    emulator: Emulator = request.getfixturevalue(scheme)
+    store = Bucket(f"{emulator.scheme}://nothing/a", Limits(retries=0, again=0.0))
+    for call in (
+        lambda: store.get("a"),
+        lambda: store.create("a", b""),
+        lambda: store.replace("a", b"", Tag('"1"')),
+        lambda: list(store.entries("")),
+    ):
+        with pytest.raises(
+            StoreError, match=r"no such bucket or container \(404 (NoSuchBucket|ContainerNotFound)\)"
+        ) as e:
+            call()
+        assert not isinstance(e.value, AbsentError)
+
+
+def test_a_tag_is_no_hash_of_a_large_object(s3: Emulator, tmp_path: Path) -> None:
+    store = open_store(s3.address())
+    put(store, "a", bytes(9 << 20), tmp_path)
+    assert store.get("a")[1].endswith('-2"')
+
+
+def test_a_store_without_tags_is_unfit(s3: Emulator) -> None:
+    store = Bucket(s3.address())
+    with pytest.raises(UnfitStoreError, match="gives no tags"):
+        store._tag(None)
+
+
+class PanicException(BaseException):
+    """As the library raises it, for one, from `get_ranges` past the end of an object."""
+
+
+def test_a_panic_of_the_library_is_an_error_of_the_store(
+    s3: Emulator, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    store = Bucket(s3.address(), Limits(again=0.2))
+    put(store, "a", b"1", tmp_path)
+    panics = iter([PanicException("index out of range")])
+
+    def panic(*_: object, **__: object) -> bytes:
+        for error in panics:
+            raise error
+        return b"1"
+
+    monkeypatch.setattr(obstore, "get_range", panic)
+    with store.open("a") as blob:
+        assert blob.read(0, 1) == b"1", "it is tried once more"
+    assert "the library for buckets failed: PanicException" in caplog.text
+    assert "index" not in caplog.text
+    panics = iter(PanicException() for _ in range(100))
+    with store.open("a", 1000) as blob, pytest.raises(StoreError, match="does not answer"):
+        blob.read(0, 1)
+
+
+def test_interrupts_are_no_failures() -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ask(interrupted)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
+def test_a_forked_process_is_told_that_it_may_not_use_the_library(s3: Emulator) -> None:
+    script = f"""
+import os, warnings
+from lodestream.stores import StoreError, open_store
+warnings.simplefilter("ignore")
+store = open_store({s3.address()!r})
+store.create("a", b"1")
+if os.fork() == 0:
+    status = 1
+    for call in (lambda: store.get("a"), lambda: open_store({s3.address()!r}).get("a")):
+        try:
+            call()
+        except StoreError as error:
+            status = 0 if "before this process was forked" in str(error) else 2
+    os._exit(status)
+print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE, check=True)
+    assert ran.stdout == "0\n"
