@@ -78,6 +78,8 @@ def imitate(system: str, *, also_tests: bool = False) -> None:
 
     modules: dict[str, ModuleType] = {"sys": _Seen(sys, platform=system), "os": _Seen(os, _LINUX)}
     absent: set[str] = set()
+    if system == "darwin":
+        modules["fcntl"] = _Seen(fcntl, F_FULLFSYNC=51)  # which Linux refuses, as some file systems do there
     if system == "win32":
         absent = _MODULES
         supported = frozenset(os.supports_fd) - {os.utime}
@@ -122,15 +124,16 @@ def _memory(status: Any) -> int:
 def _msvcrt() -> ModuleType:
     """Locks of a file for each time that it was opened, as Windows has them for ranges of bytes."""
     module = ModuleType("msvcrt")
-    free, lock = 0, 2
+    free, wait, lock = 0, 1, 2
+    flags = {free: fcntl.LOCK_UN, wait: fcntl.LOCK_EX, lock: fcntl.LOCK_EX | fcntl.LOCK_NB}
 
     def locking(handle: int, mode: int, count: int) -> None:
         try:
-            fcntl.flock(handle, fcntl.LOCK_UN if mode == free else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, flags[mode])
         except BlockingIOError:
             raise PermissionError(errno.EACCES, "Permission denied") from None
 
-    vars(module).update(LK_UNLCK=free, LK_NBLCK=lock, locking=locking)
+    vars(module).update(LK_UNLCK=free, LK_LOCK=wait, LK_NBLCK=lock, locking=locking)
     return module
 
 

@@ -27,7 +27,7 @@ _SERVER = ("access", "commands", "connections", "operation", "storage")
 def main(system: str, folder: Path, url: str) -> None:
     """Run all parts; the name of each is printed when it has passed."""
     imitate(system)
-    for part in (modules, memory, bands, continuing, commands, streams, cache, serving, limits, reader_of_vtk):
+    for part in (modules, memory, stores, bands, continuing, commands, streams, cache, serving, limits, reader_of_vtk):
         place = folder / part.__name__
         place.mkdir()
         part(place, url)
@@ -47,6 +47,26 @@ def modules(folder: Path, url: str) -> None:
         for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.", onerror=_refuse):
             if module.name not in _LEFT_OUT and not module.name.endswith("__main__"):
                 importlib.import_module(module.name)
+
+
+def stores(folder: Path, url: str) -> None:
+    """Keep objects in a folder."""
+    from lodestream.stores import Folder
+    from lodestream.stores.folder import OWN
+
+    store = Folder(folder / "store")
+    store.probe()
+    tag = store.create("a/b", b"1")
+    store.replace("a/b", b"2", tag)
+    (folder / "source").write_bytes(b"3" * 2_000_000)
+    for _ in range(2):
+        store.put_file("a/c", folder / "source")
+    with store.open("a/c") as blob:
+        assert blob.read(1_999_990, 100) == b"3" * 10
+    assert [entry.key for entry in store.entries("")] == ["a/b", "a/c"]
+    store.delete(["a/b", "a/c"])
+    (folder / "store" / OWN / "lock").unlink()
+    (folder / "store" / OWN).rmdir()
 
 
 def _refuse(name: str) -> None:

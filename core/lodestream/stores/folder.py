@@ -70,10 +70,8 @@ class Folder:
         """Read a small object and its tag."""
         path = self._path(key)
         try:
-            with path.open("rb") as file:
+            with self._opened(key, path) as file:
                 data = file.read(most + 1)
-        except _ABSENT:
-            raise self._absent(key) from None
         except OSError as error:
             self._refuse(key, error)
         if len(data) > most:
@@ -117,12 +115,7 @@ class Folder:
     def open(self, key: str, size: int | None = None) -> FileBlob:
         """Open an object for reading; it stays readable if it is deleted meanwhile."""
         path = self._path(key)
-        try:
-            return FileBlob(path, path.open("rb", buffering=0))
-        except _ABSENT:
-            raise self._absent(key) from None
-        except OSError as error:
-            self._refuse(key, error)
+        return FileBlob(path, self._opened(key, path))
 
     @contextmanager
     def local(self, key: str) -> Iterator[Path]:
@@ -207,6 +200,16 @@ class Folder:
     def _path(self, key: str) -> Path:
         return self.root.joinpath(*checked_key(key).split("/"))
 
+    def _opened(self, key: str, path: Path) -> BinaryIO:
+        try:
+            return path.open("rb")
+        except _ABSENT:
+            raise self._absent(key) from None
+        except OSError as error:
+            if path.is_dir():  # what Windows says of a folder
+                raise self._absent(key) from None
+            self._refuse(key, error)
+
     def _tag_of(self, key: str) -> Tag | None:
         try:
             return self.get(key)[1]
@@ -253,8 +256,8 @@ class Folder:
             synchronise_folder(folder, must=True)
         except OSError as error:
             raise UnacknowledgedError(
-                f"{self.describe()}: {key}: the change may be lost if the power fails: {error.strerror}; check the disk, "
-                "and try again"
+                f"{self.describe()}: {key}: the change may be lost if the power fails: {error.strerror}; check the "
+                "disk, and try again"
             ) from error
 
     def _link(self, new: Path, path: Path) -> None:

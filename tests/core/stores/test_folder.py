@@ -78,6 +78,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
     return found
 
 
+posix = pytest.mark.skipif(sys.platform == "win32", reason="of links, modes, and files that are open and gone")
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks up names of open files in /proc")
 
 
@@ -266,6 +267,7 @@ def test_a_lock_that_fails_is_an_error(store: Folder, monkeypatch: pytest.Monkey
         store.replace("a", body(), tag)
 
 
+@posix
 def test_what_other_programs_put_there_is_left_alone(store: Folder, tmp_path: Path) -> None:
     store.create("a/b", body())
     for name in (".hidden", "with space", "a/.hidden", "a/b~c.", ".folder/a"):
@@ -287,6 +289,7 @@ def test_folders_that_are_removed_meanwhile_are_made_anew(store: Folder) -> None
     assert store.get("a/b") == (data, tag)
 
 
+@posix
 def test_an_object_is_no_folder_of_others(store: Folder, tmp_path: Path) -> None:
     store.create("a", body())
     with pytest.raises(StoreError, match="a/b: Not a directory"):
@@ -299,6 +302,7 @@ def test_an_object_is_no_folder_of_others(store: Folder, tmp_path: Path) -> None
         store.put_file("c", tmp_path / "source")
 
 
+@posix
 def test_a_blob_stays_readable_when_its_object_is_deleted_or_replaced(store: Folder, tmp_path: Path) -> None:
     data = body()
     tag = store.create("a", data)
@@ -319,6 +323,7 @@ def test_a_file_that_replaces_an_object_of_another_size_is_whole_for_readers(sto
     assert store.get("a")[0] == second.read_bytes()
 
 
+@posix
 def test_others_may_read_what_is_published(store: Folder, tmp_path: Path) -> None:
     before = os.umask(0o022)
     try:
