@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from ..quality import Effort
-from .tiling import CHUNK_BITS, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE
+from .tiling import CHUNK_BITS, SMALL_CHUNK, SMALL_TILE, TILE_BITS, WHOLE_CHUNK, WHOLE_TILE
 
 __all__ = ["CHOICES", "FOR_ONE_ERROR", "Choices", "FewLayers"]
 
@@ -38,10 +38,13 @@ class Choices:
     ----------
     tile_bits, whole_tile_bits : int
         Coefficients of a tile in a band, as exponents of two: of heights, and of surfaces that are not read in windows.
-    chunk_bits : tuple of int
-        Points that a chunk of residual may have, as exponents of two, the fewest first; several are tried.
-    small_surfaces : bool
-        Surfaces of few points, of many bytes each, have smaller tiles and chunks.
+    small_tile_bits : int
+        The same of heights of few points, of many bytes each, that are kept exactly.
+    chunk_bits, whole_chunk_bits, small_chunk_bits : tuple of int
+        Points that a chunk of residual of each of these may have, as exponents of two, the fewest first; several are
+        tried.
+    chunk_growth : float
+        How many more bytes the smallest chunks may take than the best ones, as a share of all bytes.
     window_errors : bool
         The container tells errors of windows, where they take few bytes.
     layers : FewLayers or None
@@ -58,8 +61,11 @@ class Choices:
 
     tile_bits: int = TILE_BITS
     whole_tile_bits: int = WHOLE_TILE
+    small_tile_bits: int = SMALL_TILE
     chunk_bits: tuple[int, ...] = (CHUNK_BITS, WHOLE_CHUNK)
-    small_surfaces: bool = True
+    whole_chunk_bits: tuple[int, ...] = (CHUNK_BITS, WHOLE_CHUNK)
+    small_chunk_bits: tuple[int, ...] = (SMALL_CHUNK, CHUNK_BITS, WHOLE_CHUNK)
+    chunk_growth: float = 0.01
     window_errors: bool = True
     layers: FewLayers | None = None
     search: bool = True
@@ -68,11 +74,14 @@ class Choices:
     large_tried: int = 2
 
 
-#: Tiles and chunks of "small" have as many points as a container may give them.
+_ALL_CHUNKS = SMALL_CHUNK, CHUNK_BITS, 14, WHOLE_CHUNK
+
+#: Tiles of "small" have as many coefficients as a container may give them.
 CHOICES: dict[Effort, Choices] = {
     "fast": Choices(
         chunk_bits=(CHUNK_BITS,),
-        small_surfaces=False,
+        whole_chunk_bits=(WHOLE_CHUNK,),
+        small_chunk_bits=(SMALL_CHUNK, WHOLE_CHUNK),
         layers=FewLayers(most=5, bytes=16_000),
         search=False,
         large_points=1 << 11,
@@ -83,8 +92,11 @@ CHOICES: dict[Effort, Choices] = {
     "small": Choices(
         tile_bits=16,
         whole_tile_bits=16,
-        chunk_bits=(16,),
-        small_surfaces=False,
+        small_tile_bits=16,
+        chunk_bits=_ALL_CHUNKS,
+        whole_chunk_bits=_ALL_CHUNKS,
+        small_chunk_bits=_ALL_CHUNKS,
+        chunk_growth=0.0,
         window_errors=False,
         layers=FewLayers(most=8, bytes=16_000),
         large_growth=0.0,

@@ -36,7 +36,7 @@ from .arranging import arranged, may_share, unshared
 from .effort import CHOICES, Choices
 from .holes import Arrays, filled, given_arrays, valid_points
 from .named_precisions import named_errors
-from .tiling import SMALL, SMALL_CHUNK, SMALL_TILE, WHOLE_CHUNK, chunk_exponents, square, tile_exponents
+from .tiling import SMALL, WHOLE_CHUNK, chunk_exponents, square, tile_exponents
 
 __all__ = ["Prepared", "prepare"]
 
@@ -209,7 +209,7 @@ def prepare(surface: Surface, quality: Quality, room: Room = IN_MEMORY) -> Prepa
             arrangement = arranged(blocks, points, lattices[:geometric], room)
     if arrangement is None:
         exact = absolute is None and rms is None
-        small = exact and choices.small_surfaces and _takes_small_tiles(surface, valid)
+        small = exact and _takes_small_tiles(surface, valid)
         layout, chunks = _of_one_grid(first, geometric, small, choices)
     else:
         # It is never read in windows: tiles and chunks may be as large as costs the fewest bytes.
@@ -309,9 +309,14 @@ def _of_one_grid(
     block: Block, geometric: int, small: bool, choices: Choices
 ) -> tuple[Layout, Sequence[tuple[int, int]]]:
     """Return the layout of a surface of one block that shares no side, and the sizes that its chunks may have."""
-    bits = SMALL_TILE if small else choices.tile_bits if geometric == 1 else choices.whole_tile_bits
-    layout = Layout.single(block.shape, block.closed, tile_exponents(block.shape, bits))
-    return layout, chunk_exponents(block.shape, (SMALL_CHUNK,) * small + choices.chunk_bits)
+    if small:
+        tile_bits, chunk_bits = choices.small_tile_bits, choices.small_chunk_bits
+    elif geometric == 1:
+        tile_bits, chunk_bits = choices.tile_bits, choices.chunk_bits
+    else:
+        tile_bits, chunk_bits = choices.whole_tile_bits, choices.whole_chunk_bits
+    layout = Layout.single(block.shape, block.closed, tile_exponents(block.shape, tile_bits))
+    return layout, chunk_exponents(block.shape, chunk_bits)
 
 
 def _joint_changes(given: Surface, arrangement: Arrangement | None) -> JointChanges | None:

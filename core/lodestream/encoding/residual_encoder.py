@@ -18,8 +18,8 @@ from .prepared import Prepared
 
 __all__ = ["ChunkCoder", "chunk_sample", "chunk_size"]
 
-#: Bytes of tables for each chunk, and what small chunks may cost: a share of all bytes.
-_TABLES, _WORTH = 8, 0.01
+#: Bytes of tables for each chunk.
+_TABLES = 8
 
 
 def chunk_size(
@@ -52,7 +52,7 @@ def chunk_size(
             if starts[0] <= window.rows[0] < stops[0] and starts[1] <= window.columns[0] < stops[1]
         ]
         costs.append(sum(len(chunk) + _TABLES for chunk, _ in spread(coder.code, inside)) / share)
-    most = min(costs) + _WORTH * (min(costs) + coefficients)
+    most = min(costs) + prepared.choices.chunk_growth * (min(costs) + coefficients)
     return next(chunk for chunk, cost in zip(prepared.chunks, costs, strict=True) if cost <= most)
 
 

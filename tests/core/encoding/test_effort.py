@@ -97,6 +97,17 @@ def test_small_is_smaller_and_fast_has_fewer_layers() -> None:
     assert told == [True, True, False]
 
 
+@pytest.mark.parametrize(
+    "points",
+    [torus(64, 256, "float64"), terrain((77, 105), 6), np.random.default_rng(7).normal(size=(90, 300)).astype("f4")],
+    ids=["smooth", "few", "noise"],
+)
+def test_surfaces_on_no_lattice_take_chunks_that_suit_them(points: NDArray[Any]) -> None:
+    sizes = {effort: len(ls.encode(points, effort=effort)) for effort in EFFORTS}
+    assert sizes["small"] <= sizes["default"]
+    assert sizes["fast"] < 1.05 * sizes["default"]
+
+
 def test_fast_has_small_units_where_large_ones_take_many_more_bytes() -> None:
     row, column = np.mgrid[0:300, 0:340]
     steps = (row // 11 * 29 + column // 7 * 13).astype(np.int16)  # alike in one plane, and not in those above
