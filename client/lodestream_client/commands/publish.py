@@ -139,13 +139,14 @@ def run(args: argparse.Namespace) -> int:
     from lodestream.stores import open_store
 
     from ..publishing.page_address import cors_rule, page_address
-    from ..publishing.publisher import publish
+    from ..publishing.publisher import check_use, publish
 
     options = _options(args)
     pages = assets()
     if not pages:
         raise UnavailableError(HOW_TO_BUILD)
     store = open_store(options.store)
+    check_use(store)  # an encoding may take long
     with _publications(options) as publications, progress_bar() as bar:
         task = bar.add_task("publishing", total=1.0, figures="")
         done = publish(store, publications, pages, options.keep, lambda share: bar.update(task, completed=share))

@@ -7,6 +7,7 @@ import os
 from urllib.parse import quote, urlsplit
 
 from lodestream.page import INDEX
+from lodestream.stores.bucket import endpoint_of
 
 __all__ = ["cors_rule", "page_address"]
 
@@ -31,13 +32,12 @@ def page_address(address: str, public_url: str | None) -> str:
     parts = urlsplit(address)
     key = "".join(f"{quote(part)}/" for part in parts.path.split("/") if part) + INDEX
     if parts.scheme == "s3":
-        endpoint = os.environ.get("AWS_ENDPOINT_URL") or os.environ.get("AWS_ENDPOINT")
-        if endpoint:
+        if endpoint := endpoint_of("s3"):
             return f"{endpoint.rstrip('/')}/{parts.netloc}/{key}"
         region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
         return f"https://{parts.netloc}.s3.{region}.amazonaws.com/{key}"
     if parts.scheme == "az":
-        if endpoint := os.environ.get("AZURE_STORAGE_ENDPOINT"):
+        if endpoint := endpoint_of("az"):
             return f"{endpoint.rstrip('/')}/{parts.netloc}/{key}"
         account = os.environ.get("AZURE_STORAGE_ACCOUNT_NAME") or "ACCOUNT"
         return f"https://{account}.blob.core.windows.net/{parts.netloc}/{key}"

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from lodestream.page import Asset
     from lodestream.stores import Entry, Store
 
-__all__ = ["KEEP", "Publication", "Published", "publish", "published", "unpublish"]
+__all__ = ["KEEP", "Publication", "Published", "check_use", "publish", "published", "unpublish"]
 
 #: How long a container stays that another one has replaced.
 KEEP = timedelta(days=7)
@@ -118,7 +118,7 @@ def publish(
     OSError
         If a file cannot be read.
     """
-    _refuse_other_uses(store)
+    check_use(store)
     now = store.probe()
     total = sum(path.stat().st_size for it in publications for path in (it.container, *it.levels.values()))
     done = sent = 0
@@ -195,7 +195,16 @@ def _surface(publication: Publication) -> PublishedSurface:
     return PublishedSurface(publication.name, publication.title, sha256, size, levels)
 
 
-def _refuse_other_uses(store: Store) -> None:
+def check_use(store: Store) -> None:
+    """Check that a store can be read, and is empty or a published one; nothing is written.
+
+    Raises
+    ------
+    InputError
+        If something else is there, such as the data of a server.
+    StoreError
+        If it cannot be reached or refuses.
+    """
     if _size(store, _SERVER) is not None:
         raise InputError(f"{store.describe()} holds the data of a server: publish under another prefix")
     if _size(store, LIST) is not None:

@@ -32,7 +32,7 @@ from .probe import try_out
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
 
-__all__ = ["SCHEMES", "Bucket", "Limits"]
+__all__ = ["SCHEMES", "Bucket", "Limits", "endpoint_of"]
 
 _T = TypeVar("_T")
 
@@ -427,12 +427,17 @@ def _parsed(address: str) -> _Place:
     return _Place(scheme, bucket, account, checked_prefix(f"{prefix}/" if prefix else ""))
 
 
+def endpoint_of(scheme: str) -> str | None:
+    """Return the endpoint that the environment names for buckets of a scheme; None: that of Amazon or Azure."""
+    names = _S3_ENDPOINTS if scheme == "s3" else _AZURE_ENDPOINTS
+    return next((os.environ[name] for name in names if os.environ.get(name)), None)
+
+
 def _connected(place: _Place, limits: Limits, stalled: float, seconds: float) -> ObjectStore:
     """Connect to a bucket with what the environment says; nothing is asked yet."""
     from obstore.store import AzureStore, S3Store
 
-    names = _S3_ENDPOINTS if place.scheme == "s3" else _AZURE_ENDPOINTS
-    endpoint = next((os.environ[name] for name in names if os.environ.get(name)), None)
+    endpoint = endpoint_of(place.scheme)
     client: ClientConfig = {
         "timeout": timedelta(seconds=seconds),
         "read_timeout": timedelta(seconds=stalled),

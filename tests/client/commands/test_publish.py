@@ -105,6 +105,17 @@ def test_what_cannot_be_published_is_told_before_anything_is_sent(
     assert not store.exists()
 
 
+@pytest.mark.usefixtures("built")
+def test_a_store_that_is_in_use_is_told_before_anything_is_encoded(
+    tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "store").mkdir()
+    (tmp_path / "store" / "lodestream.json").write_text("{}")
+    monkeypatch.setattr("lodestream_client.commands.publish._container", lambda *_: pytest.fail("too late"))
+    assert main(["publish", str(container), str(tmp_path / "store")]) == 1
+    assert "the data of a server" in capsys.readouterr().err
+
+
 def test_a_page_that_is_not_built_is_told(
     tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
