@@ -213,7 +213,7 @@ def _set(environment: dict[str, str], patch: pytest.MonkeyPatch) -> None:
     for name in os.environ:
         if name.startswith(("AWS_", "AZURE_")):
             patch.delenv(name)
-    for name, value in environment.items():
+    for name, value in {**environment, "NO_PROXY": "127.0.0.1"}.items():
         patch.setenv(name, value)
 
 

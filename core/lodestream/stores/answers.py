@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import re
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from typing import Literal, TypeVar
 
 from .errors import StoreError
@@ -22,6 +24,8 @@ _RETRIED = re.compile(r"\bafter [1-9]\d* retries", re.ASCII)
 
 #: Codes of stores without the bucket or container itself.
 _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")
+#: Codes for credentials that are over, or were never any.
+_EXPIRED = ("ExpiredToken", "InvalidToken", "TokenRefreshRequired")
 #: Codes for a request to another region than the bucket's.
 _OTHER_REGION = ("PermanentRedirect", "AuthorizationHeaderMalformed", "IllegalLocationConstraintException")
 #: Where machines of clouds ask for the credentials of their role.
@@ -32,6 +36,11 @@ _AGAIN = (408, 429)
 _CONDITIONS = (409, 412)
 
 _CREDENTIALS = "check the credentials in the environment (AWS_..., AZURE_...) or the role of this machine"
+
+#: Seconds in which Windows notices Ctrl-C.
+_LOOK = 0.5
+#: Seconds that a call has to end after an interrupt.
+_FAREWELL = 2.0
 
 Kind = Literal["absent", "condition", "refused", "unknown"]
 
@@ -57,8 +66,15 @@ class RequestError(Exception):
 _first_process: int | None = None
 
 
-def ask(call: Callable[[], _T]) -> _T:
+def ask(call: Callable[[], _T], stop: Callable[[], None] | None = None) -> _T:
     """Call the library for buckets and return what it returns.
+
+    Parameters
+    ----------
+    call : callable
+        Called in another thread if this is the main one, which Ctrl-C could not interrupt meanwhile.
+    stop : callable, optional
+        Lets the call end soon after an interrupt.
 
     Raises
     ------
@@ -75,7 +91,7 @@ def ask(call: Callable[[], _T]) -> _T:
             "processes that are spawned, or fork before the first one is opened"
         )
     try:
-        return call()
+        return call() if threading.current_thread() is not threading.main_thread() else _interruptibly(call, stop)
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:  # also its panics, which are no Exception
@@ -83,6 +99,28 @@ def ask(call: Callable[[], _T]) -> _T:
             _log.warning("the library for buckets failed: %s", type(error).__name__)
         failure = _failure(type(error).__name__, isinstance(error, FileNotFoundError), str(error))
     raise failure
+
+
+def _interruptibly(call: Callable[[], _T], stop: Callable[[], None] | None) -> _T:
+    """Wait for a call in another thread; an interrupt ends the wait."""
+    answer: Future[_T] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(call())
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=run, name="lodestream-store", daemon=True).start()
+    try:
+        while not answer.done():
+            wait([answer], _LOOK)
+    except BaseException:
+        if stop is not None:
+            stop()
+            wait([answer], _FAREWELL)
+        raise
+    return answer.result()
 
 
 def _failure(name: str, absent: bool, text: str) -> RequestError:
@@ -116,7 +154,7 @@ def _words(name: str, text: str, status: int | None, code: str, known: str) -> s
         return f"there is no such bucket or container ({known})"
     if code in _OTHER_REGION or (status is not None and 300 <= status < 400) or "redirect" in text:
         return f"the bucket is elsewhere ({known or 'redirected'}): set AWS_REGION to its region"
-    if status in (401, 403) or name in ("PermissionDeniedError", "UnauthenticatedError"):
+    if status in (401, 403) or code in _EXPIRED or name in ("PermissionDeniedError", "UnauthenticatedError"):
         return f"the store refuses access ({known or name}): {_CREDENTIALS}"
     if status is not None:
         return f"the store answers {known}"

@@ -157,7 +157,7 @@ class Bucket:
                 file.seek(0)
                 pieces = _Pieces(file, part, progress)
                 try:
-                    ask(partial(self._send, at, key, pieces, part, whole=size <= part))
+                    ask(partial(self._send, at, key, pieces, part, whole=size <= part), pieces.stop)
                     return
                 except RequestError as failure:
                     if pieces.error is not None:
@@ -371,12 +371,19 @@ class _Pieces:
         self._file = file
         self._part = part
         self._progress = progress
+        self._stopped = False
         self.error: BaseException | None = None
+
+    def stop(self) -> None:
+        """Let the next part be an error, after which the store forgets those before."""
+        self._stopped = True
 
     def __iter__(self) -> Iterator[bytes]:
         done = 0
         try:
             while piece := self._file.read(self._part):
+                if self._stopped:
+                    raise InterruptedError("stopped")
                 done += len(piece)
                 if self._progress is not None:
                     self._progress(done)

@@ -84,6 +84,9 @@ class Folder:
         new = self._written(key, lambda file: file.write(checked_small(key, data)))
         try:
             self._name(key, path, lambda: self._link(new, path))
+        except ExistsError:
+            if self._tag_of(key) != _tag(data):
+                raise
         finally:
             _discard(new)
         return _tag(data)
@@ -94,7 +97,7 @@ class Folder:
         new = self._written(key, lambda file: file.write(checked_small(key, data)))
         try:
             with self._locked(key):
-                if (there := self._tag_of(key)) != tag:
+                if (there := self._tag_of(key)) not in (tag, _tag(data)):
                     what = "gone" if there is None else "changed"
                     raise ConflictError(f"{self.describe()}: {key} has {what} meanwhile: read it again")
                 self._name(key, path, lambda: new.replace(path))
@@ -180,8 +183,8 @@ class Folder:
 
     def room(self) -> int | None:
         """Return the free bytes of the disk."""
-        there = next(folder for folder in (self.root, *self.root.parents) if folder.exists())
         try:
+            there = next(folder for folder in (self.root, *self.root.parents) if folder.exists())
             return shutil.disk_usage(there).free
         except OSError as error:
             self._refuse("", error)

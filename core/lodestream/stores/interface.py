@@ -89,7 +89,8 @@ class Store(Protocol):
     A key is a path of a few parts, such as ``containers/0a1b.lode``; `lodestream.stores.keys` says what it may have.
     A write that returned survives a power failure, and no reader ever sees half of it. *Small objects* are changed by
     `create` and `replace` alone: each body has to hold an id of its own write, so that one whose answer is lost is told
-    from one of another writer. *Large objects* never change, and are named by their hash.
+    from one of another writer. What has the very bytes of a write counts as written by it. *Large objects* never
+    change, and are named by their hash.
 
     A process that forks must do so before it opens a store; see `docs/stores.md`.
     """

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import http.client
+import os
+import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -82,6 +86,46 @@ def test_an_upload_that_is_stopped_leaves_no_parts(s3: Emulator, tmp_path: Path)
         store.put_file("a", tmp_path / "source", stop)
     assert b"<Upload>" not in answer(s3, "/tests?uploads")[1]
     assert list(store.entries("")) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+@pytest.mark.usefixtures("interrupts")
+def test_an_upload_that_is_interrupted_leaves_no_parts(s3: Emulator, tmp_path: Path) -> None:
+    store = open_store(s3.address())
+    (tmp_path / "source").write_bytes(bytes(40 << 20))
+
+    def interrupt(done: int) -> None:
+        if done == 16 << 20:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)  # as long as a part takes
+
+    with pytest.raises(KeyboardInterrupt):
+        store.put_file("a", tmp_path / "source", interrupt)
+    assert b"<Upload>" not in answer(s3, "/tests?uploads")[1]
+    assert list(store.entries("")) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+@pytest.mark.usefixtures("interrupts")
+@pytest.mark.parametrize("call", ["get('a')", "create('a', b'')", "put_file('a', sys.argv[0])"])
+def test_a_store_that_does_not_answer_can_be_interrupted(call: str, tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(f"import sys; from lodestream.stores import open_store; open_store('s3://bucket/a').{call}")
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        place = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        credentials = {"AWS_ACCESS_KEY_ID": "a", "AWS_SECRET_ACCESS_KEY": "b", "AWS_ENDPOINT_URL": place}
+        begun = time.monotonic()
+        running = subprocess.Popen(
+            [sys.executable, script], env={**os.environ, **credentials}, stderr=subprocess.PIPE, text=True
+        )
+        connection, _ = silent.accept()
+        with connection:
+            assert connection.recv(1)
+            running.send_signal(signal.SIGINT)
+            said = running.communicate(timeout=PATIENCE)[1]
+    assert running.returncode != 0
+    assert "KeyboardInterrupt" in said
+    assert time.monotonic() - begun < 20, "it is not the limits of the store that ended it"
 
 
 def answer(s3: Emulator, target: str) -> tuple[dict[str, str], bytes]:

@@ -82,6 +82,15 @@ def test_an_object_is_replaced_by_whoever_read_the_last_state(store: Store) -> N
     assert store.get("a") == (second, new)
 
 
+def test_a_write_that_is_made_again_meets_itself(store: Store) -> None:
+    first, second = body(), body()
+    old = store.create("a", first)
+    assert store.create("a", first) == old
+    new = store.replace("a", second, old)
+    assert store.replace("a", second, old) in (new, store.get("a")[1])
+    assert store.get("a")[0] == second
+
+
 def test_what_is_gone_is_not_replaced_and_may_be_created_again(store: Store) -> None:
     tag = store.create("a", body())
     store.delete(["a"])
