@@ -29,7 +29,7 @@ from lodestream.encoding.executing import Execution
 from lodestream.encoding.lattice_coordinates import exact_lattices
 from lodestream.encoding.phases import Phases
 from lodestream.encoding.prepared import Prepared, prepare
-from lodestream.quality import Quality
+from lodestream.quality import EFFORTS, Quality
 from lodestream.scratch import IN_MEMORY, FolderScratch, MemoryScratch, Scratch
 from tests.examples import examples
 
@@ -104,13 +104,14 @@ def _check(
 
     With a ``tile``, in exponents of two, tiles are so small, and units of any size are large where that is worth it.
     """
+    effort = EFFORTS[seed % len(EFFORTS)]
     with pytest.MonkeyPatch.context() as patch:
         if tile is not None:
             patch.setattr(preparing, "tile_exponents", lambda *_: tile)
             patch.setattr(preparing, "square", lambda bits: tile)
-            patch.setitem(CHOICES, "default", replace(CHOICES["default"], large_points=200))
+            patch.setitem(CHOICES, effort, replace(CHOICES[effort], large_points=200))
         try:
-            prepared = prepare(surface, Quality.of(precision))
+            prepared = prepare(surface, Quality.of(precision, effort=effort))
             container = built(prepared, WHOLE, WHOLE, folder=False)
         except ls.InputError:
             assume(False)  # this precision is too small for the values
