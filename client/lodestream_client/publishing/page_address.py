@@ -7,7 +7,7 @@ import os
 from urllib.parse import quote, urlsplit
 
 from lodestream.page import INDEX
-from lodestream.stores.bucket import endpoint_of
+from lodestream.stores.connections import endpoint_of
 
 __all__ = ["cors_rule", "page_address"]
 

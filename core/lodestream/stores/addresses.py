@@ -7,7 +7,8 @@ import re
 from pathlib import Path
 
 from ..errors import InputError
-from .bucket import SCHEMES, Bucket
+from .bucket import Bucket
+from .connections import SCHEMES
 from .folder import Folder
 from .interface import Store
 

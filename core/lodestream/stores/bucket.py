@@ -8,49 +8,28 @@ from __future__ import annotations
 import itertools
 import os
 import random
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, Self, TypeVar
+from typing import BinaryIO, NoReturn, Self, TypeVar
 
 from ..errors import InputError, UnavailableError
 from .answers import RequestError, ask
 from .blocks import Blocks, Extent
+from .connections import Limits, connected, parsed
 from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
 from .headers import headers
 from .interface import SMALL, Entry, Progress, Tag
 from .keys import checked_key, checked_prefix, checked_small
 from .probe import try_out
 
-if TYPE_CHECKING:
-    from obstore.store import ClientConfig, ObjectStore, RetryConfig
-
-__all__ = ["SCHEMES", "Bucket", "Limits", "endpoint_of"]
+__all__ = ["Bucket"]
 
 _T = TypeVar("_T")
-
-#: Schemes of addresses, and how each is written.
-SCHEMES = {
-    "s3": "s3://bucket/prefix",
-    "az": "az://container/prefix",
-    "abfss": "abfss://container@account.dfs.core.windows.net/prefix",
-}
-
-_S3_BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]", re.ASCII)
-_CONTAINER = re.compile(r"[a-z0-9](?:[a-z0-9-]{1,61})[a-z0-9]|\$web", re.ASCII)
-# The first one that is set.
-_S3_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-_AZURE_ENDPOINTS = ("AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT")
-#: Characters of a prefix: with the longest key below what stores allow.
-_LONGEST_PREFIX = 300
-_ACCOUNT = re.compile(r"([a-z0-9]{3,24})\.(?:dfs|blob)\.core\.windows\.net", re.ASCII)
 
 #: Bytes of a part of a large object, and what more parts than this a store does not take.
 _PART = 8 << 20
@@ -63,31 +42,6 @@ _THREADS = 8
 _PIECE = 2 << 20
 
 
-@dataclass(frozen=True)
-class Limits:
-    """How long a store is waited for.
-
-    Attributes
-    ----------
-    stalled : float
-        Seconds until the answer to a request begins, or continues.
-    request : float
-        Seconds of a whole request, also the time in which a request that failed is made again.
-    part : float
-        Seconds of a request that writes a part of a large object.
-    retries : int
-        How often a request that failed is made again.
-    again : float
-        Seconds after which a call that failed, with its retries, is not made once more.
-    """
-
-    stalled: float = 10.0
-    request: float = 20.0
-    part: float = 120.0
-    retries: int = 3
-    again: float = 10.0
-
-
 class Bucket:
     """A store in a bucket. See `Store` for what the methods do.
 
@@ -98,7 +52,7 @@ class Bucket:
     Parameters
     ----------
     address : str
-        One of `SCHEMES`.
+        Such as ``s3://bucket/prefix``; see `lodestream.stores.connections`.
     limits : Limits
 
     Raises
@@ -112,7 +66,7 @@ class Bucket:
     """
 
     def __init__(self, address: str, limits: Limits | None = None) -> None:
-        place = _parsed(address)
+        place = parsed(address)
         try:
             import obstore
         except ModuleNotFoundError:
@@ -124,8 +78,8 @@ class Bucket:
         self._prefix = place.prefix
         self._limits = limits = limits or Limits()
         try:
-            self._store = ask(lambda: _connected(place, limits, limits.stalled, limits.request))
-            self._parts = ask(lambda: _connected(place, limits, limits.part, limits.part))
+            self._store = ask(lambda: connected(place, limits, limits.stalled, limits.request))
+            self._parts = ask(lambda: connected(place, limits, limits.part, limits.part))
         except RequestError as failure:
             self._refuse("", failure)
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lodestream-store")
@@ -391,83 +345,6 @@ class _Pieces:
         except BaseException as error:
             self.error = error
             raise
-
-
-@dataclass(frozen=True)
-class _Place:
-    scheme: str
-    bucket: str
-    account: str | None
-    prefix: str  # with a slash at the end, or nothing
-
-    @property
-    def address(self) -> str:
-        account = f"@{self.account}.dfs.core.windows.net" if self.account else ""
-        return f"{self.scheme}://{self.bucket}{account}/{self.prefix}".rstrip("/")
-
-
-def _parsed(address: str) -> _Place:
-    """Take an address apart; what is refused is not repeated, since it may be a credential."""
-    scheme, _, rest = address.partition("://")
-    scheme = scheme.lower()
-    host, _, prefix = rest.partition("/")
-    if "?" in rest or "#" in rest:
-        raise InputError(f"expected an address such as {SCHEMES[scheme]}, got one with a query or fragment")
-    user, at, host = host.rpartition("@")
-    account = None
-    if scheme == "abfss":
-        bucket, known = user, _ACCOUNT.fullmatch(host)
-        account = known[1] if known else None
-        right = account is not None and _CONTAINER.fullmatch(bucket) is not None
-    elif at or ":" in host:
-        raise InputError(
-            f"expected an address such as {SCHEMES[scheme]}, got one with credentials or a port: credentials come from "
-            "the environment (AWS_..., AZURE_...), and so does the endpoint"
-        )
-    else:
-        bucket, right = host, (_S3_BUCKET if scheme == "s3" else _CONTAINER).fullmatch(host) is not None
-    if not right:
-        raise InputError(f"expected an address such as {SCHEMES[scheme]}, got another bucket, container or account")
-    prefix = prefix.strip("/")
-    if len(prefix) > _LONGEST_PREFIX:
-        raise InputError(f"expected a prefix of at most {_LONGEST_PREFIX} characters, got {len(prefix):,}")
-    return _Place(scheme, bucket, account, checked_prefix(f"{prefix}/" if prefix else ""))
-
-
-def endpoint_of(scheme: str) -> str | None:
-    """Return the endpoint that the environment names for buckets of a scheme; None: that of Amazon or Azure."""
-    names = _S3_ENDPOINTS if scheme == "s3" else _AZURE_ENDPOINTS
-    return next((os.environ[name] for name in names if os.environ.get(name)), None)
-
-
-def _connected(place: _Place, limits: Limits, stalled: float, seconds: float) -> ObjectStore:
-    """Connect to a bucket with what the environment says; nothing is asked yet."""
-    from obstore.store import AzureStore, S3Store
-
-    endpoint = endpoint_of(place.scheme)
-    client: ClientConfig = {
-        "timeout": timedelta(seconds=seconds),
-        "read_timeout": timedelta(seconds=stalled),
-        "connect_timeout": timedelta(seconds=min(limits.stalled, 5.0)),
-        "allow_http": endpoint is not None and endpoint.lower().startswith("http://"),
-    }
-    retry: RetryConfig = {
-        "max_retries": limits.retries,
-        "retry_timeout": timedelta(seconds=seconds),
-        "backoff": {
-            "init_backoff": timedelta(milliseconds=100),
-            "max_backoff": timedelta(seconds=2),
-            "base": 2,
-        },
-    }
-    settings: dict[str, Any] = {"client_options": client, "retry_config": retry}
-    if endpoint is not None:
-        settings["endpoint"] = endpoint
-    if place.scheme == "s3":
-        return S3Store(place.bucket, **settings)
-    if place.account is not None:
-        settings["account_name"] = place.account
-    return AzureStore(place.bucket, **settings)
 
 
 def _waits() -> Iterator[float]:

@@ -10,7 +10,8 @@ import pytest
 
 from lodestream.errors import InputError, UnavailableError
 from lodestream.stores import Folder, Store, StoreError, open_store
-from lodestream.stores.bucket import Bucket, Limits
+from lodestream.stores.bucket import Bucket
+from lodestream.stores.connections import Limits
 from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator
 

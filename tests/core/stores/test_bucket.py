@@ -18,7 +18,8 @@ from obstore.store import S3Store
 
 from lodestream.stores import AbsentError, Store, StoreError, Tag, UnfitStoreError, open_store
 from lodestream.stores.answers import ask
-from lodestream.stores.bucket import Bucket, Limits
+from lodestream.stores.bucket import Bucket
+from lodestream.stores.connections import Limits
 from lodestream.stores.headers import headers
 from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator

@@ -237,7 +237,7 @@ def test_what_cannot_be_a_prefix_is_refused(store: Store, prefix: str) -> None:
 
 
 def test_one_of_many_writers_creates_and_one_replaces(store: Store) -> None:
-    for number in range(8):
+    for number in range(20):
         key, bodies = f"race/{number}", [body() for _ in range(4)]
         created = winners(lambda data, key=key: store.create(key, data), bodies)  # type: ignore[misc]
         assert len(created) == 1

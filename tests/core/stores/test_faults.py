@@ -18,7 +18,8 @@ from lodestream.stores import (
     UnacknowledgedError,
     UnfitStoreError,
 )
-from lodestream.stores.bucket import Bucket, Limits
+from lodestream.stores.bucket import Bucket
+from lodestream.stores.connections import Limits
 from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator
 from tests.stores.faults import Fault, FaultProxy, fault_proxy
@@ -131,6 +132,28 @@ def test_an_object_of_another_is_told_from_a_lost_answer(store: Bucket, proxy: F
     proxy.faults = [Fault("409", 1)]
     with pytest.raises(ExistsError):
         store.create("a", body())
+
+
+def test_a_conflict_may_hide_a_write_that_took_place(
+    store: Bucket, proxy: FaultProxy, emulator: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tag = store.create("a", body())
+    with monkeypatch.context() as direct:
+        direct.setenv(emulator.endpoint, emulator.environment[emulator.endpoint])
+        other = Bucket(store.describe(), LIMITS)
+    states: list[bytes] = []
+    read = store._read
+
+    def overtaken(at: str, most: int) -> tuple[bytes | None, str | None]:
+        states.append(other.get("a")[0])
+        other.replace("a", body(), other.get("a")[1])
+        return read(at, most)
+
+    monkeypatch.setattr(store, "_read", overtaken)
+    proxy.faults, data = [Fault("lost", 1)], body()
+    with pytest.raises(ConflictError):
+        store.replace("a", data, tag)
+    assert states == [data], "it was there before it was looked up"
 
 
 @pytest.mark.parametrize("kind", ["lost", "closed", "hung"])

@@ -13,8 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from lodestream.errors import LodestreamError
 from lodestream.stores import StoreError, Tag
-from lodestream.stores.bucket import Bucket, Limits
+from lodestream.stores.bucket import Bucket
+from lodestream.stores.connections import Limits
 
 HASTY = Limits(stalled=1.0, request=2.0, part=2.0, retries=1, again=0.0)
 
@@ -173,7 +175,7 @@ def test_an_endpoint_that_cannot_be_used_is_not_repeated(
     address: str, environment: dict[str, str], endpoint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use(environment, monkeypatch, endpoint)
-    with pytest.raises(StoreError) as caught:
+    with pytest.raises(LodestreamError) as caught:
         Bucket(address, HASTY).get("a")
     assert not [secret for secret in PLANTED if secret in told(caught.value)]
 
