@@ -376,12 +376,16 @@ static void update(const struct bundle *w, int64_t from, int64_t to, bool invers
 
 /* Fill the REACH places before the details, or those after them. */
 static void extend(const struct bundle *w, bool after) {
+    const int64_t *table = w->table + (after ? 2 * REACH : 0);
+    int32_t *places = w->details + (after ? w->midpoints : -REACH) * w->gap;
     for (int64_t i = 0; i < REACH; i++) {
-        const int64_t *row = w->table + 2 * (i + (after ? REACH : 0));
-        int64_t target = after ? w->midpoints + i : i - REACH;
-        int32_t sign = (int32_t)row[1];
-        for (int64_t j = 0; j < w->width; j++)
-            w->details[target * w->gap + j] = times(sign, w->details[row[0] * w->gap + j]);
+        const int32_t *from = w->details + table[2 * i] * w->gap;
+        int32_t sign = (int32_t)table[2 * i + 1];
+        if (w->gap == 1)
+            places[i] = times(sign, *from);
+        else
+            for (int64_t j = 0; j < w->width; j++)
+                places[i * STRIP + j] = times(sign, from[j]);
     }
 }
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.encoding import forward, phases, prepared, streams, transform_phases
-from lodestream.encoding.allocation import assign_layers
+from lodestream.encoding.allocation import PassOrder, layer_ends, pass_order
 from lodestream.encoding.curves import Curves
-from lodestream.encoding.effort import CHOICES
+from lodestream.encoding.effort import CHOICES, FewLayers
 from lodestream.encoding.tiling import WHOLE_TILE, square
 from lodestream.entropy.tile_coder import TileCoder, planes_of
 from lodestream.entropy.tiles import TileTable, gather
@@ -79,20 +79,24 @@ class Crafted:
         def planes(table: TileTable, true: NDArray[np.int32], tile: int) -> int:
             return planes_of(table, true, tile) + (self.ones if tile == 0 else 0)
 
-        def assigned(curves: Curves, *arguments: Any) -> list[NDArray[Any]]:
-            states = assign_layers(curves, *arguments)
-            first = np.zeros_like(states[0])
-            first[curves.tile, curves.channel] = curves.counts
-            first[0] -= 2 * self.ones
-            return [first, *states]
+        def first_alone(curves: Curves, *arguments: Any) -> PassOrder:
+            order = pass_order(curves, *arguments)
+            chosen = np.flatnonzero(order.unit == 0)[: 2 * self.ones]
+            places = np.concatenate([chosen, np.delete(np.arange(order.unit.size), chosen)])
+            return replace(order, unit=order.unit[places], number=order.number[places])
 
-        def levels(curves: Curves, layout: Layout, channels: int, *_: Any) -> list[NDArray[Any]]:
-            states = [np.zeros((len(layout.tiles), channels), np.int8) for _ in range(layout.levels + 1)]
-            level = np.array([layout.level_of(tile) for tile in range(len(layout.tiles))])[curves.tile]
-            for number, state in enumerate(states):
-                later = level > number
-                state[curves.tile[later], curves.channel[later]] = curves.counts[later]
-            return states
+        def by_level(curves: Curves, layout: Layout, channels: int) -> PassOrder:
+            order = pass_order(curves, layout, channels)
+            level = np.array([layout.level_of(tile) for tile in range(len(layout.tiles))])[order.unit // channels]
+            places = np.argsort(level, kind="stable")
+            last = np.append(np.diff(level[places]) > 0, True)
+            return replace(order, unit=order.unit[places], number=order.number[places], last=last)
+
+        def ends(order: PassOrder, most: int, few: FewLayers | None = None) -> list[int]:
+            if self.by_level:
+                return [int(place) + 1 for place in np.flatnonzero(order.last)]
+            first = 2 * self.ones
+            return [first, *(end for end in layer_ends(order, most, few) if end > first)]
 
         def coded(coder: TileCoder, tile: int, channel: int, first: int, passes: int, *costs: Any) -> bytes:
             data = code(coder, tile, channel, first, passes, *costs)
@@ -112,10 +116,13 @@ class Crafted:
             if self.ones:
                 for module in (forward, transform_phases):
                     patch.setattr(module, "planes_of", planes)
-                patch.setattr(phases, "assign_layers", assigned)
+                patch.setattr(phases, "pass_order", first_alone)
                 patch.setattr(TileCoder, "code", coded)
             if self.by_level:
-                patch.setattr(phases, "assign_layers", levels)
+                patch.setattr(phases, "pass_order", by_level)
+            if self.ones or self.by_level:
+                patch.setattr(phases, "layer_ends", ends)
+                patch.setitem(CHOICES, "default", replace(CHOICES["default"], stop_turns=0))
             yield
 
 

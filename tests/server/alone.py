@@ -70,10 +70,10 @@ def preload_waiting() -> None:
     preload_large()
     measure = tasks.measure
 
-    def measure_first(build: Build, number: int) -> None:
+    def measure_first(build: Build, number: int, turn: int) -> None:
         if number:
             time.sleep(_PATIENCE)
-        measure(build, number)
+        measure(build, number, turn)
 
     tasks.measure = measure_first
 
@@ -86,10 +86,10 @@ def preload_continuing() -> None:
     preload_large()
     measure = tasks.measure
 
-    def measure_others(build: Build, number: int) -> None:
-        if not number:
+    def measure_others(build: Build, number: int, turn: int) -> None:
+        if not number and not turn:
             raise AssertionError("expected that the first piece is measured")
-        measure(build, number)
+        measure(build, number, turn)
 
     tasks.measure = measure_others
     for name in ("first_step", "second_step", "core", "code"):

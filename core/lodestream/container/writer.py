@@ -68,15 +68,17 @@ class ContainerWriter:
             sections.Entry(s.tile, s.channel, s.top if s.begins else 0, s.passes, len(s.data)) for s in layer.segments
         ]
         table = sections.serialize_layer(layer.errors, entries, header.channels)
-        where = self._section(sections.LAYER, table, (s.data for s in layer.segments), sum(e.length for e in entries))
-        place = where.offset + where.length - 4 - sum(e.length for e in entries)
+        total = sum(entry.length for entry in entries)
+        where = self._section(sections.LAYER, table, (s.data for s in layer.segments), total)
+        place = where.offset + where.length - 4 - total
         for s in layer.segments:
             extent = ByteRange(place, len(s.data))
             self._segments.append(
                 Segment(number, s.tile, s.channel, s.top, s.passes, extent, sections.check_of(s.data))
             )
             place += len(s.data)
-            self._finest = max(self._finest, header.layout.level_of(s.tile))
+        finest = max((s.tile for s in layer.segments), default=0)  # tiles are numbered level by level
+        self._finest = max(self._finest, header.layout.level_of(finest))
         end = where.offset + where.length
         self._records.append(LayerRecord(number, where.offset, end, self._finest, *layer.errors))
 

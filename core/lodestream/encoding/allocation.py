@@ -4,10 +4,13 @@ Every tile of every channel is a list of coding passes, each with a cost in bits
 grouped into *runs*: on the convex hull of each tile, so that a poor pass before a good one does not hide it, and so
 that a run is worth the segment that it takes. Runs are sorted by gain for each bit, parents never after their
 children; layers cut this order so that one is at most `_GROWTH` times as long as the one before. There are
-never more than a container may have.
+never more than a container may have. Some of the ends are moved afterwards, see `stops`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +20,7 @@ from ..grid.layout import Layout
 from .curves import Curves, Worth
 from .effort import FewLayers
 
-__all__ = ["assign_layers"]
+__all__ = ["PassOrder", "layer_ends", "pass_order"]
 
 #: A segment takes so many bits besides its passes: in the layer's table, in the index, and to start and end a coder.
 _SEGMENT = 48.0
@@ -27,7 +30,7 @@ _SHARE_OF_STREAM = 0.005
 #: What a run adds to a layer besides its passes, in bytes.
 _ENTRY = 5
 #: By how much the bytes grow from layer to layer, at least and at most, where there are more than so many ...
-_GROWTH = 1.12, 1.14
+_GROWTH = 1.13, 1.15
 _OFTEN = 3800
 #: ... and before: a layer's frame takes about 50 bytes with its share of the index, which counts there.
 _EARLY_GROWTH = 1.4, 1.8
@@ -39,10 +42,43 @@ _FEWEST = 3
 _SECOND = 16.0  # times the first layer
 
 
-def assign_layers(
-    curves: Curves, layout: Layout, channels: int, few: FewLayers | None = None
-) -> list[NDArray[np.int8]]:
-    """Return the state after each layer.
+@dataclass(frozen=True, eq=False)
+class PassOrder:
+    """All passes of a stream in their order.
+
+    Attributes
+    ----------
+    top : int8, shape (tile, channel)
+        Passes of every tile and channel.
+    unit : int64, shape (pass,)
+        Tile times channels, plus channel.
+    number : int8, shape (pass,)
+        Passes of the unit that remain after this one.
+    sizes, gains : float64, shape (pass,)
+        Bytes, and the squared error that is removed, of all passes up to each one.
+    last : bool, shape (pass,)
+        Of a run the last pass.
+    """
+
+    top: NDArray[np.int8]
+    unit: NDArray[np.int64]
+    number: NDArray[np.int8]
+    sizes: NDArray[np.float64]
+    gains: NDArray[np.float64]
+    last: NDArray[np.bool_]
+
+    def states(self, ends: Iterable[int]) -> Iterator[NDArray[np.int8]]:
+        """Yield the passes that remain after so many, ascending: int8 arrays, shape (tile, channel)."""
+        state, start = self.top, 0
+        for end in ends:
+            state = state.copy()
+            np.minimum.at(state.reshape(-1), self.unit[start:end], self.number[start:end])
+            yield state
+            start = end
+
+
+def pass_order(curves: Curves, layout: Layout, channels: int) -> PassOrder:
+    """Return the order of all passes.
 
     Parameters
     ----------
@@ -50,17 +86,8 @@ def assign_layers(
     layout : Layout
     channels : int
         Of the surface; one whose coefficients are all 0 has no curve.
-    few : FewLayers, optional
-        Only so many layers.
-
-    Returns
-    -------
-    list of int8 arrays, shape (tile, channel)
-        Passes that remain after the layer.
     """
     top = np.zeros((len(layout.tiles), channels), np.int8)
-    if not curves.tile.size:
-        return [top]
     top[curves.tile, curves.channel] = curves.counts
     slope = curves.slopes(_worth(curves))
     curves.lift_parents(slope, layout)
@@ -69,17 +96,11 @@ def assign_layers(
     # By tile, then by number, then by channel where slopes are equal.
     order = np.lexsort((unit % channels, -number, unit // channels, -slope))
     unit, number, slope = unit[order], number[order], slope[order]
-    last = np.append((unit[1:] != unit[:-1]) | (slope[1:] != slope[:-1]), True)
+    last = np.ones(unit.size, np.bool_)
+    last[:-1] = (unit[1:] != unit[:-1]) | (slope[1:] != slope[:-1])
     del slope
     sizes = np.cumsum(curves.bits[order] / 8 + _ENTRY * last)
-    gains = np.cumsum(curves.gains[order])
-    states, state, start = [], top, 0
-    for end in _layer_ends(sizes, gains, last, few, limits.most_layers(channels, layout.levels + 1)):
-        state = state.copy()
-        np.minimum.at(state.reshape(-1), unit[start:end], number[start:end])
-        states.append(state)
-        start = end
-    return states
+    return PassOrder(top, unit, number, sizes, np.cumsum(curves.gains[order]), last)
 
 
 def _worth(curves: Curves) -> Worth:
@@ -89,10 +110,8 @@ def _worth(curves: Curves) -> Worth:
     return Worth(falling[order], np.cumsum(curves.bits[order]), _SHARE_OF_STREAM, _SEGMENT)
 
 
-def _layer_ends(
-    sizes: NDArray[np.float64], gains: NDArray[np.float64], last: NDArray[np.bool_], few: FewLayers | None, most: int
-) -> list[int]:
-    """Return the number of passes that are known after each of at most ``most`` layers.
+def layer_ends(order: PassOrder, most: int, few: FewLayers | None = None) -> list[int]:
+    """Return the number of passes that are known after each of at most ``most`` layers; with ``few``, of so many.
 
     They follow from bytes and gains that the passes add up to.
     Where there would be more layers, neighbours are merged, evenly over the stream, so that it still begins small.
@@ -101,7 +120,8 @@ def _layer_ends(
     `last` pass of a run, if there is one, where the error lies furthest below a line, in the logarithms of both, from
     one end of the range to the other: within a bit-plane the error falls faster at first than later.
     """
-    if few and float(sizes[-1]) < _BRIEF:
+    sizes, gains, last = order.sizes, order.gains, order.last
+    if not sizes.size or (few and float(sizes[-1]) < _BRIEF):
         return [sizes.size]
     errors = np.log(np.maximum(gains[-1] - gains, max(float(gains[-1]), 0.0) * 1e-15 + 1e-300))
     lengths = np.log(np.maximum(sizes, 1.0))

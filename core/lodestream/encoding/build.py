@@ -13,7 +13,6 @@ from threading import Lock
 import numpy as np
 
 from ..container.model import Header
-from ..decoding.measurer import Figures
 from ..decoding.values import Values
 from ..entropy.tiles import TileTable
 from ..quantization.band_steps import Quantiser
@@ -64,8 +63,8 @@ class Build:
         self.points, self._core_points = points, core_points
         #: Of the coordinates, where the stream is made for one error; known when they are transformed.
         self.quantiser: Quantiser | None = None
-        #: Of a build in one piece its errors, and what the last layer shows of each block, until both are used.
-        self.last: tuple[Figures, Mapping[int, Values]] | None = None
+        #: Of a build in one piece what the last layer shows of each block, until its residual is coded.
+        self.last: Mapping[int, Values] | None = None
         self._header: Header | None = None
         self._tables: dict[bool, TileTable] = {}
 
@@ -124,7 +123,7 @@ class Build:
         dump(facts, Path(self.folder) / _FILE, flush)
 
     def save_header(self, header: Header) -> None:
-        """Write the header, with the size of chunks, for the tasks that code the residual."""
+        """Write the header, with the size of chunks, for the tasks that measure and code the residual."""
         self._header = header
         self.scratch.write(_HEADER, np.frombuffer(pickle.dumps(header, pickle.HIGHEST_PROTOCOL), np.uint8))
 

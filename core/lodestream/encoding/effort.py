@@ -49,6 +49,8 @@ class Choices:
         The container tells errors of windows, where they take few bytes.
     layers : FewLayers or None
         None: so many that one is not much longer than the one before.
+    stop_turns : int
+        How often ends of layers are sought where clients stop.
     search : bool
         The predictors of details are sought; otherwise they are the best of a few.
     large_points : int
@@ -68,6 +70,7 @@ class Choices:
     chunk_growth: float = 0.01
     window_errors: bool = True
     layers: FewLayers | None = None
+    stop_turns: int = 3
     search: bool = True
     large_points: int = 1 << 15
     large_growth: float = 1.05
@@ -83,6 +86,7 @@ CHOICES: dict[Effort, Choices] = {
         whole_chunk_bits=(WHOLE_CHUNK,),
         small_chunk_bits=(SMALL_CHUNK, WHOLE_CHUNK),
         layers=FewLayers(most=5, bytes=16_000),
+        stop_turns=0,
         search=False,
         large_points=1 << 11,
         large_growth=1.06,

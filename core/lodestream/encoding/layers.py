@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,22 +59,19 @@ def all_passes(tops: Sequence[NDArray[np.int8]]) -> State:
     return np.stack([np.maximum(2 * top - 1, 0) for top in tops], axis=1).astype(np.int8)
 
 
-def shown_states(header: Header, states: Sequence[State], passes: State) -> list[State]:
-    """Return the state that a receiver has after each layer.
-
-    Tiles of which it has heard nothing are `UNANNOUNCED` until the last.
+def shown_states(header: Header, states: Iterable[State], passes: State) -> list[State]:
+    """Return the state that a receiver has after each layer but the last: tiles not heard of are `UNANNOUNCED`.
 
     Parameters
     ----------
     header : Header
-    states : sequence of int8 arrays, shape (tile, channel)
+    states : iterable of int8 arrays, shape (tile, channel)
         Passes still to come after each layer.
     passes : int8, shape (tile, channel)
         All that there are.
     """
     start = initial_state(header)
-    shown = [np.where(state < passes, state, start).astype(np.int8) for state in states[:-1]]
-    return [*shown, states[-1]]
+    return [np.where(state < passes, state, start).astype(np.int8) for state in states]
 
 
 def level_states(header: Header) -> list[State]:

@@ -10,14 +10,15 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from ..container import limits
 from ..container.codecs import needed_codecs
 from ..container.digest import DIGEST
 from ..container.model import Errors, Header
 from ..container.writer import ContainerWriter
-from ..decoding.measurer import Figures, distances_of
+from ..decoding.measurer import Measured, distances_of
 from ..planning.window_errors import KIND as WINDOW_ERRORS
 from . import tasks
-from .allocation import assign_layers
+from .allocation import layer_ends, pass_order
 from .assembling import Chunks, coded_layers, returned_digest, window_section_of
 from .build import Build
 from .coding import parents_of, sizes_of_unit
@@ -28,6 +29,7 @@ from .header import header_of
 from .large_units import candidate, tried_tiles, worth
 from .layers import (
     MeasuredLayer,
+    State,
     all_passes,
     kept_layers,
     level_states,
@@ -37,13 +39,16 @@ from .layers import (
 )
 from .residual_encoder import chunk_sample, chunk_size
 from .state_errors import exact_errors, last_values, measured_runs
-from .task_arrays import name_of, pieces_of, read_tiles, transformed
+from .stops import moved_ends, sought_ends
+from .task_arrays import name_of, pieces_of, read_figures, read_tiles, transformed
 from .transform_phases import TransformPhases, planes_of_channel
 
 __all__ = ["OutOfRangeError", "Phases"]
 
-#: Fractions of the time that the phases take, about: transform, coding, measuring, writing.
-_SHARES = 0.3, 0.3, 0.3, 0.1
+#: Fractions of the time that the phases take, about: transform, coding, measuring, residual, writing.
+_SHARES = 0.3, 0.2, 0.35, 0.05, 0.1
+#: And of that of measuring, each turn after the first.
+_OTHER_TURN = 0.03
 
 
 class OutOfRangeError(Exception):
@@ -78,9 +83,10 @@ class Phases:
         """
         self._transform()
         self._code()
-        self._choose_layers()
-        self._measure()
-        return self._assemble(out)
+        layers, levels = self._layers()
+        exact = self._residual()
+        levels.append(remaining_errors(layers[-1].errors, exact, self._build.prepared.geometric))
+        return self._assemble(out, layers, levels, all(exact))
 
     def _carry_out(self, share: float, phase: Sequence[Task]) -> None:
         self._execution.carry_out(phase, self._report(share))
@@ -157,7 +163,7 @@ class Phases:
         tile, channel = np.nonzero(counts.T)
         return tile + tiles.start, channel, counts[channel, tile], bits, gains
 
-    # Layers.
+    # Layers and their errors.
 
     @cached_property
     def _header(self) -> Header:
@@ -166,31 +172,81 @@ class Phases:
         predictors = np.array(self._read("predictors"))
         return header_of(build.prepared, build.lattices, predictors, self._tops, build.quantiser, self._large)
 
-    def _choose_layers(self) -> None:
-        if self._scratch.has("layers"):
-            return
+    def _layers(self) -> tuple[list[MeasuredLayer], list[Errors]]:
+        """Return the layers that are kept, and the errors of all levels but the last."""
+        build, header = self._build, self._header
         curves = self._curves()
-        few = self._build.prepared.choices.layers or (FOR_ONE_ERROR if self._build.quantiser is not None else None)
-        layers = assign_layers(curves, self._layout, self._build.channels, few)
-        shown = shown_states(self._header, layers, all_passes(self._tops))
-        self._scratch.write("states", np.stack([*shown, *level_states(self._header)]))
-        self._scratch.write("last-state", shown[-1])
-        self._scratch.write("coefficient-bytes", np.array(curves.bytes))
-        self._scratch.write("layers", np.stack(layers))
+        order = pass_order(curves, self._layout, build.channels)
+        if not self._scratch.has("coefficient-bytes"):
+            self._scratch.write("coefficient-bytes", np.array(curves.bytes))
+        del curves
+        most = limits.most_layers(build.channels, self._layout.levels + 1)
+        choices = build.prepared.choices
+        ends = layer_ends(order, most, choices.layers or (FOR_ONE_ERROR if build.quantiser is not None else None))
+        states = dict(zip(ends, order.states(ends), strict=True))
+        passes, last = all_passes(self._tops), states[ends[-1]]
+        if not self._scratch.has("last-state"):
+            self._scratch.write("last-state", last)
+        if build.is_whole:  # to choose chunks takes the values of all, which come later
+            build.save_header(header)
+        else:
+            self._choose_chunk()  # runs begin where chunks do
+        of_levels = level_states(header)
+        shown = shown_states(header, [states[end] for end in ends[:-1]], passes)
+        measured = self._measure(0, [*shown, last, *of_levels])
+        levels = [errors for errors, _ in measured[len(ends) :]]
+        known = dict(zip(ends, measured, strict=False))
+        for turn in range(1, choices.stop_turns + 1):
+            rms = {end: errors.rms for end, (errors, _) in known.items()}
+            sought = sought_ends(order, rms, header.extent, header.geometric)
+            if not sought:
+                break
+            states.update(zip(sought, order.states(sought), strict=True))
+            shown = shown_states(header, [states[end] for end in sought], passes)
+            known.update(zip(sought, self._measure(turn, shown), strict=True))
+        rms = {end: errors.rms for end, (errors, _) in known.items()}
+        ends = moved_ends(order, ends, rms, header.extent, most)
+        return kept_layers(header, [states[end] for end in ends], [known[end] for end in ends]), levels
 
-    # Errors and residual.
-
-    def _measure(self) -> None:
-        if not self._scratch.has("chunk"):
-            self._scratch.write("chunk", np.array(self._chunk()))
-        rows, columns = (int(exponent) for exponent in self._read("chunk"))
-        self._build.save_header(replace(self._header, chunk=(rows, columns)))
-        self._carry_out(_SHARES[2], [Task(f"exact/{k}", tasks.measure, (k,)) for k in range(self._runs)])
+    def _measure(self, turn: int, states: Sequence[State]) -> list[Measured]:
+        """Measure the errors of states, int8, shape (tile, channel) each."""
+        build = self._build
+        if not self._scratch.has(f"states/{turn}"):
+            self._scratch.write(f"states/{turn}", np.stack(states))
+        runs = range(self._runs)
+        phase = [Task(f"counts/{turn}/{k}", tasks.measure, (k, turn)) for k in runs]
+        self._carry_out(_SHARES[2] * (_OTHER_TURN if turn else 1 - 3 * _OTHER_TURN), phase)
+        figures = [read_figures(build, turn, k) for k in runs]
+        measured = []
+        for number, state in enumerate(states):
+            distances = distances_of(self._header, figures, number)
+            if distances is None and not build.is_whole:
+                raise OutOfRangeError
+            errors, cells = distances or exact_errors(build, self._header, state)
+            measured.append((told_errors(errors), cells))
+        return measured
 
     @property
     def _runs(self) -> int:
         """Number of runs of rows, or of blocks, that are measured."""
         return len(measured_runs(self._build.stored_header(), self._build.points))
+
+    # Residual.
+
+    def _residual(self) -> list[bool]:
+        """Code the residual; return for each channel whether it is exact with it."""
+        self._choose_chunk()
+        runs = range(self._runs)
+        self._carry_out(_SHARES[3], [Task(f"exact/{k}", tasks.residual, (k,)) for k in runs])
+        whole = np.all([self._read(f"exact/{k}") for k in runs], axis=0)
+        return [bool(channel) for channel in whole]
+
+    def _choose_chunk(self) -> None:
+        """Save the header with the size of chunks, for tasks."""
+        if not self._scratch.has("chunk"):
+            self._scratch.write("chunk", np.array(self._chunk()))
+        rows, columns = (int(exponent) for exponent in self._read("chunk"))
+        self._build.save_header(replace(self._header, chunk=(rows, columns)))
 
     def _chunk(self) -> tuple[int, int]:
         """Choose the size of chunks, see `chunk_size`."""
@@ -201,33 +257,10 @@ class Phases:
         values = last_values(self._build, header, range(start, stop))
         return chunk_size(prepared, header, values, float(self._read("coefficient-bytes")))
 
-    def _measured(self) -> tuple[list[MeasuredLayer], list[Errors], list[bool]]:
-        """Return the layers that are kept, the errors of all levels, and for each channel whether it is exact."""
-        prepared, count = self._build.prepared, self._runs
-        figures = [
-            Figures(self._read(f"squares/{k}"), self._read(f"equal/{k}"), self._read(f"counts/{k}"))
-            for k in range(count)
-        ]
-        layers = list(self._read("layers"))
-        states = len(self._read("states"))
-        measured = []
-        for state in range(states):
-            distances = distances_of(self._header, figures, state)
-            if distances is None and not self._build.is_whole:
-                raise OutOfRangeError
-            distances = distances or exact_errors(self._build, self._header, self._read("states")[state])
-            measured.append((told_errors(distances[0]), distances[1]))
-        kept = kept_layers(self._header, layers, measured[: len(layers)])
-        whole = np.all([self._read(f"exact/{k}") for k in range(count)], axis=0)
-        exact = [bool(channel) for channel in whole]
-        last = remaining_errors(kept[-1].errors, exact, prepared.geometric)
-        return kept, [*(errors for errors, _ in measured[len(layers) :]), last], exact
-
     # The container.
 
-    def _assemble(self, out: BinaryIO) -> int:
+    def _assemble(self, out: BinaryIO, layers: Sequence[MeasuredLayer], levels: Sequence[Errors], exact: bool) -> int:
         build, scratch = self._build, self._scratch
-        layers, levels, exact = self._measured()
         if not scratch.has("kept-states"):
             scratch.write("kept-states", np.stack([layer.state for layer in layers]))
         units = [
@@ -236,9 +269,9 @@ class Phases:
             for channel in range(build.channels)
             if tiles.start < build.first_large(channel, self._large)
         ]
-        self._carry_out(_SHARES[3] / 2, [Task(name_of("lengths", *unit), tasks.segments, unit) for unit in units])
+        self._carry_out(_SHARES[4] / 2, [Task(name_of("lengths", *unit), tasks.segments, unit) for unit in units])
         chunks = Chunks(scratch, self._runs)
-        header = replace(build.stored_header(), exact=all(exact), corrected=any(chunks), layer_count=len(layers))
+        header = replace(build.stored_header(), exact=exact, corrected=any(chunks), layer_count=len(layers))
         header = replace(header, codecs=needed_codecs(header, chunks))
         writer = ContainerWriter(out, header)
         total = sum(map(len, chunks))
@@ -248,7 +281,7 @@ class Phases:
         if header.corrected:
             writer.residual(levels[-1], chunks)
         metadata = dict(build.prepared.surface.metadata)
-        if all(exact):
+        if exact:
             metadata[DIGEST] = returned_digest(build.prepared.given, header.hole)
         writer.metadata(metadata)
         codes = [layer.window_codes for layer in layers if layer.window_codes is not None]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..container.model import Header
-from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer, distances_of
+from ..decoding.measurer import CORE_POINTS, Figures, Measured, Measurer
 from ..decoding.pieces import region_of_run, runs_of
 from ..decoding.region import Region, core_level
 from ..decoding.values import Values, chunks_of_region, values_of
@@ -28,6 +28,7 @@ __all__ = [
     "last_values",
     "measure",
     "measured_runs",
+    "residual",
 ]
 
 #: What is measured together has so many times the points of a piece of the transform. What its tiles hold takes 8 bytes
@@ -60,31 +61,19 @@ class Residual:
     exact: list[bool]
 
 
-def measure(build: Build, header: Header, run: range) -> tuple[Figures, Residual]:
-    """Measure a run in all states, and code its residual."""
-    figures, values = _measured(build, header, run)
-    build.last = None
-    return figures, _residual(build.prepared, header, _region(build, header, run), values)
-
-
-def _measured(build: Build, header: Header, run: range) -> tuple[Figures, Mapping[int, Values]]:
-    """Measure a run in all states, and only then make its values after the last layer, to hold fewer arrays at once.
-
-    Of a build in one piece both are kept, since the size of chunks is chosen by the values before they are coded. What
-    a reader knows is then needed no more.
-    """
-    if build.last is not None:
-        return build.last
+def measure(build: Build, header: Header, run: range, states: Sequence[NDArray[np.int8]]) -> Figures:
+    """Measure a run in states, int8, shape (tile, channel) each."""
     region = _region(build, header, run)
-    tiles = _tiles(build, region)
-    states = list(np.array(build.scratch.read("states")))
-    figures = Measurer(header, region, tiles, build.prepared.comparisons(region)).figures(states)
-    values = values_of(header, region, tiles, np.array(build.scratch.read("last-state")))
+    return Measurer(header, region, _tiles(build, region), build.prepared.comparisons(region)).figures(states)
+
+
+def residual(build: Build, header: Header, run: range) -> Residual:
+    """Code the residual of a run. In a build in one piece, what a reader knows is then needed no more."""
+    values = last_values(build, header, run)
+    build.last = None
     if build.is_whole:
-        build.last = figures, values
-        if all(distances_of(header, [figures], state) for state in range(len(states))):  # else see `exact_errors`
-            forget_known(build)
-    return figures, values
+        forget_known(build)
+    return _residual(build.prepared, header, _region(build, header, run), values)
 
 
 def _region(build: Build, header: Header, run: range) -> Region:
@@ -104,11 +93,17 @@ def exact_errors(build: Build, header: Header, state: NDArray[np.int8]) -> Measu
 
 
 def last_values(build: Build, header: Header, run: range) -> Mapping[int, Values]:
-    """Return rows of the only block, or some blocks, after the last layer; all of them in a build in one piece."""
-    if build.is_whole:
-        return _measured(build, header, run)[1]
+    """Return rows of the only block, or some blocks, after the last layer; all of them in a build in one piece.
+
+    These are kept until their residual is coded, since the size of chunks is chosen by them before.
+    """
+    if build.last is not None:
+        return build.last
     region = _region(build, header, run)
-    return values_of(header, region, _tiles(build, region), np.array(build.scratch.read("last-state")))
+    values = values_of(header, region, _tiles(build, region), np.array(build.scratch.read("last-state")))
+    if build.is_whole:
+        build.last = values
+    return values
 
 
 def _tiles(build: Build, region: Region) -> list[Tiles]:
@@ -126,9 +121,9 @@ def _tiles(build: Build, region: Region) -> list[Tiles]:
 def _residual(prepared: Prepared, header: Header, region: Region, values: Mapping[int, Values]) -> Residual:
     coder = ChunkCoder(prepared, header, values)
     places = [place for _, place in chunks_of_region(header, region, values)]
-    residual = Residual([], [], [True] * header.channels)
+    coded = Residual([], [], [True] * header.channels)
     for place, (data, exact) in zip(places, spread(coder.code, places), strict=True):
         is_last = place.kept and region.spans is not None  # of all rows, those of other runs too
-        (residual.kept if is_last else residual.chunks).append(data)
-        residual.exact[place.channel] &= exact
-    return residual
+        (coded.kept if is_last else coded.chunks).append(data)
+        coded.exact[place.channel] &= exact
+    return coded

@@ -25,11 +25,13 @@ __all__ = [
     "name_of",
     "name_of_fit",
     "pieces_of",
+    "read_figures",
     "read_tiles",
     "rules_of",
     "stored_tiles",
     "transformed",
-    "write_measured",
+    "write_figures",
+    "write_residual",
 ]
 
 #: The file that says which channels are transformed with the default predictors, bool, shape (channel,).
@@ -118,7 +120,7 @@ def keep_known(build: Build, channel: int, units: Units) -> None:
 
 
 def forget_known(build: Build) -> None:
-    """Drop the final coefficients of all channels, once a build in one piece is measured."""
+    """Drop the final coefficients of all channels, once a build in one piece needs no more of its states."""
     for kind in _KNOWN:
         build.scratch.remove(kind)
 
@@ -150,14 +152,23 @@ def rules_of(build: Build, channel: int, fit: int, level: int, rules: Sequence[i
     return predictors
 
 
-def write_measured(
-    build: Build, number: int, figures: Figures, chunks: Sequence[bytes], kept: Sequence[bytes], exact: Sequence[bool]
+def write_figures(build: Build, turn: int, number: int, figures: Figures) -> None:
+    """Write what a run tells of the errors of the states of a turn."""
+    build.scratch.write(f"squares/{turn}/{number}", figures.squares)
+    build.scratch.write(f"equal/{turn}/{number}", figures.equal)
+    build.scratch.write(f"counts/{turn}/{number}", figures.counts)
+
+
+def read_figures(build: Build, turn: int, number: int) -> Figures:
+    """Read what `write_figures` wrote."""
+    return Figures(*(build.scratch.read(f"{kind}/{turn}/{number}") for kind in ("squares", "equal", "counts")))
+
+
+def write_residual(
+    build: Build, number: int, chunks: Sequence[bytes], kept: Sequence[bytes], exact: Sequence[bool]
 ) -> None:
-    """Write the errors of a run, its chunks of residual, and those of holes that are kept."""
+    """Write the chunks of residual of a run, and those of holes that are kept."""
     scratch = build.scratch
-    scratch.write(f"squares/{number}", figures.squares)
-    scratch.write(f"equal/{number}", figures.equal)
-    scratch.write(f"counts/{number}", figures.counts)
     for kind, coded in (("chunks", chunks), ("kept-chunks", kept)):
         scratch.write(f"{kind}/{number}", np.frombuffer(b"".join(coded), np.uint8))
         scratch.write(f"{kind}-lengths/{number}", np.array([len(chunk) for chunk in coded], np.int64))

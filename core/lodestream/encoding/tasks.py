@@ -28,7 +28,8 @@ from .task_arrays import (
     read_tiles,
     rules_of,
     transformed,
-    write_measured,
+    write_figures,
+    write_residual,
 )
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "first_step",
     "interfaces",
     "measure",
+    "residual",
     "second_step",
     "segments",
 ]
@@ -165,11 +167,18 @@ def segments(build: Build, channel: int, level: int, band: int) -> None:
     build.scratch.write(name_of("lengths", channel, level, band), lengths)
 
 
-def measure(build: Build, number: int) -> None:
-    """Measure a run of rows, or of blocks, in all states, and code its residual."""
+def measure(build: Build, number: int, turn: int) -> None:
+    """Measure a run of rows, or of blocks, in the states of a turn."""
     header = build.stored_header()
-    figures, residual = state_errors.measure(build, header, measured_runs(header, build.points)[number])
-    write_measured(build, number, figures, residual.chunks, residual.kept, residual.exact)
+    run, states = measured_runs(header, build.points)[number], np.array(build.scratch.read(f"states/{turn}"))
+    write_figures(build, turn, number, state_errors.measure(build, header, run, list(states)))
+
+
+def residual(build: Build, number: int) -> None:
+    """Code the residual of a run of rows, or of blocks."""
+    header = build.stored_header()
+    coded = state_errors.residual(build, header, measured_runs(header, build.points)[number])
+    write_residual(build, number, coded.chunks, coded.kept, coded.exact)
 
 
 def _units(build: Build, channel: int, level: int, band: int, stop: int | None = None) -> Units:

@@ -58,7 +58,7 @@ def encode_chunk(original: NDArray[Any], restored: NDArray[Any], step: float | N
 
 
 def agree(original: NDArray[Any], restored: NDArray[Any]) -> bool:
-    """Return whether contiguous arrays of one dtype and shape are the same bit for bit."""
+    """Return whether arrays of one dtype and shape are the same bit for bit."""
     unsigned = np.dtype(f"u{original.dtype.itemsize}")
     return np.array_equal(original.view(unsigned), restored.view(unsigned))
 
