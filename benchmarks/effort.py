@@ -23,6 +23,7 @@ from .rate import layers_of
 
 NAMES = ("bigtujunga", "fuji", "etopo20", "jacksboro")
 SIDE, SHARE = 1201, 0.6  # of the generated terrain, see `fractal`
+STOP = 1e-3
 WINDOW, PLACES = 256, 20
 ROUNDS = 9
 #: `small` of the bytes of JPEG XL; `fast` of the time and of the bytes of the default.
@@ -40,25 +41,29 @@ def main() -> None:
         peer = _jpeg_xl(array.points)
         for effort, container in containers.items():
             assert np.array_equal(ls.decode(container).points, array.points)
+            marks = layers_of(container)
             rows.append(
                 [
                     array.name,
                     effort,
                     f"{len(container):,}",
                     f"{len(container) / peer:.3f}" if peer else "-",
+                    f"{next(mark.bytes for mark in marks if mark.rms <= STOP * array.extent):,}",
                     f"{1e3 * encoding[effort]:.1f}",
                     f"{1e3 * decoding[effort]:.1f}",
-                    str(len(layers_of(container))),
+                    str(len(marks)),
                     f"{_window(array, container):,}",
                 ]
             )
         _aims(array.name, {effort: len(container) for effort, container in containers.items()}, encoding, peer)
-    head = ["heights, exact", "effort", "bytes", "of JPEG XL", "encode, ms", "decode, ms", "layers", "window, bytes"]
+    head = ["heights, exact", "effort", "bytes", "of JPEG XL", "to 1e-3", "encode, ms", "decode, ms", "layers"]
+    head.append("window, bytes")
     table("What an effort costs and gains", head, rows)
     note(
         f"Processor time of one thread, medians of {ROUNDS} rounds in alternation. JPEG XL: lossless, effort 9, of the "
-        "heights as whole numbers; where they do not fit into 16 bits there is none. `window`: the bytes that an exact "
-        f"window of {WINDOW} x {WINDOW} points takes, header and index included, the median of {PLACES} places."
+        "heights as whole numbers; where they do not fit into 16 bits there is none. `to 1e-3`: the bytes up to the "
+        "first layer with this RMS error, of the range of heights. `window`: the bytes that an exact window of "
+        f"{WINDOW} x {WINDOW} points takes, header and index included, the median of {PLACES} places."
     )
 
 
