@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import lodestream
-from lodestream.errors import LodestreamError
+from lodestream.errors import LodestreamError, UnavailableError
 
 from .commands import (
     completion,
@@ -63,22 +63,21 @@ def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     # By name: a second, stale installation on the path may announce the same.
     entries = {entry.name: entry for entry in entry_points(group="lodestream.commands")}
     for name in sorted(entries):
-        _register(entries[name], subparsers)
+        _register(entries[name], subparsers, argv)
     return parser
 
 
-def _register(entry: EntryPoint, subparsers: Subparsers) -> None:
+def _register(entry: EntryPoint, subparsers: Subparsers, argv: Sequence[str]) -> None:
     try:
-        register = entry.load()
+        entry.load()(subparsers, argv)
     except ImportError as error:
         reason = str(error)
 
         def refuse(args: argparse.Namespace) -> int:
-            raise LodestreamError(f"the command {entry.name} is not fully installed: {reason}")
+            advice = "; pip install 'lodestream[server]'" if entry.value.startswith("lodestream_server.") else ""
+            raise UnavailableError(f"the command {entry.name} is not fully installed: {reason}{advice}")
 
         add_command(subparsers, entry.name, refuse, "(not fully installed)")
-    else:
-        register(subparsers)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,11 +1,11 @@
-"""Writes docs/settings.md from the table of settings: ``python -m tests.server.manual``."""
+"""Writes docs/settings.md from the model of the settings: ``python -m tests.server.manual``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from lodestream_server.operation.bounds import Bounds
-from lodestream_server.operation.table import GROUPS, TABLE, Setting
+from lodestream_server.operation.settings import GROUPS, Choice, choices
 
 PATH = Path(__file__).parents[2] / "docs" / "settings.md"
 
@@ -25,16 +25,14 @@ All settings of `lodestream serve`. A server for yourself needs none of them. Fo
   with the reason. In a stream the server sends an `error` message with the same code word, and closes with 4000 plus
   the status.
 
-This page is written by `python -m tests.server.manual` from `lodestream_server.operation.table` and
+This page is written by `python -m tests.server.manual` from `lodestream_server.operation.settings` and
 `lodestream_server.operation.bounds`; a test checks it.
 """
 
 
-def _row(setting: Setting) -> str:
-    limits = setting.limits or (setting.kind.expected if setting.kind.expected.startswith("one of") else "")
-    meaning = setting.meaning + (f"; {limits}" if limits else "")
-    default = setting.default_text
-    return f"| `{setting.variable}` | `{setting.option}` | {default} | {meaning} |"
+def _row(choice: Choice) -> str:
+    meaning = choice.meaning + (f"; {choice.limits}" if choice.limits else "")
+    return f"| `{choice.variable}` | `{choice.option}` | {choice.default_text} | {meaning} |"
 
 
 _BOUNDS = """\
@@ -60,7 +58,7 @@ def render() -> str:
     """The whole page."""
     parts = [_INTRODUCTION]
     for group, meaning in GROUPS.items():
-        rows = "\n".join(_row(setting) for setting in TABLE.values() if setting.group == group)
+        rows = "\n".join(_row(choice) for choice in choices().values() if choice.group == group)
         title = f"{meaning[0].upper()}{meaning[1:]}"
         parts.append(f"## {title}\n\n| variable | option | default | meaning |\n| --- | --- | --- | --- |\n{rows}\n")
     return "\n".join([*parts, _bounds()])

@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from lodestream_server.operation.table import TABLE
+from lodestream_server.operation.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 #: Formats by the extra that their libraries come with.
@@ -21,7 +21,7 @@ _EXTRAS = re.compile(r"(?:lodestream|'\.)\[([\w,]+)\]")
 
 @pytest.mark.parametrize(("page", "more"), [("docker/Dockerfile", set[str]()), ("docs/operating.md", {"distributed"})])
 def test_the_extras_of_a_server_are_those_of_the_default_formats(page: str, more: set[str]) -> None:
-    default = TABLE["formats"].default
+    default = Settings.model_fields["formats"].default
     wanted = {"server", *(extra for extra, formats in NEEDED.items() if formats & set(default))}
     assert wanted == {"server", "formats", "vtk"}
     installed = [set(extras.split(",")) for extras in _EXTRAS.findall((ROOT / page).read_text())]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["fsck", "register"]
 
 
-def register(subparsers: Any) -> None:
+def register(subparsers: Any, _: Sequence[str] = ()) -> None:
     """Add ``fsck`` to the sub-commands of a parser."""
     parser = subparsers.add_parser(
         "fsck",

@@ -1,32 +1,39 @@
 """The command ``lodestream serve``, found through the entry points of the group ``lodestream.commands``.
 
-Only what the parser needs is imported here, so that other commands do not wait for the web framework.
+The settings, whose library takes a third of a second, are imported only where this is the command.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lodestream.errors import OptionError
 from lodestream.interop.optional import require_library
 
 from ..linux import require_linux
-from ..operation.table import GROUPS, TABLE, Setting
 
 if TYPE_CHECKING:
-    from ..operation.settings import Settings
+    from ..operation.settings import Choice, Settings
 
-__all__ = ["add_option", "chosen_settings", "register", "serve"]
+__all__ = ["add_option", "asked_for", "chosen_settings", "register", "serve"]
 
 _EXTRA = "server"
-#: Modules of the libraries that a running server imports; the settings need pydantic alone.
+#: Modules of the libraries that a running server imports, beside those of the settings.
 _LIBRARIES = ("fastapi", "prometheus_client", "python_multipart", "starlette", "uvicorn")
 
 
-def register(subparsers: Any) -> None:
-    """Add ``serve`` to the sub-commands of a parser."""
+def register(subparsers: Any, argv: Sequence[str] = ()) -> None:
+    """Add ``serve`` to the sub-commands of a parser, without its options where another command is asked for.
+
+    Raises
+    ------
+    ImportError
+        If the library of the settings is not installed.
+    """
+    groups, settings = _described() if asked_for("serve", argv) else ({}, {})
     parser = subparsers.add_parser(
         "serve",
         help="start a server",
@@ -34,27 +41,40 @@ def register(subparsers: Any) -> None:
         "LODESTREAM_UPLOAD_BYTES. The command line takes precedence. Sizes may be written like 500MB or 4GiB.",
         allow_abbrev=False,
     )
-    groups = {name: parser.add_argument_group(name, meaning) for name, meaning in GROUPS.items()}
-    for setting in TABLE.values():
-        add_option(groups[setting.group], setting)
     parser.set_defaults(run=serve)
+    places = {name: parser.add_argument_group(name, meaning) for name, meaning in groups.items()}
+    for choice in settings.values():
+        add_option(places[choice.group], choice)
 
 
-def add_option(parser: Any, setting: Setting) -> None:
+def _described() -> tuple[Mapping[str, str], Mapping[str, Choice]]:
+    """Return the groups of settings, and the settings."""
+    from ..operation.settings import GROUPS, choices
+
+    return GROUPS, choices()
+
+
+def asked_for(command: str, argv: Sequence[str]) -> bool:
+    """Return whether the options of a command are needed: for another one, the settings would take too long."""
+    return not argv or argv[0] == command
+
+
+def add_option(parser: Any, choice: Choice) -> None:
     """Add a setting as an option. Its default is None, so that the environment is used."""
-    words = f"{setting.meaning} (default: {setting.default_text})".replace("%", "%%")
-    if setting.default is False:
-        parser.add_argument(setting.option, action=argparse.BooleanOptionalAction, help=words)
+    words = f"{choice.meaning} (default: {choice.default_text})".replace("%", "%%")
+    if choice.is_switch:
+        parser.add_argument(choice.option, action=argparse.BooleanOptionalAction, help=words)
+    elif choice.words:
+        parser.add_argument(choice.option, choices=choice.words, help=words)
     else:
-        metavar = setting.metavar or setting.kind.metavar
-        parser.add_argument(setting.option, metavar=metavar, type=_type(setting), help=words)
+        parser.add_argument(choice.option, metavar=choice.metavar, type=_type(choice), help=words)
 
 
-def _type(setting: Setting) -> Callable[[str], Any]:
+def _type(choice: Choice) -> Callable[[str], Any]:
     # argparse hides the message of any other exception behind "invalid value".
     def take(text: str) -> Any:
         try:
-            return setting.take(text)
+            return choice.take(text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from None
 
@@ -110,21 +130,16 @@ def chosen_settings(args: argparse.Namespace) -> Settings:
     ------
     OptionError
         If an environment variable has an invalid value.
-    UnavailableError
-        If the library of the settings is not installed.
     """
-    require_library("pydantic", _EXTRA)
     from pydantic import ValidationError
 
-    from lodestream.errors import OptionError
+    from ..operation.settings import Settings, choices, words_of
 
-    from ..operation.settings import Settings
-
-    given = {name: value for name in TABLE if (value := getattr(args, name, None)) is not None}
+    names = choices()
+    given = {name: value for name in names if (value := getattr(args, name, None)) is not None}
     try:
         return Settings(**given)
     except ValidationError as error:
-        first = error.errors()[0]
-        name = "_".join(map(str, first["loc"]))
-        variable = f"{TABLE[name].variable}: " if name in TABLE else ""
-        raise OptionError(f"{variable}{first['msg'].removeprefix('Value error, ')}") from None
+        name = "_".join(map(str, error.errors()[0]["loc"][:1]))
+        variable = f"{names[name].variable}: " if name in names else ""
+        raise OptionError(f"{variable}{words_of(error)}") from None

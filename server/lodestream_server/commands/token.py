@@ -11,20 +11,30 @@ import json
 import re
 import secrets
 import sys
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 from ..access.tokens import SCOPES, TokenFile
 from ..linux import require_linux
-from ..operation.table import TABLE
-from .serve import add_option, chosen_settings
+from .serve import add_option, asked_for, chosen_settings
+
+if TYPE_CHECKING:
+    from ..operation.settings import Choice
 
 __all__ = ["create", "list_tokens", "register", "revoke"]
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}", re.ASCII)
 
 
-def register(subparsers: Any) -> None:
-    """Add ``token`` and its actions to the sub-commands of a parser."""
+def register(subparsers: Any, argv: Sequence[str] = ()) -> None:
+    """Add ``token`` to the sub-commands of a parser, without its actions where another command is asked for.
+
+    Raises
+    ------
+    ImportError
+        If the library of the settings is not installed.
+    """
+    places = _places() if asked_for("token", argv) else None
     parser = subparsers.add_parser(
         "token",
         help="create, list or revoke the tokens of a server",
@@ -32,9 +42,12 @@ def register(subparsers: Any) -> None:
         "server notices a change at once.",
         allow_abbrev=False,
     )
+    if places is None:
+        return
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     make = _action(
         actions,
+        places,
         "create",
         "create a token",
         "Create a token. It is printed as the last line of standard output, and cannot be shown again.",
@@ -55,9 +68,9 @@ def register(subparsers: Any) -> None:
     )
     make.set_defaults(run=create)
     _action(
-        actions, "list", "list the tokens", "List the tokens: name, scopes, time of creation, time of expiry."
+        actions, places, "list", "list the tokens", "List the tokens: name, scopes, time of creation, time of expiry."
     ).set_defaults(run=list_tokens)
-    end = _action(actions, "revoke", "revoke a token", "Revoke a token.")
+    end = _action(actions, places, "revoke", "revoke a token", "Revoke a token.")
     end.add_argument("name", metavar="NAME", help="name of the token")
     end.set_defaults(run=revoke)
 
@@ -119,10 +132,17 @@ def revoke(args: argparse.Namespace) -> int:
     return 0
 
 
-def _action(actions: Any, name: str, summary: str, details: str) -> argparse.ArgumentParser:
+def _places() -> list[Choice]:
+    """Return the settings that say where the tokens are."""
+    from ..operation.settings import choices
+
+    return [choices()[name] for name in ("data", "token_file")]
+
+
+def _action(actions: Any, places: Sequence[Choice], name: str, summary: str, details: str) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = actions.add_parser(name, help=summary, description=details, allow_abbrev=False)
-    for setting in ("data", "token_file"):
-        add_option(parser, TABLE[setting])
+    for choice in places:
+        add_option(parser, choice)
     parser.add_argument("--json", action="store_true", help="print one JSON object on standard output")
     return parser
 

@@ -1,92 +1,282 @@
-"""The settings of a server: values of the table, checked, from the environment or from the caller; and its limits."""
+"""The settings of a server: one model, from which options, variables and the page of settings are made.
+
+An operator chooses the fields of `Settings` itself, by options of ``lodestream serve`` or by variables with the prefix
+``LODESTREAM_``; a program that starts a server may set its `Bounds` too.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import ConfigDict, Field, field_validator, model_validator
-
-from lodestream.container.capacity import memory_limit
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ByteSize,
+    Field,
+    JsonValue,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+)
 
 from .bounds import Bounds
-from .table import FORMATS, GONE, PREFIX, TABLE
 
-__all__ = ["Settings"]
+__all__ = ["FORMATS", "GROUPS", "Choice", "Settings", "choices", "words_of"]
 
+_PREFIX = "LODESTREAM_"
 
-def _field(name: str) -> Any:
-    setting = TABLE[name]
-    default: dict[str, Any] = (
-        {"default_factory": setting.default} if callable(setting.default) else {"default": setting.default}
-    )
-    return Field(description=setting.meaning, **default)
+#: Settings of earlier versions, and what says the same now.
+_GONE = {
+    "upload_rate": "least_rate, which holds for uploads and for answers",
+    "max_client_streams": "max_streams, of which each client leaves a share for the others",
+}
 
+#: The formats that a server can read: names of `lodestream.formats` (`Format.names`), `remesh` for meshes that are no
+#: grids, and `lode` for containers.
+FORMATS = (
+    *("npy", "npz", "geotiff", "netcdf", "vmec", "png", "esri-ascii", "usgs-dem", "srtm-hgt", "ply", "stl", "off"),
+    *("obj", "pcd", "vtk", "vts", "glb", "cgns", "text", "plot3d", "remesh", "lode"),
+)
+
+# Rare formats, and formats that almost any text fits: each reader that is off is one less that a hostile file can
+# attack. Remeshing takes minutes.
+_LEFT_OUT = ("usgs-dem", "vmec", "text", "remesh")
+
+#: Groups of settings, and the heading of each.
+GROUPS: Mapping[str, str] = {
+    "network": "address, data folder, proxies",
+    "access": "who may read and write",
+    "limits": "formats, sizes, memory",
+    "operation": "log",
+}
 
 _LEAST_LEVEL_MEMORY = 1 << 30
 # Python, the libraries and the kernels alone take a third of it.
 _LEAST_BUILD_MEMORY = 512 << 20
 
 
-class Settings(Bounds):
-    """Settings of a server.
+def _processors() -> int:
+    return max(1, (os.cpu_count() or 1) - 1)
 
-    Those of `lodestream_server.operation.table` can also be set by environment variables with the prefix
-    ``LODESTREAM_``; the others are its `Bounds`.
+
+def _parted(value: Any) -> Any:
+    """Take a text apart at commas."""
+    return tuple(filter(None, (part.strip() for part in value.split(",")))) if isinstance(value, str) else value
+
+
+def _named(value: Any) -> Any:
+    names = _parted(value)
+    return FORMATS if names == ("all",) else names
+
+
+def _known(names: tuple[str, ...]) -> tuple[str, ...]:
+    if not names or not set(names) <= set(FORMATS):
+        raise ValueError(f"expected all, or some of {', '.join(FORMATS)}, got {', '.join(names) or 'none'}")
+    return names
+
+
+def _place(value: Any) -> Any:
+    if isinstance(value, str) and (not value or "\0" in value):
+        raise ValueError("expected a path")
+    return value
+
+
+def _rooted(path: str) -> str:
+    if path and (not path.startswith("/") or path.endswith("/")):
+        raise ValueError("expected a path that begins with a slash and does not end with one")
+    return path
+
+
+def _scheduler(address: str) -> str:
+    from lodestream.encoding.cluster import checked_address
+
+    return checked_address(address) if address else address
+
+
+def _size(value: Any) -> Any:
+    """Read a number of bytes with its unit."""
+    try:
+        return int(TypeAdapter(ByteSize).validate_python(value)) if isinstance(value, str) else value
+    except ValidationError:
+        raise ValueError("expected bytes, such as 1000000 or 4GiB") from None
+
+
+_SIZE = "SIZE"
+_Size = Annotated[int, BeforeValidator(_size)]
+_Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_parted)]
+_Formats = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_named), AfterValidator(_known)]
+_Path = Annotated[Path, BeforeValidator(_place)]
+
+
+def _choice(default: Any, group: str, meaning: str, *, metavar: str = "", usual: str = "", **limits: Any) -> Any:
+    """Describe a field that an operator chooses.
+
+    Parameters
+    ----------
+    default : value, or callable that returns it
+    group : str
+        Key of `GROUPS`.
+    meaning : str
+    metavar : str
+        Placeholder for the value in the help of the command line.
+    usual : str
+        The default in words, if it depends on the machine.
+    limits : ge, le
     """
+    given = {"default_factory": default} if callable(default) else {"default": default}
+    shown: dict[str, JsonValue] = {"group": group, "metavar": metavar, "usual": usual}
+    return Field(description=meaning, json_schema_extra=shown, **given, **limits)
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
-    host: str = _field("host")
-    port: int = _field("port")
-    data: Path = _field("data")
-    root_path: str = _field("root_path")
-    trusted_proxies: tuple[str, ...] = _field("trusted_proxies")
-    insecure: bool = _field("insecure")
-    unconfined: bool = _field("unconfined")
-    token_file: Path | None = _field("token_file")
-    public_reads: bool = _field("public_reads")
-    origins: tuple[str, ...] = _field("origins")
-    formats: tuple[str, ...] = _field("formats")
-    upload_bytes: int = _field("upload_bytes")
-    max_vertices: int = _field("max_vertices")
-    keep_free: int | None = _field("keep_free")
-    workers: int = _field("workers")
-    threads: int | None = _field("threads")
-    memory: int | None = _field("memory")
-    dask: str = _field("dask")
-    log_format: str = _field("log_format")
-    log_level: str = _field("log_level")
+class _Environment(EnvSettingsSource):
+    """The variables of what an operator chooses: bounds are no business of the environment."""
+
+    def __call__(self) -> dict[str, Any]:
+        return {name: value for name, value in super().__call__().items() if name not in Bounds.model_fields}
+
+
+class Settings(BaseSettings, Bounds):
+    """Settings of a server."""
+
+    model_config = SettingsConfigDict(
+        frozen=True, extra="forbid", validate_default=True, env_prefix=_PREFIX, env_ignore_empty=True
+    )
+
+    host: str = _choice("127.0.0.1", "network", "address to listen on", metavar="H")
+    port: int = _choice(8000, "network", "port to listen on; 0 takes a free one", metavar="P", ge=0, le=65535)
+    data: _Path = _choice(
+        Path("lodestream-data"), "network", "data folder, which holds uploads and containers", metavar="DIR"
+    )
+    root_path: Annotated[str, AfterValidator(_rooted)] = _choice(
+        "",
+        "network",
+        "path under which a reverse proxy serves this server, such as /maps; the proxy must remove it from requests",
+        metavar="PATH",
+        usual="none",
+    )
+    trusted_proxies: _Words = _choice(
+        (),
+        "network",
+        "addresses or networks of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto headers are trusted",
+        metavar="A,B",
+        usual="none",
+    )
+    insecure: bool = _choice(
+        False,
+        "access",
+        "allow an address that others can reach although no token exists: until there is one, anyone who reaches the "
+        "port may read, upload and delete",
+    )
+    unconfined: bool = _choice(
+        False,
+        "access",
+        "start although this system or its kernel cannot confine the processes that read uploads (Landlock and seccomp "
+        "of Linux): a file that exploits a bug in its reader may then do what the server may do. "
+        "Without it `lodestream serve` refuses to start; a server that a program starts (`create_app`, "
+        "`running_server`) logs a warning",
+    )
+    token_file: _Path | None = _choice(
+        None,
+        "access",
+        "file with the hashes of the tokens, written by `lodestream token`",
+        metavar="FILE",
+        usual="tokens.json in the data folder",
+    )
+    public_reads: bool = _choice(False, "access", "allow anyone to list, fetch and stream surfaces without a token")
+    origins: _Words = _choice(
+        (),
+        "access",
+        "origins of other web sites whose pages may use this server, such as https://maps.example.org; * allows all "
+        "sites, and requires that a token exists",
+        metavar="A,B",
+        usual="none",
+    )
+    formats: _Formats = _choice(
+        tuple(name for name in FORMATS if name not in _LEFT_OUT),
+        "limits",
+        f"file formats that the server reads: all, or some of {', '.join(FORMATS)} (vmec are the NetCDF files of VMEC, "
+        "remesh are meshes that are no grids, which ?remesh=yes resamples, lode are containers)",
+        metavar="A,B",
+        usual=f"all but {', '.join(_LEFT_OUT)}",
+    )
+    upload_bytes: _Size = _choice(4 << 30, "limits", "largest upload", metavar=_SIZE, ge=1)
+    max_vertices: int = _choice(1 << 28, "limits", "vertices of one surface", ge=1)
+    keep_free: _Size | None = _choice(
+        None,
+        "limits",
+        "disk space that uploads and levels as files leave free",
+        metavar=_SIZE,
+        usual="1GiB, or a twentieth of the disk if that is less",
+        ge=0,
+    )
+    workers: int = _choice(
+        _processors,
+        "limits",
+        "number of builds that run at the same time",
+        usual="the number of processors less one",
+        ge=1,
+    )
+    threads: int | None = _choice(
+        None,
+        "limits",
+        "threads of each build, and of the process that makes levels as files",
+        usual="the number of processors divided by that of builds at the same time, at least 1",
+        ge=1,
+        le=256,
+    )
+    memory: _Size | None = _choice(
+        None,
+        "limits",
+        "memory that all running builds together may use; the process that makes levels as files may use half as much "
+        "in addition",
+        metavar=_SIZE,
+        usual="half of the machine's memory",
+        ge=256 << 20,
+    )
+    dask: Annotated[str, AfterValidator(_scheduler)] = _choice(
+        "",
+        "limits",
+        "address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers build what is too large for the "
+        "memory of one build; they must see the data folder under the same path",
+        metavar="ADDRESS",
+        usual="none",
+    )
+    log_format: Literal["text", "json"] = _choice("text", "operation", "format of the log on standard error")
+    log_level: Literal["debug", "info", "warning", "error"] = _choice(
+        "info", "operation", "least severe messages that are logged"
+    )
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Take what a program gives, then what the environment says."""
+        return init_settings, _Environment(settings_cls)
 
     @model_validator(mode="before")
     @classmethod
-    def _completed(cls, given: dict[str, Any]) -> dict[str, Any]:
-        """Return the given settings, completed from the environment; an empty variable counts as missing."""
-        for name, replacement in GONE.items():
-            if name in given or os.environ.get(PREFIX + name.upper()):
+    def _refuse_gone(cls, given: Any) -> Any:
+        for name, replacement in _GONE.items():
+            if name in given or os.environ.get(_PREFIX + name.upper()):
                 raise ValueError(f"the setting {name} is gone: use {replacement}")
-        variables = {name: os.environ.get(setting.variable) for name, setting in TABLE.items()}
-        return {name: text for name, text in variables.items() if text} | given
-
-    @field_validator(*TABLE, mode="before")
-    @classmethod
-    def _take(cls, value: Any, info: Any) -> Any:
-        return TABLE[info.field_name].take(value)
-
-    @field_validator("root_path")
-    @classmethod
-    def _rooted(cls, value: str) -> str:
-        if value and (not value.startswith("/") or value.endswith("/")):
-            raise ValueError(f"expected a path that begins with a slash and does not end with one, got {value!r}")
-        return value
-
-    @field_validator("formats")
-    @classmethod
-    def _known(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if not value or not set(value) <= set(FORMATS):
-            raise ValueError(f"expected {TABLE['formats'].kind.expected}, got {', '.join(value) or 'none'}")
-        return value
+        return given
 
     @property
     def tokens(self) -> Path:
@@ -116,4 +306,112 @@ class Settings(Bounds):
 
     @property
     def _memory(self) -> int:
+        from lodestream.container.capacity import memory_limit  # which needs numpy; the command line does not
+
         return memory_limit() // 2 if self.memory is None else self.memory
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A field of `Settings` that an operator chooses, as options and pages show it.
+
+    Attributes
+    ----------
+    name : str
+    field : FieldInfo
+    """
+
+    name: str
+    field: FieldInfo
+
+    @property
+    def variable(self) -> str:
+        """Name of the environment variable."""
+        return _PREFIX + self.name.upper()
+
+    @property
+    def option(self) -> str:
+        """Name of the option on the command line."""
+        return "--" + self.name.replace("_", "-")
+
+    @property
+    def meaning(self) -> str:
+        """What it is, in a line or a few."""
+        return self.field.description or ""
+
+    @property
+    def group(self) -> str:
+        """Key of `GROUPS`."""
+        return self._shown("group")
+
+    @property
+    def metavar(self) -> str:
+        """Placeholder for the value in the help of the command line."""
+        return self._shown("metavar") or "N"
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The words of which one is chosen; none if it is no such choice."""
+        return get_args(self.field.annotation) if get_origin(self.field.annotation) is Literal else ()
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether it is yes or no."""
+        return self.field.annotation is bool
+
+    @property
+    def default_text(self) -> str:
+        """The default, for help texts."""
+        return self._shown("usual") or self._text(self.field.default)
+
+    @property
+    def limits(self) -> str:
+        """The values that are allowed, for help texts; empty if there are no limits that need to be said."""
+        if self.words:
+            return f"one of {', '.join(self.words)}"
+        found = {type(limit).__name__: limit for limit in self.field.metadata}
+        least = getattr(found.get("Ge"), "ge", None)
+        most = getattr(found.get("Le"), "le", None)
+        if not least and most is None:
+            return ""
+        return f"at least {self._text(least)}" if most is None else f"{self._text(least)} to {self._text(most)}"
+
+    def take(self, text: str) -> Any:
+        """Return the value that a text stands for.
+
+        Raises
+        ------
+        ValueError
+            If it stands for none, in words for a user.
+        """
+        try:
+            kind: Any = Annotated[self.field.annotation, self.field]
+            return TypeAdapter(kind).validate_python(text)
+        except ValidationError as error:
+            raise ValueError(words_of(error)) from None
+
+    def _shown(self, key: str) -> str:
+        shown = self.field.json_schema_extra
+        return str(shown[key]) if isinstance(shown, dict) else ""
+
+    def _text(self, value: Any) -> str:
+        if self.is_switch:
+            return "yes" if value else "no"
+        if self.metavar == _SIZE and value > 1:
+            return ByteSize(value).human_readable().replace(".0", "")
+        return str(value)
+
+
+def choices() -> dict[str, Choice]:
+    """Return what an operator chooses, by name, in the order of the manual."""
+    fields = Settings.model_fields.items()
+    return {name: Choice(name, field) for name, field in fields if name not in Bounds.model_fields}
+
+
+def words_of(error: ValidationError) -> str:
+    """Return the first thing that is wrong with a value, in a line."""
+    first = error.errors()[0]
+    if first["type"] == "value_error":
+        words = first["msg"].removeprefix("Value error, ")
+        return words if ", got " in words or not isinstance(first["input"], str) else f"{words}, got {first['input']!r}"
+    return f"{first['msg'][0].lower()}{first['msg'][1:]}, got {first['input']!r:.200}"

@@ -61,7 +61,7 @@ def test_importing_the_client_is_light() -> None:
 
 
 def test_the_command_line_is_lighter_still() -> None:
-    statement = "from lodestream_client.program import build_parser\nbuild_parser()"
+    statement = "from lodestream_client.program import build_parser\nbuild_parser(['--help'])"
     assert loaded_after(statement, (*HEAVY, "numpy", "httpx", "websockets", "rich", "asyncio")) == []
 
 

@@ -32,7 +32,7 @@ from lodestream_server import running_server
 from lodestream_server.operation import logs
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.observation import Observation
-from lodestream_server.operation.table import TABLE
+from lodestream_server.operation.settings import choices
 from tests.server.helpers import PATIENCE, Raw, closed, data_of, eventually, hills, npy, push, raw_stream
 
 
@@ -158,7 +158,7 @@ def test_the_page_tells_of_every_figure_and_of_settings_that_there_are(http: htt
     there = {f"{family.name}_total" if family.type == "counter" else family.name for family in families}
     told = set(re.findall(r"^\| `(lodestream_\w+)` \|", page, re.MULTILINE))
     assert told == {name for name in there if name.startswith("lodestream_")}
-    variables = {setting.variable for setting in TABLE.values()} | {"LODESTREAM_TOKEN"}
+    variables = {choice.variable for choice in choices().values()} | {"LODESTREAM_TOKEN"}
     # compose.yaml takes some that are no settings of the server.
     compose = (Path(__file__).parents[3] / "docker" / "compose.yaml").read_text()
     variables |= set(re.findall(r"\$\{(LODESTREAM_[A-Z_]+)", compose))

@@ -14,13 +14,13 @@ import lodestream as ls
 from lodestream import formats
 from lodestream_server import Settings
 from lodestream_server.builds import worker
-from lodestream_server.operation.table import FORMATS, TABLE
+from lodestream_server.operation.settings import FORMATS
 from tests.core.remesh import scenes
 from tests.server.builds import slow
 from tests.server.builds.test_builds import building, running
 from tests.server.helpers import hills, npy, problem, push, settled
 
-DEFAULT: tuple[str, ...] = TABLE["formats"].default
+DEFAULT: tuple[str, ...] = Settings.model_fields["formats"].default
 LEFT_OUT = {"usgs-dem", "bpt", "vmec", "text", "remesh"}
 
 
