@@ -8,13 +8,14 @@ from pathlib import Path
 
 from ..errors import InputError
 from .bucket import Bucket
-from .connections import SCHEMES
+from .connections import SCHEMES, Place, parsed
 from .folder import Folder
 from .interface import Store
 
-__all__ = ["open_store"]
+__all__ = ["open_store", "place_of"]
 
-_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://", re.ASCII)  # one letter is a drive of Windows
+# One letter is a drive of Windows. With one slash, or none, a bucket is meant that would become a folder unnoticed.
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/?)", re.ASCII)
 
 
 def open_store(address: str | os.PathLike[str]) -> Store:
@@ -36,14 +37,22 @@ def open_store(address: str | os.PathLike[str]) -> Store:
     StoreError
         If credentials, region or account of a bucket are missing.
     """
+    return Folder(Path(address)) if place_of(address) is None else Bucket(os.fspath(address))
+
+
+def place_of(address: str | os.PathLike[str]) -> Place | None:
+    """Return where the bucket of an address is, without opening it; None: the address is a folder.
+
+    What is refused is not repeated, since it may be a credential.
+
+    Raises
+    ------
+    InputError
+        If it is no address of a store.
+    """
     if not os.fspath(address):
         raise InputError("expected a folder or the address of a bucket, got nothing")
     scheme = _SCHEME.match(address) if isinstance(address, str) else None
     if not isinstance(address, str) or scheme is None:
-        return Folder(Path(address))
-    if scheme[1].lower() not in SCHEMES:
-        raise InputError(
-            f"expected a folder or an address that begins with {', '.join(f'{name}://' for name in SCHEMES)}, got one "
-            f"that begins with {scheme[1].lower()}://"
-        )
-    return Bucket(address)
+        return None
+    return parsed(address) if scheme[2] or scheme[1].lower() in SCHEMES else None

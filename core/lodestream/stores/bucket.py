@@ -17,14 +17,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, NoReturn, Self, TypeVar
 
-from ..errors import InputError, UnavailableError
+from ..errors import UnavailableError
 from .answers import RequestError, ask
 from .blocks import Blocks, Extent
 from .connections import Limits, connected, parsed
 from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
 from .headers import headers
 from .interface import SMALL, Entry, Progress, Tag
-from .keys import checked_key, checked_prefix, checked_small
+from .keys import checked_key, checked_prefix, checked_small, is_key
 from .probe import try_out
 
 __all__ = ["Bucket"]
@@ -161,7 +161,7 @@ class Bucket:
                 while (chunk := ask(partial(next, listed, None))) is not None:
                     for found in chunk:
                         key = found["path"][len(self._prefix) :]
-                        if key > after and _is_key(key):
+                        if key > after and is_key(key):  # others are of other programs
                             after = key
                             tag = Tag((found["e_tag"] or "").strip('"'))
                             yield Entry(key, found["size"], tag, found["last_modified"].timestamp())
@@ -350,10 +350,3 @@ class _Pieces:
 def _waits() -> Iterator[float]:
     """Seconds between attempts, without end: longer and longer, and never those of other writers."""
     return (min(2.0, 0.05 * 2**number) * random.uniform(0.5, 1.5) for number in itertools.count())
-
-
-def _is_key(key: str) -> bool:
-    try:
-        return bool(checked_key(key))
-    except InputError:  # of another program
-        return False

@@ -9,7 +9,7 @@ from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from .keys import checked_prefix
+from .keys import PARTS, is_key
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
@@ -22,6 +22,7 @@ SCHEMES = {
     "az": "az://container/prefix",
     "abfss": "abfss://container@account.dfs.core.windows.net/prefix",
 }
+_BEGINNINGS = ", ".join(f"{scheme}://" for scheme in SCHEMES)
 
 _S3_BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{1,61}[A-Za-z0-9]", re.ASCII)
 _CONTAINER = re.compile(r"[a-z0-9](?:[a-z0-9-]{1,61})[a-z0-9]|\$web", re.ASCII)
@@ -93,8 +94,13 @@ def parsed(address: str) -> Place:
     InputError
         If it is no address of a bucket, or has more in it than bucket and prefix.
     """
-    scheme, _, rest = address.partition("://")
+    scheme, separated, rest = address.partition("://")
     scheme = scheme.lower()
+    if not separated or scheme not in SCHEMES:
+        raise InputError(
+            f"expected a folder or an address that begins with {_BEGINNINGS}, got another one: put ./ before a folder "
+            "with a colon in its name"
+        )
     host, _, prefix = rest.partition("/")
     if "?" in rest or "#" in rest:
         raise InputError(f"expected an address such as {SCHEMES[scheme]}, got one with a query or fragment")
@@ -114,9 +120,9 @@ def parsed(address: str) -> Place:
     if not right:
         raise InputError(f"expected an address such as {SCHEMES[scheme]}, got another bucket, container or account")
     prefix = prefix.strip("/")
-    if len(prefix) > _LONGEST_PREFIX:
-        raise InputError(f"expected a prefix of at most {_LONGEST_PREFIX} characters, got {len(prefix):,}")
-    return Place(scheme, bucket, account, checked_prefix(f"{prefix}/" if prefix else ""))
+    if prefix and (len(prefix) > _LONGEST_PREFIX or not is_key(prefix)):
+        raise InputError(f"expected a prefix of at most {_LONGEST_PREFIX} characters whose {PARTS}, got another one")
+    return Place(scheme, bucket, account, f"{prefix}/" if prefix else "")
 
 
 def endpoint_of(scheme: str) -> str | None:

@@ -14,7 +14,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO, NoReturn, Self
 
-from ..errors import InputError
 from ..operating_system import (
     NO_LOCKS,
     lock,
@@ -26,7 +25,7 @@ from ..operating_system import (
 )
 from .errors import AbsentError, ConflictError, ExistsError, FullError, StoreError, UnacknowledgedError
 from .interface import SMALL, Entry, Progress, Tag
-from .keys import checked_key, checked_prefix, checked_small
+from .keys import checked_key, checked_prefix, checked_small, is_key
 from .probe import try_out
 
 __all__ = ["OWN", "Folder"]
@@ -170,11 +169,10 @@ class Folder:
 
     def _entry(self, key: str, found: os.DirEntry[str]) -> Entry | None:
         try:
-            checked_key(key)
-            if not found.is_file(follow_symlinks=False):
+            if not is_key(key) or not found.is_file(follow_symlinks=False):  # of another program
                 return None
             status = os.lstat(found.path)
-        except (InputError, FileNotFoundError):  # of another program, or deleted meanwhile
+        except FileNotFoundError:  # deleted meanwhile
             return None
         except OSError as error:
             self._refuse(key, error)

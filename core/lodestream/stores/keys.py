@@ -10,15 +10,24 @@ import re
 from ..errors import InputError
 from .interface import SMALL
 
-__all__ = ["LONGEST_KEY", "LONGEST_PART", "checked_key", "checked_prefix", "checked_small"]
+__all__ = ["LONGEST_KEY", "LONGEST_PART", "PARTS", "checked_key", "checked_prefix", "checked_small", "is_key"]
 
 #: Characters of a key. Buckets allow 1,024 with the prefix of a store.
 LONGEST_KEY = 600
 #: Characters of a part; file systems allow 255.
 LONGEST_PART = 200
 
+#: What the parts of a key are, for messages.
+PARTS = "parts between slashes are letters, digits and -_.=@,~ without a dot at either end"
+
 # Not those that mean something in an address or to Windows. A leading dot is the store's own, and makes no `..`.
 _PART = re.compile(r"[A-Za-z0-9_=@,~-]([A-Za-z0-9._=@,~-]*[A-Za-z0-9_=@,~-])?", re.ASCII)
+
+
+def is_key(key: str) -> bool:
+    """Return whether a text can be a key."""
+    parts = key.split("/")
+    return len(key) <= LONGEST_KEY and all(len(part) <= LONGEST_PART and _PART.fullmatch(part) for part in parts)
 
 
 def checked_key(key: str) -> str:
@@ -30,12 +39,8 @@ def checked_key(key: str) -> str:
         If it cannot: it is empty or too long, has an empty part, a leading dot, a last dot, or other characters than
         letters, digits and ``-_.=@,~``.
     """
-    parts = key.split("/")
-    if len(key) > LONGEST_KEY or not all(len(part) <= LONGEST_PART and _PART.fullmatch(part) for part in parts):
-        raise InputError(
-            f"expected a key of at most {LONGEST_KEY} characters whose parts between slashes are letters, digits and "
-            f"-_.=@,~ without a dot at either end, got {key[:80]!r}"
-        )
+    if not is_key(key):
+        raise InputError(f"expected a key of at most {LONGEST_KEY} characters whose {PARTS}, got {key[:80]!r}")
     return key
 
 

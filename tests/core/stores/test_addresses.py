@@ -4,14 +4,17 @@ import os
 import re
 import subprocess
 import sys
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from lodestream.errors import InputError, UnavailableError
 from lodestream.stores import Folder, Store, StoreError, open_store
+from lodestream.stores.addresses import place_of
 from lodestream.stores.bucket import Bucket
-from lodestream.stores.connections import Limits
+from lodestream.stores.connections import Limits, Place, parsed
 from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator
 
@@ -24,7 +27,7 @@ def _environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
 
 
-@pytest.mark.parametrize("address", ["store", "a/b", ".", "s3:bucket", "c:\\store", "C:/store"])
+@pytest.mark.parametrize("address", ["store", "a/b", ".", "c:\\store", "C:/store", "a:b", "./s3:/a"])
 def test_whatever_has_no_scheme_is_a_folder(address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     store = open_store(address)
@@ -67,10 +70,17 @@ def test_a_bucket_says_its_address(address: str, described: str) -> None:
     ("address", "message"),
     [
         ("", "got nothing"),
-        ("gs://bucket/a", r"begins with s3://, az://, abfss://, got one that begins with gs://"),
-        ("http://SECRET@host/a", "got one that begins with http://"),
-        ("file:///store", "got one that begins with file://"),
-        ("memory://store", "got one that begins with memory://"),
+        ("gs://bucket/a", "begins with s3://, az://, abfss://, got another one"),
+        ("http://SECRET@host/a", "got another one"),
+        ("SECRET://bucket/a", "got another one"),
+        ("file:///store", "got another one"),
+        ("memory://store", "got another one"),
+        ("s3:/maps/SECRET", "put ./ before a folder"),
+        ("S3:maps/SECRET", "put ./ before a folder"),
+        ("az:/maps/SECRET", "put ./ before a folder"),
+        ("abfss:/maps@SECRET", "put ./ before a folder"),
+        ("gs:/maps/SECRET", "put ./ before a folder"),
+        ("file:/SECRET", "put ./ before a folder"),
         ("s3://", "got another bucket"),
         ("s3:///a", "got another bucket"),
         ("s3://key:SECRET@bucket/a", "credentials come from the environment"),
@@ -87,17 +97,44 @@ def test_a_bucket_says_its_address(address: str, described: str) -> None:
         ("s3://bu/a", "got another bucket"),
         ("s3://bucket_/a", "got another bucket"),
         ("az://Container/a", "got another bucket"),
-        ("s3://bucket/a//b", "expected a key"),
-        ("s3://bucket/../b", "expected a key"),
-        ("s3://bucket/a%2fb", "expected a key"),
-        ("s3://bucket/a b", "expected a key"),
+        ("s3://SECRET_/a", "got another bucket"),
+        ("az://SECRET/a", "got another bucket"),
+        ("abfss://SECRET@account.dfs.core.windows.net/a", "got another bucket, container or account"),
+        ("abfss://container@SECRET.dfs.core.windows.net/a", "got another bucket, container or account"),
+        ("s3://bucket/AKIA:SECRET@x/y", "expected a prefix"),
+        ("az://container/a/key:SECRET", "expected a prefix"),
+        ("abfss://container@account.dfs.core.windows.net/a/SECRET%2f", "expected a prefix"),
+        ("s3://bucket/SECRET//b", "expected a prefix"),
+        ("s3://bucket/../SECRET", "expected a prefix"),
+        ("s3://bucket/a%2fb", "expected a prefix"),
+        ("s3://bucket/a b", "expected a prefix"),
         ("s3://bucket/" + "a/" * 200, "at most 300 characters"),
     ],
 )
 def test_other_addresses_are_refused_and_no_credential_is_repeated(address: str, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        open_store(address)
-    assert "SECRET" not in str(caught.value)
+    refusals: list[Callable[[str], object]] = [open_store, place_of]
+    if address:
+        refusals += [Bucket, parsed]
+    for refuse in refusals:
+        with pytest.raises(InputError, match=message) as caught:
+            refuse(address)
+        assert "secret" not in "".join(traceback.format_exception_only(caught.value)).lower()
+        assert caught.value.__context__ is None, "nor in what led to it"
+
+
+@pytest.mark.parametrize(
+    ("address", "place"),
+    [
+        ("s3://my.maps/alps/", Place("s3", "my.maps", None, "alps/")),
+        ("S3://maps", Place("s3", "maps", None, "")),
+        ("az://maps/a/b", Place("az", "maps", None, "a/b/")),
+        ("abfss://maps@account.dfs.core.windows.net/a", Place("abfss", "maps", "account", "a/")),
+        ("maps/alps", None),
+        (Path("s3://maps"), None),
+    ],
+)
+def test_the_place_of_a_bucket_is_told_without_opening_it(address: str | Path, place: Place | None) -> None:
+    assert place_of(address) == place
 
 
 def test_an_account_that_is_missing_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
