@@ -160,7 +160,9 @@ class LodeBackend(BackendEntrypoint):
         if not isinstance(name, str):
             return False
         if is_url(name):
-            return name.partition("?")[0].endswith(".lode") or is_surface(name) or published_name(name) is not None
+            page = name.partition("#")[0].partition("?")[0]
+            named = page.endswith(("/", ".html")) and published_name(name) is not None
+            return page.endswith(".lode") or is_surface(name) or named
         return name.endswith(".lode")
 
 

@@ -28,9 +28,12 @@ from .values import parse_days, parse_http
 
 if TYPE_CHECKING:
     from ..publishing.published_list import PublishedSurface
-    from ..publishing.publisher import Publication
+    from ..publishing.publisher import Publication, Removed
 
 __all__ = ["PublishOptions", "register", "run", "run_published", "run_unpublish"]
+
+# Of a container that anybody may have listed.
+_MOST_BYTES = 2**63
 
 _NO_OPTIONS = SurfaceOptions(Quality(), "auto", None, {})
 
@@ -158,15 +161,15 @@ def run(args: argparse.Namespace) -> int:
                 "page": page,
                 "surfaces": [_report(surface, page) for surface in done.surfaces],
                 "sent": done.sent,
-                "removed": done.removed,
+                "removed": done.removed.containers,
                 "cors": rule,
             }
         )
         return 0
     for surface in done.surfaces:
         note(f"{surface.name}: {human_size(surface.bytes)}, {page}#{_fragment(surface.name)}")
-    removed = f", {done.removed} old containers removed" if done.removed else ""
-    note(f"{human_size(done.sent)} of containers and levels sent{removed}")
+    note(f"{human_size(done.sent)} of containers and levels sent")
+    _note_removed(done.removed)
     if rule is not None:
         note(f"for pages of other origins, allow them once: {rule}")
     say(page)
@@ -179,9 +182,15 @@ def run_unpublish(args: argparse.Namespace) -> int:
 
     from ..publishing.publisher import unpublish
 
-    removed = unpublish(open_store(args.store), args.names, args.keep)
-    note(f"{len(args.names)} names removed, {removed} old containers removed")
+    _note_removed(unpublish(open_store(args.store), args.names, args.keep))
     return 0
+
+
+def _note_removed(removed: Removed) -> None:
+    if removed.containers:
+        note(f"{removed.containers} old containers removed")
+    if removed.failure is not None:
+        note(f"not all old containers could be removed, which a later publish does: {removed.failure}")
 
 
 def run_published(args: argparse.Namespace) -> int:
@@ -216,7 +225,7 @@ def _row(surface: Mapping[str, Any]) -> tuple[str, ...]:
     size = surface.get("bytes")
     return (
         str(surface["name"]),
-        human_size(size) if isinstance(size, int) else "-",
+        human_size(size) if isinstance(size, int) and 0 <= size < _MOST_BYTES else "-",
         str(surface["src"]),
         str(surface.get("title") or ""),
     )
@@ -226,7 +235,7 @@ def _options(args: argparse.Namespace) -> PublishOptions:
     from ..publishing.published_list import check_name
 
     if is_url(args.store):
-        args.parser.error(f"expected a folder, or a bucket such as s3://BUCKET/PREFIX, last, got {args.store}")
+        args.parser.error("expected a folder, or a bucket such as s3://BUCKET/PREFIX, last, got the address of a host")
     options = surface_options(args)
     if options.name is not None and len(args.files) > 1:
         args.parser.error(f"argument --name: expected one FILE, got {len(args.files)}")

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable
 from datetime import timedelta
 from typing import TypeVar
+from urllib.parse import urlsplit
 
 from lodestream import sizes
 from lodestream.errors import OptionError
@@ -224,8 +225,8 @@ def parse_days(text: str) -> timedelta:
 
 
 def _http(text: str) -> str:
-    if not addresses.is_url(text):
-        raise OptionError(f"expected an address that begins with http:// or https://, got {text}")
+    if not addresses.is_url(text) or "@" in urlsplit(text).netloc:
+        raise OptionError("expected an address that begins with http:// or https://, without credentials")
     return text
 
 

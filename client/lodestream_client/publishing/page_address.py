@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 from lodestream.page import INDEX
-from lodestream.stores.connections import endpoint_of
+from lodestream.stores.addresses import place_of
+from lodestream.stores.connections import Place, endpoint_of
 
 __all__ = ["cors_rule", "page_address"]
 
@@ -29,28 +30,31 @@ def page_address(address: str, public_url: str | None) -> str:
     """
     if public_url is not None:
         return f"{public_url.rstrip('/')}/{INDEX}"
-    parts = urlsplit(address)
-    key = "".join(f"{quote(part)}/" for part in parts.path.split("/") if part) + INDEX
-    if parts.scheme == "s3":
-        if endpoint := endpoint_of("s3"):
-            return f"{endpoint.rstrip('/')}/{parts.netloc}/{key}"
+    place = place_of(address)
+    return os.path.join(address, INDEX) if place is None else f"{_host(place)}/{quote(place.prefix)}{INDEX}"
+
+
+def _host(place: Place) -> str:
+    """Return the URL of a bucket, by path: the certificate of a host is not for names with dots before it."""
+    if endpoint := endpoint_of(place.scheme):
+        host = endpoint.rstrip("/")
+    elif place.scheme == "s3":
         region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or "us-east-1"
-        return f"https://{parts.netloc}.s3.{region}.amazonaws.com/{key}"
-    if parts.scheme == "az":
-        if endpoint := endpoint_of("az"):
-            return f"{endpoint.rstrip('/')}/{parts.netloc}/{key}"
-        account = os.environ.get("AZURE_STORAGE_ACCOUNT_NAME") or "ACCOUNT"
-        return f"https://{account}.blob.core.windows.net/{parts.netloc}/{key}"
-    if parts.scheme == "abfss":
-        container, _, host = parts.netloc.partition("@")
-        return f"https://{host.replace('.dfs.', '.blob.')}/{container}/{key}"
-    return os.path.join(address, INDEX)
+        if "." not in place.bucket:
+            return f"https://{place.bucket}.s3.{region}.amazonaws.com"
+        host = f"https://s3.{region}.amazonaws.com"
+    else:
+        account = place.account or os.environ.get("AZURE_STORAGE_ACCOUNT_NAME") or "ACCOUNT"
+        host = f"https://{account}.blob.core.windows.net"
+    return f"{host}/{place.bucket}"
 
 
 def cors_rule(address: str) -> str | None:
     """Return what lets pages of other origins read a bucket, as its tools take it; None of a folder."""
-    scheme = urlsplit(address).scheme
-    if scheme == "s3":
+    place = place_of(address)
+    if place is None:
+        return None
+    if place.scheme == "s3":
         rule = {
             "AllowedOrigins": ["*"],
             "AllowedMethods": _METHODS,
@@ -58,13 +62,10 @@ def cors_rule(address: str) -> str | None:
             "ExposeHeaders": _EXPOSED,
             "MaxAgeSeconds": _SECONDS,
         }
-        bucket = urlsplit(address).netloc
         text = json.dumps({"CORSRules": [rule]})
-        return f"aws s3api put-bucket-cors --bucket {bucket} --cors-configuration '{text}'"
-    if scheme in ("az", "abfss"):
-        allowed, exposed = " ".join(_ALLOWED), " ".join(_EXPOSED)
-        return (
-            f"az storage cors add --services b --origins '*' --methods {' '.join(_METHODS)} "
-            f"--allowed-headers {allowed} --exposed-headers {exposed} --max-age {_SECONDS}"
-        )
-    return None
+        return f"aws s3api put-bucket-cors --bucket {place.bucket} --cors-configuration '{text}'"
+    allowed, exposed = " ".join(_ALLOWED), " ".join(_EXPOSED)
+    return (
+        f"az storage cors add --services b --origins '*' --methods {' '.join(_METHODS)} "
+        f"--allowed-headers {allowed} --exposed-headers {exposed} --max-age {_SECONDS}"
+    )

@@ -7,7 +7,6 @@ streams of it may be under way.
 from __future__ import annotations
 
 import json
-import math
 import re
 import secrets
 from collections.abc import Iterable, Mapping
@@ -35,6 +34,8 @@ LIST = "view.json"
 LONGEST_LIST = 8 << 20
 
 _LONGEST_NAME = 255
+_MOST = 2**63
+_LATEST = 1e12  # seconds since 1970
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _CONTAINER = re.compile(r"containers/([0-9a-f]{64})\.lode")
 _SOURCE = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*(?:/[A-Za-z0-9][A-Za-z0-9._-]*)*")
@@ -105,6 +106,11 @@ class PublishedSurface:
         """Key of the container."""
         return container_key(self.container)
 
+    @property
+    def files(self) -> dict[str, int]:
+        """Bytes of the container and of the files of levels, by their keys."""
+        return {self.src: self.bytes, **{level.src: level.bytes for level in self.levels}}
+
     def document(self) -> dict[str, Any]:
         """Return the entry of the list."""
         titled = {} if self.title is None else {"title": self.title}
@@ -150,7 +156,7 @@ class PublishedList:
                 raise TypeError
             surfaces = tuple(map(_surface, document["surfaces"]))
             replaced = tuple(_replaced(entry) for entry in document["replaced"])
-        except (ValueError, TypeError, KeyError, RecursionError, OptionError):
+        except (ValueError, TypeError, KeyError, RecursionError, OverflowError, OptionError):
             raise InputError(
                 f"expected a {LIST} that lodestream publish has written, got another file: choose another prefix"
             ) from None
@@ -180,6 +186,24 @@ class PublishedList:
         """SHA-256 of the containers that names lead to."""
         return {surface.container for surface in self.surfaces}
 
+    @property
+    def kept(self) -> set[str]:
+        """SHA-256 of the containers that stay: those that names lead to, and those that were replaced of late."""
+        return self.containers | {it.container for it in self.replaced}
+
+    def check(self, names: Iterable[str]) -> None:
+        """Check that names are there.
+
+        Raises
+        ------
+        InputError
+            If one is not.
+        """
+        there = {surface.name for surface in self.surfaces}
+        for name in names:
+            if name not in there:
+                raise InputError(f"expected a name that is published, got {name!a}: lodestream published lists them")
+
     def with_surfaces(self, new: Iterable[PublishedSurface], now: float) -> PublishedList:
         """Return the list with surfaces added, or in the place of those of the same names.
 
@@ -194,18 +218,9 @@ class PublishedList:
         return self._of(by_name, now)
 
     def without(self, names: Iterable[str], now: float) -> PublishedList:
-        """Return the list without these names.
-
-        Raises
-        ------
-        InputError
-            If one is not there.
-        """
-        by_name = {surface.name: surface for surface in self.surfaces}
-        for name in names:
-            if by_name.pop(name, None) is None:
-                raise InputError(f"expected a name that is published, got {name!a}: lodestream published lists them")
-        return self._of(by_name, now)
+        """Return the list without these names, as far as they are there."""
+        gone = set(names)
+        return self._of({it.name: it for it in self.surfaces if it.name not in gone}, now)
 
     def expired(self, now: float, keep: timedelta) -> tuple[PublishedList, set[str]]:
         """Return the list without containers that were replaced longer ago than `keep`, and their SHA-256."""
@@ -224,11 +239,12 @@ class PublishedList:
 
 def _surface(entry: Any) -> PublishedSurface:
     found = _CONTAINER.fullmatch(entry["src"])
-    title, size = entry.get("title"), entry["bytes"]
+    name, title, size = entry["name"], entry.get("title"), entry["bytes"]
     levels = tuple(map(_level, entry.get("levels", ())))
-    if found is None or not isinstance(title, str | None):
+    if found is None or not isinstance(name, str) or not isinstance(title, str | None):
         raise TypeError
-    return PublishedSurface(check_name(entry["name"]), title, found[1], _count(size), levels)
+    (title or "").encode()  # no half of a pair, which could not be written again
+    return PublishedSurface(check_name(name), title, found[1], _count(size), levels)
 
 
 def _level(entry: Any) -> LevelFile:
@@ -237,13 +253,13 @@ def _level(entry: Any) -> LevelFile:
 
 def _replaced(entry: Any) -> Replaced:
     since = entry["since"]
-    if not _SHA256.fullmatch(entry["container"]) or not isinstance(since, int | float) or not math.isfinite(since):
+    if not _SHA256.fullmatch(entry["container"]) or not isinstance(since, int | float) or not 0 <= since < _LATEST:
         raise ValueError
     return Replaced(entry["container"], float(since))
 
 
 def _count(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < _MOST:
         raise TypeError
     return value
 

@@ -1,13 +1,19 @@
 """Put containers, the page and the list of names into a store, so that an interruption leaves the old list or the new.
 
-The order is: containers and level files, the page's assets, the list, and the page itself. What nobody refers to yet
-does no harm, and the same command again finds it there. The list changes by *create if absent* and *replace by tag*
-alone, so several publishers do not lose each other's names.
+The order is: containers and level files, the page's assets, the list, the page itself, and what is removed. What nobody
+refers to yet does no harm. The list changes by *create if absent* and *replace by tag* alone, so several publishers do
+not lose each other's names.
+
+What the list names is not sent again. What is there but not named is sent again: then it is on the disk for sure, and
+counts as new for whoever removes what is old. After the list is written, its files are looked for once more. So two
+publishers, of which one removes what the other publishes, lose nothing, unless one stands still in between for as long
+as the other one's whole run.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 import random
 import re
 import time
@@ -21,15 +27,15 @@ from typing import TYPE_CHECKING
 
 from lodestream.errors import InputError, LodestreamError
 from lodestream.page import INDEX
-from lodestream.stores import AbsentError, ConflictError, ExistsError
+from lodestream.stores import AbsentError, ConflictError, ExistsError, StoreError
 
-from .published_list import LIST, LONGEST_LIST, LevelFile, PublishedList, PublishedSurface
+from .published_list import LIST, LONGEST_LIST, LevelFile, PublishedList, PublishedSurface, container_key
 
 if TYPE_CHECKING:
     from lodestream.page import Asset
     from lodestream.stores import Entry, Store
 
-__all__ = ["KEEP", "Publication", "Published", "check_use", "publish", "published", "unpublish"]
+__all__ = ["KEEP", "Publication", "Published", "Removed", "check_use", "publish", "published", "unpublish"]
 
 #: How long a container stays that another one has replaced.
 KEEP = timedelta(days=7)
@@ -76,13 +82,28 @@ class Published:
         In the order of the publications.
     sent : int
         Bytes of containers and level files that were sent; what was there was not sent again.
-    removed : int
-        Containers that were removed, since their time was over.
+    removed : Removed
     """
 
     surfaces: tuple[PublishedSurface, ...]
     sent: int
-    removed: int
+    removed: Removed
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What was removed after the list was written.
+
+    Attributes
+    ----------
+    containers : int
+        Containers whose time was over, and strays of interrupted commands.
+    failure : str or None
+        Why not all of them were; a later `publish` removes the others.
+    """
+
+    containers: int
+    failure: str | None = None
 
 
 def publish(
@@ -120,39 +141,35 @@ def publish(
     """
     check_use(store)
     now = store.probe()
-    total = sum(path.stat().st_size for it in publications for path in (it.container, *it.levels.values()))
-    done = sent = 0
-    surfaces = []
-    for publication in publications:
-        surface = _surface(publication)
-        files = {surface.src: publication.container}
-        files |= {level.src: publication.levels[level.level] for level in surface.levels}
-        for key, path in files.items():
-            size = path.stat().st_size
-            if _size(store, key) != size:
-                store.put_file(key, path, partial(_tell, progress, done, total))
-                sent += size
-            done += size
-            progress(done / total)
-        surfaces.append(surface)
+    prepared = [_prepared(publication) for publication in publications]
+    files = {key: file for _, found in prepared for key, file in found.items()}
+    named = _named_files(store)
+    total, done, sent = max(sum(file.size for file in files.values()), 1), 0, 0
+    for key, file in files.items():
+        if named.get(key) != file.size:
+            file.put(store, key, partial(_tell, progress, done, total))
+            sent += file.size
+        done += file.size
+        progress(done / total)
     index = None
     for asset in pages.values():
         if asset.name == INDEX:
             index = asset
         else:
             store.put_file(asset.name, asset.path)
-    removed = _change(store, lambda before: before.with_surfaces(surfaces, now), now, keep)
+    surfaces = tuple(surface for surface, _ in prepared)
+    old = _change(store, lambda before: before.with_surfaces(surfaces, now), now, keep)
     if index is not None:
         store.put_file(INDEX, index.path)
-    for publication, surface in zip(publications, surfaces, strict=True):
+    for key, file in files.items():
         # Another publisher may have removed it as old between our look and our list.
-        if _size(store, surface.src) != surface.bytes:
-            store.put_file(surface.src, publication.container)
-    return Published(tuple(surfaces), sent, removed)
+        if _size(store, key) != file.size:
+            file.put(store, key)
+    return Published(surfaces, sent, _remove(store, old, now))
 
 
-def unpublish(store: Store, names: Iterable[str], keep: timedelta = KEEP) -> int:
-    """Remove names from the list; return how many containers were removed, since their time was over.
+def unpublish(store: Store, names: Iterable[str], keep: timedelta = KEEP) -> Removed:
+    """Remove names from the list, and the containers whose time is over.
 
     Raises
     ------
@@ -162,9 +179,10 @@ def unpublish(store: Store, names: Iterable[str], keep: timedelta = KEEP) -> int
         As `publish`.
     """
     names = tuple(names)
-    published(store)
+    published(store).check(names)
     now = store.probe()
-    return _change(store, lambda before: before.without(names, now), now, keep)
+    # From here on a name that is gone is none that is wrong: a conflict may hide that this very write took place.
+    return _remove(store, _change(store, lambda before: before.without(names, now), now, keep), now)
 
 
 def published(store: Store) -> PublishedList:
@@ -184,15 +202,70 @@ def published(store: Store) -> PublishedList:
     return PublishedList.parse(data)
 
 
-def _surface(publication: Publication) -> PublishedSurface:
-    with publication.container.open("rb") as file:
-        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    levels = tuple(
-        LevelFile(level, f"levels/{sha256}/{level}.tif", path.stat().st_size)
-        for level, path in sorted(publication.levels.items())
-    )
-    size = publication.container.stat().st_size
-    return PublishedSurface(publication.name, publication.title, sha256, size, levels)
+@dataclass(frozen=True)
+class _File:
+    """A file to send, as it was when its hash was taken.
+
+    Attributes
+    ----------
+    path : Path
+    sha256 : str
+    size : int
+    state : tuple of int
+        Another one when the file is another, or has been written since.
+    """
+
+    path: Path
+    sha256: str
+    size: int
+    state: tuple[int, ...]
+
+    @classmethod
+    def of(cls, path: Path) -> _File:
+        """Take the hash of a file."""
+        with path.open("rb") as file:
+            state = _state(os.fstat(file.fileno()))
+            return cls(path, hashlib.file_digest(file, "sha256").hexdigest(), os.fstat(file.fileno()).st_size, state)
+
+    def put(self, store: Store, key: str, progress: Callable[[int], None] | None = None) -> None:
+        """Send it.
+
+        Raises
+        ------
+        InputError
+            If it has changed since its hash was taken: then what is there under its hash is named by nobody.
+        StoreError, OSError
+        """
+        store.put_file(key, self.path, progress)
+        if _state(self.path.stat()) != self.state:
+            raise InputError(f"{self.path} has changed while it was published: publish it again")
+
+
+def _state(status: os.stat_result) -> tuple[int, ...]:
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _prepared(publication: Publication) -> tuple[PublishedSurface, dict[str, _File]]:
+    """Return a surface as the list will name it, and its files by their keys."""
+    container = _File.of(publication.container)
+    found = {container_key(container.sha256): container}
+    levels = []
+    for level, path in sorted(publication.levels.items()):
+        file = _File.of(path)
+        key = f"levels/{container.sha256}/{level}-{file.sha256[:16]}.tif"
+        found[key] = file
+        levels.append(LevelFile(level, key, file.size))
+    surface = PublishedSurface(publication.name, publication.title, container.sha256, container.size, tuple(levels))
+    return surface, found
+
+
+def _named_files(store: Store) -> dict[str, int]:
+    """Return the bytes of the files that the list names, by their keys."""
+    try:
+        surfaces = published(store).surfaces
+    except InputError:  # there is no list yet
+        return {}
+    return {key: size for surface in surfaces for key, size in surface.files.items()}
 
 
 def check_use(store: Store) -> None:
@@ -226,8 +299,8 @@ def _tell(progress: Callable[[float], None], before: int, total: int, written: i
     progress((before + written) / total)
 
 
-def _change(store: Store, change: Callable[[PublishedList], PublishedList], now: float, keep: timedelta) -> int:
-    """Change the list, as often as another publisher was first; remove what is old, and return how much it was."""
+def _change(store: Store, change: Callable[[PublishedList], PublishedList], now: float, keep: timedelta) -> set[str]:
+    """Change the list, as often as another publisher was first; return the containers whose time is over."""
     for attempt in range(_ATTEMPTS):
         try:
             data, tag = store.get(LIST, LONGEST_LIST)
@@ -243,25 +316,34 @@ def _change(store: Store, change: Callable[[PublishedList], PublishedList], now:
         except (ExistsError, ConflictError):
             time.sleep(random.uniform(0.0, min(0.05 * 2**attempt, _LONGEST_PAUSE)))
             continue
-        return _remove(store, old, now)
+        return old
     raise LodestreamError(
         f"{LIST} of {store.describe()} was changed by others {_ATTEMPTS} times meanwhile: publish again"
     )
 
 
-def _remove(store: Store, old: set[str], now: float) -> int:
-    """Remove old containers, and strays of interrupted commands, with their level files; return how many containers.
+def _remove(store: Store, old: set[str], now: float) -> Removed:
+    """Remove old containers, and strays of interrupted commands, with their level files.
 
-    The list is read again just before, since somebody may have published the same bytes meanwhile.
+    The list is read again before each of them: somebody may have published the same bytes meanwhile.
     """
-    objects: dict[str, list[Entry]] = {}
-    for entry in (*store.entries("containers/"), *store.entries("levels/")):
-        if found := _OBJECT.match(entry.key):
-            objects.setdefault(found[1], []).append(entry)
-    before = now - _STRAY.total_seconds()
-    strays = {sha256 for sha256, entries in objects.items() if all(entry.modified < before for entry in entries)}
-    current = published(store)
-    named = current.containers | {it.container for it in current.replaced}
-    gone = (old | strays) & objects.keys() - named
-    store.delete([entry.key for sha256 in gone for entry in objects[sha256]])
-    return len(gone)
+    gone: set[str] = set()
+    try:
+        objects: dict[str, list[Entry]] = {}
+        for entry in (*store.entries("containers/"), *store.entries("levels/")):
+            if found := _OBJECT.match(entry.key):
+                objects.setdefault(found[1], []).append(entry)
+        before = now - _STRAY.total_seconds()
+        strays = {sha256 for sha256, entries in objects.items() if all(entry.modified < before for entry in entries)}
+        for sha256 in sorted((old | strays) & objects.keys()):
+            if sha256 in published(store).kept:
+                continue
+            store.delete([entry.key for entry in objects[sha256]])
+            gone.add(sha256)
+        again = [it for it in published(store).surfaces if it.container in gone] if gone else []
+        lost = [it.name for it in again if any(_size(store, key) is None for key in it.files)]
+    except StoreError as error:
+        return Removed(len(gone), str(error))
+    if lost:
+        return Removed(len(gone), f"{', '.join(lost)} was published by another at this moment: publish it again")
+    return Removed(len(gone))

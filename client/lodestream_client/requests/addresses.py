@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from urllib.parse import unquote, urljoin, urlsplit, urlunsplit
+import string
+from urllib.parse import quote, unquote, urljoin, urlsplit, urlunsplit
 
 from lodestream.errors import OptionError, RemoteProtocolError
 
@@ -98,11 +99,15 @@ def source_url(url: str) -> str:
 def published_name(url: str) -> tuple[str, str] | None:
     """Return the URL of the list of a published page, and the name on it that ``PAGE#NAME`` asks for.
 
-    None if the URL asks for no name. What the page adds to its address after ``&`` tells how a surface is looked at.
+    None if the URL asks for no name. What has an equals sign tells how a surface is looked at, as does what the page
+    adds to its address after ``&``; a name has ``%3D`` in its place.
     """
     page, _, fragment = url.partition("#")
-    name = unquote(fragment.partition("&")[0])
-    return (urljoin(page.partition("?")[0], "view.json"), name) if name and not is_surface(page) else None
+    name = fragment.partition("&")[0]
+    if not name or "=" in name or is_surface(page):
+        return None
+    # What is not ASCII is as a browser sends it.
+    return urljoin(quote(page.partition("?")[0], safe=string.punctuation), "view.json"), unquote(name)
 
 
 def is_surface(url: str) -> bool:

@@ -287,11 +287,11 @@ def locate(url: str) -> Flow[str]:
     surfaces = yield from published_surfaces(url)
     entry = next((entry for entry in surfaces if entry["name"] == name), None)
     if entry is None:
-        names = ", ".join(str(entry["name"]) for entry in surfaces[:_NAMES_TOLD])
-        raise NotFoundError(f"expected a name that is published at {page}, got {name!a:.300}; there are: {names:.1000}")
+        names = ", ".join(f"{entry['name']!a:.100}" for entry in surfaces[:_NAMES_TOLD])
+        raise NotFoundError(f"expected a name that is published at {page}, got {name!a:.300}; there are: {names}")
     container = addresses.resolved(page, entry["src"])
-    if not addresses.same_origin(container, page):
-        raise RemoteProtocolError(f"expected a container on {addresses.origin(page)}, got {container:.300}")
+    if not addresses.same_origin(container, page) or "#" in container:
+        raise RemoteProtocolError(f"expected a container on {addresses.origin(page)}, got {container!a:.300}")
     return container
 
 

@@ -94,16 +94,20 @@ def _located(session: Session) -> Flow[str]:
 
 
 def _read(session: Session, call: Call) -> Flow[Answer]:
-    """Return a short answer."""
+    """Return a short answer, which takes no longer than a server may be silent."""
     import httpx
 
+    until = session.clock() + session.silence
     try:
         headers = {"Accept-Encoding": "identity", **call.headers, **session.authorization(call.url)}
         head: Head = yield Get(call.url, headers, session.patience(session.tick()))
         session.landed(call.url, head.url)
         incoming = Incoming(head, call.most, call.url, session.url, None)
         while (chunk := (yield Read())) and incoming.take(chunk):
-            pass
+            if session.tick() == 0:
+                raise TruncatedStreamError(f"expected the list of {session.url}, but its time is over")
+            if session.clock() >= until:
+                raise session.silent()
     except httpx.HTTPError as error:
         raise problems.from_connection(error, session.url) from error
     return incoming.answer()

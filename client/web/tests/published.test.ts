@@ -58,6 +58,8 @@ describe("the name of an address", () => {
     ],
     ["http://host/a/#100%", { list: "http://host/a/view.json", name: "100%" }],
     ["http://host/a.lode", undefined],
+    ["http://server/#s=0123456789abcdef0123&v=1,2", undefined],
+    ["http://host/#a%3Db", { list: "http://host/view.json", name: "a=b" }],
     ["http://host/v1/surfaces/ab#hills", undefined],
   ])("%s", (address, expected) => expect(publishedName(address)).toEqual(expected));
 
@@ -65,6 +67,7 @@ describe("the name of an address", () => {
     expect(sourceUrl("http://host/#hills")).toBe("http://host/#hills");
     expect(sourceUrl("http://host/v1/surfaces/ab/#hills")).toBe("http://host/v1/surfaces/ab");
     expect(() => sourceUrl("http://host/#")).toThrow("#NAME");
+    expect(sourceUrl("http://host/a.lode?sig=1#v=3")).toBe("http://host/a.lode?sig=1");
   });
 });
 
@@ -85,9 +88,16 @@ describe("a name", () => {
     { surfaces: 3 },
     { surfaces: [{ name: "hills & dales" }] },
     { surfaces: [{ name: "hills & dales", src: "http://127.0.0.1:1/one.lode" }] },
+    { surfaces: [{ name: "hills & dales", src: "http://:x" }] },
+    { surfaces: [{ name: "hills & dales", src: "#hills%20%26%20dales" }] },
   ])("is not followed from a list like %j", async (given) => {
     list = given;
     await expect(find(`${url}/maps/#hills%20%26%20dales`)).rejects.toThrow(RemoteProtocolError);
+  });
+
+  it("is not looked for in a list that is too long", async () => {
+    list = `{"surfaces": [${" ".repeat(17 * 1024 * 1024)}]}`;
+    await expect(find(`${url}/maps/#hills`)).rejects.toThrow(RemoteProtocolError);
   });
 
   it("is asked for once, and the stream ends on what it began", async () => {

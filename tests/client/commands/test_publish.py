@@ -136,24 +136,29 @@ def test_a_page_that_is_not_built_is_told(
         ["hills.lode", "store", "--keep", "nan"],
         ["hills.lode", "store", "--name", "two\nlines"],
         ["hills.lode", "store", "--public-url", "ftp://host/"],
+        ["hills.lode", "store", "--public-url", "https://me:SECRET@host/"],
+        ["hills.lode", "https://me:SECRET@host/"],
     ],
 )
 def test_wrong_command_lines(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["publish", *arguments])
     assert ended.value.code == 2
-    assert "error" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "error" in told
+    assert "SECRET" not in told
 
 
 @pytest.mark.parametrize(
     ("address", "environment", "expected"),
     [
-        ("s3://maps/a b", {}, "https://maps.s3.us-east-1.amazonaws.com/a%20b/index.html"),
+        ("s3://maps/a~b", {}, "https://maps.s3.us-east-1.amazonaws.com/a~b/index.html"),
+        ("s3://my.maps/a", {}, "https://s3.us-east-1.amazonaws.com/my.maps/a/index.html"),
         ("s3://maps", {"AWS_REGION": "eu-west-1"}, "https://maps.s3.eu-west-1.amazonaws.com/index.html"),
         ("s3://maps/a/", {"AWS_ENDPOINT_URL": "http://127.0.0.1:9/"}, "http://127.0.0.1:9/maps/a/index.html"),
         ("az://maps/a", {"AZURE_STORAGE_ACCOUNT_NAME": "me"}, "https://me.blob.core.windows.net/maps/a/index.html"),
         ("az://maps/a", {"AZURE_STORAGE_ENDPOINT": "http://127.0.0.1:9/me"}, "http://127.0.0.1:9/me/maps/a/index.html"),
-        ("abfss://maps@me.dfs.core.windows.net/a", {}, "https://me.blob.core.windows.net/maps/a/index.html"),
+        ("abfss://maps@mine.dfs.core.windows.net/a", {}, "https://mine.blob.core.windows.net/maps/a/index.html"),
     ],
 )
 def test_the_address_of_the_page(

@@ -27,7 +27,7 @@ names = st.text(min_size=1, max_size=20).filter(lambda name: name.isprintable() 
 surfaces = st.builds(
     PublishedSurface,
     names | st.sampled_from("abc"),
-    st.none() | st.text(max_size=20),
+    st.none() | st.text(st.characters(exclude_categories=["Cs"]), max_size=20),
     digests,
     st.integers(0, 2**60),
     st.lists(st.builds(LevelFile, st.integers(0, 30), st.just("levels/ab/3.tif"), st.integers(0, 9)), max_size=3).map(
@@ -83,8 +83,11 @@ def test_a_name_keeps_its_place_and_files_of_levels_their_container() -> None:
 
 
 def test_a_name_that_is_not_there() -> None:
+    found = PublishedList().with_surfaces([surface("a", "1")], 0.0)
     with pytest.raises(InputError, match="'c'"):
-        PublishedList().with_surfaces([surface("a", "1")], 0.0).without(["a", "c"], 1.0)
+        found.check(["a", "c"])
+    # A conflict may hide that it has gone by this very command.
+    assert found.without(["a", "c"], 1.0) == found.without(["a"], 1.0)
 
 
 @pytest.mark.parametrize("name", ["", " a", "a\n", "\x1b[31m", "é" * 200])
@@ -108,6 +111,11 @@ GOOD = {"surfaces": [surface("a", "1").document()], "replaced": [], "write": "x"
         json.dumps(GOOD | {"surfaces": 3}).encode(),
         json.dumps(GOOD | {"surfaces": [{"name": "a", "src": "../secret", "bytes": 1}]}).encode(),
         json.dumps(GOOD | {"surfaces": [{"name": "a", "src": f"containers/{'1' * 64}.lode", "bytes": -1}]}).encode(),
+        json.dumps(GOOD | {"surfaces": [{"name": 5, "src": f"containers/{'1' * 64}.lode", "bytes": 1}]}).encode(),
+        json.dumps(GOOD | {"surfaces": [surface("a", "1").document() | {"bytes": 10**400}]}).encode(),
+        json.dumps(GOOD | {"surfaces": [surface("a", "1").document() | {"title": "\ud800"}]}).encode(),
+        json.dumps(GOOD | {"surfaces": [surface("\ud800", "1").document()]}).encode(),
+        json.dumps(GOOD | {"replaced": [{"container": "1" * 64, "since": 10**400}]}).encode(),
         json.dumps(GOOD | {"replaced": [{"container": "1", "since": 0}]}).encode(),
         json.dumps(GOOD | {"replaced": [{"container": "1" * 64, "since": "yesterday"}]}).encode(),
         json.dumps(GOOD | {"replaced": [{"container": "1" * 64, "since": float("nan")}]}).encode(),

@@ -5,9 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import pickle
+import time
 from collections.abc import Iterator
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -16,9 +19,11 @@ import lodestream as ls
 import lodestream_client
 from lodestream.errors import NotFoundError, RemoteProtocolError
 from lodestream_client import sync
+from lodestream_client.errors import SilenceError
 from lodestream_client.program import main
+from lodestream_client.requests.addresses import published_name
 from lodestream_client.viewer.sources import RemoteSource
-from tests.client.files import Ranged, ranged
+from tests.client.files import Ranged, ranged, running
 
 HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
 
@@ -123,7 +128,7 @@ def test_what_is_published_is_listed(tmp_path: Path, host: Ranged, capsys: pytes
 
 
 def test_a_name_that_is_not_there(host: Ranged) -> None:
-    with pytest.raises(NotFoundError, match="got 'dales'; there are: hills & dales, plain"):
+    with pytest.raises(NotFoundError, match="got 'dales'; there are: 'hills & dales', 'plain'"):
         sync.locate(f"{host.url}/#dales")
     with pytest.raises(NotFoundError, match="dales"), sync.connect(f"{host.url}/#dales") as stream:
         list(stream)
@@ -133,6 +138,7 @@ def test_a_name_that_is_not_there(host: Ranged) -> None:
     ("text", "words"),
     [
         ('{"surfaces": [{"name": "plain", "src": "http://other.example/a.lode"}]}', "expected a container on"),
+        ('{"surfaces": [{"name": "plain", "src": "index.html#plain"}]}', "expected a container on"),
         ('{"surfaces": [{"name": "plain", "src": 3}]}', "the surfaces of a published page"),
         ('{"surfaces": {}}', "the surfaces of a published page"),
         ("{}", "the surfaces of a published page"),
@@ -152,8 +158,93 @@ def test_a_page_that_is_no_published_one(tmp_path: Path, host: Ranged) -> None:
         sync.locate(f"{host.url}/elsewhere/#plain")
 
 
-def test_a_token_goes_to_the_host_of_the_page(tmp_path: Path, host: Ranged) -> None:
-    assert sync.locate(f"{host.url}/#plain", token="t").startswith(host.url)
+class _Dripping(BaseHTTPRequestHandler):
+    """A host whose list comes byte by byte, or leads to another host; what it was told is kept."""
+
+    told: ClassVar[list[tuple[str, str | None]]] = []
+    leads: ClassVar[str | None] = None
+
+    def do_GET(self) -> None:
+        self.told.append((str(self.server.server_port), self.headers.get("Authorization")))  # type: ignore[attr-defined]
+        if self.leads is not None:
+            self.send_response(302)
+            self.send_header("Location", self.leads)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+            return
+        self.send_response(200)
+        self.send_header("Content-Length", "100000")
+        self.end_headers()
+        with suppress(OSError):
+            while True:
+                self.wfile.write(b" ")
+                time.sleep(0.05)
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+def test_a_list_that_drips_ends_with_the_time_of_the_target() -> None:
+    _Dripping.leads = None
+    server = ThreadingHTTPServer(("127.0.0.1", 0), _Dripping)
+    server.daemon_threads = True
+    with running(server):
+        url = f"http://127.0.0.1:{server.server_port}/#plain"
+        with sync.connect(url, target=ls.Target(seconds=0.5)) as stream:
+            assert list(stream) == []
+        assert stream.ended == "stopped" or stream.ended == "seconds"
+        with pytest.raises(SilenceError), sync.connect(url, silence=0.5, deadline=0) as stream:
+            list(stream)
+
+
+def test_a_token_is_for_the_host_of_the_page_alone(host: Ranged) -> None:
+    _Dripping.told.clear()
+    _Dripping.leads = f"{host.url}/view.json"
+    with running(server := ThreadingHTTPServer(("127.0.0.1", 0), _Dripping)):
+        page_url = f"http://127.0.0.1:{server.server_port}/#plain"
+        heard: list[str | None] = []
+        seen = host.RequestHandlerClass._serve  # type: ignore[attr-defined]
+
+        def listening(handler: Any, body: bool) -> None:
+            heard.append(handler.headers.get("Authorization"))
+            seen(handler, body)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(host.RequestHandlerClass, "_serve", listening)
+            sync.locate(page_url, token="secret")
+    assert [token for _, token in _Dripping.told] == ["Bearer secret"]
+    assert heard == [None]
+
+
+@pytest.mark.parametrize(
+    ("url", "opened"),
+    [
+        ("http://host/#plain", True),
+        ("http://host/a/index.html#plain", True),
+        ("http://host/data.nc#mode=bytes", False),
+        ("http://host/data.nc#plain", False),
+        ("http://host/#v=1", False),
+        ("http://host/", False),
+    ],
+)
+def test_xarray_guesses_pages_by_their_end(url: str, opened: bool) -> None:
+    pytest.importorskip("xarray")
+    from lodestream_client.xarray_engine import LodeBackend
+
+    assert LodeBackend().guess_can_open(url) == opened
+
+
+@pytest.mark.parametrize(
+    ("url", "expected"),
+    [
+        ("http://host/#s=0123&v=1", None),
+        ("http://host/a%20b/#c", ("http://host/a%20b/view.json", "c")),
+        ("http://host/\u00c4/#n", ("http://host/%C3%84/view.json", "n")),
+        ("http://host/#a%3Db", ("http://host/view.json", "a=b")),
+    ],
+)
+def test_the_name_in_an_address(url: str, expected: tuple[str, str] | None) -> None:
+    assert published_name(url) == expected
 
 
 def test_levels_are_files_that_gdal_opens(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

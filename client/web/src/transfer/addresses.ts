@@ -19,7 +19,8 @@ export function sourceUrl(given: string | URL, base?: string): string {
     return url.href;
   }
   // The query may be what allows reading a file.
-  if (url.hash.length > 1) return url.href;
+  if (url.hash.length > 1 && !/^#[^&]*=/.test(url.hash)) return url.href;
+  url.hash = "";
   if (url.pathname === "/" || url.pathname.replace(/\/+$/, "").endsWith(SURFACES)) {
     throw new OptionError(
       "expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as " +

@@ -6,13 +6,14 @@ import { fromResponse } from "./problems";
 
 /** Bytes of the longest list that is read. */
 const LONGEST = 16 * 1024 * 1024;
+const LONGEST_PROBLEM = 64 * 1024;
 
 /** The address of the list of a published page, and the name on it; undefined if this is no `PAGE#NAME`. */
 export function publishedName(url: string): { readonly list: string; readonly name: string } | undefined {
   const page = new URL(url);
-  // What the page adds after & tells how a surface is looked at.
+  // What has an equals sign, and what the page adds after &, tell how a surface is looked at.
   const [name] = page.hash.slice(1).split("&", 1);
-  if (!name || isSurface(url)) return undefined;
+  if (!name || name.includes("=") || isSurface(url)) return undefined;
   page.hash = page.search = "";
   return { list: new URL("view.json", page).href, name: unescaped(name) };
 }
@@ -33,17 +34,36 @@ export async function locate(
   if (place === undefined) return url;
   const { list, name } = place;
   const answer = await fetch(list, { headers, cache: "no-store", credentials: "same-origin", signal });
-  const text = await answer.text();
-  if (!answer.ok) throw fromResponse(answer.status, answer.statusText, text, list);
-  const entries = text.length > LONGEST ? undefined : entriesOf(text);
+  const text = await textOf(answer, answer.ok ? LONGEST : LONGEST_PROBLEM);
+  if (!answer.ok) throw fromResponse(answer.status, answer.statusText, text ?? "", list);
+  const entries = text === undefined ? undefined : entriesOf(text);
   if (entries === undefined) throw new RemoteProtocolError(`expected the surfaces of a published page from ${list}`);
   const found = entries.find((entry) => entry.name === name);
   if (found === undefined) throw new NotFoundError(`nothing is published at ${list} under the name ${name}`);
-  const container = new URL(found.src, list).href;
-  if (!sameOrigin(container, list)) {
-    throw new RemoteProtocolError(`expected a container of ${new URL(list).origin}, got ${container.slice(0, 200)}`);
+  const container = URL.canParse(found.src, list) ? new URL(found.src, list) : undefined;
+  if (container === undefined || !sameOrigin(container.href, list) || container.hash !== "") {
+    const { origin } = new URL(list);
+    throw new RemoteProtocolError(`expected a container of ${origin}, got ${JSON.stringify(found.src.slice(0, 200))}`);
   }
-  return container;
+  return container.href;
+}
+
+/** The text of a body; undefined if it has more bytes than allowed. */
+async function textOf(answer: Response, most: number): Promise<string | undefined> {
+  const reader = answer.body?.getReader();
+  const decoder = new TextDecoder();
+  let text = "";
+  let size = 0;
+  for (;;) {
+    const { value } = (await reader?.read()) ?? {};
+    if (value === undefined) return text + decoder.decode();
+    size += value.length;
+    if (size > most) {
+      await reader!.cancel();
+      return undefined;
+    }
+    text += decoder.decode(value, { stream: true });
+  }
 }
 
 function entriesOf(text: string): { readonly name: string; readonly src: string }[] | undefined {

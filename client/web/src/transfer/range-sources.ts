@@ -32,7 +32,7 @@ const LONGEST_PROBLEM = 64 * 1024;
 
 /** A container on a server of Lodestream or on any web server that knows Range. */
 export class HttpRanges implements RangeSource {
-  /** Where the container is; until there is an answer, the name on a published page that leads to it. */
+  /** Where the container is; until it is known, the name on a published page that leads to it. */
   located: string;
   private address: string;
 
