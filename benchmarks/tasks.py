@@ -44,10 +44,11 @@ FORESEEN = ((10**9, 2), (10**10, 16), (10**11, 16), (10**11, 100))
 #: Values of a band where there is memory enough, see `lodestream.encoding.encode`, and the tiles' exponents of two.
 _POINTS, _TILE = 1 << 22, (6, 6)
 #: Phases in their order; those that run level by level, from the finest one to the core.
-_PHASES = "coordinates", "first_step", "second_step", "core", "code", "measure", "segments"
+_PHASES = "coordinates", "first_step", "second_step", "core", "code", "measure", "residual", "segments"
 _BY_LEVEL = "first_step", "second_step", "code"
-#: Bytes of a height, and how often each is read: for its range, for its coordinate, and to measure.
-_HEIGHT, _READS = 2, 3
+#: Bytes of a height, and how often each is read at least: for its range, its coordinate, its errors, its residual. It
+#: is read once more for each further turn of measuring.
+_HEIGHT, _READS = 2, 4
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def _print_tasks(built: Built) -> None:
         f"{built.seconds:.1f} s by the clock, of which {built.alone:.1f} s no task was at work. Anonymous memory of a "
         f"worker: {built.worker_memory >> 20} MiB; of the process that hands tasks out: {built.own_memory >> 20} MiB. "
         "What is read counts whole files of the scratch folder, of which some tasks want a part; the heights "
-        f"themselves, {_HEIGHT} B a value, are read {_READS} times besides."
+        f"themselves, {_HEIGHT} B a value, are read {_READS} times or more besides."
     )
 
 
@@ -179,7 +180,8 @@ def _tasks_of(side: int) -> Iterator[tuple[str, int, float]]:
     yield from (("core", 1, core), ("code", 1, core), ("segments", 1, core))
     rows = PART_ROWS * max(1, RUNS_TOGETHER * _POINTS // (PART_ROWS * side))
     runs = math.ceil(side / rows)
-    yield "measure", runs, side**2 / runs
+    for name in ("measure", "residual"):  # all turns of measuring as one
+        yield name, runs, side**2 / runs
 
 
 class _Recorded(Executor):
