@@ -6,10 +6,12 @@ import errno
 import os
 import secrets
 import shutil
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO, NoReturn, Self
@@ -44,6 +46,10 @@ _NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 # Of file systems without hard links: FAT, some of a network.
 _NO_LINKS = (errno.EPERM, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EMLINK)
 _ABSENT = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
+# What Windows says of a file that a program has open: access denied, or a violation of sharing or of a lock.
+_HELD = (5, 32, 33)
+#: Seconds until a file that a program has open is given up, or a folder that others remove again and again.
+_PATIENCE = 1.0
 
 
 class Folder:
@@ -51,7 +57,7 @@ class Folder:
 
     Each object is a file of the name of its key, which other programs may read at any time, and never write. It is
     written in a folder of the store's own, synchronised, and then linked or renamed to its name. Tags of `get` are
-    hashes of the bytes.
+    hashes of the bytes. Folders that a delete leaves empty go too, except those directly in the store.
 
     Parameters
     ----------
@@ -63,7 +69,7 @@ class Folder:
         self.root = Path(root).absolute()
         self._own = self.root / OWN
         self._one_at_a_time = threading.Lock()
-        self._on_disk: set[Path] = set()  # folders whose names are
+        self._on_disk: set[Path] = set()  # the store and folders directly in it, whose names are on disk and stay
 
     def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
         """Read a small object and its tag."""
@@ -136,15 +142,31 @@ class Folder:
         paths = {key: self._path(key) for key in keys}
         for key, path in paths.items():
             try:
-                path.unlink()
-            except _ABSENT:
-                pass
+                _patiently(partial(self._remove, key, path))
             except OSError as error:
                 self._refuse(key, error)
-        for folder, key in {path.parent: key for key, path in paths.items()}.items():
-            # Also for what was gone already: it may be gone in memory alone.
-            if folder.is_dir():
-                self._synchronise(key, folder)
+        # Also of what was gone already: it may be gone in memory alone.
+        for folder, key in {folder: key for key, path in paths.items() for folder in self._above(path)}.items():
+            self._synchronise(key, folder)
+
+    def _remove(self, key: str, path: Path) -> None:
+        """Remove a file, if there is one, and the folders that are then empty."""
+        if os.path.lexists(path) and not path.is_dir():
+            # Or, after a create of another writer, a `replace` that has looked would overwrite what it never read.
+            with self._locked(key), suppress(*_ABSENT):
+                path.unlink()
+        for folder in self._above(path)[:-1]:
+            try:
+                folder.rmdir()
+            except _ABSENT:
+                continue
+            except OSError:  # there is something in it
+                return
+
+    def _above(self, path: Path) -> list[Path]:
+        """Return the folders above a file of the store, from the last one to the one directly in the store, or it."""
+        folders = path.parents[: len(path.relative_to(self.root).parts) - 1]
+        return list(folders) or [self.root]
 
     def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
         """List objects in the order of their keys."""
@@ -153,29 +175,30 @@ class Folder:
     def _below(self, folder: Path, prefix: str, after: str) -> Iterator[Entry]:
         try:
             with os.scandir(folder) as found:
-                names = {each.name + ("/" if each.is_dir(follow_symlinks=False) else ""): each for each in found}
+                # Names alone: of 100,000 objects what the system tells of each is much.
+                names = sorted(each.name + ("/" if each.is_dir(follow_symlinks=False) else "") for each in found)
         except (FileNotFoundError, NotADirectoryError):
             return
         except OSError as error:
             self._refuse(prefix, error)
-        for name in sorted(names):
+        for name in names:
             key = prefix + name
             if name.startswith(".") or (key <= after and not after.startswith(key)):
                 continue
             if name.endswith("/"):
                 yield from self._below(folder / name, key, after)
-            elif key > after and (entry := self._entry(key, names[name])):
+            elif key > after and (entry := self._entry(key, folder / name)):
                 yield entry
 
-    def _entry(self, key: str, found: os.DirEntry[str]) -> Entry | None:
+    def _entry(self, key: str, path: Path) -> Entry | None:
         try:
-            if not is_key(key) or not found.is_file(follow_symlinks=False):  # of another program
-                return None
-            status = os.lstat(found.path)
+            status = path.lstat()
         except FileNotFoundError:  # deleted meanwhile
             return None
         except OSError as error:
             self._refuse(key, error)
+        if not is_key(key) or not stat.S_ISREG(status.st_mode):  # of another program
+            return None
         tag = Tag(f"{status.st_mtime_ns:x}-{status.st_size:x}-{status.st_ino:x}")
         return Entry(key, status.st_size, tag, status.st_mtime)
 
@@ -235,31 +258,41 @@ class Folder:
         return new
 
     def _name(self, key: str, path: Path, give: Callable[[], object]) -> None:
-        """Make the folder of an object, call what gives its file the name, and synchronise the folder."""
-        try:
-            self._make(path.parent)
+        """Make the folders of an object, call what gives its file the name, and put all names on disk."""
+
+        def make_and_give() -> None:
             try:
-                give()
-            except FileNotFoundError:  # another program has removed folders
-                self._on_disk.clear()
                 self._make(path.parent)
                 give()
+            except FileNotFoundError:  # another writer, or another program, has removed folders
+                self._on_disk.clear()
+                raise
+
+        try:
+            _patiently(make_and_give, FileNotFoundError)
         except FileExistsError:
             # Whoever is told that it is there may rely on it: it may be of another process that is about to do this.
-            self._synchronise(key, path.parent)
+            self._synchronise(key, *self._above(path))
             raise ExistsError(f"{self.describe()}: {key} exists already") from None
         except OSError as error:
             self._refuse(key, error)
-        self._synchronise(key, path.parent)
+        self._synchronise(key, *self._above(path))
 
-    def _synchronise(self, key: str, folder: Path) -> None:
-        try:
-            synchronise_folder(folder, must=True)
-        except OSError as error:
-            raise UnacknowledgedError(
-                f"{self.describe()}: {key}: the change may be lost if the power fails: {error.strerror}; check the "
-                "disk, and try again"
-            ) from error
+    def _synchronise(self, key: str, *folders: Path) -> None:
+        """Put the names in folders on disk, as far as there still are such folders.
+
+        Those of an object are put there last: now that it is in them, nobody removes them and makes others.
+        """
+        for folder in folders:
+            try:
+                synchronise_folder(folder, must=True)
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            except OSError as error:
+                raise UnacknowledgedError(
+                    f"{self.describe()}: {key}: the change may be lost if the power fails: {error.strerror}; check the "
+                    "disk, and try again"
+                ) from error
 
     def _link(self, new: Path, path: Path) -> None:
         try:
@@ -274,9 +307,13 @@ class Folder:
 
     @contextmanager
     def _locked(self, key: str) -> Iterator[None]:
-        """Keep others from replacing objects: threads of this process, and other processes where there are locks."""
+        """Keep others from replacing and deleting objects: threads, and other processes where there are locks.
+
+        Creates need no lock: while it is held, what is there stays, and no file takes the place of another.
+        """
         with self._one_at_a_time:
             try:
+                self._make(self._own)
                 handle = open_own(self._own / "lock", create=True)
             except OSError as error:
                 self._refuse(key, error)
@@ -291,7 +328,7 @@ class Folder:
                 os.close(handle)
 
     def _make(self, folder: Path) -> None:
-        """Make a folder of the store and put its name on disk, once for each process."""
+        """Make a folder of the store and those above it; the ones that stay are put on disk, once for each process."""
         if folder in self._on_disk:
             return
         if folder == self.root:
@@ -300,7 +337,9 @@ class Folder:
             self._make(folder.parent)
             with suppress(FileExistsError):
                 folder.mkdir(0o700 if folder == self._own else 0o777)
-            synchronise_folder(folder.parent, must=True)
+            if folder.parent != self.root:
+                return
+            synchronise_folder(self.root, must=True)
             if folder == self._own:
                 self._clear()
         if len(self._on_disk) >= _FOLDERS_KNOWN:
@@ -331,6 +370,10 @@ class Folder:
         place = f"{self.describe()}: {key}" if key else self.describe()
         if error.errno in _NO_SPACE:
             raise FullError(f"{place}: {error.strerror}: delete something, or use another disk") from error
+        if _is_held(error):
+            raise StoreError(
+                f"{place}: {error.strerror}: a program may have it open: close that, and try again"
+            ) from error
         raise StoreError(f"{place}: {error.strerror or error}") from error
 
 
@@ -371,6 +414,22 @@ class FileBlob:
 
 def _tag(data: bytes) -> Tag:
     return Tag(sha256(data).hexdigest()[:32])
+
+
+def _is_held(error: OSError) -> bool:
+    return getattr(error, "winerror", None) in _HELD
+
+
+def _patiently(change: Callable[[], None], *passing: type[OSError]) -> None:
+    """Make a change of names; again for a while if a reader has the file open (Windows), or such an error may pass."""
+    end = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            return change()
+        except OSError as error:
+            if not (_is_held(error) or isinstance(error, passing)) or time.monotonic() > end:
+                raise
+        time.sleep(0.01)
 
 
 def _copy(source: BinaryIO, target: BinaryIO, progress: Progress | None) -> None:

@@ -92,6 +92,11 @@ class Store(Protocol):
     from one of another writer. What has the very bytes of a write counts as written by it. *Large objects* never
     change, and are named by their hash.
 
+    What is found by a read or in a list may be of a writer that was killed before its write was on disk, and may not
+    survive a power failure. A caller may rely on it if it wrote it itself, or was told so by `ExistsError`, or if a
+    small object that names it was acknowledged after it was put. Otherwise it has to be put again before it is named: a
+    write of the object that names it puts nothing else on disk.
+
     A process that forks must do so before it opens a store; see `docs/stores.md`.
     """
 
@@ -145,6 +150,8 @@ class Store(Protocol):
 
     def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
         """Write a large object from a file, whatever is there: until the end there is what was before.
+
+        To find an object of this key with `open` or `entries` is no reason to leave this out; see `Store`.
 
         It may be repeated, and must be if it fails.
 

@@ -1,6 +1,7 @@
 """What a key may be: a path that is the same in a folder, in a bucket, in an address and on every system.
 
-No key may be the beginning of another one's path: in a folder, ``a`` and ``a/b`` cannot both be objects.
+No key may be the beginning of another one's path: in a folder, ``a`` and ``a/b`` cannot both be objects. Nor may two
+keys differ in upper and lower case alone: to Windows and macOS they are one file.
 """
 
 from __future__ import annotations
@@ -18,16 +19,23 @@ LONGEST_KEY = 600
 LONGEST_PART = 200
 
 #: What the parts of a key are, for messages.
-PARTS = "parts between slashes are letters, digits and -_.=@,~ without a dot at either end"
+PARTS = (
+    "parts between slashes are letters, digits and -_.=@,~ without a dot at either end, and no names that Windows "
+    "keeps for itself (such as con, nul.json, a~1)"
+)
 
 # Not those that mean something in an address or to Windows. A leading dot is the store's own, and makes no `..`.
 _PART = re.compile(r"[A-Za-z0-9_=@,~-]([A-Za-z0-9._=@,~-]*[A-Za-z0-9_=@,~-])?", re.ASCII)
+# Devices, with any suffix, and short names that Windows gives to files of other names.
+_OF_WINDOWS = re.compile(r"(con|prn|aux|nul|com[0-9]|lpt[0-9])(\..*)?|.*~[0-9].*", re.ASCII | re.IGNORECASE)
 
 
 def is_key(key: str) -> bool:
     """Return whether a text can be a key."""
-    parts = key.split("/")
-    return len(key) <= LONGEST_KEY and all(len(part) <= LONGEST_PART and _PART.fullmatch(part) for part in parts)
+    return len(key) <= LONGEST_KEY and all(
+        len(part) <= LONGEST_PART and _PART.fullmatch(part) and not _OF_WINDOWS.fullmatch(part)
+        for part in key.split("/")
+    )
 
 
 def checked_key(key: str) -> str:
@@ -36,8 +44,8 @@ def checked_key(key: str) -> str:
     Raises
     ------
     InputError
-        If it cannot: it is empty or too long, has an empty part, a leading dot, a last dot, or other characters than
-        letters, digits and ``-_.=@,~``.
+        If it cannot: it is empty or too long, has an empty part, a leading dot, a last dot, other characters than
+        letters, digits and ``-_.=@,~``, or a name that Windows keeps for itself.
     """
     if not is_key(key):
         raise InputError(f"expected a key of at most {LONGEST_KEY} characters whose {PARTS}, got {key[:80]!r}")

@@ -12,12 +12,16 @@ from .interface import Store
 
 __all__ = ["PROBES", "try_out"]
 
-#: Where the objects of trials are; those of one that was interrupted are left.
+#: Where the objects of trials are.
 PROBES = "probe/"
+#: Seconds after which they are of a trial that was interrupted.
+_DEAD = 24 * 3600.0
 
 
 def try_out(store: Store) -> float:
     """Create, replace, list, read and delete two objects of a store, also where that must be refused.
+
+    What trials have left that were interrupted a day ago or earlier is deleted too.
 
     Returns
     -------
@@ -68,13 +72,14 @@ def _try_lists(store: Store, small: str, large: str) -> float:
     listed = {entry.key: entry for entry in store.entries(PROBES)}
     if large not in listed or listed[large].size != len(data) or small not in listed:
         raise _unfit(store, "does not list what was just written")
-    store.delete([small, large])
+    now = listed[large].modified
+    store.delete([small, large, *(key for key, entry in listed.items() if entry.modified < now - _DEAD)])
     with suppress(AbsentError):
         store.get(small)
         raise _unfit(store, "reads what was just deleted")
     if {small, large} & {entry.key for entry in store.entries(PROBES)}:
         raise _unfit(store, "lists what was just deleted")
-    return listed[large].modified
+    return now
 
 
 def _unfit(store: Store, what: str) -> UnfitStoreError:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -208,7 +209,8 @@ def test_more_bytes_than_a_reader_takes_are_refused(store: Store, tmp_path: Path
 
 
 BAD_KEYS = ("", "/a", "a/", "a//b", "..", "a/../b", ".", "a/.b", ".lodestream/lock", "a.", "a b", "ä", "a\\b", "a:b",
-            "a?b", "a#b", "a%2e", "a\n", "a\0", "a" * 201, "a/" * 300 + "b")  # fmt: skip
+            "a?b", "a#b", "a%2e", "a\n", "a\0", "a" * 201, "a/" * 300 + "b", "con", "NUL", "aux/a", "a/Prn.json",
+            "COM1", "lpt9.a.b", "LODEST~1/lock")  # fmt: skip
 
 
 @pytest.mark.parametrize("key", BAD_KEYS)
@@ -266,6 +268,29 @@ def winners(write: Callable[[bytes], T], bodies: list[bytes]) -> list[tuple[byte
 def test_the_probe_of_a_fit_store_leaves_nothing(store: Store) -> None:
     store.probe()
     assert list(store.entries("")) == []
+
+
+def test_a_probe_clears_what_an_interrupted_one_left_a_day_ago(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    old, new = (f"probe/{secrets.token_hex(8)}" for _ in "12")
+    for key in (old, new, "a"):
+        store.create(key, body())
+    listed = store.entries
+
+    def later(prefix: str, after: str = "") -> Iterator[Entry]:
+        for entry in listed(prefix, after):
+            ago = {old: 24.1, new: 23.9}.get(entry.key, 0.0) * 3600
+            yield replace(entry, modified=entry.modified - ago)
+
+    monkeypatch.setattr(store, "entries", later)
+    store.probe()
+    assert sorted(entry.key for entry in listed("")) == ["a", new]
+
+
+def test_names_that_only_look_like_those_of_windows_are_keys(store: Store) -> None:
+    keys = sorted(["console", "com", "a.con", "COM10", "null.json", "a~b", "a-con"])
+    for key in keys:
+        store.create(key, b"")
+    assert [entry.key for entry in store.entries("")] == keys
 
 
 def test_a_store_says_where_it_is_and_how_much_room_it_has(store: Store) -> None:

@@ -7,7 +7,9 @@ import os
 import secrets
 import subprocess
 import sys
+import threading
 import time
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from lodestream.stores import (
     Folder,
     FullError,
     StoreError,
+    Tag,
     UnacknowledgedError,
 )
 from lodestream.stores import folder as module
@@ -43,7 +46,7 @@ Step = tuple[str, str]
 def steps(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
     """The steps that change a folder or put something on disk, with names relative to the store."""
     found: list[Step] = []
-    fsync, link, mkdir, unlink, replace = os.fsync, os.link, Path.mkdir, Path.unlink, Path.replace
+    fsync, link, mkdir, rmdir, unlink, replace = (os.fsync, os.link, Path.mkdir, Path.rmdir, Path.unlink, Path.replace)
 
     def name(path: object) -> str:
         text = str(path)
@@ -62,6 +65,10 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
         mkdir(path, *arguments, **options)  # type: ignore[arg-type]
         found.append(("mkdir", name(path)))
 
+    def rmdired(path: Path) -> None:
+        rmdir(path)
+        found.append(("rmdir", name(path)))
+
     def unlinked(path: Path, missing_ok: bool = False) -> None:
         found.append(("unlink", name(path)))
         unlink(path, missing_ok)
@@ -73,6 +80,7 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
     monkeypatch.setattr(os, "fsync", synchronised)
     monkeypatch.setattr(os, "link", linked)
     monkeypatch.setattr(Path, "mkdir", made)
+    monkeypatch.setattr(Path, "rmdir", rmdired)
     monkeypatch.setattr(Path, "unlink", unlinked)
     monkeypatch.setattr(Path, "replace", renamed)
     return found
@@ -110,7 +118,130 @@ def test_a_write_is_on_disk_before_it_returns_the_file_first_and_then_its_name(
     assert steps == [("fsync", "file"), ("rename", "a/c"), ("fsync", "a"), ("unlink", "file")]
     steps.clear()
     store.delete(["a/b", "a/c", "a/d"])
-    assert steps == [("unlink", "a/b"), ("unlink", "a/c"), ("unlink", "a/d"), ("fsync", "a")]
+    assert steps == [("unlink", "a/b"), ("unlink", "a/c"), ("fsync", "a")]
+
+
+@linux
+def test_folders_below_those_of_the_store_are_on_disk_too_and_go_when_they_are_empty(
+    store: Folder, steps: list[Step]
+) -> None:
+    store.create("a/b/c/d", body())
+    steps.clear()
+    store.create("a/b/c/e", body())
+    assert steps == [("fsync", "file"), ("link", "a/b/c/e"), ("fsync", "a/b/c"), ("fsync", "a/b"), ("fsync", "a"),
+                     ("unlink", "file")]  # fmt: skip
+    steps.clear()
+    store.delete(["a/b/c/d"])
+    assert steps == [("unlink", "a/b/c/d"), ("fsync", "a/b/c"), ("fsync", "a/b"), ("fsync", "a")]
+    steps.clear()
+    store.delete(["a/b/c/e"])
+    assert steps == [("unlink", "a/b/c/e"), ("rmdir", "a/b/c"), ("rmdir", "a/b"), ("fsync", "a")]
+    assert [path.name for path in store.root.iterdir() if path.name != ".lodestream"] == ["a"]
+    steps.clear()
+    store.delete(["a/b/c/e"])
+    assert steps == [("fsync", "a")]
+
+
+def test_an_empty_folder_that_a_crash_has_left_goes_with_the_next_delete(store: Folder) -> None:
+    store.create("a/b/c", body())
+    (store.root / "a" / "b" / "c").unlink()
+    store.delete(["a/b/c"])
+    assert list((store.root / "a").iterdir()) == []
+
+
+def test_a_delete_where_no_store_is_makes_none(store: Folder) -> None:
+    store.delete(["a", "a/b/c"])
+    assert not store.root.exists()
+
+
+def test_writers_and_deleters_of_one_folder_do_not_disturb_each_other(store: Folder, tmp_path: Path) -> None:
+    (tmp_path / "source").write_bytes(b"1")
+    end = threading.Event()
+    script = f"""
+from lodestream.stores import Folder
+store = Folder({str(store.root)!r})
+while True:
+    store.delete(["uploads/a/0", "uploads/a/b/0"])
+"""
+
+    def delete() -> None:
+        while not end.is_set():
+            store.delete(["uploads/a/1", "uploads/a/b/1"])
+
+    running = subprocess.Popen([sys.executable, "-c", script])
+    deleting = [threading.Thread(target=delete) for _ in "12"]
+    try:
+        for each in deleting:
+            each.start()
+        for number in range(100):
+            key = f"uploads/a/{'b/' if number % 2 else ''}2"
+            if number % 3:
+                store.create(key, b"2")
+            else:
+                store.put_file(key, tmp_path / "source")
+            assert store.get(key)[0] in (b"1", b"2")
+            store.delete([key])
+        assert [each.is_alive() for each in deleting] == [True, True]
+    finally:
+        end.set()
+        running.kill()
+        running.wait()
+        for each in deleting:
+            each.join()
+
+
+def test_what_another_creates_between_the_look_and_the_rename_is_not_overwritten(store: Folder) -> None:
+    other = Folder(store.root)
+    looked = store._tag_of
+    changes: list[threading.Thread] = []
+
+    def change() -> None:
+        other.delete(["a"])
+        other.create("a", b"of the other")
+
+    def look(key: str) -> Tag | None:
+        found = looked(key)
+        changes.append(threading.Thread(target=change))
+        changes[0].start()
+        changes[0].join(0.3)  # it waits for the lock
+        return found
+
+    store._tag_of = look  # type: ignore[method-assign]
+    store.replace("a", b"mine", store.create("a", b"old"))
+    changes[0].join()
+    assert store.get("a")[0] == b"of the other", "which was acknowledged last"
+
+
+def test_processes_that_delete_create_and_replace_lose_nothing(store: Folder) -> None:
+    store.create("names", b"")
+    script = f"""
+import time
+from lodestream.stores import AbsentError, ConflictError, Folder
+store = Folder({str(store.root)!r})
+looked = store._tag_of
+store._tag_of = lambda key: (looked(key), time.sleep(0.002))[0]
+while True:
+    try:
+        data, tag = store.get("names")
+        store.replace("names", data + b" more", tag)
+    except (AbsentError, ConflictError):
+        continue
+"""
+    running = [subprocess.Popen([sys.executable, "-c", script]) for _ in "12"]
+    try:
+        begun = 0
+        for _ in range(100):
+            name = body()
+            store.delete(["names"])
+            store.create("names", name)
+            while (there := store.get("names")[0]) == name and not begun:
+                assert [process.poll() for process in running] == [None, None]
+            begun = 1
+            assert there.startswith(name), "what was created is there, or what was made of it"
+    finally:
+        for process in running:
+            process.kill()
+            process.wait()
 
 
 @linux
@@ -340,3 +471,61 @@ def test_a_folder_that_must_be_synchronised_and_cannot_be_is_an_error(tmp_path: 
     synchronise_folder(tmp_path / "nothing")
     with pytest.raises(FileNotFoundError):
         synchronise_folder(tmp_path / "nothing", must=True)
+
+
+class HeldError(PermissionError):
+    """What Windows says of a file that a program has open."""
+
+    winerror = 32
+
+
+@pytest.mark.parametrize("held", [0.3, PATIENCE])
+def test_what_a_reader_has_open_on_windows_is_changed_when_it_is_closed_or_that_is_an_error(
+    store: Folder, held: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, tag = tmp_path / "source", store.create("a/b", b"1")
+    source.write_bytes(b"2")
+    end = 0.0
+    for name in ("replace", "unlink"):
+        function = getattr(Path, name)
+
+        def instead(
+            path: Path, *arguments: object, function: Callable[..., object] = function, **options: bool
+        ) -> None:
+            if time.monotonic() < end and "b" in (path.name, *(getattr(each, "name", "") for each in arguments)):
+                raise HeldError(errno.EACCES, "The process cannot access the file")
+            function(path, *arguments, **options)
+
+        monkeypatch.setattr(Path, name, instead)
+    calls: list[Callable[[], object]] = [
+        lambda: store.replace("a/b", b"2", tag),
+        lambda: store.put_file("a/b", source),
+        lambda: store.delete(["a/b"]),
+    ]
+    for call in calls:
+        end = time.monotonic() + held
+        if held < 1:
+            call()
+        else:
+            with pytest.raises(StoreError, match=r"a/b: .*: a program may have it open") as caught:
+                call()
+            assert type(caught.value) is StoreError, "nothing was done"
+            assert store.get("a/b")[0] == b"1"
+        assert list((store.root / ".lodestream").glob("*.new")) == []
+    assert [entry.key for entry in store.entries("")] == ([] if held < 1 else ["a/b"])
+
+
+def test_a_list_of_many_objects_takes_little_memory(store: Folder) -> None:
+    store.create("a/0", b"")
+    for number in range(1, 3000):
+        (store.root / "a" / f"{number:064}").touch()
+    tracemalloc.start()
+    try:
+        listed = store.entries("a/")
+        next(listed)
+        taken, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 3000 * 250, "bytes for each"
+    assert taken < 3000 * 200
+    assert len(list(listed)) == 2999
