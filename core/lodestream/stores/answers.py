@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 
 from .errors import StoreError
 
-__all__ = ["RequestError", "ask"]
+__all__ = ["RequestError", "ask", "check_process", "wait_for"]
 
 _log = logging.getLogger(__name__)
 
@@ -66,6 +66,30 @@ class RequestError(Exception):
 _first_process: int | None = None
 
 
+def check_process() -> None:
+    """Check that this process was not forked from one that used the library: it would wait for ever.
+
+    Raises
+    ------
+    StoreError
+        If it was.
+    """
+    global _first_process
+    _first_process = _first_process or os.getpid()
+    if _first_process != os.getpid():
+        raise StoreError(
+            "a store in a bucket was used before this process was forked, so it cannot be used here: open stores in "
+            "processes that are spawned, or fork before the first one is opened"
+        )
+
+
+def wait_for(answer: Future[_T]) -> _T:
+    """Wait for a call in another thread and return what it returns; Ctrl-C ends the wait, on Windows too."""
+    while not answer.done():
+        wait([answer], _LOOK)
+    return answer.result()
+
+
 def ask(call: Callable[[], _T], stop: Callable[[], None] | None = None) -> _T:
     """Call the library for buckets and return what it returns.
 
@@ -81,15 +105,9 @@ def ask(call: Callable[[], _T], stop: Callable[[], None] | None = None) -> _T:
     RequestError
         If the library raises anything. The failure has no reference to it: its text may hold addresses with signatures.
     StoreError
-        In a process that was forked from one that used the library: it would wait for ever.
+        In a process that was forked from one that used the library.
     """
-    global _first_process
-    _first_process = _first_process or os.getpid()
-    if _first_process != os.getpid():
-        raise StoreError(
-            "a store in a bucket was used before this process was forked, so it cannot be used here: open stores in "
-            "processes that are spawned, or fork before the first one is opened"
-        )
+    check_process()
     try:
         return call() if threading.current_thread() is not threading.main_thread() else _interruptibly(call, stop)
     except (KeyboardInterrupt, SystemExit, GeneratorExit):
@@ -113,14 +131,12 @@ def _interruptibly(call: Callable[[], _T], stop: Callable[[], None] | None) -> _
 
     threading.Thread(target=run, name="lodestream-store", daemon=True).start()
     try:
-        while not answer.done():
-            wait([answer], _LOOK)
+        return wait_for(answer)
     except BaseException:
-        if stop is not None:
+        if stop is not None and not answer.done():
             stop()
             wait([answer], _FAREWELL)
         raise
-    return answer.result()
 
 
 def _failure(name: str, absent: bool, text: str) -> RequestError:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
+from .answers import check_process, wait_for
 from .errors import StoreError
 
 __all__ = ["BLOCK", "Blocks", "Extent"]
@@ -74,20 +75,28 @@ class Blocks:
         Raises
         ------
         StoreError
-            If they cannot be read, or the object is shorter than was said.
+            If they cannot be read, or the object is shorter than was said; or in a process that was forked since.
         """
+        check_process()
         end = min(offset + length, extent.size)
         pieces: list[bytes] = []
         while offset < end:
             first = offset // BLOCK
             behind = min(first + _AT_ONCE, -(-end // BLOCK))
             for number, block in enumerate(self._wanted(extent, first, behind), first):
-                pieces.append(block.result()[max(offset - number * BLOCK, 0) : end - number * BLOCK])
+                pieces.append(wait_for(block)[max(offset - number * BLOCK, 0) : end - number * BLOCK])
             offset = behind * BLOCK
         return b"".join(pieces)
 
     def read_at_once(self, extent: Extent, offset: int, length: int) -> bytes | None:
-        """Read exactly so many bytes if they are in memory; otherwise return None."""
+        """Read exactly so many bytes if they are in memory; otherwise return None.
+
+        Raises
+        ------
+        StoreError
+            In a process that was forked since.
+        """
+        check_process()
         if offset + length > extent.size:
             return None
         first, behind = offset // BLOCK, -(-(offset + length) // BLOCK)

@@ -10,7 +10,7 @@ import os
 import random
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO, NoReturn, Self, TypeVar
 
 from ..errors import UnavailableError
-from .answers import RequestError, ask
+from .answers import RequestError, ask, check_process, wait_for
 from .blocks import Blocks, Extent
 from .connections import Limits, connected, parsed
 from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
@@ -26,6 +26,7 @@ from .headers import headers
 from .interface import SMALL, Entry, Progress, Tag
 from .keys import checked_key, checked_prefix, checked_small, is_key
 from .probe import try_out
+from .threads import Threads
 
 __all__ = ["Bucket"]
 
@@ -82,7 +83,7 @@ class Bucket:
             self._parts = ask(lambda: connected(place, limits, limits.part, limits.part))
         except RequestError as failure:
             self._refuse("", failure)
-        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lodestream-store")
+        self._threads = Threads(_THREADS)
         self._blocks = Blocks(self._range, self._threads)
 
     def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
@@ -107,7 +108,7 @@ class Bucket:
             size = os.fstat(file.fileno()).st_size
             part = max(_PART, -(-size // _MOST_PARTS))
             end = self._end()
-            for wait in _waits():
+            for pause in _waits():
                 file.seek(0)
                 pieces = _Pieces(file, part, progress)
                 try:
@@ -117,7 +118,7 @@ class Bucket:
                     if pieces.error is not None:
                         raise pieces.error from None
                     # A conflict with another upload of the same bytes, or no answer: it never changes, so once more.
-                    self._pause(key, failure, wait, end)
+                    self._pause(key, failure, pause, end)
 
     def open(self, key: str, size: int | None = None) -> BucketBlob:
         """Open an object for reading."""
@@ -141,12 +142,21 @@ class Bucket:
 
     def delete(self, keys: Iterable[str]) -> None:
         """Delete objects, as far as there are any."""
+        places = {key: self._at(key) for key in keys}
+        check_process()
         # One by one: not every store has a request for many, and that of Azure fails for those that are gone.
-        for _ in self._threads.map(self._delete, [(key, self._at(key)) for key in keys]):
-            pass
+        answers: list[Future[None]] = []
+        try:
+            answers.extend(self._threads.submit(self._delete, key, at) for key, at in places.items())
+            for answer in answers:
+                wait_for(answer)
+        except BaseException as error:
+            under_way = [answer for answer in answers if not answer.cancel()]
+            if isinstance(error, StoreError):
+                wait(under_way)  # they would delete what the caller makes anew
+            raise
 
-    def _delete(self, place: tuple[str, str]) -> None:
-        key, at = place
+    def _delete(self, key: str, at: str) -> None:
         with suppress(AbsentError):
             self._ask(key, lambda: self._library.delete(self._store, at))
 
@@ -195,21 +205,21 @@ class Bucket:
     def _ask(self, key: str, call: Callable[[], _T]) -> _T:
         """Make a call that may be repeated: the library repeats not every request, and none whose answer is cut."""
         end = self._end()
-        for wait in _waits():
+        for pause in _waits():
             try:
                 return ask(call)
             except RequestError as failure:
-                self._pause(key, failure, wait, end)
+                self._pause(key, failure, pause, end)
         raise AssertionError("there is always another attempt")
 
     def _end(self) -> float:
         return time.monotonic() + self._limits.again
 
-    def _pause(self, key: str, failure: RequestError, wait: float, end: float) -> None:
+    def _pause(self, key: str, failure: RequestError, pause: float, end: float) -> None:
         """Wait before a call is made once more, or raise what its failure is if that does not help."""
-        if failure.kind in ("absent", "refused") or time.monotonic() + wait > end:
+        if failure.kind in ("absent", "refused") or time.monotonic() + pause > end:
             self._refuse(key, failure)
-        time.sleep(wait)
+        time.sleep(pause)
 
     def _refuse(self, key: str, failure: RequestError) -> NoReturn:
         """Raise what a failure is for whoever reads, or writes what may be repeated."""
@@ -244,7 +254,7 @@ class Bucket:
             use_multipart=False,
         )
         end = self._end()
-        for wait in _waits():
+        for pause in _waits():
             try:
                 return self._tag(ask(put)["e_tag"])
             except RequestError as failure:
@@ -263,9 +273,9 @@ class Bucket:
                 self._refuse(key, unmade)
             if its_tag != tag:
                 raise self._lost(key, tag, its_tag)
-            if time.monotonic() + wait > end:
+            if time.monotonic() + pause > end:
                 break
-            time.sleep(wait)
+            time.sleep(pause)
         if unmade.kind == "refused":
             self._refuse(key, unmade)
         raise UnacknowledgedError(
