@@ -35,7 +35,7 @@ class Quality:
         Maximum errors of attributes, by name, or of single channels: a coordinate (x, y, z), a component of an
         attribute (``wind_0``). The others are restored bit for bit, except coordinates to which `precision` applies.
     effort : "fast", "default" or "small"
-        It changes bytes and time, never values. "fast": about half the time, in few layers. "small": the fewest bytes,
+        It changes bytes and time, never values. "fast": about half the time, in few layers. "small": fewer bytes,
         in few layers; a window takes more of them, since tiles and chunks are large.
 
     Raises

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+import sys
 import tempfile
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,7 +14,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lodestream.errors import FormatError, OptionError, StreamError, TooLargeError, UnavailableError
+from lodestream.errors import FormatError, FormatWarning, OptionError, StreamError, TooLargeError, UnavailableError
 from lodestream.quality import Quality
 from lodestream.target import Target
 
@@ -182,7 +185,10 @@ def run_unpublish(args: argparse.Namespace) -> int:
 
     from ..publishing.publisher import unpublish
 
-    _note_removed(unpublish(open_store(args.store), args.names, args.keep))
+    _check_store(args)
+    removed = unpublish(open_store(args.store), args.names, args.keep)
+    note(f"not published any more: {', '.join(args.names)}")
+    _note_removed(removed)
     return 0
 
 
@@ -206,6 +212,8 @@ def run_published(args: argparse.Namespace) -> int:
 
 
 def _listed(store: str) -> Sequence[Mapping[str, Any]]:
+    from lodestream.page import INDEX
+
     if is_url(store):
         import httpx
 
@@ -218,7 +226,8 @@ def _listed(store: str) -> Sequence[Mapping[str, Any]]:
 
     from ..publishing.publisher import published
 
-    return [surface.document() for surface in published(open_store(store)).surfaces]
+    found = published(open_store(store.removesuffix(f"/{INDEX}")))  # what publish prints will do, too
+    return [surface.document() for surface in found.surfaces]
 
 
 def _row(surface: Mapping[str, Any]) -> tuple[str, ...]:
@@ -234,8 +243,7 @@ def _row(surface: Mapping[str, Any]) -> tuple[str, ...]:
 def _options(args: argparse.Namespace) -> PublishOptions:
     from ..publishing.published_list import check_name
 
-    if is_url(args.store):
-        args.parser.error("expected a folder, or a bucket such as s3://BUCKET/PREFIX, last, got the address of a host")
+    _check_store(args)
     options = surface_options(args)
     if options.name is not None and len(args.files) > 1:
         args.parser.error(f"argument --name: expected one FILE, got {len(args.files)}")
@@ -254,8 +262,16 @@ def _options(args: argparse.Namespace) -> PublishOptions:
     return PublishOptions(files, args.store, options, args.memory, args.levels, args.public_url, args.keep, args.json)
 
 
+def _check_store(args: argparse.Namespace) -> None:
+    """End the program if STORE is none for sure."""
+    if is_url(args.store):
+        args.parser.error("expected a folder, or a bucket such as s3://BUCKET/PREFIX, last, got the address of a host")
+    if "://" not in args.store and Path(args.store).is_file():
+        args.parser.error(f"expected a folder, or a bucket such as s3://BUCKET/PREFIX, last, got the file {args.store}")
+
+
 def _name(file: str, options: SurfaceOptions) -> str:
-    return options.name or Path(file.rstrip("/")).stem
+    return Path(file.rstrip("/")).stem if options.name is None else options.name
 
 
 @contextmanager
@@ -271,24 +287,39 @@ def _publications(options: PublishOptions) -> Iterator[list[Publication]]:
             container = _container(file, folder, options)
             title, finest = _described(container, file)
             name = _name(file, options.surface)
-            levels = _levels(container, finest, folder, options) if options.levels else {}
+            levels = _levels(file, container, finest, folder, options) if options.levels else {}
             publications.append(Publication(name, None if title == name else title, container, levels))
         yield publications
 
 
 def _container(file: str, folder: Path, options: PublishOptions) -> Path:
-    from lodestream.container.sections import SIGNATURE, is_container
-
-    if file != "-" and not (path := Path(file)).is_dir():  # a Zarr store is a folder
-        with path.open("rb") as opened:
-            if is_container(opened.read(len(SIGNATURE))):
-                if replace(options.surface, name=None) != _NO_OPTIONS:
-                    raise OptionError(f"expected no options of encoding, got some for the container {file}")
-                return path
+    """Return the container of a file: the file itself, or what it is encoded into, in a folder."""
+    if file == "-":
+        path = folder / "input"
+        with path.open("wb") as copy:
+            shutil.copyfileobj(sys.stdin.buffer, copy)
+    else:
+        path = Path(file)
+    if _is_container(path):
+        if replace(options.surface, name=None) != _NO_OPTIONS:
+            raise OptionError(
+                "expected no --precision, --rms, --effort, --closed, --nodata, --format or -o, got one for "
+                f"{file}, which is a container and is published as it is"
+            )
+        return path
     container = folder / "surface.lode"
     building = BuildingOptions(options.memory, None, None)
-    encode_files(EncodeOptions((file,), str(container), options.surface, building, json=options.json))
+    encode_files(EncodeOptions((str(path),), str(container), options.surface, building, json=options.json))
     return container
+
+
+def _is_container(path: Path) -> bool:
+    from lodestream.container.sections import SIGNATURE, is_container
+
+    if path.is_dir():  # as a Zarr store is
+        return False
+    with path.open("rb") as file:
+        return is_container(file.read(len(SIGNATURE)))
 
 
 def _described(container: Path, file: str) -> tuple[str | None, int]:
@@ -310,20 +341,26 @@ def _described(container: Path, file: str) -> tuple[str | None, int]:
     return (title if isinstance(title, str) and title else None), index.header.levels
 
 
-def _levels(container: Path, finest: int, folder: Path, options: PublishOptions) -> dict[int, Path]:
+def _levels(file: str, container: Path, finest: int, folder: Path, options: PublishOptions) -> dict[int, Path]:
     """Write the levels of a container as files; those that cannot be on an even grid are left out, with a note."""
     levels: dict[int, Path] = {}
-    for level in range(finest, -1, -1):
-        path = folder / f"{level}.cog.tif"
-        target = Target(level=level)
-        try:
-            decode_file(DecodeOptions(str(container), str(path), target, None, False, options.memory, False))
-        except FormatError as error:
-            if level == finest:
-                raise
-            note(f"level {level} and coarser ones have no file: {error}")
-            break
-        levels[level] = path
+    with warnings.catch_warnings():
+        for level in range(finest, -1, -1):
+            path = folder / f"{level}.cog.tif"
+            asked = DecodeOptions(str(container), str(path), Target(level=level), None, False, options.memory, False)
+            try:
+                decode_file(asked)
+            except FormatError as error:
+                words = str(error).removeprefix(f"{path}: ")
+                if level == finest:
+                    raise FormatError(f"{file}: --levels: {words}") from None
+                note(f"{file}: level {level} and coarser ones have no file: {words}")
+                break
+            levels[level] = path
+            # Of coarser levels it is always the same, and said once.
+            warnings.simplefilter("ignore", FormatWarning)
+    if len(levels) > 1:
+        note(f"{file}: in files of levels coarser than {finest}, a node may be off by up to a cell of its level")
     return levels
 
 

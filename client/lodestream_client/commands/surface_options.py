@@ -77,7 +77,7 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         "--effort",
         choices=EFFORTS,
         default="default",
-        help="fast: half the time; small: the fewest bytes, of which a window then takes more; both in few layers "
+        help="fast: half the time; small: fewer bytes, of which a window then takes more; both in few layers "
         "(default: default)",
     )
     add_remeshing_options(group)

@@ -1,8 +1,9 @@
 """Put containers, the page and the list of names into a store, so that an interruption leaves the old list or the new.
 
-The order is: containers and level files, the page's assets, the list, the page itself, and what is removed. What nobody
-refers to yet does no harm. The list changes by *create if absent* and *replace by tag* alone, so several publishers do
-not lose each other's names.
+The order is: an empty list where there is none, containers and level files, the page's assets, the list, the page
+itself, and what is removed. Only where there is a list is anything removed: then no other program's files are there.
+What nobody refers to yet does no harm. The list changes by *create if absent* and *replace by tag* alone, so several
+publishers do not lose each other's names.
 
 What the list names is not sent again. What is there but not named is sent again: then it is on the disk for sure, and
 counts as new for whoever removes what is old. After the list is written, its files are looked for once more. So two
@@ -18,7 +19,7 @@ import random
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -40,8 +41,10 @@ __all__ = ["KEEP", "Publication", "Published", "Removed", "check_use", "publish"
 #: How long a container stays that another one has replaced.
 KEEP = timedelta(days=7)
 
-# Of a server's data, see the server's storage: it and a published prefix do not share one.
-_SERVER = "lodestream.json"
+# Of others: what would be written over, and where files are that would be taken for old ones of this program, such as
+# the data of a server.
+_FOREIGN = ("lodestream.json", INDEX)
+_FOREIGN_FOLDERS = ("containers/", "levels/", "records/", "surfaces/", "uploads/")
 
 # What no list names may belong to a command that runs now, and has not come to the list yet.
 _STRAY = timedelta(days=1)
@@ -141,6 +144,7 @@ def publish(
     """
     check_use(store)
     now = store.probe()
+    _begin(store)
     prepared = [_prepared(publication) for publication in publications]
     files = {key: file for _, found in prepared for key, file in found.items()}
     named = _named_files(store)
@@ -259,17 +263,20 @@ def _prepared(publication: Publication) -> tuple[PublishedSurface, dict[str, _Fi
     return surface, found
 
 
+def _begin(store: Store) -> None:
+    """Put an empty list where there is none: from now on the prefix is one of this program."""
+    with suppress(ExistsError):
+        if _size(store, LIST) is None:
+            store.create(LIST, PublishedList().dump())
+
+
 def _named_files(store: Store) -> dict[str, int]:
     """Return the bytes of the files that the list names, by their keys."""
-    try:
-        surfaces = published(store).surfaces
-    except InputError:  # there is no list yet
-        return {}
-    return {key: size for surface in surfaces for key, size in surface.files.items()}
+    return {key: size for surface in published(store).surfaces for key, size in surface.files.items()}
 
 
 def check_use(store: Store) -> None:
-    """Check that a store can be read, and is empty or a published one; nothing is written.
+    """Check that a store can be read and holds nothing of others; nothing is written.
 
     Raises
     ------
@@ -278,12 +285,18 @@ def check_use(store: Store) -> None:
     StoreError
         If it cannot be reached or refuses.
     """
-    if _size(store, _SERVER) is not None:
-        raise InputError(f"{store.describe()} holds the data of a server: publish under another prefix")
     if _size(store, LIST) is not None:
         published(store)
-    elif _size(store, INDEX) is not None:
-        raise InputError(f"{store.describe()} holds an {INDEX} that is not of lodestream: publish under another prefix")
+        return
+    foreign = next((key for key in _FOREIGN if _size(store, key) is not None), None)
+    for folder in _FOREIGN_FOLDERS:
+        found = next(iter(store.entries(folder)), None)
+        foreign = foreign or (None if found is None else found.key)
+    if foreign is not None:
+        raise InputError(
+            f"{store.describe()} holds {foreign}, which lodestream publish has not put there, such as the data of a "
+            "server or the page of another program: publish under another prefix"
+        )
 
 
 def _size(store: Store, key: str) -> int | None:

@@ -87,6 +87,10 @@ def source_url(url: str) -> str:
     if published_name(url) is not None:
         return url
     path = urlsplit(base).path
+    if urlsplit(url).path.endswith(("/", ".html")):
+        raise OptionError(
+            f"expected a name after the page's address, such as {base}#NAME: lodestream published lists them"
+        )
     if not path or path.endswith(_SURFACES):
         raise OptionError(
             f"expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as "

@@ -117,7 +117,7 @@ def encode(
         precision, whatever `precision` is. If `precision` is None, the other coordinates are restored bit for bit.
     effort : "fast", "default" or "small", optional
         It changes bytes and time, never values. "fast" takes about half the time of "default", and has few layers.
-        "small" takes the fewest bytes, also in few layers. A window of it takes more bytes, since tiles and chunks have
+        "small" takes fewer bytes, also in few layers. A window of it takes more bytes, since tiles and chunks have
         four times as many rows and columns, and its errors on the way are bounded by those of the whole surface.
     quality : Quality, optional
         Replaces the four parameters above, which are a shorthand for ``Quality.of(precision, rms,

@@ -141,5 +141,6 @@ def chosen_settings(args: argparse.Namespace) -> Settings:
         return Settings(**given)
     except ValidationError as error:
         name = "_".join(map(str, error.errors()[0]["loc"][:1]))
-        variable = f"{names[name].variable}: " if name in names else ""
-        raise OptionError(f"{variable}{words_of(error)}") from None
+        if name not in names:
+            raise OptionError(words_of(error)) from None
+        raise OptionError(f"{names[name].variable}: {names[name].words_of(error)}") from None

@@ -7,8 +7,10 @@ An operator chooses the fields of `Settings` itself, by options of ``lodestream 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from ipaddress import ip_network
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -115,6 +117,25 @@ def _size(value: Any) -> Any:
 
 _SIZE = "SIZE"
 _Size = Annotated[int, BeforeValidator(_size)]
+
+
+def _networks(addresses: tuple[str, ...]) -> tuple[str, ...]:
+    for address in addresses:
+        try:
+            ip_network(address, strict=False)
+        except ValueError:
+            raise ValueError(f"expected addresses or networks such as 10.0.0.0/8, got {address!r}") from None
+    return addresses
+
+
+def _origins(origins: tuple[str, ...]) -> tuple[str, ...]:
+    for origin in origins:
+        if origin not in ("*", "null") and not _ORIGIN.fullmatch(origin):
+            raise ValueError(f"expected origins such as https://maps.example.org, or *, got {origin!r}")
+    return origins
+
+
+_ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://[^/?#@\s]+", re.IGNORECASE)
 _Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_parted)]
 _Formats = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_named), AfterValidator(_known)]
 _Path = Annotated[Path, BeforeValidator(_place)]
@@ -166,7 +187,7 @@ class Settings(BaseSettings, Bounds):
         metavar="PATH",
         usual="none",
     )
-    trusted_proxies: _Words = _choice(
+    trusted_proxies: Annotated[_Words, AfterValidator(_networks)] = _choice(
         (),
         "network",
         "addresses or networks of reverse proxies whose X-Forwarded-For and X-Forwarded-Proto headers are trusted",
@@ -195,7 +216,7 @@ class Settings(BaseSettings, Bounds):
         usual="tokens.json in the data folder",
     )
     public_reads: bool = _choice(False, "access", "allow anyone to list, fetch and stream surfaces without a token")
-    origins: _Words = _choice(
+    origins: Annotated[_Words, AfterValidator(_origins)] = _choice(
         (),
         "access",
         "origins of other web sites whose pages may use this server, such as https://maps.example.org; * allows all "
@@ -388,7 +409,19 @@ class Choice:
             kind: Any = Annotated[self.field.annotation, self.field]
             return TypeAdapter(kind).validate_python(text)
         except ValidationError as error:
-            raise ValueError(words_of(error)) from None
+            raise ValueError(self.words_of(error)) from None
+
+    def words_of(self, error: ValidationError) -> str:
+        """Return what is wrong with a value, in a line for a user."""
+        first = error.errors()[0]
+        expected = {
+            "bool_parsing": "yes or no",
+            "int_parsing": "a whole number",
+            "greater_than_equal": self.limits or "0 or more",
+            "less_than_equal": self.limits,
+            "literal_error": self.limits,
+        }.get(first["type"])
+        return words_of(error) if expected is None else f"expected {expected}, got {first['input']!r:.200}"
 
     def _shown(self, key: str) -> str:
         shown = self.field.json_schema_extra

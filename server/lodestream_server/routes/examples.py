@@ -85,7 +85,7 @@ UPLOAD: dict[str, Any] = {
                 None,
                 "1e-3d",
             ),
-            ("effort", "fast: half the time; small: the fewest bytes; both in few layers", list(EFFORTS), None),
+            ("effort", "fast: half the time; small: fewer bytes; both in few layers", list(EFFORTS), None),
             ("closed", "closed axes", ["auto", "none", "rows", "cols", "both"], None),
             ("nodata", "value that marks holes though the file does not say so: a number or nan", None, "-9999"),
             ("name", "name of the surface", None, "Jacksboro"),

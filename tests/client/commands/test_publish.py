@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from pathlib import Path
@@ -106,6 +107,28 @@ def test_what_cannot_be_published_is_told_before_anything_is_sent(
 
 
 @pytest.mark.usefixtures("built")
+def test_a_container_comes_on_standard_input(tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(container.read_bytes())))
+    assert main(["publish", "-", str(tmp_path / "store"), "--name", "piped"]) == 0
+    (entry,) = entries(tmp_path / "store")
+    assert (tmp_path / "store" / str(entry["src"])).read_bytes() == container.read_bytes()
+
+
+@pytest.mark.usefixtures("built")
+def test_notes_of_levels_are_one_and_refusals_name_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = [0.0, 30.0, 0.0, 4_200_000.0, 0.0, -30.0]
+    (tmp_path / "hills.lode").write_bytes(ls.encode(ls.Surface(HILLS, metadata={"geotransform": place})))
+    assert main(["publish", str(tmp_path / "hills.lode"), str(tmp_path / "store"), "--levels"]) == 0
+    told = capsys.readouterr().err
+    assert told.count("off by up to a cell") == 1
+    assert "evenly spaced" not in told
+    (tmp_path / "curve.lode").write_bytes(ls.encode(np.random.default_rng(1).normal(size=(9, 9, 3))))
+    assert main(["publish", str(tmp_path / "curve.lode"), str(tmp_path / "store"), "--levels"]) == 1
+    assert f"{tmp_path / 'curve.lode'}: --levels: expected heights" in capsys.readouterr().err
+    assert main(["published", str(tmp_path / "store" / "index.html")]) == 0
+
+
+@pytest.mark.usefixtures("built")
 def test_a_store_that_is_in_use_is_told_before_anything_is_encoded(
     tmp_path: Path, container: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -113,7 +136,7 @@ def test_a_store_that_is_in_use_is_told_before_anything_is_encoded(
     (tmp_path / "store" / "lodestream.json").write_text("{}")
     monkeypatch.setattr("lodestream_client.commands.publish._container", lambda *_: pytest.fail("too late"))
     assert main(["publish", str(container), str(tmp_path / "store")]) == 1
-    assert "the data of a server" in capsys.readouterr().err
+    assert "holds lodestream.json, which lodestream publish has not put there" in capsys.readouterr().err
 
 
 def test_a_page_that_is_not_built_is_told(
@@ -135,6 +158,8 @@ def test_a_page_that_is_not_built_is_told(
         ["hills.lode", "store", "--keep", "-1"],
         ["hills.lode", "store", "--keep", "nan"],
         ["hills.lode", "store", "--name", "two\nlines"],
+        ["hills.lode", "store", "--name", ""],
+        ["hills.lode", __file__],
         ["hills.lode", "store", "--public-url", "ftp://host/"],
         ["hills.lode", "store", "--public-url", "https://me:SECRET@host/"],
         ["hills.lode", "https://me:SECRET@host/"],

@@ -338,6 +338,7 @@ def test_a_store_that_cannot_be_listed_is_published_in_all_the_same(
             return super().entries(prefix, after)
 
     store = Unlisted(tmp_path / "store")
+    publish(Folder(store.root), [], {})
     done = publish(store, [publication(tmp_path, "one", 1)], pages)
     assert (store.root / "index.html").is_file()
     assert done.removed.failure == "listing is not allowed"
@@ -346,20 +347,25 @@ def test_a_store_that_cannot_be_listed_is_published_in_all_the_same(
 @pytest.mark.parametrize(
     ("file", "words"),
     [
-        ("lodestream.json", "the data of a server"),
-        ("index.html", "an index.html that is not of lodestream"),
+        ("lodestream.json", "holds lodestream.json"),
+        ("index.html", "holds index.html"),
         ("view.json", "another file"),
+        ("containers/identity", "holds containers/identity"),
+        ("records/0.json", "holds records/0.json"),
+        (f"containers/{'a' * 64}.lode", "holds containers/a"),
+        (f"levels/{'a' * 64}/mine.tif", "holds levels/a"),
     ],
 )
 def test_what_others_have_there_is_left_alone(
     tmp_path: Path, pages: dict[str, page.Asset], file: str, words: str
 ) -> None:
     root = tmp_path / "store"
-    root.mkdir()
+    (root / file).parent.mkdir(parents=True)
     (root / file).write_text("{}")
+    age(root)
     with pytest.raises(InputError, match=words):
         publish(Folder(root), [publication(tmp_path, "one", 1)], pages)
-    assert [path.name for path in root.iterdir()] == [file]
+    assert [path for path in root.rglob("*") if path.is_file()] == [root / file]
     assert (root / file).read_text() == "{}"
 
 
@@ -372,6 +378,7 @@ def test_where_nothing_is_published(tmp_path: Path) -> None:
 
 def test_strays_go_after_a_day(tmp_path: Path, pages: dict[str, page.Asset], monkeypatch: pytest.MonkeyPatch) -> None:
     store, one = Folder(tmp_path / "store"), publication(tmp_path, "one", 1)
+    publish(store, [], pages)
     for digit in "ab":
         store.put_file(f"containers/{digit * 64}.lode", one.container)
     publish(store, [one], pages)

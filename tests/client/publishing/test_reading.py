@@ -17,7 +17,7 @@ import pytest
 
 import lodestream as ls
 import lodestream_client
-from lodestream.errors import NotFoundError, RemoteProtocolError
+from lodestream.errors import NotFoundError, OptionError, RemoteProtocolError
 from lodestream_client import sync
 from lodestream_client.errors import SilenceError
 from lodestream_client.program import main
@@ -151,6 +151,12 @@ def test_a_list_that_cannot_be_followed(tmp_path: Path, host: Ranged, text: str,
         sync.locate(f"{host.url}/#plain")
     with pytest.raises(RemoteProtocolError, match=words), sync.connect(f"{host.url}/#plain") as stream:
         list(stream)
+
+
+@pytest.mark.parametrize("url", ["http://host/", "http://host/a/", "http://host/a/index.html", "http://host/#v=1"])
+def test_a_page_without_a_name_is_told(url: str) -> None:
+    with pytest.raises(OptionError, match="expected a name after"):
+        sync.connect(url)
 
 
 def test_a_page_that_is_no_published_one(tmp_path: Path, host: Ranged) -> None:

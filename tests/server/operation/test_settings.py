@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,14 @@ def example(choice: Choice) -> str:
         return choice.words[-1]
     if choice.is_switch:
         return "yes"
-    if choice.name in ("formats", "dask"):
-        return {"formats": "text,npy", "dask": "tcp://10.0.0.2:8786"}[choice.name]
+    known = {
+        "formats": "text,npy",
+        "dask": "tcp://10.0.0.2:8786",
+        "origins": "https://a.example",
+        "trusted_proxies": "::1",
+    }
+    if choice.name in known:
+        return known[choice.name]
     if choice.metavar == "SIZE":
         return "3GiB"
     return "7" if "int" in str(choice.field.annotation) else "/x"
@@ -117,6 +124,9 @@ def test_sizes_carry_units(text: str, size: int) -> None:
         ("insecure", "perhaps", "a valid boolean"),
         ("log_format", "xml", "'text' or 'json'"),
         ("formats", "npy,exe", "some of npy"),
+        ("origins", "foo", "https://maps.example.org"),
+        ("origins", "https://a.example/path", "https://maps.example.org"),
+        ("trusted_proxies", "300.1.1.1", "10.0.0.0/8"),
         ("formats", "", "got none"),
         ("root_path", "maps/", "begins with a slash"),
         ("data", "a\0b", "a path"),
@@ -125,6 +135,29 @@ def test_sizes_carry_units(text: str, size: int) -> None:
 def test_what_cannot_be_is_said(name: str, value: Any, words: str) -> None:
     with pytest.raises(ValidationError, match=words):
         Settings(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "words"),
+    [
+        ("--port", "many", "expected a whole number, got 'many'"),
+        ("--port", "70000", "expected 0 to 65535, got"),
+        ("--memory", "1MB", "expected at least 256MiB, got"),
+        ("--upload-bytes", "4 pounds", "expected bytes, such as 1000000 or 4GiB, got '4 pounds'"),
+        ("--workers", "0", "expected at least 1, got"),
+        ("--data", "", "expected a path, got ''"),
+    ],
+)
+def test_the_command_line_says_what_is_expected(
+    option: str, text: str, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        parse(option, text)
+    assert words in capsys.readouterr().err
+    if text:
+        monkeypatch.setenv(CHOICES[option[2:].replace("-", "_")].variable, text)
+        with pytest.raises(OptionError, match=f": {re.escape(words)}"):
+            parse()
 
 
 def test_lists_and_paths() -> None:
