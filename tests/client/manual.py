@@ -77,9 +77,9 @@ What all commands have in common:
 `encode` and `push`:
 
 - `--effort` changes bytes and time, never values. *fast* takes about half the time, *small* usually the fewest bytes.
-  Both have few layers: a stream of a *fast* container that stops early takes many more bytes, one of a *small* container
-  stops best near 1e-2, 1e-3 and 1e-4 of the extent. A window of a *small* container takes up to three times the bytes,
-  and its errors on the way are bounded by those of the whole surface
+  Both have few layers: a stream of a *fast* container that stops early takes many more bytes, one of a *small*
+  container stops best near 1e-2, 1e-3 and 1e-4 of the extent. A window of a *small* container takes up to three times
+  the bytes, and its errors on the way are bounded by those of the whole surface
   ([measured](measurements.md#what-an-effort-costs-and-gains)). A stream for one error (`--rms`) hardly gains.
 
 `pull --watch`:
