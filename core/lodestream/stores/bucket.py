@@ -20,7 +20,7 @@ from typing import BinaryIO, NoReturn, Self, TypeVar
 from ..errors import UnavailableError
 from .answers import RequestError, ask, check_process, wait_for
 from .blocks import Blocks, Extent
-from .connections import Limits, connected, parsed
+from .connections import LONGEST_PAUSE, Limits, connected, parsed
 from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
 from .headers import headers
 from .interface import SMALL, Entry, Progress, Tag
@@ -108,7 +108,7 @@ class Bucket:
             size = os.fstat(file.fileno()).st_size
             part = max(_PART, -(-size // _MOST_PARTS))
             end = self._end()
-            for pause in _waits():
+            for pause in self._pauses():
                 file.seek(0)
                 pieces = _Pieces(file, part, progress)
                 try:
@@ -163,7 +163,7 @@ class Bucket:
     def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
         """List objects in the order of their keys."""
         where = self._prefix + checked_prefix(prefix)
-        end, waits = self._end(), _waits()
+        end, pauses = self._end(), self._pauses()
         while True:
             offset = self._prefix + after if after else None
             try:
@@ -175,11 +175,11 @@ class Bucket:
                             after = key
                             tag = Tag((found["e_tag"] or "").strip('"'))
                             yield Entry(key, found["size"], tag, found["last_modified"].timestamp())
-                    end, waits = self._end(), _waits()
+                    end, pauses = self._end(), self._pauses()
                 return
             except RequestError as failure:
                 # A list that failed ends as if there were no more: another one goes on behind the last key.
-                self._pause(prefix, failure, next(waits), end)
+                self._pause(prefix, failure, next(pauses), end)
 
     def room(self) -> int | None:
         """Return None: a bucket has no end."""
@@ -205,12 +205,17 @@ class Bucket:
     def _ask(self, key: str, call: Callable[[], _T]) -> _T:
         """Make a call that may be repeated: the library repeats not every request, and none whose answer is cut."""
         end = self._end()
-        for pause in _waits():
+        for pause in self._pauses():
             try:
                 return ask(call)
             except RequestError as failure:
                 self._pause(key, failure, pause, end)
         raise AssertionError("there is always another attempt")
+
+    def _pauses(self) -> Iterator[float]:
+        """Seconds between attempts, without end: longer and longer, and never those of other writers."""
+        first = self._limits.pause
+        return (min(LONGEST_PAUSE, first * 2**number) * random.uniform(0.5, 1.5) for number in itertools.count())
 
     def _end(self) -> float:
         return time.monotonic() + self._limits.again
@@ -254,7 +259,7 @@ class Bucket:
             use_multipart=False,
         )
         end = self._end()
-        for pause in _waits():
+        for pause in self._pauses():
             try:
                 return self._tag(ask(put)["e_tag"])
             except RequestError as failure:
@@ -355,8 +360,3 @@ class _Pieces:
         except BaseException as error:
             self.error = error
             raise
-
-
-def _waits() -> Iterator[float]:
-    """Seconds between attempts, without end: longer and longer, and never those of other writers."""
-    return (min(2.0, 0.05 * 2**number) * random.uniform(0.5, 1.5) for number in itertools.count())

@@ -14,7 +14,7 @@ from .keys import PARTS, is_key
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
 
-__all__ = ["SCHEMES", "Limits", "Place", "connected", "endpoint_of", "parsed"]
+__all__ = ["LONGEST_PAUSE", "SCHEMES", "Limits", "Place", "connected", "endpoint_of", "parsed"]
 
 #: Schemes of addresses, and how each is written.
 SCHEMES = {
@@ -34,6 +34,10 @@ _LONGEST_PREFIX = 300
 _ACCOUNT = re.compile(r"([a-z0-9]{3,24})\.(?:dfs|blob)\.core\.windows\.net", re.ASCII)
 
 
+#: Seconds between two attempts at most.
+LONGEST_PAUSE = 2.0
+
+
 @dataclass(frozen=True)
 class Limits:
     """How long a store is waited for.
@@ -50,6 +54,8 @@ class Limits:
         How often a request that failed is made again.
     again : float
         Seconds after which a call that failed, with its retries, is not made once more.
+    pause : float
+        Seconds until what failed is made again for the first time; then about twice as many each time, up to 2.
     """
 
     stalled: float = 10.0
@@ -57,6 +63,7 @@ class Limits:
     part: float = 120.0
     retries: int = 3
     again: float = 10.0
+    pause: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -157,8 +164,8 @@ def connected(place: Place, limits: Limits, stalled: float, seconds: float) -> O
         "max_retries": limits.retries,
         "retry_timeout": timedelta(seconds=seconds),
         "backoff": {
-            "init_backoff": timedelta(milliseconds=100),
-            "max_backoff": timedelta(seconds=2),
+            "init_backoff": timedelta(seconds=limits.pause),
+            "max_backoff": timedelta(seconds=LONGEST_PAUSE),
             "base": 2,
         },
     }

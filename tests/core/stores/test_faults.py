@@ -25,11 +25,11 @@ from tests.stores.emulators import Emulator
 from tests.stores.faults import Fault, FaultProxy, fault_proxy
 
 #: For stores that answer, on a busy machine too, and refuse.
-LIMITS = Limits(stalled=10.0, request=20.0, part=20.0, again=2.0)
+LIMITS = Limits(stalled=10.0, request=20.0, part=20.0, again=2.0, pause=0.01)
 #: For a store that refuses whatever is done.
-IMPATIENT = Limits(retries=1, again=0.2)
+IMPATIENT = Limits(retries=1, again=0.1, pause=0.01)
 #: For a store that does not answer.
-HASTY = Limits(stalled=0.8, request=2.0, part=2.0, again=4.0)
+HASTY = Limits(stalled=0.6, request=2.0, part=1.0, again=4.0, pause=0.01)
 
 
 @pytest.fixture(params=["s3", "azure"])
