@@ -20,7 +20,7 @@ from typing import BinaryIO, NoReturn, Self, TypeVar
 from ..errors import UnavailableError
 from .answers import RequestError, ask, check_process, wait_for
 from .blocks import Blocks, Extent
-from .connections import LONGEST_PAUSE, Limits, connected, parsed
+from .connections import LONGEST_PAUSE, Limits, connected, endpoint_of, parsed
 from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
 from .headers import headers
 from .interface import SMALL, Entry, Progress, Tag
@@ -68,6 +68,7 @@ class Bucket:
 
     def __init__(self, address: str, limits: Limits | None = None) -> None:
         place = parsed(address)
+        endpoint_of(place.scheme)  # in words of ours, before the library tries it
         try:
             import obstore
         except ModuleNotFoundError:

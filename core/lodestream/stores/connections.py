@@ -31,6 +31,9 @@ _S3_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 _AZURE_ENDPOINTS = ("AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT")
 #: Characters of a prefix: with the longest key below what stores allow.
 _LONGEST_PREFIX = 300
+_ENDPOINT = re.compile(
+    r"https?://(?:[a-z0-9_.-]+|\[[0-9a-f:.]+\])(?::[0-9]{1,5})?(?:/[a-z0-9._~/-]*)?", re.ASCII | re.IGNORECASE
+)
 _ACCOUNT = re.compile(r"([a-z0-9]{3,24})\.(?:dfs|blob)\.core\.windows\.net", re.ASCII)
 
 
@@ -104,10 +107,8 @@ def parsed(address: str) -> Place:
     scheme, separated, rest = address.partition("://")
     scheme = scheme.lower()
     if not separated or scheme not in SCHEMES:
-        raise InputError(
-            f"expected a folder or an address that begins with {_BEGINNINGS}, got another one: put ./ before a folder "
-            "with a colon in its name"
-        )
+        advice = "" if separated else ": put ./ before a folder with a colon in its name"
+        raise InputError(f"expected a folder or an address that begins with {_BEGINNINGS}, got another one{advice}")
     host, _, prefix = rest.partition("/")
     if "?" in rest or "#" in rest:
         raise InputError(f"expected an address such as {SCHEMES[scheme]}, got one with a query or fragment")
@@ -125,7 +126,10 @@ def parsed(address: str) -> Place:
     else:
         bucket, right = host, (_S3_BUCKET if scheme == "s3" else _CONTAINER).fullmatch(host) is not None
     if not right:
-        raise InputError(f"expected an address such as {SCHEMES[scheme]}, got another bucket, container or account")
+        raise InputError(
+            f"expected an address such as {SCHEMES[scheme]}, got another bucket, container or account: their names "
+            "have 3 to 63 small letters, digits and hyphens"
+        )
     prefix = prefix.strip("/")
     if prefix and (len(prefix) > _LONGEST_PREFIX or not is_key(prefix)):
         raise InputError(f"expected a prefix of at most {_LONGEST_PREFIX} characters whose {PARTS}, got another one")
@@ -138,7 +142,7 @@ def endpoint_of(scheme: str) -> str | None:
     Raises
     ------
     InputError
-        If it has a credential in it.
+        If it is no address of a service, or has a credential in it.
     """
     names = _S3_ENDPOINTS if scheme == "s3" else _AZURE_ENDPOINTS
     name = next((name for name in names if os.environ.get(name)), None)
@@ -146,6 +150,10 @@ def endpoint_of(scheme: str) -> str | None:
         return None
     if any(each in os.environ[name] for each in "@?#"):
         raise InputError(f"expected the address of a service in {name}, got one with credentials, a query or fragment")
+    if not _ENDPOINT.fullmatch(os.environ[name]):
+        raise InputError(
+            f"expected the address of a service in {name}, such as http://127.0.0.1:9000, got another text"
+        )
     return os.environ[name]
 
 

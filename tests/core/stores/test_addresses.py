@@ -14,7 +14,7 @@ from lodestream.errors import InputError, UnavailableError
 from lodestream.stores import Folder, Store, StoreError, open_store
 from lodestream.stores.addresses import place_of
 from lodestream.stores.bucket import Bucket
-from lodestream.stores.connections import Limits, Place, parsed
+from lodestream.stores.connections import Limits, Place, endpoint_of, parsed
 from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator
 
@@ -163,3 +163,21 @@ def test_plain_http_needs_an_endpoint_that_says_so(s3: Emulator, monkeypatch: py
         Bucket(store.describe(), Limits(retries=0, again=0.0)).get("a")
     monkeypatch.setenv("AWS_ENDPOINT_URL_S3", f"HTTP://127.0.0.1:{s3.port}")
     assert open_store(store.describe()).get("a")[0] == b"1"
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["notaurl", "ftp://host", "http://", "http://host:port", "http://a b", "http://[::1", "127.0.0.1:9000"]
+)
+@pytest.mark.parametrize("variable", ["AWS_ENDPOINT_URL", "AZURE_STORAGE_ENDPOINT"])
+def test_an_endpoint_that_is_no_address_is_told_at_once(
+    variable: str, endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(variable, endpoint)
+    with pytest.raises(InputError, match=f"expected the address of a service in {variable}, such as"):
+        open_store("s3://maps/alps" if variable.startswith("AWS") else "az://maps/alps")
+
+
+@pytest.mark.parametrize("endpoint", ["http://127.0.0.1:9000", "https://minio.example/", "http://[::1]:9/account"])
+def test_addresses_of_services(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", endpoint)
+    assert endpoint_of("s3") == endpoint
