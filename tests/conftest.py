@@ -122,7 +122,7 @@ def one_fork_server() -> Iterator[None]:
         yield
         return
     from lodestream_server.builds import jobs
-    from lodestream_server.builds.fork_control import ForkServer
+    from lodestream_server.builds.processes import ForkServer
     from tests.server.builds import slow
 
     class Shared(ForkServer):

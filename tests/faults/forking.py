@@ -15,7 +15,6 @@ import gc
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -26,7 +25,7 @@ from importlib import import_module
 from typing import Any
 
 from lodestream_client import program
-from lodestream_server.builds import fork_control, forkserver, jobs, worker
+from lodestream_server.builds import fork_server, jobs, processes, worker
 from lodestream_server.maintenance import repair
 from lodestream_server.storage import records
 
@@ -61,23 +60,32 @@ class _Forked:
     Attributes
     ----------
     pid : int
-    control : socket
-        Over which it is asked for processes.
+    stdin, stdout : binary file
+        Its other ends.
+    address : int
+        Handle of its listener.
     """
 
     def __init__(self) -> None:
-        self.control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        alive, stdin = os.pipe()
+        stdout, told = os.pipe()
+        listener, self.address = processes.new_listener()
         self._code: int | None = None
         self._lock = threading.Lock()
         self.pid = os.fork()
         if not self.pid:
             try:
-                self.control.close()
-                sys.argv[1:] = [str(theirs.detach()), ""]
-                forkserver.main()
+                for theirs, standard in ((alive, 0), (told, 1)):
+                    os.dup2(theirs, standard)
+                for handle in (alive, stdin, stdout, told, self.address):
+                    os.close(handle)
+                fork_server.main(None, listener.detach())
             finally:
                 os._exit(0)
-        theirs.close()
+        listener.close()
+        os.close(alive)
+        os.close(told)
+        self.stdin, self.stdout = os.fdopen(stdin, "wb", 0), os.fdopen(stdout, "rb", 0)
 
     def poll(self) -> int | None:
         """Its exit code, once it has ended."""
@@ -107,16 +115,16 @@ class _Forked:
         return code
 
 
-class _ForkServer(fork_control.ForkServer):
+class _ForkServer(processes.ForkServer):
     """Has one fork server already; when that has died, it starts another as it always does."""
 
     def __init__(self, preload: Callable[[], object] | None, forked: _Forked) -> None:
         super().__init__(preload)
         self._forked: Any = forked
 
-    def _start(self) -> Any:
+    def _start(self) -> processes.Started:
         forked, self._forked = self._forked, None
-        return super()._start() if forked is None else fork_control.Started(forked, forked.control)
+        return super()._start() if forked is None else processes.Started(forked, forked.address)
 
 
 def main() -> None:
@@ -133,7 +141,7 @@ def main() -> None:
     gc.collect()
     gc.freeze()  # or the first collection in each process would copy every page
     # A fork server that is started anew belongs to the shim, too.
-    shim: Any = fork_control
+    shim: Any = processes
     shim._ENVIRONMENT += ("LODE_FAULT_CONTROL", "LODE_FAULT_CALLS")
     # What shim.c asks for: from which lines a call comes. The processes of builds keep this file open, and no other.
     preloaded = ctypes.CDLL(None)

@@ -20,7 +20,6 @@ __all__ = [
     "UnforeseenError",
     "WrongAnswerError",
     "answer_of",
-    "name_of",
     "reason_of",
     "result_of",
 ]
@@ -75,11 +74,6 @@ class UnforeseenError(LodestreamError):
         self.kind = kind
         self.errno = errno
         self.traceback = traceback
-
-
-def name_of(function: Callable[..., Any]) -> str:
-    """Return the module and the name by which another process finds a function."""
-    return f"{function.__module__}:{function.__qualname__}"
 
 
 def answer_of(call: Callable[[], Any]) -> bytes:

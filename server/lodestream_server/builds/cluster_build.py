@@ -6,7 +6,7 @@ to its standard output. It ends when its standard input does: with the server.
 What the confined process has left is not trusted. Before anything is opened or written in its folder, it is looked
 through: there may be nothing but folders and plain files of their own, and all but the parsed arrays are removed. The
 arrays are read as numbers. Tasks are files that this process writes, into a temporary folder beside them. By then
-nobody else can write there: the confined process has ended with all that it had started, see `forkserver`.
+nobody else can write there: the confined process has ended with all that it had started, see `processes`.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from .answers import ProcessDiedError, result_of
 from .cluster_build import ClusterJob, build
-from .fork_control import ONE_THREAD
+from .processes import ONE_THREAD
 from .worker import Built, Refused
 
 __all__ = ["build_by_cluster"]

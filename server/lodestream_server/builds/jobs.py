@@ -55,9 +55,8 @@ from . import results, worker
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason_of
 from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
-from .fork_control import ForkServer
-from .forkserver import Allowed
-from .processes import Call, Pool
+from .fork_server import Allowed
+from .processes import Call, ForkServer, Pool
 from .shares import Turns
 
 __all__ = ["Builder"]

@@ -43,11 +43,10 @@ from ..storage.durable import discard, make_folder, remove
 from ..storage.folders import is_file
 from ..storage.storage import Storage
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
-from .fork_control import ForkServer
-from .forkserver import Allowed
+from .fork_server import Allowed
 from .level_files import Key, Lease, LevelFiles
 from .levels import FileTooLongError, LevelJob, MadeLevel, RefusedLevel, make_level
-from .processes import Call, Pool
+from .processes import Call, ForkServer, Pool
 
 __all__ = ["LevelQueue", "Loan"]
 

@@ -1,6 +1,6 @@
 """Call functions in separate processes, each with one call and only the rights that the call needs.
 
-The processes are forked from one that has loaded everything and has read no untrusted data (`forkserver`). If one of
+The processes are forked from one that has loaded everything and has read no untrusted data (`fork_server`). If one of
 them dies, the others continue, and the next call gets a new one.
 
 The answer of such a process is not trusted: it is JSON of bounded length, which must have the type that the function
@@ -10,82 +10,367 @@ returns, or it is refused.
 from __future__ import annotations
 
 import asyncio
+import json
+import math
+import os
+import pickle
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import partial
+from multiprocessing import Pipe, forkserver, reduction
+from multiprocessing.connection import Connection, wait
 from typing import Any, Final
 
-from pydantic_core import to_json
+from .answers import LONGEST_ANSWER, ProcessDiedError, WrongAnswerError, result_of
+from .fork_server import Allowed, Order, main
 
-from .answers import ProcessDiedError, name_of, result_of
-from .fork_control import ForkServer, Process
-from .forkserver import Allowed
+assert sys.platform == "linux"  # no other system has what follows
 
-__all__ = ["Call", "Pool"]
+__all__ = ["ONE_THREAD", "Call", "ForkServer", "Pool", "Started", "new_listener"]
 
 # A process may die between the last look at it and the call; one that dies again and again has another reason.
 _STARTS: Final = 3
+_LOOK_SECONDS = 0.05
+_LAST_SECONDS = 5.0
+_GROUP_SECONDS = 0.001
+
+# What processes that read strangers' files find in their environment: no secret of whoever started the server.
+_ENVIRONMENT = ("HOME", "LANG", "LD_LIBRARY_PATH", "LD_PRELOAD", "PATH", "TMPDIR", "TZ", "XDG_CACHE_HOME")
+_ENVIRONMENT_PREFIXES = ("CPL_", "GDAL_", "HDF5_", "LC_", "PROJ_", "PYTHON")
+
+#: Threads of libraries would not be there in a process that is forked, and a build has one processor.
+ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
+
+_PROGRAM = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); pickle.load(sys.stdin.buffer)()"
 
 
-class Call:
-    """One call of a function in a separate process.
+def new_listener() -> tuple[socket.socket, int]:
+    """Return a socket that listens, and a handle by which alone one connects to it: it has no name any more."""
+    with tempfile.TemporaryDirectory(prefix="lodestream-") as folder, socket.socket(socket.AF_UNIX) as listener:
+        inside = os.open(folder, os.O_PATH)  # a socket's name has at most 107 bytes
+        try:
+            name = f"/proc/self/fd/{inside}/socket"
+            listener.bind(name)
+            listener.listen()
+            return listener.dup(), os.open(name, os.O_PATH)
+        finally:
+            os.close(inside)
+
+
+@dataclass
+class Started:
+    """A fork server that was started.
+
+    Attributes
+    ----------
+    process : Popen
+        With pipes as its standard input and output.
+    address : int
+        Handle of its listener, see `new_listener`.
+    told : dict or None
+        What it has said, see `fork_server.main`; None before that.
+    """
+
+    process: Any
+    address: int
+    told: dict[str, Any] | None = None
+
+    def end(self) -> int:
+        """End the fork server with its calls, wait for their end, and return its exit code."""
+        if self.told is None:
+            self.process.kill()
+        self.process.stdin.close()
+        self.process.stdout.close()
+        os.close(self.address)
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(_LAST_SECONDS)
+        self.process.kill()
+        code: int = self.process.wait()
+        return code
+
+
+class ForkServer:
+    """The process from which others are forked; started when first needed, and again after it has died.
 
     Parameters
     ----------
+    preload : callable or None
+        Called in it without arguments before it forks for the first time; it imports what calls need.
+    """
+
+    def __init__(self, preload: Callable[[], object] | None = None) -> None:
+        self._preload = preload
+        self._lock = threading.Lock()
+        self._started: Started | None = None
+        self._closed = False
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the fork server's process, once it is started."""
+        return None if self._started is None else self._started.process.pid
+
+    @property
+    def confinement(self) -> tuple[str, ...] | None:
+        """How the kernel confines the processes of calls, see `lodestream.confinement`; None before it is known."""
+        started = self._started  # another thread may end it meanwhile
+        return None if started is None or started.told is None else tuple(started.told["confinement"])
+
+    def wait(self, given_up: Callable[[], bool] = lambda: False) -> str | None:
+        """Start the fork server, and wait until it is ready, or until `given_up` returns True.
+
+        Returns
+        -------
+        str or None
+            What went wrong in `preload`, if anything did.
+
+        Raises
+        ------
+        ProcessDiedError
+            If it ended, or was closed.
+        OSError
+            If it could not be started.
+        """
+        while not given_up():
+            with self._lock:
+                told = self._told()
+            if told is not None:
+                problem: str | None = told["problem"]
+                return problem
+        return None
+
+    def fork(self, call: Call) -> Process:
+        """Fork a process for a call.
+
+        Raises
+        ------
+        ProcessDiedError
+            If there is no fork server, or it is not ready; `wait` starts another one.
+        OSError
+            If the system has no room for more.
+        """
+        with self._lock:
+            started = self._started
+            if started is None or started.told is None:
+                raise ProcessDiedError(None)
+            address = os.dup(started.address)
+        confinement = tuple(started.told["confinement"])
+        order = Order(call.function, call.args, call.allowed, call.seconds, started.process.pid, confinement)
+        try:
+            return _fork(order, address)
+        except (ConnectionError, EOFError):
+            with suppress(subprocess.TimeoutExpired):
+                started.process.wait(_LAST_SECONDS)
+            code = started.process.poll()
+            if code is not None and code > 0:
+                raise OSError(code, os.strerror(code)) from None
+            raise ProcessDiedError(code) from None
+        finally:
+            os.close(address)
+
+    def close(self) -> None:
+        """End the fork server, with all processes that were forked from it."""
+        with self._lock:
+            self._closed = True
+            self._end()
+
+    def _end(self) -> int | None:
+        started, self._started = self._started, None
+        return None if started is None else started.end()
+
+    def _told(self) -> dict[str, Any] | None:
+        """Return what the fork server has said; wait a moment if it has said nothing yet, which is None."""
+        if self._closed:
+            raise ProcessDiedError(None)
+        if self._started is not None and self._started.process.poll() is not None:
+            self._end()
+        if self._started is None:
+            self._started = self._start()
+        started = self._started
+        if started.told is None and wait([started.process.stdout], _LOOK_SECONDS):
+            line = started.process.stdout.readline()
+            if not line.endswith(b"\n"):
+                raise ProcessDiedError(self._end())
+            started.told = json.loads(line)
+        return started.told
+
+    def _start(self) -> Started:
+        environment = {
+            name: value
+            for name, value in os.environ.items()
+            if name in _ENVIRONMENT or name.startswith(_ENVIRONMENT_PREFIXES)
+        }
+        listener, address = new_listener()
+        with listener:
+            try:
+                process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", _PROGRAM],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    bufsize=0,
+                    env=environment | ONE_THREAD,
+                    pass_fds=(listener.fileno(),),
+                )
+            except BaseException:
+                os.close(address)
+                raise
+            program = partial(main, self._preload, listener.fileno())
+        path = [place or os.getcwd() for place in sys.path]
+        started = Started(process, address)
+        with suppress(BrokenPipeError):  # it has died already
+            started.process.stdin.write(pickle.dumps(path) + pickle.dumps(program))
+        return started
+
+
+def _fork(order: Order, address: int) -> Process:
+    text = pickle.dumps({}) + pickle.dumps(order)  # the first changes nothing in the process
+    answer, its_answer = Pipe(duplex=False)
+    status, its_status = Pipe(duplex=False)
+    its_orders, orders = Pipe(duplex=False)
+    try:
+        with orders, open(orders.fileno(), "wb", closefd=False) as file:
+            # The process has them alone, so that its death is an end of file here.
+            with its_answer, its_status, its_orders, socket.socket(socket.AF_UNIX) as client:
+                client.connect(f"/proc/self/fd/{address}")
+                # Two more stand for what processes of the standard library get, and this one has no use for.
+                handles = [its_orders, its_status, its_orders, its_orders, its_answer]
+                reduction.sendfds(client, [each.fileno() for each in handles])
+            file.write(text)
+        return Process(forkserver.read_signed(status.fileno()), status, answer)
+    except BaseException:
+        answer.close()
+        status.close()
+        raise
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process that was forked for a call; one thread waits for it.
+
+    Attributes
+    ----------
+    number : int
+        Of the process, and of its group.
+    status : Connection
+        From the fork server, which writes its exit code when it has ended.
+    answer : Connection
+        From the process.
+    """
+
+    number: int
+    status: Connection
+    answer: Connection
+
+    def finish(self, call: Call) -> bytes:
+        """Wait for the end of the process with all that it has started, and return its answer.
+
+        Raises
+        ------
+        TimeoutError
+            If it has not ended after the seconds of the call, or has used up its processor time; it is killed.
+        ProcessDiedError
+            If it ended with another exit code than 0, or was killed since the call has ended.
+        WrongAnswerError
+            If the answer is too long.
+        """
+        until = math.inf if call.seconds is None else time.monotonic() + call.seconds
+        try:
+            answer = self._read(call, until)
+            late = answer is None or not _ready([self.status], call, until)
+        finally:
+            code = self._end()
+        if not call.ended and (answer is None or (late and code == -signal.SIGKILL)):
+            raise TimeoutError
+        if code == -signal.SIGXCPU:
+            raise TimeoutError("processor time")
+        if code != 0 or answer is None:
+            raise ProcessDiedError(code)
+        return answer
+
+    def _read(self, call: Call, until: float) -> bytes | None:
+        """Return the whole answer of the process; None when it takes too long."""
+        data = bytearray()
+        while len(data) <= LONGEST_ANSWER:
+            ready = _ready([self.answer, self.status], call, until)
+            if not ready:
+                return None
+            if self.answer not in ready:
+                self._end_group()  # the process has ended; what it has left behind keeps its pipe open
+                continue
+            piece = os.read(self.answer.fileno(), 1 << 16)
+            if not piece:
+                return bytes(data)
+            data += piece
+        raise WrongAnswerError(f"expected at most {LONGEST_ANSWER} bytes")
+
+    def _end(self) -> int | None:
+        """Kill the process and all that it has started, wait for their end, and return the exit code."""
+        with self.status, self.answer:
+            if not wait([self.status], 0):  # otherwise its number may be another's
+                with suppress(ProcessLookupError):
+                    os.kill(self.number, signal.SIGKILL)
+            code: int | None = None
+            with suppress(EOFError):  # the fork server has died, and it with it
+                code = forkserver.read_signed(self.status.fileno())
+            self._end_group()
+            return code
+
+    def _end_group(self) -> None:
+        """Kill what the process has started, and wait for its end: until then it might still write."""
+        until = time.monotonic() + _LAST_SECONDS
+        # The system gives numbers in turn: this one is nobody else's yet.
+        with suppress(ProcessLookupError, PermissionError):
+            while time.monotonic() < until:
+                os.killpg(self.number, signal.SIGKILL)
+                time.sleep(_GROUP_SECONDS)
+
+
+def _ready(pipes: list[Connection], call: Call, until: float) -> list[Any]:
+    """Wait until a pipe can be read; return those that can: none when it is too late, or nobody waits for the call."""
+    while not call.ended and (left := until - time.monotonic()) > 0:
+        if ready := wait(pipes, min(left, _LOOK_SECONDS)):
+            return ready
+    return []
+
+
+@dataclass(eq=False)
+class Call:
+    """One call of a function in a separate process.
+
+    Attributes
+    ----------
     function : callable
-        A function of a module, found by its name. Arguments and result are JSON values, or types that pydantic makes
-        from them by the function's annotations: paths, tuples, dataclasses.
+        A function of a module, found by its name. Its result is a JSON value, or a type that pydantic makes from one by
+        the function's annotation.
     args : tuple
+        What can be pickled.
     seconds : float or None
         Limit on its duration and on its processor time.
     before : callable or None
         Called in this process when a process is free, before the call begins.
     allowed : Allowed
         Rights and limits of its process; by default none.
-
-    Attributes
-    ----------
     begun : threading.Event
         Set when a process runs the call.
+    ended : bool
+        Set when nobody waits for it any more: its process is killed.
     """
 
-    def __init__(
-        self,
-        function: Callable[..., Any],
-        args: tuple[Any, ...] = (),
-        seconds: float | None = None,
-        before: Callable[[], object] | None = None,
-        allowed: Allowed | None = None,
-    ) -> None:
-        self.function = function
-        self.args = args
-        self.seconds = seconds
-        self.before = before
-        self.allowed = Allowed() if allowed is None else allowed
-        self.begun = threading.Event()
-        self._lock = threading.Lock()
-        self._process: Process | None = None
-        self._ended = False
-
-    @property
-    def ended(self) -> bool:
-        """Whether nobody waits for it any more."""
-        return self._ended
-
-    def attach(self, process: Process | None) -> None:
-        """Set the process that runs it now."""
-        with self._lock:
-            if self._ended and process is not None:
-                process.kill()
-            self._process = process
-
-    def end(self) -> None:
-        """Kill the process that runs it, now or as soon as there is one."""
-        with self._lock:
-            self._ended = True
-            if self._process is not None:
-                self._process.kill()
+    function: Callable[..., Any]
+    args: tuple[Any, ...] = ()
+    seconds: float | None = None
+    before: Callable[[], object] | None = None
+    allowed: Allowed = field(default_factory=Allowed)
+    begun: threading.Event = field(default_factory=threading.Event, init=False)
+    ended: bool = field(default=False, init=False)
 
 
 class Pool:
@@ -101,8 +386,7 @@ class Pool:
     def __init__(self, size: int, server: ForkServer) -> None:
         self._server = server
         self._threads = ThreadPoolExecutor(size, "lodestream-process")
-        self._lock = threading.Lock()
-        self._busy: set[Process] = set()
+        self._calls = set[Call]()
         self._closed = False
 
     async def run(self, call: Call) -> Any:
@@ -123,61 +407,42 @@ class Pool:
         OSError
             If no process could be started, or from `before`.
         """
-        future = self._threads.submit(self._run, call)
-        waiting = asyncio.wrap_future(future)
+        self._calls.add(call)
         try:
+            future = self._threads.submit(self._run, call)
+            waiting = asyncio.wrap_future(future)
             return await asyncio.shield(waiting)
         except asyncio.CancelledError:
-            call.end()
+            call.ended = True
             if not future.cancel():
                 await asyncio.wait((waiting,))
                 waiting.exception()  # nobody wants to know any more
             raise
+        finally:
+            self._calls.discard(call)
 
     def close(self) -> None:
         """Kill all processes; their calls raise `ProcessDiedError`."""
-        with self._lock:
-            self._closed = True
-            for process in self._busy:
-                process.kill()
+        self._closed = True
+        for call in self._calls.copy():
+            call.ended = True
         self._threads.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, call: Call) -> Any:
-        allowed = {**asdict(call.allowed), "seconds": call.seconds}
-        request = to_json({"function": name_of(call.function), "args": call.args, "allowed": allowed})
+        call.ended |= self._closed
         died, ready = ProcessDiedError(None), False
         for _ in range(_STARTS):
-            if call.ended or self._closed:
-                break
             try:
-                self._server.wait(lambda: call.ended or self._closed)
-                if call.ended or self._closed:
+                self._server.wait(lambda: call.ended)
+                if call.ended:
                     break
                 if call.before is not None and not ready:
                     call.before()
                 ready = True
-                process = self._server.fork(request)
+                process = self._server.fork(call)
             except ProcessDiedError as error:
                 died = error
                 continue
-            self._add(process)
-            call.attach(process)
-            try:
-                if process.begin():
-                    call.begun.set()
-                    return result_of(call.function, process.finish(call.seconds))
-            finally:
-                call.attach(None)
-                self._remove(process)
+            call.begun.set()
+            return result_of(call.function, process.finish(call))
         raise died
-
-    def _add(self, process: Process) -> None:
-        with self._lock:
-            self._busy.add(process)
-            if self._closed:
-                process.kill()
-
-    def _remove(self, process: Process) -> None:
-        with self._lock:
-            self._busy.discard(process)
-        process.end()

@@ -6,8 +6,10 @@ import errno
 import os
 import resource
 import signal
+import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -16,7 +18,7 @@ from threading import Barrier, get_ident
 from lodestream.confinement import landlock
 from lodestream.parallel import spread, threads
 from lodestream_server.builds import jobs, level_queue, worker
-from lodestream_server.builds.forkserver import Allowed
+from lodestream_server.builds.fork_server import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 from lodestream_server.storage import durable
@@ -26,19 +28,24 @@ from tests.server.storage.disks import FullDisk
 __all__ = [
     "allow_levels_more",
     "allow_more",
+    "answer_and_stay",
+    "chat",
     "end_by",
     "end_once",
     "explode",
     "explode_later",
     "find_full",
+    "fork_no_more",
     "full_at_each_step",
     "hoard",
     "hoard_level",
+    "hold",
     "kill",
     "kill_level_once",
     "kill_once",
     "lack_memory_for_level",
     "leave",
+    "limits",
     "listed",
     "make_coarsest",
     "make_level_by_bands",
@@ -54,10 +61,16 @@ __all__ = [
     "raise_full",
     "refuse",
     "refuse_large_level",
+    "say",
     "share",
     "sleep",
+    "sleep_with_another",
+    "stay",
+    "surroundings",
     "take",
+    "touch",
     "use_processors",
+    "vanish",
     "wait",
     "weaken",
 ]
@@ -96,6 +109,37 @@ def much() -> None:
 _loaded = list[bytearray]()
 
 
+def fork_no_more() -> None:
+    """The system has no room for another process."""
+
+    def fail() -> int:
+        raise BlockingIOError(errno.EAGAIN, "no room")
+
+    os.fork = fail
+
+
+def hold() -> None:
+    """Open files, as a library may that is loaded."""
+    handle = os.open("/dev/zero", os.O_RDONLY)
+    os.dup2(handle, 200)
+
+
+def stay() -> None:
+    """Load for longer than any test waits."""
+    time.sleep(600)
+
+
+def vanish() -> None:
+    """End what loads it."""
+    os._exit(7)
+
+
+def chat() -> None:
+    """Print something, then fail."""
+    os.write(1, b"hello\n")
+    raise KeyError("missing")
+
+
 def preload() -> None:
     """What `worker.preload` does, where calls of the tests find imported what they are called from."""
     import_module("tests.server.connections.hostile")
@@ -115,10 +159,54 @@ def sleep(begun: Path) -> None:
     time.sleep(600)
 
 
+def sleep_with_another(begun: Path) -> None:
+    """The same, and so does a process that this one has started."""
+    other = os.fork()
+    if other:
+        begun.with_suffix(".other").write_text(str(other))
+        sleep(begun)
+    time.sleep(600)
+
+
+def surroundings() -> dict[str, list[str]]:
+    """What stands open in a process that has just begun, and the names in its environment."""
+    found = []
+    for handle in range(1 << 12):
+        with suppress(OSError):
+            found.append(os.readlink(f"/proc/self/fd/{handle}"))
+    return {"open": found, "environment": sorted(os.environ)}
+
+
+def touch(path: Path) -> list[str | None]:
+    """Make a file, and say where temporary ones are made."""
+    path.touch()
+    return [tempfile.gettempdir(), os.environ.get("TMPDIR")]
+
+
+def limits() -> dict[str, tuple[int, int]]:
+    """The limits of the process."""
+    return {name: resource.getrlimit(getattr(resource, f"RLIMIT_{name}")) for name in ("CORE", "FSIZE", "NOFILE")}
+
+
 def raise_error(kind: str, number: int | None = None) -> None:
     """Raise an error of a built-in class."""
     error = {"KeyError": KeyError, "OSError": OSError, "ZeroDivisionError": ZeroDivisionError}[kind]
     raise error("secret") if number is None else error(number, "secret")
+
+
+def say(count: int) -> str:
+    """Answer with so many letters."""
+    return "x" * count
+
+
+def answer_and_stay() -> None:
+    """Answer, and go on for longer than any test waits."""
+    for handle in range(3, 64):
+        with suppress(OSError):
+            if os.readlink(f"/proc/self/fd/{handle}").startswith("pipe:"):
+                os.write(handle, b'{"returned": null}')
+                os.close(handle)
+    time.sleep(600)
 
 
 def leave(code: int) -> None:

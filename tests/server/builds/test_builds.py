@@ -352,7 +352,7 @@ def test_what_builds_and_levels_import_is_there_before_they_begin(tmp_path: Path
     program = """
 import sys
 from pathlib import Path
-from lodestream_server.builds import forkserver, worker
+from lodestream_server.builds import fork_server, worker
 worker.preload()
 from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
 before = set(sys.modules)

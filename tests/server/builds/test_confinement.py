@@ -23,8 +23,7 @@ import lodestream as ls
 from lodestream.confinement import landlock
 from lodestream_server.builds import jobs, worker
 from lodestream_server.builds.answers import UnforeseenError
-from lodestream_server.builds.fork_control import ForkServer
-from lodestream_server.builds.processes import Call, Pool
+from lodestream_server.builds.processes import Call, ForkServer, Pool
 from lodestream_server.maintenance import fsck
 from lodestream_server.storage.durable import remove
 from tests.patience import PATIENCE

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,9 +21,8 @@ import pytest
 
 from lodestream_server.builds import worker
 from lodestream_server.builds.answers import ProcessDiedError, UnforeseenError
-from lodestream_server.builds.fork_control import ForkServer
-from lodestream_server.builds.forkserver import Allowed
-from lodestream_server.builds.processes import Call, Pool
+from lodestream_server.builds.fork_server import Allowed
+from lodestream_server.builds.processes import ONE_THREAD, Call, ForkServer, Pool
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, eventually
 from tests.server.programs import alive
@@ -98,9 +100,15 @@ def test_a_fork_server_killed_while_it_idles_harms_nobody() -> None:
             assert second not in (first, before, os.getpid())
             assert server.pid not in (before, None)
             assert await ask(made, slow.number) not in (first, second)
-            # What others hear of the end of a service it leaves to its parent.
-            os.kill(server.pid or 0, signal.SIGTERM)
+            # What others hear of the end of a service, and Ctrl-C, it leaves to its parent; a call ends with a service.
+            for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+                os.kill(server.pid or 0, number)
             assert await ask(made, slow.number)
+            assert await ask(made, slow.end_by, int(signal.SIGINT)) is None
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                with pytest.raises(ProcessDiedError) as died:
+                    await ask(made, slow.end_by, int(number))
+                assert died.value.exitcode == -number
 
     try:
         asyncio.run(check())
@@ -126,6 +134,151 @@ def test_a_fork_server_that_dies_takes_its_calls_with_it(tmp_path: Path) -> None
         asyncio.run(check())
     finally:
         server.close()
+
+
+def _open() -> list[str]:
+    """What stands open in this process."""
+    found = []
+    for handle in os.listdir("/proc/self/fd"):
+        with suppress(OSError):
+            found.append(f"{handle} {os.readlink(f'/proc/self/fd/{handle}')}")
+    return found
+
+
+def test_a_process_has_its_pipe_and_nothing_else_of_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also while others run, and whatever the server holds, or the fork server has opened."""
+    monkeypatch.setenv("SOMEBODYS_SECRET", "x")
+    monkeypatch.setenv("LODESTREAM_TOKEN", "x")
+    monkeypatch.setenv("LC_ALL", "C.UTF-8")
+    server = ForkServer(slow.hold)
+
+    async def check() -> None:
+        async with pool(server, 2) as made:
+            begun = tmp_path / "begun"
+            other = asyncio.create_task(ask(made, slow.sleep, begun, write=tmp_path))
+            await asyncio.to_thread(eventually, begun.exists, "the call to begin")
+            found = await ask(made, slow.surroundings)
+            assert found["open"][:3] == [os.devnull] * 3
+            (pipe,) = found["open"][3:]
+            assert pipe.startswith("pipe:")
+            assert {"LC_ALL", "PATH", "LODESTREAM_THREADS", *ONE_THREAD} <= set(found["environment"])
+            assert not {"SOMEBODYS_SECRET", "LODESTREAM_TOKEN"} & set(found["environment"])
+            other.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await other
+
+    secret = os.open(tmp_path / "secret", os.O_RDWR | os.O_CREAT)
+    pipes = os.pipe()
+    try:
+        for handle in (secret, *pipes):
+            os.set_inheritable(handle, True)
+        asyncio.run(check())
+    finally:
+        for handle in (secret, *pipes):
+            os.close(handle)
+        server.close()
+
+
+def test_nothing_is_left_open_or_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the name of the temporary folder is longer than that of a socket may be."""
+    temporary = tmp_path / ("x" * 150)
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    server = ForkServer(slow.nothing)
+
+    async def check() -> None:
+        async with pool(server, 2) as made:
+            for _ in range(2):
+                await ask(made, slow.number)
+                with pytest.raises(ProcessDiedError):
+                    await ask(made, slow.leave, 3)
+                with pytest.raises(ProcessDiedError, match="invalid answer"):
+                    await ask(made, slow.say, 1 << 20)
+                assert list(temporary.iterdir()) == []
+                os.kill(server.pid or 0, signal.SIGKILL)
+            await ask(made, slow.number)
+
+    before = _open()
+    asyncio.run(check())
+    last = server.pid
+    assert last is not None
+    server.close()
+    assert gone(last)
+    with pytest.raises(ProcessDiedError):
+        server.wait()
+    assert _open() == before
+
+
+def test_a_call_has_the_limits_it_is_given(server: ForkServer) -> None:
+    async def check() -> None:
+        async with pool(server) as made:
+            found = await made.run(Call(slow.limits, allowed=Allowed(file_bytes=12345)))
+            assert found == {"CORE": (0, 0), "FSIZE": (12345, 12345), "NOFILE": (256, 256)}
+
+    asyncio.run(check())
+
+
+def test_a_call_has_its_two_folders(server: ForkServer, tmp_path: Path) -> None:
+    write, kept = tmp_path / "write", tmp_path / "kept"
+    write.mkdir()
+    kept.mkdir()
+
+    async def check() -> None:
+        async with pool(server) as made:
+            for path in (write / "a", kept / "b"):
+                found = await made.run(Call(slow.touch, (path,), allowed=Allowed(write=write, kept=kept)))
+                assert found == [str(write), str(write)]
+                assert path.exists()
+
+    asyncio.run(check())
+
+
+def test_where_there_is_no_room_for_a_process_the_system_says_so() -> None:
+    server = ForkServer(slow.fork_no_more)
+
+    async def check() -> None:
+        async with pool(server) as made:
+            with pytest.raises(BlockingIOError) as raised:
+                await ask(made, slow.number)
+            assert raised.value.errno == errno.EAGAIN
+
+    try:
+        asyncio.run(check())
+    finally:
+        server.close()
+
+
+def test_a_fork_server_that_ends_while_it_loads_is_told() -> None:
+    server = ForkServer(slow.vanish)
+    try:
+        for _ in range(2):
+            with pytest.raises(ProcessDiedError, match="exit code 7"):
+                server.wait()
+    finally:
+        server.close()
+
+
+def test_a_fork_server_that_loads_is_closed_at_once() -> None:
+    server = ForkServer(slow.stay)
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(server.wait)
+        process = eventually(lambda: server.pid, "the fork server to start")
+        server.close()
+        with pytest.raises(ProcessDiedError):
+            waiting.result(PATIENCE)
+    assert gone(process)
+
+
+def test_what_a_library_prints_is_no_message(capfd: pytest.CaptureFixture[str]) -> None:
+    server = ForkServer(slow.chat)
+    try:
+        problem = server.wait()
+        assert problem is not None
+        assert "KeyError" in problem
+        assert server.confinement is not None
+    finally:
+        server.close()
+    assert capfd.readouterr().err == "hello\n"
 
 
 def test_what_happens_to_a_call_is_told_and_the_next_one_works(server: ForkServer, tmp_path: Path) -> None:
@@ -199,26 +352,85 @@ def test_closing_kills_what_runs(server: ForkServer, tmp_path: Path) -> None:
     asyncio.run(check())
 
 
-def test_a_process_does_not_outlive_its_parent(tmp_path: Path) -> None:
-    begun = tmp_path / "begun"
-    program = (
-        "import asyncio, pathlib, sys\n"
-        "from lodestream_server.builds.forkserver import Allowed\n"
-        "from lodestream_server.builds.processes import Call, Pool\n"
-        "from lodestream_server.builds.fork_control import ForkServer\n"
-        "from tests.server.builds import slow\n"
-        "begun = pathlib.Path(sys.argv[1])\n"
-        "asyncio.run(Pool(1, ForkServer()).run(Call(slow.sleep, (begun,), allowed=Allowed(write=begun.parent))))\n"
-    )
-    script = tmp_path / "parent.py"
-    script.write_text(program)
+@pytest.mark.parametrize("ending", ["cancel", "close", "fork server"])
+def test_what_a_call_has_started_ends_with_it(tmp_path: Path, ending: str) -> None:
+    server = ForkServer()
+    begun, other = tmp_path / "begun", tmp_path / "begun.other"
+
+    async def check() -> None:
+        async with pool(server) as made:
+            call = Call(slow.sleep_with_another, (begun,), allowed=Allowed(write=tmp_path, processes=True))
+            task = asyncio.create_task(made.run(call))
+            await asyncio.to_thread(eventually, begun.exists, "the call to begin")
+            if ending == "cancel":
+                task.cancel()
+            elif ending == "close":
+                await asyncio.to_thread(server.close)
+            else:
+                os.kill(server.pid or 0, signal.SIGKILL)
+            with pytest.raises((ProcessDiedError, asyncio.CancelledError)):
+                await task
+            if ending == "fork server":  # then the system reaps them
+                eventually(lambda: not alive(int(other.read_text())), "the end of both")
+            else:
+                assert gone(int(begun.read_text()))
+                assert gone(int(other.read_text()))
+
+    try:
+        asyncio.run(check())
+    finally:
+        server.close()
+
+
+_PARENT = """
+import asyncio, pathlib, sys
+from lodestream_server.builds.fork_server import Allowed
+from lodestream_server.builds.processes import ONE_THREAD, Call, ForkServer, Pool
+from tests.server.builds import slow
+begun = pathlib.Path(sys.argv[1])
+with (begun.parent / "read").open("a") as file:
+    file.write("x")
+call = Call(getattr(slow, sys.argv[2]), (begun,), allowed=Allowed(write=begun.parent, processes=True))
+asyncio.run(Pool(1, ForkServer()).run(call))
+"""
+
+
+@contextmanager
+def _parent(folder: Path, program: list[str], function: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that calls a function in another, once that has begun."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    with subprocess.Popen([sys.executable, str(script), str(begun)], env=environment) as parent:
-        eventually(begun.exists, "the call to begin")
-        child = int(begun.read_text())
-        assert not gone(child)
-        parent.kill()
-    assert eventually(lambda: gone(child), "the process to end with its parent")
+    command = [sys.executable, *program, str(folder / "begun"), function]
+    with subprocess.Popen(command, env=environment) as parent:
+        try:
+            eventually((folder / "begun").exists, "the call to begin")
+            yield parent
+        finally:
+            parent.kill()
+
+
+@pytest.mark.parametrize("way", ["a script", "-c"])
+def test_a_process_does_not_outlive_its_parent(tmp_path: Path, way: str) -> None:
+    """Nor does it run the program of its parent again, which says nowhere that it would mind."""
+    script = tmp_path / "parent.py"
+    script.write_text(_PARENT)
+    program = [str(script)] if way == "a script" else ["-c", _PARENT]
+    with _parent(tmp_path, program, "sleep_with_another"):
+        processes = [int((tmp_path / name).read_text()) for name in ("begun", "begun.other")]
+        assert not any(gone(process) for process in processes)
+    for process in processes:
+        assert eventually(partial(gone, process), "the processes to end with their parent")
+    assert (tmp_path / "read").read_text() == "x"
+
+
+def test_a_process_does_not_outlive_its_parent_and_the_fork_server(tmp_path: Path) -> None:
+    """As where the system kills both at once for their memory."""
+    with _parent(tmp_path, ["-c", _PARENT], "sleep") as parent:
+        process = int((tmp_path / "begun").read_text())
+        status = Path(f"/proc/{process}/stat").read_text()
+        fork_server = int(status.rpartition(")")[2].split()[1])
+        os.kill(parent.pid, signal.SIGSTOP)
+        os.kill(fork_server, signal.SIGKILL)
+        assert eventually(lambda: not alive(process), "the process to end with the fork server")
 
 
 def test_each_call_has_its_own_processor_time(server: ForkServer) -> None:
@@ -257,5 +469,7 @@ def test_a_process_that_has_used_up_its_processor_time_ends(server: ForkServer) 
                 await ask(made, slow.end_by, int(signal.SIGXCPU))
             with pytest.raises(TimeoutError, match=r"^$"):
                 await ask(made, slow.use_processors, 60.0, seconds=0.5)
+            with pytest.raises(TimeoutError, match=r"^$"):
+                await ask(made, slow.answer_and_stay, seconds=0.5)
 
     asyncio.run(call())
