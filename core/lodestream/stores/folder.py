@@ -151,10 +151,11 @@ class Folder:
 
     def _remove(self, key: str, path: Path) -> None:
         """Remove a file, if there is one, and the folders that are then empty."""
-        if os.path.lexists(path) and not path.is_dir():
-            # Or, after a create of another writer, a `replace` that has looked would overwrite what it never read.
-            with self._locked(key), suppress(*_ABSENT):
-                path.unlink()
+        if not os.path.lexists(path) or path.is_dir():
+            return
+        # Or, after a create of another writer, a `replace` that has looked would overwrite what it never read.
+        with self._locked(key), suppress(*_ABSENT):
+            path.unlink()
         for folder in self._above(path)[:-1]:
             try:
                 folder.rmdir()
@@ -264,8 +265,9 @@ class Folder:
             try:
                 self._make(path.parent)
                 give()
-            except FileNotFoundError:  # another writer, or another program, has removed folders
-                self._on_disk.clear()
+            except FileNotFoundError:  # another writer has removed empty folders, or another program any
+                if not self._above(path)[-1].is_dir():
+                    self._on_disk.clear()
                 raise
 
         try:
