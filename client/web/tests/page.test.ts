@@ -90,13 +90,15 @@ describe("the configuration of a static host", () => {
       parseConfiguration({
         surfaces: [
           { name: "a", src: "a.lode", bytes: 7 },
-          { src: "b.lode", progress: 0.4 },
+          { name: "b", title: "The second", src: "b.lode", bytes: 8 },
+          { src: "c.lode", progress: 0.4 },
         ],
         live: false,
       }),
     ).toEqual([
-      { name: "a", src: "a.lode", bytes: 7, progress: null },
-      { name: "b.lode", src: "b.lode", bytes: null, progress: 0.4 },
+      { name: "a", title: "a", src: "a.lode", bytes: 7, progress: null },
+      { name: "b", title: "The second", src: "b.lode", bytes: 8, progress: null },
+      { name: "c.lode", title: "c.lode", src: "c.lode", bytes: null, progress: 0.4 },
     ]);
   });
 
