@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lodestream import page
 from lodestream_client.__main__ import main
 from lodestream_client.sync import upload
 from lodestream_server import running_server
@@ -29,6 +30,26 @@ def make_terrain(rows: int = 97, columns: int = 70) -> NDArray[np.float32]:
 @pytest.fixture(scope="session", autouse=True)
 def _one_fork_server(one_fork_server: None) -> None:
     """For all of these tests."""
+
+
+@pytest.fixture
+def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Make a page of two files, in place of the one that Node builds."""
+    folder = tmp_path / "built"
+    (folder / "assets").mkdir(parents=True)
+    (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
+    (folder / "assets" / "main-1.js").write_text("export {}")
+    made = page.assets(folder)
+    for module in ("lodestream.page", "lodestream_client.commands.view", "lodestream_client.demo.site"):
+        monkeypatch.setattr(f"{module}.assets", lambda: made)
+    return folder
+
+
+@pytest.fixture
+def pages(built: Path) -> dict[str, page.Asset]:
+    """Return the files of that page."""
+    assert (built / page.INDEX).is_file()
+    return page.assets()  # which is replaced
 
 
 @pytest.fixture(scope="session")

@@ -8,21 +8,9 @@ import httpx
 import numpy as np
 import pytest
 
-from lodestream import page
 from lodestream_client import sync
 from lodestream_client.demo import site
 from tests.client.files import ranged
-
-
-@pytest.fixture
-def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page of two files, in place of the one that Node builds."""
-    folder = tmp_path / "built"
-    (folder / "assets").mkdir(parents=True)
-    (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
-    (folder / "assets" / "main-1.js").write_text("export {}")
-    assets = page.assets(folder)
-    monkeypatch.setattr("lodestream_client.demo.site.assets", lambda: assets)
 
 
 @pytest.mark.usefixtures("built")

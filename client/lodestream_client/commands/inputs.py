@@ -15,7 +15,16 @@ from typing import Any, BinaryIO
 
 from lodestream.errors import FormatWarning, LodestreamError
 
-__all__ = ["Inputs", "input_files", "named", "no_container", "option_hints", "option_words", "reason_of"]
+__all__ = [
+    "Inputs",
+    "holds_container",
+    "input_files",
+    "named",
+    "no_container",
+    "option_hints",
+    "option_words",
+    "reason_of",
+]
 
 _STANDARD_INPUT = "standard input"
 
@@ -89,6 +98,22 @@ def option_words(text: str, names: Sequence[str] = ()) -> str:
     file = next((words for words in called if text.startswith(words)), "")
     hint = re.compile(rf"(?<!-o )(?<=[ (])(?:{'|'.join(sorted(keys))})=")
     return file + hint.sub(r"-o \g<0>", text[len(file) :]).replace("-o remesh=yes", "--remesh")
+
+
+def holds_container(path: Path) -> bool:
+    """Return whether what is there is a container: a file, by its first bytes.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    """
+    from lodestream.container.sections import SIGNATURE, is_container
+
+    if path.is_dir():  # as a Zarr store is
+        return False
+    with path.open("rb") as file:
+        return is_container(file.read(len(SIGNATURE)))
 
 
 def no_container(file: BinaryIO) -> str:

@@ -25,7 +25,7 @@ from .arguments import Subparsers, add_command, add_json_option
 from .building_options import BuildingOptions, add_memory_option
 from .decode import DecodeOptions, decode_file
 from .encode import EncodeOptions, encode_files
-from .inputs import input_files, named
+from .inputs import holds_container, named
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
 from .values import parse_days, parse_http
 
@@ -300,7 +300,7 @@ def _container(file: str, folder: Path, options: PublishOptions) -> Path:
             shutil.copyfileobj(sys.stdin.buffer, copy)
     else:
         path = Path(file)
-    if _is_container(path):
+    if holds_container(path):
         if replace(options.surface, name=None) != _NO_OPTIONS:
             raise OptionError(
                 "expected no --precision, --rms, --effort, --closed, --nodata, --format or -o, got one for "
@@ -313,20 +313,11 @@ def _container(file: str, folder: Path, options: PublishOptions) -> Path:
     return container
 
 
-def _is_container(path: Path) -> bool:
-    from lodestream.container.sections import SIGNATURE, is_container
-
-    if path.is_dir():  # as a Zarr store is
-        return False
-    with path.open("rb") as file:
-        return is_container(file.read(len(SIGNATURE)))
-
-
 def _described(container: Path, file: str) -> tuple[str | None, int]:
     """Return the title of a container and the number of its finest level."""
     from lodestream.container import read_index
 
-    with input_files([str(container)]) as files, files.paths[0].open("rb") as opened:
+    with container.open("rb") as opened:
         size = opened.seek(0, 2)
 
         def read(offset: int, length: int) -> bytes:

@@ -21,7 +21,7 @@ from ..terminal.interrupts import Terminated, interruptible
 from ..terminal.output import note, progress_bar, require_folder, say
 from .arguments import Subparsers, add_command, add_size_option, add_token_option, standard_input_once, token_of
 from .encode import read_surface
-from .inputs import input_files
+from .inputs import holds_container, input_files
 from .surface_options import SurfaceOptions, add_surface_options, surface_options
 from .values import parse_pictures, parse_port, parse_region
 
@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from ..viewer.sources import Source
 
 __all__ = ["ViewOptions", "register", "run"]
-
-# The first bytes of a container, see docs/format.md.
-_MAGIC = b"\xf5LODE\r\n"
 
 
 @dataclass(frozen=True)
@@ -249,11 +246,7 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
     with ExitStack() as stack:
         files = stack.enter_context(input_files(options.files))
         first = files.paths[0]
-        ready = False
-        if len(files.paths) == 1 and not first.is_dir():  # a Zarr store is a folder
-            with first.open("rb") as file:
-                ready = file.read(len(_MAGIC)) == _MAGIC
-        if ready:
+        if len(files.paths) == 1 and holds_container(first):
             _refuse_options(options.surface, "a container")
             yield lambda _: FileSource(first, options.name)
             return

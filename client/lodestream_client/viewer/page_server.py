@@ -113,7 +113,7 @@ class PageServer(ThreadingHTTPServer):
             surface["progress"] = self.progress
         else:
             surface["bytes"] = self.source.size
-        return {"surfaces": [surface], "live": True}
+        return {"surfaces": [surface]}
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore errors: browsers close connections at any time."""

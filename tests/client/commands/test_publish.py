@@ -11,22 +11,10 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream import page
 from lodestream_client.program import main
 from lodestream_client.publishing.page_address import cors_rule, page_address
 
 HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
-
-
-@pytest.fixture
-def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page of two files, in place of the one that Node builds."""
-    folder = tmp_path / "built"
-    (folder / "assets").mkdir(parents=True)
-    (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
-    (folder / "assets" / "main-1.js").write_text("export {}")
-    made = page.assets(folder)
-    monkeypatch.setattr("lodestream.page.assets", lambda: made)
 
 
 @pytest.fixture

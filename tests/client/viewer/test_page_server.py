@@ -51,7 +51,7 @@ def test_the_page_and_what_it_is_to_show(server: PageServer) -> None:
     assert get(server, "assets/main-1.js").text == "export {}"
     assert get(server, if_none_match=home.headers["etag"]).status_code == 304
     surface = {"name": "hills", "src": "surface.lode", "bytes": len(DATA)}
-    assert get(server, "view.json").json() == {"surfaces": [surface], "live": True}
+    assert get(server, "view.json").json() == {"surfaces": [surface]}
 
 
 def test_while_it_is_encoded_the_page_is_there_and_the_container_is_not(server: PageServer) -> None:

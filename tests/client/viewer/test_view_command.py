@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream import page
 from lodestream_client.program import main
 from lodestream_client.viewer.picture_change import DONE, VISIBLE, picture_change, share_above
 from lodestream_client.viewer.pictures import Picture, view_after, view_when_done
@@ -24,19 +23,6 @@ from tests.client.files import ranged
 from tests.patience import PATIENCE
 
 HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
-
-
-@pytest.fixture
-def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A page of two files, in place of the one that Node builds."""
-    folder = tmp_path / "built"
-    (folder / "assets").mkdir(parents=True)
-    (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
-    (folder / "assets" / "main-1.js").write_text("export {}")
-    made = page.assets(folder)
-    for module in ("lodestream.page", "lodestream_client.commands.view"):
-        monkeypatch.setattr(f"{module}.assets", lambda: made)
-    return folder
 
 
 @pytest.fixture
