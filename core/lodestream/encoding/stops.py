@@ -26,9 +26,6 @@ _WORTH = 0.02
 _LAYER = 128
 #: What is sought lies so far below the error: a little above, it would be of no use.
 _BELOW = 0.998
-#: Where no end is foretold to meet the error, the nearest one is measured if it is foretold to be at most so many times
-#: as large.
-_NEAR = 1.02
 
 
 def sought_ends(order: PassOrder, measured: Mapping[int, float], extent: float, geometric: int) -> list[int]:
@@ -51,9 +48,8 @@ def sought_ends(order: PassOrder, measured: Mapping[int, float], extent: float, 
         if not places.size:
             continue
         errors = _foretold(order, left, places, (before, measured[before]), (end, measured[end]))
-        place = (
-            int(places[np.argmax(errors <= _BELOW * limit)]) if (errors <= _BELOW * limit).any() else int(places[-1])
-        )
+        met = np.flatnonzero(errors <= _BELOW * limit)
+        place = int(places[met[0] if met.size else -1])
         if order.sizes[place] < (1 - _WORTH) * order.sizes[end - 1]:
             found.add(place + 1)
     return sorted(found)
