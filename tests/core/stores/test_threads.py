@@ -5,37 +5,39 @@ import threading
 import pytest
 
 from lodestream.stores.threads import Threads
-
-
-def named() -> int:
-    return sum(thread.name == "lodestream-store" for thread in threading.enumerate())
+from tests.patience import PATIENCE
 
 
 def test_all_calls_are_carried_out_a_few_at_once_and_no_thread_is_left() -> None:
-    threads, before = Threads(3), named()
+    threads, others = Threads(3), set(threading.enumerate())
     lock, now, most = threading.Lock(), 0, 0
-    gate = threading.Event()
+    full, gate = threading.Event(), threading.Event()
 
     def call(number: int) -> int:
         nonlocal now, most
         with lock:
             now += 1
             most = max(most, now)
+            if now == 3:
+                full.set()
         gate.wait()
         with lock:
             now -= 1
         return number
 
     for _ in range(2):
+        full.clear()
         gate.clear()
         answers = [threads.submit(call, number) for number in range(50)]
-        assert named() == before + 3
+        assert full.wait(PATIENCE), "three at once"
+        own = [thread for thread in threading.enumerate() if thread not in others]
+        assert [thread.name for thread in own] == 3 * ["lodestream-store"]
+        assert all(thread.daemon for thread in own), "the end of the program does not wait for them"
         gate.set()
         assert [answer.result() for answer in answers] == list(range(50))
-        for thread in threading.enumerate():
-            if thread.name == "lodestream-store":
-                assert thread.daemon, "the end of the program does not wait for it"
-                thread.join()
+        for thread in own:
+            thread.join(PATIENCE)
+            assert not thread.is_alive()
     assert most == 3
 
 
