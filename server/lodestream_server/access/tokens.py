@@ -23,8 +23,8 @@ from typing import Any
 from lodestream.errors import LodestreamError, NotFoundError, OptionError
 from lodestream.operating_system import give_to_owner, lock
 
-from ..storage.durable import NewFile, remove, rename
-from ..storage.private import make_private
+from ..store.durable import NewFile, remove, rename
+from ..store.private import make_private
 
 __all__ = ["SCOPES", "Token", "TokenFile", "Tokens"]
 

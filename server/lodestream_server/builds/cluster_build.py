@@ -25,7 +25,7 @@ from pydantic import TypeAdapter
 from lodestream.errors import FormatWarning, InputError, LodestreamError, OptionError, TooLargeError, UnavailableError
 from lodestream.operating_system import lower_limit
 
-from ..storage.durable import remove
+from ..store.durable import remove
 from .answers import answer_of
 from .worker import Built, Job, Refused, may_pass, moved, raise_passing, reporter
 

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import CorruptStreamError, FormatError, OptionError, TooLargeError
 
-from ..storage.durable import NewFile
 from ..storage.records import plain
+from ..store.durable import NewFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence

@@ -47,10 +47,10 @@ from lodestream.errors import InputError, TooLargeError
 from ..access.access import key_of
 from ..operation.settings import Settings
 from ..problems import FullError, MissingError
-from ..storage.durable import discard
 from ..storage.records import Record, State
 from ..storage.storage import Storage
 from ..storage.uploads import check_upload
+from ..store.durable import discard
 from . import results, worker
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason_of
 from .cluster_build import ClusterJob

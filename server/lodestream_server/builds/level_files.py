@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from ..storage.durable import discard
+from ..store.durable import discard
 
 __all__ = ["Key", "Lease", "LevelFiles"]
 

@@ -39,9 +39,9 @@ from ..access.access import Caller
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, LargeLevelError, RestartingError, TooManyError, UnfitLevelError
 from ..storage import damage
-from ..storage.durable import discard, make_folder, remove
 from ..storage.folders import is_file
 from ..storage.storage import Storage
+from ..store.durable import discard, make_folder, remove
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
 from .fork_server import Allowed
 from .level_files import Key, Lease, LevelFiles

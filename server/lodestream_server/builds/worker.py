@@ -31,7 +31,7 @@ from lodestream.errors import (
 )
 from lodestream.operating_system import open_own
 
-from ..storage.durable import NewFile
+from ..store.durable import NewFile
 from . import finished
 from .stored_quality import without_quality
 

@@ -16,10 +16,10 @@ from ..builds.finished import figures_of
 from ..builds.jobs import Builder
 from ..operation.settings import Settings
 from ..storage import aside
-from ..storage.durable import write_file
 from ..storage.folders import Folders, is_file
 from ..storage.records import Record, read_record, serialize
 from ..storage.storage import Storage
+from ..store.durable import write_file
 from . import fsck
 from .fsck import Finding, Report
 

@@ -20,8 +20,8 @@ from ..access.scopes import needs
 from ..builds import options
 from ..problems import BusyError, FullError, NotOwnerError, TooManyError, responses
 from ..storage import uploads
-from ..storage.durable import discard
 from ..storage.records import Record
+from ..store.durable import discard
 from . import examples
 from .routing import Parts, State, readable
 from .sending import ready

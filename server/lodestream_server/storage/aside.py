@@ -9,7 +9,7 @@ import secrets
 import shutil
 from pathlib import Path
 
-from .durable import remove, rename, sync_folder
+from ..store.durable import remove, rename, sync_folder
 from .folders import Folders, is_folder
 
 __all__ = ["set_aside"]

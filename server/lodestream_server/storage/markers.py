@@ -15,7 +15,7 @@ from pathlib import Path
 
 from lodestream.errors import LodestreamError
 
-from .durable import remove, sync_folder, write_file
+from ..store.durable import remove, sync_folder, write_file
 from .folders import Folders
 from .records import read_record
 

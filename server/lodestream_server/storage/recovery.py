@@ -29,9 +29,9 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from ..store.durable import remove, sync_folder, write_file
 from . import work
 from .aside import set_aside
-from .durable import remove, sync_folder, write_file
 from .folders import Folders, is_file
 from .records import Record, read_record, serialize
 from .versions import other_version

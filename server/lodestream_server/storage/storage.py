@@ -19,11 +19,11 @@ from lodestream.errors import InputError, LodestreamError, NotFoundError
 from lodestream.operating_system import lock
 
 from ..problems import BusyError, MissingError
+from ..store.durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
+from ..store.private import check_writable, make_private, tighten
 from . import markers, work
 from .catalog import Catalog, Position
-from .durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from .folders import Folders, is_file, is_folder
-from .private import check_writable, make_private, tighten
 from .records import Record, State, serialize
 from .recovery import finish_delete, has_container, has_upload, present, recover
 from .versions import other_version

@@ -20,7 +20,7 @@ from lodestream.errors import FormatError, OptionError, TooLargeError
 
 from ..operation.settings import Settings
 from ..problems import SlowUploadError
-from .durable import NewFile
+from ..store.durable import NewFile
 from .records import Record
 
 if TYPE_CHECKING:

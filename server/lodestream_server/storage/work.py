@@ -22,7 +22,7 @@ from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from .durable import discard, make_folder, remove
+from ..store.durable import discard, make_folder, remove
 from .folders import Folders, is_folder
 
 __all__ = ["bands_of", "begin", "begun", "clean", "end", "forget", "new_attempt"]

@@ -27,7 +27,7 @@ from lodestream_client import sync
 from lodestream_server import running_server
 from lodestream_server.access.tokens import SCOPES, TokenFile
 from lodestream_server.routes import streams
-from lodestream_server.storage.durable import write_file
+from lodestream_server.store.durable import write_file
 from tests.patience import PATIENCE
 from tests.server.helpers import Keys, Raw, closed, eventually, hills, npy, problem, push, raw_stream
 

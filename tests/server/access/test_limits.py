@@ -24,7 +24,7 @@ from lodestream_server.access.limits import Limits
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.operation import least_rate
 from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
-from lodestream_server.storage import durable
+from lodestream_server.store import durable
 from tests.server.helpers import PATIENCE, Raw, eventually, hills, npy, push, raw_stream
 from tests.server.storage.disks import FullDisk
 

@@ -160,7 +160,7 @@ def test_deletes_and_uploads_of_the_same_bytes_at_once(office: Office) -> None:
 def test_what_a_delete_could_not_remove_does_not_take_what_was_uploaded_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lodestream_server.storage import durable
+    from lodestream_server.store import durable
 
     class Stubborn(durable.Disk):
         def unlink(self, path: Path) -> None:
@@ -187,7 +187,7 @@ def test_what_a_delete_could_not_remove_does_not_take_what_was_uploaded_again(
 def test_what_a_delete_could_not_remove_is_removed_by_the_next_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lodestream_server.storage import durable
+    from lodestream_server.store import durable
 
     class Stubborn(durable.Disk):
         def remove_folder(self, path: Path) -> None:

@@ -21,7 +21,7 @@ from lodestream_server.builds import jobs, level_queue, worker
 from lodestream_server.builds.fork_server import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
-from lodestream_server.storage import durable
+from lodestream_server.store import durable
 from tests.patience import PATIENCE as _PATIENCE
 from tests.server.storage.disks import FullDisk
 

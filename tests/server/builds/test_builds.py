@@ -21,9 +21,9 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.builds import jobs, worker
-from lodestream_server.storage.durable import discard
 from lodestream_server.storage.markers import MARKER
 from lodestream_server.storage.storage import Storage
+from lodestream_server.store.durable import discard
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, push, settled, upload_of
 

@@ -25,7 +25,7 @@ from lodestream_server.builds import jobs, worker
 from lodestream_server.builds.answers import UnforeseenError
 from lodestream_server.builds.processes import Call, ForkServer, Pool
 from lodestream_server.maintenance import fsck
-from lodestream_server.storage.durable import remove
+from lodestream_server.store.durable import remove
 from tests.patience import PATIENCE
 from tests.server.builds import slow
 from tests.server.builds.test_builds import running

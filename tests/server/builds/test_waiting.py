@@ -215,7 +215,7 @@ def test_fsck_without_a_lock_repairs_what_it_says(
 def test_setting_aside_on_another_disk(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    from lodestream_server.storage import durable
+    from lodestream_server.store import durable
 
     class OtherDisk(durable.Disk):
         def rename(self, source: Path, target: Path) -> None:
@@ -244,7 +244,7 @@ def test_setting_aside_on_another_disk(
 def test_nothing_is_lost_where_it_cannot_be_set_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from lodestream_server.storage import durable
+    from lodestream_server.store import durable
 
     class NoRename(durable.Disk):
         def rename(self, source: Path, target: Path) -> None:

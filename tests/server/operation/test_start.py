@@ -23,9 +23,9 @@ from lodestream.errors import LodestreamError
 from lodestream_client.__main__ import main
 from lodestream_server import Settings, create_app, running_server
 from lodestream_server.access.tokens import TokenFile
-from lodestream_server.storage import durable
-from lodestream_server.storage.durable import Disk
 from lodestream_server.storage.storage import Storage
+from lodestream_server.store import durable
+from lodestream_server.store.durable import Disk
 from tests.server.helpers import PATIENCE, Keys, hills, npy, problem, push
 
 Refused = Callable[..., str]

@@ -1,4 +1,4 @@
-"""Disks that are full, and disks that lose what was never synchronised: for `storage.durable.disk`."""
+"""Disks that are full, and disks that lose what was never synchronised: for `store.durable.disk`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, TypeVar
 
-from lodestream_server.storage.durable import Disk
+from lodestream_server.store.durable import Disk
 
 T = TypeVar("T")
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from lodestream_server.maintenance.fsck import check
-from lodestream_server.storage import durable
 from lodestream_server.storage.records import Record
 from lodestream_server.storage.storage import Storage
 from lodestream_server.storage.uploads import Upload
+from lodestream_server.store import durable
 from tests.server.storage.disks import FullDisk, LosingDisk
 
 UPLOADS = {"a" * 20: b"first" * 100, "b" * 20: b"second" * 100}

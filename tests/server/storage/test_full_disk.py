@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from lodestream_server.builds import jobs, worker
-from lodestream_server.storage import durable
 from lodestream_server.storage.storage import Storage
+from lodestream_server.store import durable
 from tests.server.builds import slow
 from tests.server.builds.test_builds import running
 from tests.server.helpers import eventually, hills, kept, npy, push, settled

@@ -20,10 +20,10 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.commands.fsck import register
-from lodestream_server.storage.durable import Disk, write_file
 from lodestream_server.storage.folders import Folders
 from lodestream_server.storage.markers import MARKER, adopt
 from lodestream_server.storage.storage import Storage
+from lodestream_server.store.durable import Disk, write_file
 from tests.patience import PATIENCE
 from tests.server.helpers import hills, npy, push, settled, upload_of
 
@@ -242,7 +242,7 @@ def test_a_server_starts_after_adopting_that_an_error_has_ended_anywhere(
     for step in itertools.count():
         with monkeypatch.context() as patch:
             disk = Stale(step)
-            patch.setattr("lodestream_server.storage.durable.disk", disk)
+            patch.setattr("lodestream_server.store.durable.disk", disk)
             with suppress(OSError):
                 adopt(Folders(data))
         storage = Storage(data)
