@@ -1,13 +1,8 @@
-"""Folders as servers leave them: with surfaces in every state, with leftovers, with damage.
-
-These are the only lines of the harness that know how a folder is laid out (docs/formats.md and the head of
-`lodestream_server.storage.storage`).
-"""
+"""Folders as servers leave them: with surfaces in every state, with leftovers, with damage."""
 
 from __future__ import annotations
 
 import copy
-import json
 import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -18,6 +13,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from tests import data_folder
 from tests.server.helpers import hills, npy
 
 from .oracle import Ledger, Talk
@@ -27,7 +23,6 @@ from .shim import Fault
 __all__ = ["DAMAGES", "Folder", "Made"]
 
 _ALWAYS = 1 << 31
-_NOBODY = "0123456789abcdef" * 2
 
 
 @dataclass
@@ -106,11 +101,7 @@ def _mixed(programs: Programs, folder: Folder) -> Folder:
         for seed in (5, 6):
             queued = _push(talk, hills(12, 11, seed=seed))
     _container(folder, 1).unlink()
-    for name in ("incoming", "work"):
-        left = folder.data / name / f"{queued}.{_NOBODY[:16]}"
-        left.mkdir(parents=True)
-        (left / "0").write_bytes(b"half of an upload")
-    (folder.data / "records" / f"{queued}.json.{_NOBODY[:16]}.new").write_bytes(b'{"id": ')
+    data_folder.leave_unfinished(folder.data, queued)
     return folder
 
 
@@ -133,12 +124,11 @@ def _surface(folder: Folder, number: int) -> str:
 
 
 def _container(folder: Folder, number: int) -> Path:
-    return folder.data / "containers" / f"{folder.ledger.kept[_surface(folder, number)].container}.lode"
+    return data_folder.container(folder.data, folder.ledger.kept[_surface(folder, number)].container)
 
 
 def _upload(folder: Folder) -> Path:
-    record = json.loads((folder.data / "records" / f"{_surface(folder, 0)}.json").read_bytes())
-    return folder.data / "uploads" / str(record["upload"]) / "0"
+    return data_folder.upload_file(folder.data, _surface(folder, 0))
 
 
 def _flip(path: Path) -> None:
@@ -148,7 +138,7 @@ def _flip(path: Path) -> None:
 
 
 def _cut_record(folder: Folder) -> None:
-    path = folder.data / "records" / f"{_surface(folder, 0)}.json"
+    path = data_folder.manifest(folder.data, _surface(folder, 0))
     path.write_bytes(path.read_bytes()[:-9])
 
 

@@ -26,8 +26,7 @@ from typing import Any
 
 from lodestream_client import program
 from lodestream_server.builds import fork_server, jobs, processes, worker
-from lodestream_server.maintenance import repair
-from lodestream_server.storage import records
+from tests import data_folder
 
 __all__ = ["DIED", "main"]
 
@@ -41,7 +40,6 @@ _MODULES = (
     "lodestream_client.program",
     "lodestream_server.app",
     "lodestream_server.commands.fsck",
-    "lodestream_server.maintenance.repair",
     "lodestream_server.running",
     "lodestream_server.commands.token",
     "uvicorn.lifespan.on",
@@ -134,7 +132,7 @@ def main() -> None:
         import_module(module)
     worker.preload()
     # What each process would make first: both take as long as looking through a small folder.
-    records._adapter()
+    data_folder.warm()
     parser = program.build_parser()
     names: Any = program
     names.build_parser = lambda _: parser
@@ -186,14 +184,7 @@ def _be(arguments: list[str], log: str) -> int:
     # A fork server is forked while this process has one thread; for fsck only where it builds, at last.
     if "serve" in arguments:
         _fork_server()
-    names: Any = repair
-    rebuild = names.rebuild
-
-    def fork_and_rebuild(*args: Any, **options: Any) -> Any:
-        _fork_server()
-        return rebuild(*args, **options)
-
-    names.rebuild = fork_and_rebuild
+    data_folder.when_fsck_builds(_fork_server)
     return main(arguments)
 
 

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -20,7 +18,7 @@ import lodestream as ls
 
 from .programs import PATIENCE
 
-__all__ = ["Kept", "Ledger", "Problem", "Talk", "contents"]
+__all__ = ["Kept", "Ledger", "Problem", "Talk"]
 
 #: What an answer may say while a call fails: the server's fault, or not now.
 _EXCUSES = (409, 424)
@@ -252,12 +250,3 @@ class Talk:
             _decoded[sha256] = ls.decode(answer.content).points
         if sha256 in _decoded and not np.array_equal(_decoded[sha256], kept.points):  # type: ignore[arg-type]
             self.say("wrong", f"{surface} is another surface than the one that was uploaded")
-
-
-def contents(folder: Path, *, without: tuple[str, ...] = ()) -> Counter[str]:
-    """The hashes of all files beneath a folder, and how many files have each; without some names."""
-    return Counter(
-        hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file() and not set(without).intersection(path.relative_to(folder).parts)
-    )

@@ -17,6 +17,7 @@ from typing import Any, Self
 
 import httpx
 
+from tests.data_folder import PLACES
 from tests.patience import PATIENCE as PATIENCE
 
 from .shim import Shim, library
@@ -48,7 +49,7 @@ class Programs:
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        self.shim = Shim(library(folder), folder / "page")
+        self.shim = Shim(library(folder, PLACES), folder / "page")
         # A program without a file: a process that is spawned from it would import that file again.
         command = [sys.executable, "-c", "from tests.faults.forking import main; main()"]
         environment = self.shim.environment() | _ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import httpx
 
+from tests.data_folder import APART, bytes_of_surfaces, contents
+
 from .cases import Case, Outcome, stopped
 from .folders import DAMAGES, Folder, Made
 from .forking import DIED
-from .oracle import Problem, Talk, contents
+from .oracle import Problem, Talk
 from .programs import Program, Programs, Server
 from .shim import SHORT, Site
 
@@ -23,14 +25,14 @@ _FAR = "another file system"
 #: Options of ``lodestream fsck``; those that it does not have are left out.
 _OPTIONS = ("--repair", "--adopt", "--retry")
 
-#: Each damage, looked at and repaired, with ``damaged/`` in the folder's file system and in another.
+#: Each damage, looked at and repaired, with all of the folder in one file system and with a part of it in another.
 REPAIRS = tuple(
     ", ".join(words)
     for damage in DAMAGES
     for words in (
         (damage, "fsck"),
         *((damage, f"fsck {option}") for option in _OPTIONS),
-        (damage, "fsck --repair", f"damaged/ in {_FAR}"),
+        (damage, "fsck --repair", f"{APART}/ in {_FAR}"),
     )
 )
 
@@ -87,7 +89,7 @@ class Rest:
                 folder = self._made.plain.copy(self._folder)
                 DAMAGES[damage](folder)
                 self._shim.beneath(folder.data)
-                with self._shim.apart("damaged") if where else nullcontext():
+                with self._shim.apart(APART) if where else nullcontext():
                     self._repair(folder, damage, command.split()[1:], fault, case, fails=fails)
         finally:
             shutil.rmtree(self._folder)
@@ -145,8 +147,7 @@ class Rest:
         *,
         fails: bool,
     ) -> None:
-        # A marker says only where its folder belongs, and --adopt changes it.
-        everything, precious = contents(folder.data), contents(folder.data, without=("records", "lock", "identity"))
+        everything, precious = contents(folder.data), bytes_of_surfaces(folder.data)
         with fault:
             first = self._programs.run("fsck", str(folder.data), *options)
         self._note()

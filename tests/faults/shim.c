@@ -47,10 +47,10 @@
     X(STATVFS, "statvfs") X(SENDFILE, "sendfile") X(COPY_RANGE, "copy_file_range") X(UTIME, "utime") \
     X(CHMOD, "chmod") X(CHOWN, "chown") X(CLOSE, "close")
 
-/* What lies in the folder itself; the first is the folder, the last whatever has another name. */
-#define TOPS(X) \
-    X("") X("lock") X("tokens.json") X("records") X("uploads") X("containers") X("incoming") X("work") X("levels") \
-    X("damaged") X("other")
+/* What lies in the folder; the first is the folder, the last whatever has another name. tests/faults/shim.py gives it. */
+#ifndef TOPS
+#error "expected TOPS(X), such as X(\"\") X(\"uploads\") X(\"other\")"
+#endif
 
 /* Itself; below it what is called by an id, by another name, or is being written; below that a number, another name. */
 #define KINDS(X) X("") X("/ID") X("/name") X("/*.new") X("/*/N") X("/*/name")
@@ -74,8 +74,7 @@ static const char *const kind_names[] = {KINDS(X)};
 #undef X
 
 #define TOP_COUNT ((int)(sizeof top_names / sizeof *top_names))
-#define PLACE_COUNT (11 * KIND_COUNT)
-_Static_assert(sizeof top_names / sizeof *top_names * KIND_COUNT == PLACE_COUNT, "one place for each top and kind");
+#define PLACE_COUNT (TOP_COUNT * KIND_COUNT)
 
 /* ---- the page; tests/faults/shim.py has the same ---- */
 
@@ -105,9 +104,11 @@ extern const char *lode_call(int number);
 extern int lode_calls(void);
 int lode_calls(void) { return calls; }
 extern const char *lode_place(int number);
+extern const char *lode_top(int number);
 extern size_t lode_size(void);
 extern int lode_leave_signal_stack(void);
 const char *lode_call(int number) { return number < CALL_COUNT ? call_names[number] : NULL; }
+const char *lode_top(int number) { return number < TOP_COUNT ? top_names[number] : NULL; }
 size_t lode_size(void) { return sizeof(struct control); }
 const char *lode_place(int number)
 {
@@ -200,13 +201,15 @@ static int place_of(const char *path)
         path++;
     if (*path == '\0')
         return 0;
-    size_t first = strcspn(path, "/");
-    const char *below = path + first;
+    const char *below = path + strcspn(path, "/");
     int top = TOP_COUNT - 1;
     for (int number = 1; number < TOP_COUNT - 1; number++) {
         size_t size = strlen(top_names[number]);
-        if (strncmp(path, top_names[number], size) == 0 && (size == first || path[size] == '.'))
+        /* With it go files beside it whose names only add to it: one that is being written, those of a database. */
+        if (strncmp(path, top_names[number], size) == 0 && (path[size] == '\0' || strchr("/.-", path[size]) != NULL)) {
             top = number;
+            below = path + size + strcspn(path + size, "/");
+        }
     }
     if (*below == '\0' || below[1] == '\0')
         return top * KIND_COUNT + (ends_in_new(path) ? KIND_NEW : KIND_SELF);

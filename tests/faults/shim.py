@@ -15,7 +15,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +82,7 @@ class Fault:
     call : str
         A key of `ERRORS`.
     place : str
-        Where its path lies, such as ``records/*.new``.
+        Where its path lies: one of the names given to `library`, and what is there, such as ``uploads/*/N``.
     number : int
         Which of these calls, from 0.
     error : str
@@ -133,7 +133,7 @@ class Shim:
     def __init__(self, library: Path, page: Path) -> None:
         names = ctypes.CDLL(str(library))
         self._calls = _names(names.lode_call)
-        self._places = _names(names.lode_place)
+        self._tops, self._places = _names(names.lode_top), _names(names.lode_place)
         names.lode_size.restype = ctypes.c_size_t
         kind = _layout(len(self._calls), len(self._places))
         assert ctypes.sizeof(kind) == names.lode_size(), "expected the page of shim.c"
@@ -159,8 +159,8 @@ class Shim:
 
     @contextmanager
     def apart(self, folder: str) -> Iterator[None]:
-        """Let a folder such as ``damaged`` be on a file system of its own meanwhile: nothing is renamed into it."""
-        self._page.apart = self._places.index(folder) // (self._places.index("lock") - self._places.index(""))
+        """Let a folder be on a file system of its own meanwhile: nothing is renamed into it."""
+        self._page.apart = self._tops.index(folder)
         try:
             yield
         finally:
@@ -223,8 +223,14 @@ class Shim:
         return found
 
 
-def library(folder: Path) -> Path:
+def library(folder: Path, places: Sequence[str]) -> Path:
     """Compile the shim into a folder, and see whether it works here.
+
+    Parameters
+    ----------
+    folder : Path
+    places : sequence of str
+        The files and folders in which calls are told apart, by their paths; one within another comes after it.
 
     Raises
     ------
@@ -237,20 +243,21 @@ def library(folder: Path) -> Path:
     if sys.platform != "linux" or platform.libc_ver()[0] != "glibc":
         raise CannotError("calls are intercepted on Linux with glibc only")
     made = folder / "shim.so"
-    command = [compiler, *_FLAGS, "-o", str(made), str(_SOURCE), "-ldl"]
+    tops = " ".join(f'X("{name}")' for name in ("", *places, "other"))
+    command = [compiler, *_FLAGS, f"-DTOPS(X)={tops}", "-o", str(made), str(_SOURCE), "-ldl"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    _probe(made, folder)
+    _probe(made, folder, places[0])
     return made
 
 
-def _probe(made: Path, folder: Path) -> None:
+def _probe(made: Path, folder: Path, place: str) -> None:
     root = folder / "probe"
     root.mkdir()
     shim = Shim(made, folder / "probe.page")
     shim.beneath(root)
-    with shim.failing(Fault("mkdir", "records", 0, "EIO")):
-        program = f"import os; os.mkdir({str(root / 'records')!r})"
+    with shim.failing(Fault("mkdir", place, 0, "EIO")):
+        program = f"import os; os.mkdir({str(root / place)!r})"
         command = [sys.executable, "-I", "-c", program]
         done = subprocess.run(command, env=shim.environment(), capture_output=True, text=True, check=False)
     if shim.hits == 0:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from tests.data_folder import APART
 from tests.faults.cases import Case
 from tests.faults.run import Session
 
@@ -53,8 +54,8 @@ def test_a_server_starts_with_what_was_acknowledged_or_says_why_not(session: Ses
 
 
 @pytest.mark.parametrize("damage", ["flipped container", "broken record"])
-def test_a_repair_loses_nothing_where_damaged_is_on_another_file_system(session: Session, damage: str) -> None:
-    cases = session.repair(f"{damage}, fsck --repair, damaged/ in another file system")
+def test_a_repair_loses_nothing_where_a_part_is_on_another_file_system(session: Session, damage: str) -> None:
+    cases = session.repair(f"{damage}, fsck --repair, {APART}/ in another file system")
     problems, session.report.problems = session.report.problems, []
     assert not problems, "\n".join(map(str, problems))
     assert cases

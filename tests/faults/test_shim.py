@@ -39,6 +39,7 @@ do("back", lambda: (root / "damaged").rename(path))
 do("remove", lambda: shutil.rmtree(path.parent))
 command = [sys.executable, "-I", "-c", "import os, sys; os.mkdir(sys.argv[1])", str(root / "work")]
 print("child", subprocess.run(command, stderr=subprocess.DEVNULL).returncode)
+do("deep", lambda: (root / "work" / "deep").mkdir())
 """
 
 WELL = {
@@ -51,6 +52,7 @@ WELL = {
     "back": "{root}/records/0123456789.json",
     "remove": "None",
     "child": "0",
+    "deep": "None",
 }
 
 
@@ -58,7 +60,7 @@ class Bench:
     """A shim, a folder, and the program."""
 
     def __init__(self, folder: Path) -> None:
-        self.shim = Shim(library(folder), folder / "page")
+        self.shim = Shim(library(folder, ("records", "damaged", "work", "work/deep")), folder / "page")
         self.folder = folder
         self._runs = 0
 
@@ -105,15 +107,18 @@ def test_calls_are_counted_by_what_they_are_and_where(bench: Bench) -> None:
         ("unlink", "records/ID"),
         ("rmdir", "records"),
         ("mkdir", "work"),  # by the process that the program starts
+        ("mkdir", "work/deep"),
     }
-    assert bench.run(root) == bench.well(root) | {"child": "1"}  # there is a folder of this name by now
+    there = {"child": "1", "deep": "File-exists"}  # folders of these names, by now
+    assert bench.run(root) == bench.well(root) | there
     assert {(site.call, site.place) for site in bench.shim.sites()} == found  # nothing was added meanwhile
 
 
 @pytest.mark.parametrize(
     ("fault", "changes"),
     [
-        (Fault("mkdir", "work", 0, "EIO"), {"child": "1"}),
+        (Fault("mkdir", "work", 0, "EIO"), {"child": "1", "deep": "No-such-file-or-directory"}),
+        (Fault("mkdir", "work/deep", 0, "EIO"), {"deep": "Input/output-error"}),
         (Fault("write", "records/ID", 0, "ENOSPC"), {"write": "No-space-left-on-device", "read": "0", "stat": "0"}),
         (Fault("write", "records/ID", 0, SHORT), {"write": "16", "read": "16", "stat": "16"}),
         (Fault("read", "records/ID", 0, SHORT), {"read": "16"}),

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
 import random
 import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, TypeVar
 
+from tests import data_folder
 from tests.patience import PATIENCE as _PATIENCE
 from tests.server.helpers import eventually
 
 from .driver import Client
 from .events import History, Subject
-from .site import FOLDERS, Site, copy_tree
+from .site import Site
 
 __all__ = ["KINDS", "Disasters"]
+
+T = TypeVar("T")
 
 
 _MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
@@ -67,7 +72,7 @@ class Disasters:
         self._folder = folder
         self._random = random_
         self._longest = longest
-        self._left: dict[str, list[str]] = {}
+        self._left: dict[str, list[Any]] = {}
 
     @property
     def count(self) -> int:
@@ -112,7 +117,7 @@ class Disasters:
 
     def unmounted(self) -> None:
         """One of the folders, or two, are not there when the server starts: it must refuse, and lose nothing."""
-        names = self._next("unmounted", (*FOLDERS, "records uploads", "uploads containers")).split()
+        names = self._next("unmounted", _unmounted())
         self._end(self._random.choice(("kill", "stop")))
         data, aside = self._site.data, self._site.aside
         aside.mkdir()
@@ -142,9 +147,9 @@ class Disasters:
         """The folder is copied under load as docs/operating.md says, lost later, and restored from the copy."""
         site, history = self._site, self._history
         history.mark("backup begins")
-        copy_tree(site.data, site.backup, names=("records",))
+        data_folder.copy_small(site.data, site.backup)
         self._calm()
-        copy_tree(site.data, site.backup, without=("records", "incoming", "work", "levels", "lock"))
+        data_folder.copy_rest(site.data, site.backup)
         history.mark("backup ends")
         self._calm()
         self._end(self._random.choice(("kill", "stop")))
@@ -217,12 +222,18 @@ class Disasters:
     def _calm(self) -> None:
         time.sleep(self._random.uniform(0.05, 1) * self._random.choice((self._longest / 5, self._longest)))
 
-    def _next(self, what: str, choices: Sequence[str]) -> str:
+    def _next(self, what: str, choices: Sequence[T]) -> T:
         """One of some choices, each once before any of them comes again."""
-        left = self._left.setdefault(what, [])
+        left: list[T] = self._left.setdefault(what, [])
         if not left:
             left += self._random.sample(choices, len(choices))
         return left.pop()
+
+
+def _unmounted() -> list[tuple[str, ...]]:
+    """Each of the folders by itself, and each pair of neighbours."""
+    names = data_folder.KEPT
+    return [*((name,) for name in names), *itertools.pairwise(names)]
 
 
 #: What may happen, by name.

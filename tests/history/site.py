@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,7 @@ from tests.torture.small_disk import can_mount
 from .driver import Server
 from .events import History
 
-__all__ = ["FOLDERS", "Disk", "Site", "can_fill", "copy_tree"]
-
-#: The folders in which everything acknowledged lies.
-FOLDERS = ("records", "uploads", "containers")
+__all__ = ["Disk", "Site", "can_fill"]
 
 
 def can_fill() -> bool:
@@ -245,30 +242,3 @@ class Site:
         assert self._running is not None
         running, self._running = self._running, None
         return running
-
-
-def copy_tree(source: Path, target: Path, names: Sequence[str] | None = None, without: Sequence[str] = ()) -> None:
-    """Copy a folder while a server works in it, as rsync does: what is gone when its turn comes is left out.
-
-    Parameters
-    ----------
-    source, target : Path
-    names : sequence of str or None
-        Of the top level; None for all.
-    without : sequence of str
-        Names of the top level that are left out.
-    """
-    target.mkdir(parents=True, exist_ok=True)
-    for path in _listed(source):
-        if path.name in without or (names is not None and path.name not in names):
-            continue
-        with contextlib.suppress(FileNotFoundError):
-            if path.is_dir():
-                copy_tree(path, target / path.name)
-            else:
-                shutil.copy2(path, target / path.name)
-
-
-def _listed(folder: Path) -> Iterator[Path]:
-    with contextlib.suppress(FileNotFoundError):
-        yield from sorted(folder.iterdir())

@@ -114,6 +114,7 @@ def sent(container: bytes) -> str:
 
 
 def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    from tests import data_folder
     from tests.server.helpers import hills, npy, push
     from tests.server.programs import server
 
@@ -123,7 +124,7 @@ def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple
     with server(data, **crowd.settings(count)) as running:
         with running.client() as http:
             surface = push(http, npy(hills(420, 400)))
-        container = (data / "containers" / f"{surface['container']}.lode").read_bytes()
+        container = data_folder.container(data, surface["container"]).read_bytes()
         outcome = asyncio.run(crowd.visit(running, running.url + surface["url"], sent(container), count))
     assert not outcome.wrong, outcome.wrong
     assert not outcome.remains, outcome.remains
