@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError
-from lodestream.operating_system import lock
 
 from ..problems import BusyError, MissingError
+from ..store.claim import claim
 from ..store.durable import NewFile, discard, make_folder, remove, rename, sync_folder, write_file
 from ..store.private import check_writable, make_private, tighten
 from . import markers, work
@@ -496,25 +496,3 @@ def _may_be(known: Record, record: Record) -> bool:
         return True
     same = known.upload_sha256 in (None, record.upload_sha256)
     return same and known.owner == record.owner and (known.upload is None or known.name == record.name)
-
-
-def claim(root: Path) -> int:
-    """Lock a folder against other processes until the handle is closed or this process ends.
-
-    Raises
-    ------
-    LodestreamError
-        If another process uses the folder.
-    OSError
-        If nothing can be written there.
-    """
-    handle = os.open(root / "lock", os.O_RDONLY | os.O_CREAT, 0o600)
-    try:
-        free = lock(handle)
-    except OSError:
-        os.close(handle)
-        raise
-    if not free:
-        os.close(handle)
-        raise LodestreamError(f"expected a folder that no other process uses, got {root}, which another one uses")
-    return handle

@@ -13,7 +13,8 @@ is a *stray*: it is of no harm, and of no use after a day. A start moves and del
 
 Each small object holds the id of its own write, which tells it from that of another writer (`lodestream.stores`). An
 object ``built`` names the write of its manifest: after a delete and another upload of the same bytes it belongs to
-nobody, and counts as absent.
+nobody, and counts as absent. The last value of a small object is a checksum of what is before it: no other checksum
+covers, say, the name of an owner.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from __future__ import annotations
 import json
 import re
 import secrets
+import zlib
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any, TypeVar
@@ -48,6 +50,7 @@ __all__ = [
     "manifest_key",
     "new_write",
     "parse",
+    "sha256_of",
     "upload_key",
 ]
 
@@ -60,6 +63,8 @@ MOST_TEXT, MOST_REASON = 3072, 1024
 VERSION = 1
 
 _ID = re.compile(r"(?:surfaces|built)/([0-9a-f]{20})\.json")
+_BYTES = re.compile(r"uploads/([0-9a-f]{64})/(?:0|[1-9][0-9]*)|containers/([0-9a-f]{64})\.lode")
+_CHECK = re.compile(rb', "check": "([0-9a-f]{8})"\}\Z')
 T = TypeVar("T")
 
 
@@ -182,6 +187,12 @@ def id_of(key: str) -> str | None:
     return None if found is None else found[1]
 
 
+def sha256_of(key: str) -> str | None:
+    """Return the hash by which a container, or the upload of a file, is called; None of another key."""
+    found = _BYTES.fullmatch(key)
+    return None if found is None else found[1] or found[2]
+
+
 @cache
 def _adapters() -> dict[type[Any], TypeAdapter[Any]]:
     return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built)}
@@ -195,7 +206,8 @@ def dump(small: Identity | Manifest | Built) -> bytes:
     ValueError
         If JSON cannot express a value.
     """
-    return json.dumps(asdict(small), ensure_ascii=False, allow_nan=False).encode()
+    body = json.dumps(asdict(small), ensure_ascii=False, allow_nan=False).encode()[:-1]
+    return body + b', "check": "%08x"}' % zlib.crc32(body)
 
 
 def parse(kind: type[T], key: str, data: bytes) -> T:
@@ -204,8 +216,11 @@ def parse(kind: type[T], key: str, data: bytes) -> T:
     Raises
     ------
     DamagedObjectError
-        If it is none of this kind, or that of another surface; in one line.
+        If it is none of this kind, its checksum is wrong, or it is that of another surface; in one line.
     """
+    check = _CHECK.search(data)
+    if check is None or int(check[1], 16) != zlib.crc32(data[: check.start()]):
+        raise DamagedObjectError(f"{key} cannot be read: expected a small object with its checksum, got other bytes")
     try:
         small: T = _adapters()[kind].validate_json(data)
     except (ValidationError, InputError) as error:

@@ -24,7 +24,7 @@ from .index import Index, IndexLostError, Known, Surface, state_of
 from .layout import BUILT, CONTAINERS, IDENTITY, SURFACES, UPLOADS, Built, DamagedObjectError, Identity, Manifest
 from .states import Event, after
 
-__all__ = ["STRAY", "Surfaces", "establish"]
+__all__ = ["STRAY", "Surfaces", "establish", "read_identity"]
 
 _log = logging.getLogger(__name__)
 #: Seconds after which what no small object refers to is a stray that may be removed: whoever has put it there has come
@@ -164,15 +164,19 @@ class Surfaces:
 
     def _built(self, manifest: Manifest) -> tuple[Built, Tag] | None:
         """Return what became of the build of a manifest, and its tag; None if there is nothing of this manifest."""
-        key = layout.built_key(manifest.id)
         try:
-            data, tag = self.store.get(key)
-            built = layout.parse(Built, key, data)
-        except AbsentError:
-            return None
+            return self._read_built(manifest)
         except DamagedObjectError as error:
             _log.error("%s; the surface is built again", error)
             return None
+
+    def _read_built(self, manifest: Manifest) -> tuple[Built, Tag] | None:
+        key = layout.built_key(manifest.id)
+        try:
+            data, tag = self.store.get(key)
+        except AbsentError:
+            return None
+        built = layout.parse(Built, key, data)
         return (built, tag) if built.manifest == manifest.write else None
 
     # What becomes of builds. A surface that was deleted meanwhile is left alone.
@@ -314,20 +318,25 @@ class Surfaces:
         StoreError
             If the store cannot be read; the index is then as far as it was.
         """
+        return self._synced(progress)[0]
+
+    def _synced(self, progress: Callable[[int], None] = lambda _: None) -> tuple[int, DamagedObjectError | None]:
+        """Return the number of surfaces that were read, and what is wrong with one that cannot be."""
         taken = looked = 0
         changed: list[_Found] = []
+        damaged = None
         for found in self._found():
             looked += 1
             if found.changed:
                 changed.append(found)
                 taken += 1
             if len(changed) == _AT_ONCE:
-                self._take(changed)
+                damaged = self._take(changed) or damaged
                 changed = []
                 progress(looked)
-        self._take(changed)
+        damaged = self._take(changed) or damaged
         progress(looked)
-        return taken
+        return taken, damaged
 
     def _found(self) -> Iterator[_Found]:
         """Return what the store lists and the index knows of each surface, in the order of their ids."""
@@ -338,8 +347,9 @@ class Surfaces:
             parts = {kind: part for _, kind, part in group}
             yield _Found(id_, parts.get(0), parts.get(1), parts.get(2))
 
-    def _take(self, changed: Sequence[_Found]) -> None:
-        """Read surfaces from the store into the index."""
+    def _take(self, changed: Sequence[_Found]) -> DamagedObjectError | None:
+        """Read surfaces from the store into the index; return what is wrong with one that cannot be read."""
+        damaged = None
         with self._lock, self._index.together():
             for found in changed:
                 key = layout.manifest_key(found.id)
@@ -350,16 +360,24 @@ class Surfaces:
                     continue
                 except DamagedObjectError as error:
                     _log.error("%s; nothing is changed", error)
+                    damaged = error
                     continue
-                surface = self._adopted(manifest)
+                tags = [None if entry is None else entry.tag for entry in (found.manifest, found.built)]
+                try:
+                    built = self._read_built(manifest)
+                except DamagedObjectError as error:
+                    _log.error("%s; the surface is built again", error)
+                    damaged, built = error, None
+                    tags[1] = None  # so that it is told each time, until it is replaced
+                surface = _surface(manifest, *(built or (None, None)))
                 before = self._index.find(found.id)
                 if before is not None and before.manifest.write == manifest.write and surface.state == "queued":
                     # What only the index knows: how often it was tried, and whether and why it waits.
                     surface = replace(surface, attempts=before.attempts)
                     if before.state == "waiting":
                         surface = replace(surface, state="waiting", reason=before.reason)
-                tags = (None if entry is None else entry.tag for entry in (found.manifest, found.built))
                 self._index.put(surface, *tags)
+        return damaged
 
     def restore(self) -> None:
         """Make an index that was lost again, from the store."""
@@ -391,24 +409,34 @@ class Surfaces:
 
         Raises
         ------
+        DamagedObjectError
+            If a small object is damaged: it may refer to anything, so nothing is removed.
         StoreError
-            If the store does not answer; the others go at another time.
+            If the store does not answer, or a small object cannot be read now. What was not removed goes at another
+            time.
         """
         with self._lock:  # so that nothing is taken into use meanwhile
-            self.sync()
+            _, damaged = self._synced()
+            if damaged is not None:
+                raise DamagedObjectError(f"{damaged}; what it refers to is not known, so nothing is removed")
             found = self.strays(older)
             self.store.delete([entry.key for entry in found])
         return found
 
     def _uses_upload(self, key: str) -> bool:
-        return bool(self._index.of_upload(key.split("/")[1]))
+        sha256 = layout.sha256_of(key)
+        if sha256 is None:
+            return True  # of somebody else
+        number = int(key.split("/")[2])
+        return any(number < len(it.manifest.filenames) for it in self._index.of_upload(sha256))
 
     def _uses_container(self, key: str) -> bool:
-        return bool(self._index.of_container(key.removeprefix(CONTAINERS).removesuffix(".lode")))
+        sha256 = layout.sha256_of(key)
+        return sha256 is None or bool(self._index.of_container(sha256))
 
     def _uses_built(self, key: str) -> bool:
         id_ = layout.id_of(key)
-        return id_ is not None and self._index.find(id_) is not None
+        return id_ is None or self._index.find(id_) is not None
 
 
 @dataclass(frozen=True)
@@ -445,24 +473,38 @@ def establish(store: Store) -> str:
         If it cannot be used.
     """
     try:
-        data = store.get(IDENTITY)[0]
+        return read_identity(store).identity
     except AbsentError:
         store.probe()
         if next(iter(store.entries("")), None) is not None and _published(store):
             raise InputError(f"{store.describe()} is a published prefix, with view.json: choose another one") from None
-        new = Identity(layout.VERSION, layout.new_write())
-        try:
-            store.create(IDENTITY, layout.dump(new))
-        except ExistsError:
-            return establish(store)
-        return new.identity
-    identity = layout.parse(Identity, IDENTITY, data)
+    new = Identity(layout.VERSION, layout.new_write())
+    try:
+        store.create(IDENTITY, layout.dump(new))
+    except ExistsError:
+        return establish(store)
+    return new.identity
+
+
+def read_identity(store: Store) -> Identity:
+    """Return the identity of a server's data in a store.
+
+    Raises
+    ------
+    AbsentError
+        If there are no such data.
+    InputError
+        If they are of another version.
+    DamagedObjectError
+        If it cannot be read.
+    """
+    identity = layout.parse(Identity, IDENTITY, store.get(IDENTITY)[0])
     if identity.version != layout.VERSION:
         raise InputError(
             f"expected data of version {layout.VERSION} in {store.describe()}, got version {identity.version}: "
             "another version of Lodestream has made them"
         )
-    return identity.identity
+    return identity
 
 
 def _published(store: Store) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import sqlite3
 import tempfile
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
     RuleBasedStateMachine,
@@ -26,10 +25,10 @@ from hypothesis.stateful import (
 )
 
 from lodestream.errors import InputError, NotFoundError
-from lodestream.stores import Folder, Store
+from lodestream.stores import Folder, Store, StoreError, Tag
 from lodestream_server.store import layout
 from lodestream_server.store.index import Index, IndexLostError
-from lodestream_server.store.layout import MOST_TEXT, Manifest
+from lodestream_server.store.layout import MOST_TEXT, Built, DamagedObjectError, Identity, Manifest
 from lodestream_server.store.states import EDGES, STATES, Event, WrongTurnError, after
 from lodestream_server.store.surfaces import Surfaces, establish
 
@@ -235,6 +234,76 @@ def test_shared_files_stay_until_the_last_surface_is_deleted(surfaces: Surfaces,
     assert keys(surfaces.store) == ["lodestream.json"]
 
 
+@pytest.mark.parametrize("kind", ["surfaces", "built"])
+def test_nothing_is_collected_while_a_small_object_is_damaged(surfaces: Surfaces, tmp_path: Path, kind: str) -> None:
+    manifest, files = upload(tmp_path, 0)
+    surfaces.accept(manifest, files)
+    build(surfaces, manifest, tmp_path)
+    surfaces.accept(*upload(tmp_path, 1))
+    surfaces.delete(f"{1:020x}")
+    before = keys(surfaces.store)
+    path = tmp_path / "data" / kind / f"{manifest.id}.json"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-9] + b"0" + whole[-8:] if whole[-9:-8] != b"0" else whole[:-9] + b"1" + whole[-8:])
+    for restored in (False, True, False):  # whether the index has ever known what was there
+        if restored:
+            surfaces.restore()
+        with pytest.raises(DamagedObjectError, match=r"cannot be read: .*so nothing is removed"):
+            surfaces.collect(older=-3600)
+        assert keys(surfaces.store) == before
+    path.write_bytes(whole)
+    assert len(surfaces.collect(older=-3600)) == 1
+
+
+def test_nothing_is_collected_while_a_manifest_cannot_be_read(
+    surfaces: Surfaces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest, files = upload(tmp_path, 0)
+    surfaces.accept(manifest, files)
+    surfaces.close()
+    Index.remove(tmp_path / "index.sqlite")
+    again = Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+    before = keys(again.store)
+    with monkeypatch.context() as failing:
+        read = again.store.get
+
+        def get(key: str, most: int = 1 << 24) -> tuple[bytes, Tag]:
+            if key.startswith("surfaces/"):
+                raise StoreError(f"{key}: Input/output error")
+            return read(key, most)
+
+        failing.setattr(again.store, "get", get)
+        with pytest.raises(StoreError, match="Input/output"):
+            again.collect(older=-3600)
+    assert keys(again.store) == before
+    assert not again.collect(older=-3600)
+
+
+def test_only_what_has_the_name_of_an_own_object_is_a_stray(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 0)
+    surfaces.accept(manifest, files)
+    folder = tmp_path / "data" / "uploads" / manifest.upload
+    (folder / "1").write_bytes(b"one file too many")
+    (folder / "notes").write_text("mine")
+    (tmp_path / "data" / "containers").mkdir()
+    (tmp_path / "data" / "containers" / "notes.txt").write_text("mine")
+    assert [entry.key for entry in surfaces.collect(older=-3600)] == [f"uploads/{manifest.upload}/1"]
+
+
+@given(st.data())
+def test_every_changed_bit_of_a_small_object_is_seen(data: st.DataObject) -> None:
+    small = Built("ab" * 16, "cd" * 32, 4711, None, "ef" * 16, {"shape": [5, 7]})
+    whole = layout.dump(small)
+    assert layout.parse(Built, "built/x.json", whole) == small
+    place = data.draw(st.integers(0, 8 * len(whole) - 1))
+    changed = bytearray(whole)
+    changed[place // 8] ^= 1 << place % 8
+    cut = data.draw(st.integers(0, len(whole) - 1))
+    for damaged in (bytes(changed), whole[:cut], whole + b" "):
+        with pytest.raises(DamagedObjectError, match=r"built/x\.json cannot be read"):
+            layout.parse(Built, "built/x.json", damaged)
+
+
 def test_files_that_become_strays_are_put_again(surfaces: Surfaces, tmp_path: Path) -> None:
     manifest, files = upload(tmp_path, 0)
     surfaces.accept(manifest, files)
@@ -374,7 +443,7 @@ def test_what_is_there_decides_what_a_store_may_be(tmp_path: Path) -> None:
         establish(Folder(published))
     newer = tmp_path / "newer"
     newer.mkdir()
-    (newer / "lodestream.json").write_text(json.dumps({"version": 2, "identity": "x"}))
+    (newer / "lodestream.json").write_bytes(layout.dump(Identity(2, "x")))
     with pytest.raises(InputError, match="version 2"):
         establish(Folder(newer))
     store = Folder(tmp_path / "new")
