@@ -85,7 +85,7 @@ class MissingError(LodestreamError):
 
 
 class NotOwnerError(LodestreamError):
-    """The surface belongs to another owner."""
+    """The surface, or the name, belongs to another owner."""
 
 
 class SlowUploadError(LodestreamError):
@@ -160,7 +160,7 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (NoTokenError, _Answer(401, "no-token", "A token is needed")),
     (BadTokenError, _Answer(403, "bad-token", "The token is unknown, expired or revoked")),
     (SmallScopeError, _Answer(403, "small-scope", "The token's scope does not allow this")),
-    (NotOwnerError, _Answer(403, "not-owner", "Only the owner of a surface and an admin may do this")),
+    (NotOwnerError, _Answer(403, "not-owner", "Only its owner and an admin may do this")),
     (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
     (TooManyError, _Answer(429, "too-many", "The client has too much in progress")),
     (BusyError, _Answer(503, "busy", "The server is busy; try again later")),

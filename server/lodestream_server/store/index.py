@@ -19,10 +19,10 @@ from typing import Any
 
 from lodestream.errors import LodestreamError
 
-from .layout import Built, Manifest
+from .layout import Built, Manifest, Name, name_key, name_of
 from .states import State
 
-__all__ = ["Index", "IndexLostError", "Known", "Position", "Surface"]
+__all__ = ["Index", "IndexLostError", "Known", "Named", "Position", "Surface"]
 
 #: When a surface was made, in seconds since 1970, and its id: the order of a listing.
 Position = tuple[float, str]
@@ -52,6 +52,24 @@ CREATE INDEX IF NOT EXISTS by_upload ON surface (upload);
 CREATE INDEX IF NOT EXISTS by_container ON surface (container) WHERE container IS NOT NULL;
 CREATE INDEX IF NOT EXISTS by_owner ON surface (owner);
 CREATE INDEX IF NOT EXISTS by_turn ON surface (attempts, created) WHERE state = 'queued';
+CREATE TABLE IF NOT EXISTS name (
+    key TEXT PRIMARY KEY,
+    owner TEXT,
+    surface TEXT,
+    changed REAL NOT NULL,
+    seen TEXT
+) STRICT;
+CREATE INDEX IF NOT EXISTS name_by_surface ON name (surface);
+CREATE INDEX IF NOT EXISTS name_by_owner ON name (owner);
+CREATE INDEX IF NOT EXISTS name_by_letters ON name (lower(key));
+CREATE TABLE IF NOT EXISTS replaced (
+    surface TEXT NOT NULL,
+    key TEXT NOT NULL,
+    due REAL NOT NULL,
+    PRIMARY KEY (surface, key)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS replaced_by_key ON replaced (key);
+CREATE INDEX IF NOT EXISTS replaced_by_time ON replaced (due);
 CREATE TABLE IF NOT EXISTS source (identity TEXT NOT NULL) STRICT;
 """
 
@@ -117,6 +135,26 @@ class Known:
     built_seen: str | None
 
 
+@dataclass(frozen=True)
+class Named:
+    """A name as the index knows it.
+
+    Attributes
+    ----------
+    name : str
+    owner : str or None
+    surface : str or None
+        Id of the surface that it leads to; None: its object in the store cannot be read.
+    changed : float
+        When it last came to lead to another surface, in seconds since 1970.
+    """
+
+    name: str
+    owner: str | None
+    surface: str | None
+    changed: float
+
+
 class Index:
     """The index in a file; safe to use from several threads.
 
@@ -153,8 +191,8 @@ class Index:
         with self._change() as change:
             found = [row[0] for row in change.execute("SELECT identity FROM source")]
             if found != [self._identity]:
-                change.execute("DELETE FROM surface")
-                change.execute("DELETE FROM source")
+                for table in ("surface", "name", "replaced", "source"):
+                    change.execute(f"DELETE FROM {table}")
                 change.execute("INSERT INTO source VALUES (?)", (self._identity,))
 
     def close(self) -> None:
@@ -228,6 +266,75 @@ class Index:
         ):
             yield from (Known(*row) for row in rows)
             last = rows[-1][0]
+
+    # Names.
+
+    def find_name(self, name: str) -> Named | None:
+        """Return a name, if there is one."""
+        rows = self._rows("SELECT key, owner, surface, changed FROM name WHERE key = ?", name_key(name))
+        return _named(rows[0]) if rows else None
+
+    def name_like(self, name: str) -> str | None:
+        """Return a name that differs from this one in upper and lower case alone, if there is one."""
+        key = name_key(name)
+        rows = self._rows("SELECT key FROM name WHERE lower(key) = lower(?) AND key <> ?", key, key)
+        return name_of(rows[0][0]) if rows else None
+
+    def names(self, after: str, most: int) -> list[Named]:
+        """Return at most `most` names behind this one, in the order of their keys."""
+        query = "SELECT key, owner, surface, changed FROM name WHERE key > ? ORDER BY key LIMIT ?"
+        return [_named(row) for row in self._rows(query, name_key(after) if after else "", most)]
+
+    def count_names(self, owner: str | None) -> tuple[int, int]:
+        """Return the number of names: all of them, and those of an owner."""
+        found = self._one("SELECT count(*), (SELECT count(*) FROM name WHERE owner IS ?) FROM name", owner)
+        return int(found[0]), int(found[1])
+
+    def is_kept(self, surface: str, now: float) -> bool:
+        """Return whether a name leads to a surface, or has replaced it and its time has not come."""
+        query = "SELECT 1 FROM name WHERE surface = ?1 UNION ALL SELECT 1 FROM replaced WHERE surface = ?1 AND due > ?2"
+        return bool(self._rows(f"{query} LIMIT 1", surface, now))
+
+    def replaced_by(self, surface: str) -> list[str]:
+        """Return the keys of the names that have replaced a surface."""
+        return [row[0] for row in self._rows("SELECT key FROM replaced WHERE surface = ?", surface)]
+
+    def due(self, now: float) -> list[str]:
+        """Return keys of names that have replaced surfaces whose time has come; none while a name cannot be read.
+
+        That one may lead to any surface.
+        """
+        return [
+            row[0]
+            for row in self._rows(
+                "SELECT DISTINCT key FROM replaced WHERE due <= ? "
+                "AND NOT EXISTS (SELECT 1 FROM name WHERE surface IS NULL) LIMIT ?",
+                now,
+                _AT_ONCE,
+            )
+        ]
+
+    def known_names(self) -> Iterator[tuple[str, str | None]]:
+        """Return the key of each name and the tag of the listing it was read with, by their keys, some at a time."""
+        last = ""
+        while rows := self._rows("SELECT key, seen FROM name WHERE key > ? ORDER BY key LIMIT ?", last, _AT_ONCE):
+            yield from ((str(key), seen) for key, seen in rows)
+            last = rows[-1][0]
+
+    def put_name(self, key: str, name: Name | None, seen: str | None = None) -> None:
+        """Add a name, or replace what is known of it; None: its object cannot be read."""
+        values = (None, None, 0.0) if name is None else (name.owner, name.surface, name.changed)
+        with self._change() as change:
+            change.execute("INSERT OR REPLACE INTO name VALUES (?, ?, ?, ?, ?)", (key, *values, seen))
+            change.execute("DELETE FROM replaced WHERE key = ?", (key,))
+            rows = ((surface, key, due) for surface, due in (() if name is None else name.replaced))
+            change.executemany("INSERT OR REPLACE INTO replaced VALUES (?, ?, ?)", rows)
+
+    def drop_name(self, key: str) -> None:
+        """Remove a name, if it is there."""
+        with self._change() as change:
+            for table in ("name", "replaced"):
+                change.execute(f"DELETE FROM {table} WHERE key = ?", (key,))
 
     # Changing.
 
@@ -325,6 +432,11 @@ def _surface(row: tuple[Any, ...]) -> Surface:
         write,
     )
     return Surface(manifest, *row[9:])
+
+
+def _named(row: tuple[Any, ...]) -> Named:
+    key, *rest = row
+    return Named(name_of(key) or "", *rest)
 
 
 def state_of(built: Built | None) -> State:

@@ -7,6 +7,7 @@
     surfaces/<id>.json            the manifest; created if absent: it *is* the surface
     containers/<sha256>.lode      written once
     built/<id>.json               what became of the build: a container, or the reason of a final failure
+    names/<name>.json             a name that stays: the surface that it leads to, and those that it led to of late
 
 Bytes come first, then the small object that refers to them; a delete goes the other way. What no small object refers to
 is a *stray*: it is of no harm, and of no use after a day. A start moves and deletes nothing.
@@ -30,6 +31,7 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from lodestream.errors import InputError, LodestreamError
+from lodestream.stores.keys import is_key
 
 __all__ = [
     "BUILT",
@@ -37,17 +39,21 @@ __all__ = [
     "IDENTITY",
     "MOST_REASON",
     "MOST_TEXT",
+    "NAMES",
     "SURFACES",
     "UPLOADS",
     "Built",
     "DamagedObjectError",
     "Identity",
     "Manifest",
+    "Name",
     "built_key",
     "container_key",
     "dump",
     "id_of",
     "manifest_key",
+    "name_key",
+    "name_of",
     "new_write",
     "parse",
     "sha256_of",
@@ -55,7 +61,7 @@ __all__ = [
 ]
 
 IDENTITY = "lodestream.json"
-UPLOADS, SURFACES, CONTAINERS, BUILT = "uploads/", "surfaces/", "containers/", "built/"
+UPLOADS, SURFACES, CONTAINERS, BUILT, NAMES = "uploads/", "surfaces/", "containers/", "built/", "names/"
 
 #: Bytes of text that a surface may have: its name, names of files and options; and the reason of a failure.
 MOST_TEXT, MOST_REASON = 3072, 1024
@@ -63,6 +69,7 @@ MOST_TEXT, MOST_REASON = 3072, 1024
 VERSION = 1
 
 _ID = re.compile(r"(?:surfaces|built)/([0-9a-f]{20})\.json")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _BYTES = re.compile(r"uploads/([0-9a-f]{64})/(?:0|[1-9][0-9]*)|containers/([0-9a-f]{64})\.lode")
 _CHECK = re.compile(rb', "check": "([0-9a-f]{8})"\}\Z')
 T = TypeVar("T")
@@ -156,6 +163,41 @@ class Built:
     info: dict[str, Any] = field(repr=False, default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Name:
+    """A name that stays while the surface behind it changes.
+
+    Attributes
+    ----------
+    name : str
+    owner : str or None
+        Name of the token that it was made with; None without one.
+    surface : str
+        Id of the surface that it leads to.
+    changed : float
+        When it last came to lead to another surface, in seconds since 1970.
+    replaced : tuple of (str, float)
+        Ids of surfaces that it led to, oldest first, and from when on each may be deleted, in seconds since 1970.
+    write : str
+        Id of this write.
+
+    Raises
+    ------
+    InputError
+        If it cannot be a name.
+    """
+
+    name: str
+    owner: str | None
+    surface: str
+    changed: float
+    replaced: tuple[tuple[str, float], ...]
+    write: str
+
+    def __post_init__(self) -> None:
+        name_key(self.name)
+
+
 def new_write() -> str:
     """Return the id of a new write."""
     return secrets.token_hex(16)
@@ -181,6 +223,29 @@ def container_key(sha256: str) -> str:
     return f"{CONTAINERS}{sha256}.lode"
 
 
+def name_key(name: str) -> str:
+    """Return the key of a name.
+
+    Raises
+    ------
+    InputError
+        If it cannot be a name.
+    """
+    key = f"{NAMES}{name}.json"
+    if not _NAME.fullmatch(name) or not is_key(key):
+        raise InputError(
+            "expected a name of at most 100 letters, digits and ._- that begins with a letter or a digit, and none "
+            f"that Windows keeps for itself, such as con, got {name[:100]!a}"
+        )
+    return key
+
+
+def name_of(key: str) -> str | None:
+    """Return the name that has a key; None of another key."""
+    name = key.removeprefix(NAMES).removesuffix(".json")
+    return name if f"{NAMES}{name}.json" == key and _NAME.fullmatch(name) else None
+
+
 def id_of(key: str) -> str | None:
     """Return the id of the surface to which a manifest or a ``built`` belongs; None of another key."""
     found = _ID.fullmatch(key)
@@ -195,10 +260,10 @@ def sha256_of(key: str) -> str | None:
 
 @cache
 def _adapters() -> dict[type[Any], TypeAdapter[Any]]:
-    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built)}
+    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built, Name)}
 
 
-def dump(small: Identity | Manifest | Built) -> bytes:
+def dump(small: Identity | Manifest | Built | Name) -> bytes:
     """Return a small object as bytes.
 
     Raises
@@ -216,7 +281,7 @@ def parse(kind: type[T], key: str, data: bytes) -> T:
     Raises
     ------
     DamagedObjectError
-        If it is none of this kind, its checksum is wrong, or it is that of another surface; in one line.
+        If it is none of this kind, its checksum is wrong, or it is that of another surface or name; in one line.
     """
     check = _CHECK.search(data)
     if check is None or int(check[1], 16) != zlib.crc32(data[: check.start()]):
@@ -231,4 +296,6 @@ def parse(kind: type[T], key: str, data: bytes) -> T:
         raise DamagedObjectError(f"{key} cannot be read: {words}") from None
     if isinstance(small, Manifest) and manifest_key(small.id) != key:
         raise DamagedObjectError(f"{key} holds the surface {small.id[:80]!a}")
+    if isinstance(small, Name) and name_key(small.name) != key:
+        raise DamagedObjectError(f"{key} holds the name {small.name}")
     return small

@@ -22,6 +22,7 @@ from lodestream.stores import AbsentError, Entry, ExistsError, Store, Tag
 from . import layout
 from .index import Index, IndexLostError, Known, Surface, state_of
 from .layout import BUILT, CONTAINERS, IDENTITY, SURFACES, UPLOADS, Built, DamagedObjectError, Identity, Manifest
+from .names import Names
 from .states import Event, after
 
 __all__ = ["STRAY", "Surfaces", "establish", "read_identity"]
@@ -44,6 +45,11 @@ class Surfaces:
     index : Path
         File of the index, on a local disk.
 
+    Attributes
+    ----------
+    names : Names
+        The names that lead to surfaces.
+
     Raises
     ------
     LodestreamError
@@ -62,6 +68,7 @@ class Surfaces:
             _log.warning("%s", error)
             Index.remove(index)
             self._index = Index(index, self._identity)
+        self.names = Names(self, self._lock)
 
     def close(self) -> None:
         """Close the index."""
@@ -110,6 +117,7 @@ class Surfaces:
             If it could not be stored, or it is not known whether it was: the same upload again is harmless.
         """
         with self._lock:
+            self.names.keep(manifest.id)
             known = self._index.find(manifest.id)
             if known is not None:
                 _check_same(known.manifest, manifest)
@@ -304,7 +312,7 @@ class Surfaces:
     # The index and the store.
 
     def sync(self, progress: Callable[[int], None] = lambda _: None) -> int:
-        """Bring the index up to date with the store; return the number of surfaces that were read.
+        """Bring the index up to date with the store, names too; return the number of surfaces that were read.
 
         Objects that were seen with the same tag are not read again. What cannot be read is told, and left alone.
 
@@ -336,6 +344,7 @@ class Surfaces:
                 progress(looked)
         damaged = self._take(changed) or damaged
         progress(looked)
+        self.names.sync()
         return taken, damaged
 
     def _found(self) -> Iterator[_Found]:

@@ -7,6 +7,7 @@ import os
 import sqlite3
 import tempfile
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -510,6 +511,8 @@ class Model(RuleBasedStateMachine):
         self.surfaces = Surfaces(Folder(self.root / "data"), self.root / "index.sqlite")
         self.expected: dict[str, str] = {}
         self.manifests: dict[str, Manifest] = {}
+        self.names: dict[str, str] = {}
+        self.replaced: dict[str, set[str]] = {"a": set(), "b": set()}
 
     @rule(number=st.integers(0, 5))
     def accept(self, number: int) -> None:
@@ -519,6 +522,8 @@ class Model(RuleBasedStateMachine):
         if new:
             self.expected[found.id] = "queued"
             self.manifests[found.id] = found.manifest
+        for replaced in self.replaced.values():
+            replaced.discard(found.id)
         assert found.state == self.expected[found.id]
 
     def _one_of(self, *states: str) -> str | None:
@@ -563,6 +568,41 @@ class Model(RuleBasedStateMachine):
             self.expected[id_] = "queued"
         assert self.surfaces.retry(id_).state == self.expected[id_]
 
+    @rule(name=st.sampled_from("ab"), number=st.integers(0, 5))
+    def point(self, name: str, number: int) -> None:
+        id_ = f"{number:020x}"
+        if id_ not in self.expected:
+            with pytest.raises(NotFoundError):
+                self.surfaces.names.point(name, id_, None, lambda _: True, 60.0)
+            return
+        self.surfaces.names.point(name, id_, None, lambda _: True, 60.0)
+        before = self.names.get(name)
+        if before in self.expected:
+            self.replaced[name].add(before)
+        self.replaced[name].discard(id_)
+        self.names[name] = id_
+
+    @rule(name=st.sampled_from("ab"))
+    def forget(self, name: str) -> None:
+        if self.names.pop(name, None) is None:
+            with pytest.raises(NotFoundError):
+                self.surfaces.names.delete(name, lambda _: True)
+        else:
+            self.surfaces.names.delete(name, lambda _: True)
+            self.replaced[name] = set()
+
+    @rule(late=st.booleans())
+    def expire(self, late: bool) -> None:
+        gone = {it.id for it in self.surfaces.names.expire(time.time() + (120.0 if late else 0.0))}
+        if late:
+            assert gone == {
+                id_ for ids in self.replaced.values() for id_ in ids if id_ not in self.names.values()
+            } & set(self.expected)
+            self.replaced = {"a": set(), "b": set()}
+        assert late or not gone
+        for id_ in gone:
+            del self.expected[id_]
+
     @rule(keep=st.booleans())
     def restart(self, keep: bool) -> None:
         self.surfaces.close()
@@ -581,6 +621,7 @@ class Model(RuleBasedStateMachine):
     def same(self) -> None:
         found = {it.id: it.state for it in self.surfaces.index.page((0.0, ""), 100)}
         assert found == self.expected
+        assert {it.name: it.surface for it in self.surfaces.index.names("", 100)} == self.names
         for it in self.surfaces.index.page((0.0, ""), 100):
             with self.surfaces.store.open(layout.upload_key(it.manifest.upload, 0)):
                 pass

@@ -1,0 +1,280 @@
+"""Names that stay: each leads to one surface, and what it led to before stays for a time and is then deleted.
+
+A change is one write: the object of the name is created or replaced. Only after it are surfaces deleted that the name
+has replaced. A surface is not deleted while any name leads to it, or has replaced it a shorter time ago.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from operator import itemgetter
+from typing import TYPE_CHECKING
+
+from lodestream.errors import InputError, NotFoundError
+from lodestream.stores import AbsentError, Tag
+
+from ..problems import NotOwnerError
+from . import layout
+from .index import Named, Surface
+from .layout import NAMES, DamagedObjectError, Name
+
+if TYPE_CHECKING:
+    from .surfaces import Surfaces
+
+__all__ = ["MOST_REPLACED", "Names"]
+
+_log = logging.getLogger(__name__)
+
+#: Replaced surfaces that a name keeps; the time of older ones has come.
+MOST_REPLACED = 100
+
+
+class Names:
+    """The names of a store; part of its `Surfaces`.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    lock : RLock
+        Held for each change of surfaces and names.
+    """
+
+    def __init__(self, surfaces: Surfaces, lock: threading.RLock) -> None:
+        self._surfaces = surfaces
+        self._store = surfaces.store
+        self._lock = lock
+
+    def get(self, name: str) -> Named:
+        """Return a name whose object can be read.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none.
+        DamagedObjectError
+            If it cannot be read.
+        InputError
+            If it cannot be a name.
+        """
+        found = self._surfaces.index.find_name(name)
+        if found is None:
+            raise _absent(name)
+        if found.surface is None:
+            raise DamagedObjectError(
+                f"the name {name} cannot be read on this server: an admin can make it lead to a surface again"
+            )
+        return found
+
+    def point(
+        self, name: str, surface: str, owner: str | None, may_change: Callable[[str | None], bool], keep: float
+    ) -> Named:
+        """Make a name lead to a surface; return it. To do so again is harmless.
+
+        Parameters
+        ----------
+        name : str
+            A new one belongs to `owner`.
+        surface : str
+            Id of the surface.
+        owner : str or None
+        may_change : callable (owner) -> bool
+            Whether the caller may change what belongs to an owner: the name, and the surface. What the name led to
+            before is deleted later if the caller may change that.
+        keep : float
+            Seconds for which the surface that the name led to before stays.
+
+        Raises
+        ------
+        NotFoundError
+            If there is no such surface.
+        NotOwnerError
+            If the caller may not.
+        InputError
+            If it cannot be a name, or differs from another one in case alone.
+        DamagedObjectError
+            If the name cannot be read and the caller does not own everything.
+        StoreError
+            If it could not be stored, or it is not known whether it was.
+        """
+        key, now = layout.name_key(name), time.time()
+        with self._lock:
+            _check_owner(f"the surface {surface}", self._surfaces.get(surface).manifest.owner, may_change)
+            other = self._surfaces.index.name_like(name)
+            if other is not None:
+                raise InputError(f"expected a name that differs from {other} in more than case, got {name}")
+            before, tag = self._before(key, may_change)
+            if before is not None and before.surface == surface:
+                new = before
+            else:
+                replaced = () if before is None else self._replaced(before, surface, may_change, now, keep)
+                owner = owner if before is None else before.owner
+                new = Name(name, owner, surface, now, replaced, layout.new_write())
+                data = layout.dump(new)
+                if tag is None:
+                    self._store.create(key, data)
+                else:
+                    self._store.replace(key, data, tag)
+            self._surfaces.index.put_name(key, new)
+            return Named(name, new.owner, new.surface, new.changed)
+
+    def _replaced(
+        self, before: Name, surface: str, may_change: Callable[[str | None], bool], now: float, keep: float
+    ) -> tuple[tuple[str, float], ...]:
+        """Return the surfaces that a name has replaced when it leads to another one."""
+        left = [it for it in before.replaced if it[0] not in (before.surface, surface)]
+        old = self._surfaces.index.find(before.surface)
+        if old is not None and may_change(old.manifest.owner):
+            left.append((before.surface, now + keep))
+        more = len(left) - MOST_REPLACED
+        return tuple((id_, min(due, now) if place < more else due) for place, (id_, due) in enumerate(left))
+
+    def delete(self, name: str, may_change: Callable[[str | None], bool]) -> None:
+        """Delete a name. The surface that it leads to stays, and so do those that it has replaced.
+
+        Raises
+        ------
+        NotFoundError
+            If there is none.
+        NotOwnerError
+            If the caller may not.
+        DamagedObjectError
+            If the name cannot be read and the caller does not own everything.
+        StoreError
+            If it is not known whether it is gone; to delete it again is harmless.
+        """
+        key = layout.name_key(name)
+        with self._lock:
+            _, tag = self._before(key, may_change)
+            if tag is not None:
+                self._store.delete([key])
+            self._surfaces.index.drop_name(key)
+            if tag is None:
+                raise _absent(name)
+
+    def keep(self, surface: str) -> None:
+        """Keep a surface that names have replaced: somebody has uploaded it again.
+
+        Raises
+        ------
+        StoreError
+            If that could not be stored.
+        """
+        with self._lock:
+            for key in self._surfaces.index.replaced_by(surface):
+                if (found := self._current(key)) is not None:
+                    name, tag = found
+                    self._forget(name, tag, lambda id_, _: id_ == surface)
+
+    def expire(self, now: float | None = None) -> list[Surface]:
+        """Delete the replaced surfaces whose time has come; return them.
+
+        The index must be up to date with the store.
+
+        Parameters
+        ----------
+        now : float, optional
+            Seconds since 1970.
+
+        Raises
+        ------
+        StoreError
+            If the store does not answer; the others go at another time.
+        """
+        now = time.time() if now is None else now
+        gone: list[Surface] = []
+        for key in self._surfaces.index.due(now):
+            with self._lock:
+                gone += self._expire(key, now)
+        return gone
+
+    def _expire(self, key: str, now: float) -> list[Surface]:
+        found = self._current(key)
+        if found is None:
+            return []
+        name, tag = found
+        index = self._surfaces.index
+        due = (index.find(id_) for id_, when in name.replaced if when <= now and not index.is_kept(id_, now))
+        gone = [surface for surface in due if surface is not None]
+        for surface in gone:
+            self._surfaces.delete(surface.id)
+        self._forget(name, tag, lambda _, when: when <= now)
+        return gone
+
+    def _forget(self, name: Name, tag: Tag, gone: Callable[[str, float], bool]) -> None:
+        """Write a name without some of the surfaces that it has replaced."""
+        left = tuple(it for it in name.replaced if not gone(*it))
+        name, key = replace(name, replaced=left, write=layout.new_write()), layout.name_key(name.name)
+        self._store.replace(key, layout.dump(name), tag)
+        self._surfaces.index.put_name(key, name)
+
+    def sync(self) -> None:
+        """Bring the index of the names up to date with the store; what cannot be read is told, and left alone.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read.
+        """
+        listed = ((it.key, 0, it.tag) for it in self._store.entries(NAMES) if layout.name_of(it.key) is not None)
+        known = ((key, 1, seen) for key, seen in self._surfaces.index.known_names())
+        merged = heapq.merge(listed, known, key=itemgetter(0, 1))
+        for key, group in itertools.groupby(merged, key=itemgetter(0)):
+            tags = {kind: tag for _, kind, tag in group}
+            if 0 not in tags or tags[0] != tags.get(1):
+                with self._lock:
+                    self._current(key, tags.get(0))
+
+    def _current(self, key: str, seen: str | None = None) -> tuple[Name, Tag] | None:
+        """Return a name and its tag, and tell the index; None if there is none, or it cannot be read."""
+        name = found = None
+        try:
+            data, tag = self._store.get(key)
+            name = layout.parse(Name, key, data)
+            found = name, tag
+        except AbsentError:
+            self._surfaces.index.drop_name(key)
+            return None
+        except DamagedObjectError as error:
+            _log.error("%s; it is left as it is, and no replaced surface is deleted", error)
+        # One that cannot be read is told each time, until it is replaced.
+        self._surfaces.index.put_name(key, name, seen if found is not None else None)
+        return found
+
+    def _before(self, key: str, may_change: Callable[[str | None], bool]) -> tuple[Name | None, Tag | None]:
+        """Return a name and its tag; without a tag there is none.
+
+        Raises
+        ------
+        DamagedObjectError
+            If it cannot be read, and the caller may not change what belongs to nobody; others may write it anew.
+        NotOwnerError
+            If it belongs to another owner.
+        """
+        try:
+            data, tag = self._store.get(key)
+        except AbsentError:
+            return None, None
+        try:
+            name = layout.parse(Name, key, data)
+        except DamagedObjectError:
+            if not may_change(None):
+                raise
+            return None, tag
+        _check_owner(f"the name {name.name}", name.owner, may_change)
+        return name, tag
+
+
+def _absent(name: str) -> NotFoundError:
+    return NotFoundError(f"expected a name on this server, got {name}")
+
+
+def _check_owner(what: str, owner: str | None, may_change: Callable[[str | None], bool]) -> None:
+    if not may_change(owner):
+        whose = "nobody" if owner is None else "another owner"
+        raise NotOwnerError(f"expected the owner of {what} or an admin, got another caller: it belongs to {whose}")
