@@ -102,7 +102,7 @@ class Bucket:
         """Write a small object in place of the one that was read with a tag, and return the new tag."""
         return self._write(key, data, tag)
 
-    def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
+    def put_file(self, key: str, path: Path, progress: Progress | None = None, *, given: bool = False) -> None:
         """Write a large object from a file, in parts. After a failure it begins again, and so does what is told."""
         at = self._at(key)
         with open(path, "rb") as file:

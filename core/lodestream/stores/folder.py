@@ -110,11 +110,13 @@ class Folder:
             _discard(new)
         return _tag(data)
 
-    def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
-        """Write a large object from a file."""
+    def put_file(self, key: str, path: Path, progress: Progress | None = None, *, given: bool = False) -> None:
+        """Write a large object from a file; one that is given, and on the same disk, is moved."""
         final = self._path(key)
-        with open(path, "rb") as source:
-            new = self._written(key, lambda file: _copy(source, file, progress))
+        new = self._moved(key, path) if given else None
+        if new is None:
+            with open(path, "rb") as source:
+                new = self._written(key, lambda file: _copy(source, file, progress))
         try:
             self._name(key, final, lambda: new.replace(final))
         finally:
@@ -256,6 +258,21 @@ class Folder:
         except BaseException:
             _discard(new)
             raise
+        return new
+
+    def _moved(self, key: str, path: Path) -> Path | None:
+        """Move a file to the store's own folder and synchronise it; return its path, None if it is on another disk."""
+        new = self._own / f"{secrets.token_hex(8)}.new"
+        source = path.open("rb")
+        try:
+            with source:
+                synchronise_file(source.fileno())
+            self._make(self._own)
+            path.rename(new)
+        except OSError as error:
+            if error.errno == errno.EXDEV:
+                return None
+            self._refuse(key, error)
         return new
 
     def _name(self, key: str, path: Path, give: Callable[[], object]) -> None:

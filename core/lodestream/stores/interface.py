@@ -148,12 +148,20 @@ class Store(Protocol):
         """
         ...
 
-    def put_file(self, key: str, path: Path, progress: Progress | None = None) -> None:
+    def put_file(self, key: str, path: Path, progress: Progress | None = None, *, given: bool = False) -> None:
         """Write a large object from a file, whatever is there: until the end there is what was before.
 
         To find an object of this key with `open` or `entries` is no reason to leave this out; see `Store`.
 
         It may be repeated, and must be if it fails.
+
+        Parameters
+        ----------
+        key : str
+        path : Path
+        progress : callable, optional
+        given : bool
+            The file is the store's from now on: it may be moved and not copied. If the write fails, it may be gone.
 
         Raises
         ------

@@ -11,21 +11,25 @@ from __future__ import annotations
 import json
 import sqlite3
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from lodestream.errors import LodestreamError
+from lodestream.stores import FullError, StoreError
 
-from .layout import Built, Manifest, Name, name_key, name_of
+from .layout import Built, Manifest, Name, Summary, name_key, name_of
 from .states import State
 
-__all__ = ["Index", "IndexLostError", "Known", "Named", "Position", "Surface"]
+__all__ = ["LEAST", "Index", "IndexLostError", "Known", "Named", "Position", "Surface"]
 
 #: When a surface was made, in seconds since 1970, and its id: the order of a listing.
 Position = tuple[float, str]
+
+#: Bytes that a surface counts beside its files: its small objects, folders, and its place in the index.
+LEAST = 16 << 10
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS surface (
@@ -43,6 +47,9 @@ CREATE TABLE IF NOT EXISTS surface (
     attempts INTEGER NOT NULL DEFAULT 0,
     container TEXT,
     container_bytes INTEGER,
+    title TEXT,
+    levels INTEGER NOT NULL DEFAULT 0,
+    shown TEXT NOT NULL DEFAULT '{}',
     built_tag TEXT,
     seen TEXT,
     built_seen TEXT
@@ -50,8 +57,12 @@ CREATE TABLE IF NOT EXISTS surface (
 CREATE INDEX IF NOT EXISTS by_time ON surface (created, id);
 CREATE INDEX IF NOT EXISTS by_upload ON surface (upload);
 CREATE INDEX IF NOT EXISTS by_container ON surface (container) WHERE container IS NOT NULL;
-CREATE INDEX IF NOT EXISTS by_owner ON surface (owner);
+CREATE INDEX IF NOT EXISTS by_size ON surface (upload_bytes);
+CREATE INDEX IF NOT EXISTS by_owner ON surface (owner, upload, upload_bytes);
+CREATE INDEX IF NOT EXISTS by_owner_built ON surface (owner, container, container_bytes) WHERE container IS NOT NULL;
+CREATE INDEX IF NOT EXISTS building ON surface (id) WHERE state = 'building';
 CREATE INDEX IF NOT EXISTS by_turn ON surface (attempts, created) WHERE state = 'queued';
+CREATE INDEX IF NOT EXISTS waiting ON surface (created) WHERE state = 'waiting';
 CREATE TABLE IF NOT EXISTS name (
     key TEXT PRIMARY KEY,
     owner TEXT,
@@ -70,14 +81,17 @@ CREATE TABLE IF NOT EXISTS replaced (
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS replaced_by_key ON replaced (key);
 CREATE INDEX IF NOT EXISTS replaced_by_time ON replaced (due);
-CREATE TABLE IF NOT EXISTS source (identity TEXT NOT NULL) STRICT;
+CREATE TABLE IF NOT EXISTS source (identity TEXT NOT NULL, complete INTEGER NOT NULL) STRICT;
 """
 
 _COLUMNS = (
     "id, created, owner, name, filenames, options, upload, upload_bytes, write, state, reason, attempts, container, "
-    "container_bytes, built_tag"
+    "container_bytes, title, levels, shown, built_tag"
 )
 
+
+# There is too little memory, there are too many open files, or a program of somebody looks at the index.
+_PASSING = (sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_BUSY)
 
 # Rows that are in memory at a time where all are asked for.
 _AT_ONCE = 500
@@ -85,6 +99,8 @@ _AT_ONCE = 500
 
 class IndexLostError(LodestreamError):
     """The index is damaged or gone, and is being made again from the store."""
+
+    headers: ClassVar = {"retry-after": "5"}
 
 
 @dataclass(frozen=True)
@@ -100,8 +116,10 @@ class Surface:
     attempts : int
         Builds that began and did not end because the server itself died.
     container : str or None
-        SHA-256 of its container.
+        SHA-256 of the container that it has, or had before it was lost.
     container_bytes : int or None
+    summary : Summary
+        Of its container.
     built_tag : str or None
         Tag of its object ``built`` in the store; None if there is none of this manifest.
     """
@@ -112,6 +130,7 @@ class Surface:
     attempts: int = 0
     container: str | None = None
     container_bytes: int | None = None
+    summary: Summary = field(default_factory=Summary)
     built_tag: str | None = None
 
     @property
@@ -164,6 +183,13 @@ class Index:
         Made if it is not there.
     identity : str
         Of the data that it is of; an index of other data is made anew.
+    lost : callable
+        Called once, by whatever thread finds that the index cannot be used any more.
+
+    Attributes
+    ----------
+    is_new : bool
+        Whether nothing of the store was known to it when it was opened: `Surfaces.sync` has never come to its end.
 
     Raises
     ------
@@ -171,7 +197,9 @@ class Index:
         If the file cannot be used.
     """
 
-    def __init__(self, path: Path, identity: str) -> None:
+    def __init__(self, path: Path, identity: str, lost: Callable[[], object] = lambda: None) -> None:
+        self.is_new = True
+        self._lost: Callable[[], object] | None = lost
         self._path = path
         self._local = threading.local()
         self._opened: list[sqlite3.Connection] = []
@@ -189,11 +217,21 @@ class Index:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.executescript(_SCHEMA)
         with self._change() as change:
-            found = [row[0] for row in change.execute("SELECT identity FROM source")]
-            if found != [self._identity]:
+            found = change.execute("SELECT identity, complete FROM source").fetchall()
+            if [identity for identity, _ in found] != [self._identity]:
                 for table in ("surface", "name", "replaced", "source"):
                     change.execute(f"DELETE FROM {table}")
-                change.execute("INSERT INTO source VALUES (?)", (self._identity,))
+                change.execute("INSERT INTO source VALUES (?, 0)", (self._identity,))
+            else:
+                self.is_new = not found[0][1]
+            # Of a server that died; the attempt was counted when it began.
+            change.execute("UPDATE surface SET state = 'queued' WHERE state = 'building'")
+
+    def complete(self) -> None:
+        """Note that the index has all that is in the store."""
+        with self._change() as change:
+            change.execute("UPDATE source SET complete = 1")
+        self.is_new = False
 
     def close(self) -> None:
         """Close all connections."""
@@ -235,28 +273,31 @@ class Index:
         where, given = ("", ()) if size is None else (" WHERE upload_bytes = ?", (size,))
         return bool(self._rows(f"SELECT 1 FROM surface{where} LIMIT 1", *given))
 
-    def next_build(self, busy: Iterable[str] = ()) -> Surface | None:
-        """Return the queued surface with the fewest attempts, and of those the oldest; none of these ids."""
-        held = json.dumps(list(busy))
-        where = (
-            "WHERE state = 'queued' AND id NOT IN (SELECT value FROM json_each(?)) ORDER BY attempts, created LIMIT 1"
-        )
-        rows = self._rows(f"SELECT {_COLUMNS} FROM surface {where}", held)
-        return _surface(rows[0]) if rows else None
+    def queued(self) -> list[str]:
+        """Return the ids of the surfaces that wait for a build: those with the fewest attempts first, then the oldest.
+
+        What may have killed a server comes last: everything else is built before it does so again.
+        """
+        rows = self._rows("SELECT id FROM surface WHERE state = 'queued' ORDER BY attempts, created")
+        return [row[0] for row in rows]
+
+    def waiting(self) -> list[str]:
+        """Return the ids of the surfaces that wait for a retry, oldest first."""
+        return [row[0] for row in self._rows("SELECT id FROM surface WHERE state = 'waiting' ORDER BY created")]
 
     def count_of(self, owner: str | None) -> int:
         """Return the number of an owner's surfaces."""
         return int(self._one("SELECT count(*) FROM surface WHERE owner IS ?", owner)[0])
 
     def kept(self, owner: str | None) -> int:
-        """Return the bytes of an owner's uploads and containers; those that several surfaces share count once."""
+        """Return the bytes of an owner's surfaces; uploads and containers that several of them share count once."""
         found = self._one(
             "SELECT coalesce(sum(size), 0) FROM ("
             "SELECT DISTINCT upload, upload_bytes AS size FROM surface WHERE owner IS ?1 UNION ALL "
             "SELECT DISTINCT container, container_bytes FROM surface WHERE owner IS ?1 AND container IS NOT NULL)",
             owner,
         )
-        return int(found[0])
+        return int(found[0]) + LEAST * self.count_of(owner)
 
     def known(self) -> Iterator[Known]:
         """Return what is known of each surface's objects, in the order of their ids, some at a time."""
@@ -356,6 +397,9 @@ class Index:
             surface.attempts,
             surface.container,
             surface.container_bytes,
+            surface.summary.name,
+            surface.summary.levels,
+            json.dumps(surface.summary.shown, ensure_ascii=False),
             surface.built_tag,
             seen,
             built_seen,
@@ -399,6 +443,8 @@ class Index:
 
     def _connection(self) -> sqlite3.Connection:
         connection: sqlite3.Connection | None = getattr(self._local, "connection", None)
+        if self._opened and not self._path.exists():
+            raise sqlite3.DatabaseError("its file is gone")
         if connection is None:
             # It is used by its thread alone, and closed by whoever closes the index.
             connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
@@ -406,8 +452,6 @@ class Index:
             connection.execute("PRAGMA busy_timeout = 10000")
             self._local.connection = connection
             self._opened.append(connection)
-        if not self._path.exists():
-            raise sqlite3.DatabaseError("its file is gone")
         return connection
 
     @contextmanager
@@ -415,6 +459,14 @@ class Index:
         try:
             yield
         except sqlite3.Error as error:
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            if code == sqlite3.SQLITE_FULL:
+                raise FullError(f"{self._path}: {error}: make room on the disk of the index") from error
+            if code in _PASSING:
+                raise StoreError(f"{self._path}: {error}: try again") from error
+            lost, self._lost = self._lost, None
+            if lost is not None:
+                lost()
             raise IndexLostError(f"the index of the surfaces cannot be used, and is made again: {error}") from error
 
 
@@ -431,7 +483,9 @@ def _surface(row: tuple[Any, ...]) -> Surface:
         upload_bytes,
         write,
     )
-    return Surface(manifest, *row[9:])
+    state, reason, attempts, container, container_bytes, title, levels, shown, built_tag = row[9:]
+    summary = Summary(title, levels, json.loads(shown))
+    return Surface(manifest, state, reason, attempts, container, container_bytes, summary, built_tag)
 
 
 def _named(row: tuple[Any, ...]) -> Named:

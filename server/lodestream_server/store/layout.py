@@ -24,12 +24,13 @@ import json
 import re
 import secrets
 import zlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
+from lodestream.container.series import SERIES, place_of
 from lodestream.errors import InputError, LodestreamError
 from lodestream.stores.keys import is_key
 
@@ -37,6 +38,7 @@ __all__ = [
     "BUILT",
     "CONTAINERS",
     "IDENTITY",
+    "LONGEST_NAME",
     "MOST_REASON",
     "MOST_TEXT",
     "NAMES",
@@ -47,8 +49,10 @@ __all__ = [
     "Identity",
     "Manifest",
     "Name",
+    "Summary",
     "built_key",
     "container_key",
+    "describe",
     "dump",
     "id_of",
     "manifest_key",
@@ -68,6 +72,12 @@ MOST_TEXT, MOST_REASON = 3072, 1024
 
 VERSION = 1
 
+#: Characters of the name of a surface; every page of a list has it.
+LONGEST_NAME = 255
+
+# Of a description, what a list shows too.
+_SHOWN = ("shape", "closed", "bytes")
+_INFO = b', "info":\n'
 _ID = re.compile(r"(?:surfaces|built)/([0-9a-f]{20})\.json")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _BYTES = re.compile(r"uploads/([0-9a-f]{64})/(?:0|[1-9][0-9]*)|containers/([0-9a-f]{64})\.lode")
@@ -136,6 +146,24 @@ class Manifest:
 
 
 @dataclass(frozen=True)
+class Summary:
+    """What a list says of a container, and what requests need to know before it is opened.
+
+    Attributes
+    ----------
+    name : str or None
+        The name in its metadata, of at most `LONGEST_NAME` characters.
+    levels : int
+    shown : mapping
+        ``shape``, ``closed``, ``bytes`` of the description, and the place in a series.
+    """
+
+    name: str | None = None
+    levels: int = 0
+    shown: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Built:
     """What became of the build of a surface.
 
@@ -145,22 +173,23 @@ class Built:
         Id of the write of its manifest.
     container : str or None
         SHA-256 of the container; None if the build failed for good.
-    bytes : int
-        Of the container.
+    container_bytes : int
     reason : str or None
         Why it failed for good, in one line.
-    info : mapping
-        What ``lodestream info --json`` prints of the container.
     write : str
         Id of this write.
+    summary : Summary
+    info : bytes
+        The description: what ``lodestream info --json`` prints of the container, as JSON. It is sent as it is.
     """
 
     manifest: str
     container: str | None
-    bytes: int
+    container_bytes: int
     reason: str | None
     write: str
-    info: dict[str, Any] = field(repr=False, default_factory=dict)
+    summary: Summary = field(default_factory=Summary)
+    info: bytes = field(repr=False, default=b"")
 
 
 @dataclass(frozen=True)
@@ -258,20 +287,42 @@ def sha256_of(key: str) -> str | None:
     return None if found is None else found[1] or found[2]
 
 
-@cache
-def _adapters() -> dict[type[Any], TypeAdapter[Any]]:
-    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built, Name)}
-
-
-def dump(small: Identity | Manifest | Built | Name) -> bytes:
-    """Return a small object as bytes.
+def describe(info: dict[str, Any]) -> tuple[bytes, Summary]:
+    """Return a description as JSON, and its summary.
 
     Raises
     ------
     ValueError
         If JSON cannot express a value.
     """
-    body = json.dumps(asdict(small), ensure_ascii=False, allow_nan=False).encode()[:-1]
+    metadata = info.get("metadata") or {}
+    name = metadata.get("name")
+    shown: dict[str, Any] = {key: info[key] for key in _SHOWN if key in info}
+    place = place_of(metadata)
+    if place is not None:
+        shown[SERIES] = place.told()
+    summary = Summary(name[:LONGEST_NAME] if isinstance(name, str) and name else None, len(info["levels"]), shown)
+    return json.dumps(info | shown, ensure_ascii=False, allow_nan=False).encode(), summary
+
+
+@cache
+def _adapters() -> dict[type[Any], TypeAdapter[Any]]:
+    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built, Name)}
+
+
+def dump(small: Identity | Manifest | Built | Name) -> bytes:
+    """Return a small object as bytes. The description in a ``built`` is JSON, and stands on a line of its own.
+
+    Raises
+    ------
+    ValueError
+        If JSON cannot express a value.
+    """
+    values = asdict(small)
+    info = values.pop("info", b"")
+    body = json.dumps(values, ensure_ascii=False, allow_nan=False).encode()[:-1]
+    if info:
+        body += _INFO + info + b"\n"
     return body + b', "check": "%08x"}' % zlib.crc32(body)
 
 
@@ -286,8 +337,9 @@ def parse(kind: type[T], key: str, data: bytes) -> T:
     check = _CHECK.search(data)
     if check is None or int(check[1], 16) != zlib.crc32(data[: check.start()]):
         raise DamagedObjectError(f"{key} cannot be read: expected a small object with its checksum, got other bytes")
+    head, _, info = data[: check.start()].partition(_INFO)
     try:
-        small: T = _adapters()[kind].validate_json(data)
+        small: T = _adapters()[kind].validate_json(head + b"}")
     except (ValidationError, InputError) as error:
         words = str(error)
         if isinstance(error, ValidationError):
@@ -298,4 +350,4 @@ def parse(kind: type[T], key: str, data: bytes) -> T:
         raise DamagedObjectError(f"{key} holds the surface {small.id[:80]!a}")
     if isinstance(small, Name) and name_key(small.name) != key:
         raise DamagedObjectError(f"{key} holds the name {small.name}")
-    return small
+    return replace(small, info=info.removesuffix(b"\n")) if isinstance(small, Built) else small

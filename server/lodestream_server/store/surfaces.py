@@ -10,18 +10,30 @@ import heapq
 import itertools
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from lodestream.errors import InputError, NotFoundError
-from lodestream.stores import AbsentError, Entry, ExistsError, Store, Tag
+from lodestream.stores import AbsentError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
 
 from . import layout
 from .index import Index, IndexLostError, Known, Surface, state_of
-from .layout import BUILT, CONTAINERS, IDENTITY, SURFACES, UPLOADS, Built, DamagedObjectError, Identity, Manifest
+from .layout import (
+    BUILT,
+    CONTAINERS,
+    IDENTITY,
+    SURFACES,
+    UPLOADS,
+    Built,
+    DamagedObjectError,
+    Identity,
+    Manifest,
+)
 from .names import Names
 from .states import Event, after
 
@@ -31,6 +43,9 @@ _log = logging.getLogger(__name__)
 #: Seconds after which what no small object refers to is a stray that may be removed: whoever has put it there has come
 #: to its small object since, or never will.
 STRAY = 86400.0
+
+# Another upload, or somebody who asks for it, begins another attempt of these.
+_STOPPED = ("failed", "waiting")
 
 # Surfaces that `sync` reads in one transaction.
 _AT_ONCE = 500
@@ -44,9 +59,15 @@ class Surfaces:
     store : Store
     index : Path
         File of the index, on a local disk.
+    lost : callable
+        Called by whatever thread finds that the index cannot be used any more; `restore` makes it again, and until then
+        everything raises `IndexLostError`.
 
     Attributes
     ----------
+    store : Store
+    is_synced : bool
+        Whether `sync` has come to its end: before that the index may lack what was changed while no server ran.
     names : Names
         The names that lead to surfaces.
 
@@ -56,19 +77,35 @@ class Surfaces:
         If the store holds something else, or is not fit.
     """
 
-    def __init__(self, store: Store, index: Path) -> None:
+    def __init__(self, store: Store, index: Path, lost: Callable[[], object] = lambda: None) -> None:
         self.store = store
+        self.is_synced = False
         self._identity = establish(store)
         self._path = index
+        self._tell_lost = lost
+        self._mending = False
+        self._mender: int | None = None  # the thread that makes the index again
         #: Held for each change, so that what was looked at is still so when it is written.
         self._lock = threading.RLock()
+        #: Prefixes and keys of large objects that are being put and that no small object refers to yet.
+        self._coming: Counter[str] = Counter()
+        #: What is wrong with a small object that cannot be read: nobody knows which large ones it refers to.
+        self._damaged: DamagedObjectError | None = None
         try:
-            self._index = Index(index, self._identity)
+            self._index = Index(index, self._identity, self._lost)
         except IndexLostError as error:
             _log.warning("%s", error)
-            Index.remove(index)
-            self._index = Index(index, self._identity)
+            self._open_new()
+            self._mending = False
         self.names = Names(self, self._lock)
+
+    def _open_new(self) -> None:
+        Index.remove(self._path)
+        self._index = Index(self._path, self._identity, self._lost)
+
+    def _lost(self) -> None:
+        self._mending = True
+        self._tell_lost()
 
     def close(self) -> None:
         """Close the index."""
@@ -76,7 +113,15 @@ class Surfaces:
 
     @property
     def index(self) -> Index:
-        """The index, for reading."""
+        """The index, for reading.
+
+        Raises
+        ------
+        IndexLostError
+            While it is made again.
+        """
+        if self._mending and threading.get_ident() != self._mender:
+            raise IndexLostError("the index of the surfaces is made again; try again soon")
         return self._index
 
     def get(self, surface: str) -> Surface:
@@ -89,15 +134,31 @@ class Surfaces:
         IndexLostError
             While the index is made again.
         """
-        found = self._index.find(surface)
+        found = self.index.find(surface)
         if found is None:
             raise NotFoundError(f"expected the id of a surface on this server, got {surface[:80]!a}")
         return found
 
-    def info(self, surface: Surface) -> dict[str, Any]:
-        """Return what ``lodestream info --json`` prints of a surface's container; empty if it has none."""
+    def info(self, surface: Surface) -> bytes:
+        """Return what ``lodestream info --json`` prints of a surface's container, as JSON; ``{}`` if it has none."""
         built = self._built(surface.manifest)
-        return {} if built is None else built[0].info
+        return (built and built[0].info) or b"{}"
+
+    @contextmanager
+    def upload(self, surface: Surface) -> Iterator[list[Path]]:
+        """Give the uploaded files of a surface, in order, for the length of a block.
+
+        Raises
+        ------
+        AbsentError
+            If one is not there.
+        StoreError
+            If the store cannot be read.
+        """
+        it = surface.manifest
+        with ExitStack() as stack:
+            keys = (layout.upload_key(it.upload, number) for number in range(len(it.filenames)))
+            yield [stack.enter_context(self.store.local(key)) for key in keys]
 
     def accept(self, manifest: Manifest, files: Sequence[Path]) -> tuple[Surface, bool]:
         """Store an upload; return its surface, and whether it must be built.
@@ -108,6 +169,7 @@ class Surfaces:
         ----------
         manifest : Manifest
         files : sequence of Path
+            They are the store's from now on, and may be moved.
 
         Raises
         ------
@@ -116,39 +178,109 @@ class Surfaces:
         StoreError
             If it could not be stored, or it is not known whether it was: the same upload again is harmless.
         """
-        with self._lock:
-            self.names.keep(manifest.id)
-            known = self._index.find(manifest.id)
-            if known is not None:
-                _check_same(known.manifest, manifest)
-                return self._again(known, files)
-            self._put_upload(manifest, files)
-            try:
-                self.store.create(layout.manifest_key(manifest.id), layout.dump(manifest))
-            except ExistsError:
-                manifest = self._there(manifest)
-            found = self._adopted(manifest)
-            self._index.put(found)
-            return found, found.state == "queued"
-
-    def _again(self, known: Surface, files: Sequence[Path]) -> tuple[Surface, bool]:
-        """Return a surface that was uploaded again; one that was not built is tried again, with these files."""
-        if known.state in ("ready", "building", "queued"):
+        self.names.keep(manifest.id)
+        known = self.index.find(manifest.id)
+        if known is not None and known.state not in _STOPPED:
+            _check_same(known.manifest, manifest)
             return known, False
-        for number, file in enumerate(files):
-            self.store.put_file(layout.upload_key(known.manifest.upload, number), file)
-        return self.retry(known.id), True
+        keys = [layout.upload_key(manifest.upload, number) for number in range(len(files))]
+        with self._arriving(keys):
+            self._put_upload(manifest, keys, files)
+            with self._lock:
+                known = self.index.find(manifest.id)
+                if known is not None:
+                    _check_same(known.manifest, manifest)
+                    again = self.retry(known.id)
+                    return again, known.state in _STOPPED
+                found = self._adopted(self._created(manifest))
+                self._noted_or_taken_back(found)
+                return found, found.state == "queued"
 
-    def _put_upload(self, manifest: Manifest, files: Sequence[Path]) -> None:
+    def _put_upload(self, manifest: Manifest, keys: Sequence[str], files: Sequence[Path]) -> None:
         """Put the files of an upload, but those that are there and that another surface refers to.
 
         What nobody refers to may be collected as a stray at any time, unless it is put again.
         """
-        shared = any(other.id != manifest.id for other in self._index.of_upload(manifest.upload))
-        for number, file in enumerate(files):
-            key = layout.upload_key(manifest.upload, number)
+        shared = any(other.id != manifest.id for other in self.index.of_upload(manifest.upload))
+        for key, file in zip(keys, files, strict=True):
             if not shared or self._size(key) != file.stat().st_size:
-                self.store.put_file(key, file)
+                self.store.put_file(key, file, given=True)
+
+    def _created(self, manifest: Manifest) -> Manifest:
+        """Create a manifest; return the one that is in the store then."""
+        key, data = layout.manifest_key(manifest.id), layout.dump(manifest)
+        try:
+            self.store.create(key, data)
+        except ExistsError:
+            there, tag = self.store.get(key)
+            try:
+                known = layout.parse(Manifest, key, there)
+            except DamagedObjectError as error:
+                _log.error("%s; the same upload has come again, and takes its place", error)
+                self.store.replace(key, data, tag)
+                return manifest
+            _check_same(known, manifest)
+            return known
+        return manifest
+
+    def _noted_or_taken_back(self, new: Surface) -> None:
+        """Tell the index of a new surface; if it cannot be told, there is no such surface."""
+        try:
+            self.index.put(new)
+        except StoreError as error:
+            try:
+                self.store.delete([layout.manifest_key(new.id)])
+            except StoreError:
+                raise UnacknowledgedError(f"{new.id} may be stored or not; upload it again: {error}") from error
+            raise
+
+    @contextmanager
+    def _arriving(self, keys: Sequence[str]) -> Iterator[None]:
+        """Keep large objects that are put, and that no small object refers to yet, from being removed.
+
+        What nothing refers to when the block ends is removed: as a stray it would take room for a day.
+        """
+        with self._lock:
+            self._coming.update(keys)
+        settled = False
+        try:
+            yield
+            settled = True
+        except UnacknowledgedError:
+            raise  # there may be a small object that refers to them
+        except StoreError:
+            settled = True
+            raise
+        finally:
+            with self._lock:
+                self._coming.subtract(keys)
+                self._coming += Counter()
+                if settled:
+                    with suppress(StoreError, IndexLostError):
+                        self._remove_unused(keys)
+
+    def _remove_unused(self, keys: Iterable[str], deleted: str | None = None) -> None:
+        """Remove large objects to which nothing refers, as far as that is known; `deleted` is about to leave the index.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot remove them; they are strays then.
+        """
+        # Before the end of the first `sync` the index may not know who refers to them.
+        if not self.is_synced or self._damaged is not None or self._mending:
+            return
+        unused = [key for key in keys if not self._coming[key] and self._users(key) <= {deleted}]
+        if unused:
+            self.store.delete(unused)
+
+    def _users(self, key: str) -> set[str | None]:
+        """Return the surfaces that refer to a large object."""
+        sha256 = layout.sha256_of(key) or ""
+        if key.startswith(CONTAINERS):
+            return {it.id for it in self._index.of_container(sha256)}
+        number = int(key.rpartition("/")[2])
+        return {it.id for it in self._index.of_upload(sha256) if number < len(it.manifest.filenames)}
 
     def _size(self, key: str) -> int | None:
         """Return the bytes of an object; None if it is not there."""
@@ -157,13 +289,6 @@ class Surfaces:
                 return blob.size
         except AbsentError:
             return None
-
-    def _there(self, manifest: Manifest) -> Manifest:
-        """Return the manifest that is in the store in place of one that was to be created."""
-        key = layout.manifest_key(manifest.id)
-        there = layout.parse(Manifest, key, self.store.get(key)[0])
-        _check_same(there, manifest)
-        return there
 
     def _adopted(self, manifest: Manifest) -> Surface:
         """Return a surface as the store knows it."""
@@ -193,9 +318,18 @@ class Surfaces:
         """Note that a build begins: it counts as an attempt until it ends. None: it was deleted."""
         return self._noted(surface, "begun", attempt=1)
 
-    def later(self, surface: str, reason: str | None = None) -> Surface | None:
-        """Note that a build lacks something now and is tried again; the attempt does not count."""
-        return self._noted(surface, "later", reason, attempt=-1)
+    def later(self, surface: str, reason: str | None = None, *, counts: bool = False) -> Surface | None:
+        """Note that a build ended without a result, and is tried again.
+
+        Parameters
+        ----------
+        surface : str
+        reason : str or None
+        counts : bool
+            Whether this counts as an attempt: its process died, and may again. Otherwise the build lacked something, or
+            the server ends.
+        """
+        return self._noted(surface, "later", reason, attempt=0 if counts else -1)
 
     def stuck(self, surface: str, reason: str) -> Surface | None:
         """Note that a surface could not be built for a reason of the server; it waits until somebody asks again."""
@@ -203,36 +337,49 @@ class Surfaces:
 
     def _noted(self, surface: str, event: Event, reason: str | None = None, attempt: int = 0) -> Surface | None:
         with self._lock:
-            known = self._index.find(surface)
+            known = self.index.find(surface)
             if known is None:
                 return None
             attempts = max(known.attempts + attempt, 0)
             noted = replace(known, state=after(known.state, event), reason=_bounded(reason), attempts=attempts)
-            self._index.put(noted)
+            self.index.put(noted)
             return noted
 
     def built(self, surface: str, container: Path, sha256: str, info: dict[str, Any]) -> Surface | None:
         """Store what was built; None: the surface was deleted, and nothing is stored.
 
+        Parameters
+        ----------
+        surface : str
+        container : Path
+            It is the store's from now on, and may be moved.
+        sha256 : str
+        info : mapping
+            Description of the container.
+
         Raises
         ------
+        ValueError
+            If JSON cannot express the description.
         StoreError
             If it could not be stored; the surface is as before.
         OSError
             If the file cannot be read.
         """
-        with self._lock:
-            known = self._index.find(surface)
-            if known is None:
-                return None
-            after(known.state, "built")
-            size = container.stat().st_size
-            built = Built(known.manifest.write, sha256, size, None, layout.new_write(), info)
-            data = layout.dump(built)  # before anything is put: a figure may be such that it cannot be written
-            key = layout.container_key(sha256)
-            if not self._index.of_container(sha256) or self._size(key) != size:
-                self.store.put_file(key, container)
-            return self._told(known, built, data)
+        if self.index.find(surface) is None:
+            return None
+        described, summary = layout.describe(info)
+        key, size = layout.container_key(sha256), container.stat().st_size
+        with self._arriving([key]):
+            if not self.index.of_container(sha256) or self._size(key) != size:
+                self.store.put_file(key, container, given=True)
+            with self._lock:
+                known = self.index.find(surface)
+                if known is None:
+                    return None
+                after(known.state, "built")
+                built = Built(known.manifest.write, sha256, size, None, layout.new_write(), summary, info=described)
+                return self._told(known, built)
 
     def refused(self, surface: str, reason: str) -> Surface | None:
         """Store that a reader refuses the files of a surface, for good; None: the surface was deleted.
@@ -243,23 +390,29 @@ class Surfaces:
             If that could not be stored; nobody may be told then what a restart could take back.
         """
         with self._lock:
-            known = self._index.find(surface)
+            known = self.index.find(surface)
             if known is None:
                 return None
             after(known.state, "refused")
-            built = Built(known.manifest.write, None, 0, _bounded(reason), layout.new_write())
-            return self._told(known, built, layout.dump(built))
+            return self._told(known, Built(known.manifest.write, None, 0, _bounded(reason), layout.new_write()))
 
-    def _told(self, known: Surface, built: Built, data: bytes) -> Surface:
+    def _told(self, known: Surface, built: Built) -> Surface:
         """Write what became of a build in place of whatever is there, and tell the index."""
-        key = layout.built_key(known.id)
+        key, data = layout.built_key(known.id), layout.dump(built)
+        before: list[str] = []
         try:
             tag = self.store.create(key, data)
         except ExistsError:
             # Of another manifest, of another version of the format, of a failure before a retry, or damaged.
-            tag = self.store.replace(key, data, self.store.get(key)[1])
+            there, old = self.store.get(key)
+            tag = self.store.replace(key, data, old)
+            with suppress(DamagedObjectError):
+                container = layout.parse(Built, key, there).container
+                before += [layout.container_key(container)] if container not in (None, built.container) else []
         told = _surface(known.manifest, built, tag)
-        self._index.put(told)
+        self.index.put(told)
+        with suppress(StoreError):
+            self._remove_unused(before)
         return told
 
     def retry(self, surface: str) -> Surface:
@@ -277,24 +430,37 @@ class Surfaces:
             state = after(known.state, "retry")
             if state == known.state:
                 return known
+            tag = known.built_tag
             if known.state == "failed":
                 self.store.delete([layout.built_key(surface)])  # or a lost index would make it fail again
-            again = replace(known, state=state, reason=None, attempts=0, built_tag=None)
-            self._index.put(again)
+                tag = None
+            again = replace(known, state=state, reason=None, attempts=0, built_tag=tag)
+            self.index.put(again)
             return again
 
-    def lose(self, surface: str) -> Surface | None:
-        """Queue a surface again whose container is gone or is no longer read; None: it was deleted, or is not ready."""
+    def lose(self, container: str, *, unreadable: bool = False) -> list[Surface]:
+        """Queue the surfaces of a container again that is not there; return them.
+
+        Parameters
+        ----------
+        container : str
+            Its SHA-256.
+        unreadable : bool
+            It is there, but of a version of the format that is no longer read.
+        """
         with self._lock:
-            known = self._index.find(surface)
-            if known is None or known.state != "ready":
-                return None
-            lost = replace(known, state=after(known.state, "lost"), container=None, container_bytes=None)
-            self._index.put(lost)
+            if not unreadable and self._size(layout.container_key(container)) is not None:
+                return []
+            lost = []
+            for known in self.index.of_container(container):
+                if known.state == "ready":
+                    again = replace(known, state=after(known.state, "lost"))
+                    self.index.put(again)
+                    lost.append(again)
             return lost
 
     def delete(self, surface: str) -> None:
-        """Delete a surface. Its upload and its container become strays, unless another surface has them.
+        """Delete a surface, with its upload and its container unless another surface has them.
 
         Raises
         ------
@@ -304,10 +470,17 @@ class Surfaces:
             If it is not known whether the manifest is gone; to delete it again is harmless.
         """
         with self._lock:
-            self.get(surface)
+            known = self.get(surface)
+            it = known.manifest
             self.store.delete([layout.manifest_key(surface)])  # it is deleted from here on
-            self._index.drop(surface)
-            self.store.delete([layout.built_key(surface)])
+            keys = [layout.upload_key(it.upload, number) for number in range(len(it.filenames))]
+            keys += [layout.container_key(known.container)] if known.container is not None else []
+            try:
+                self.store.delete([layout.built_key(surface)])
+                self._remove_unused(keys, deleted=surface)
+            except StoreError as error:
+                _log.warning("%s was deleted, but some of its files are left as strays: %s", surface, error)
+            self.index.drop(surface)
 
     # The index and the store.
 
@@ -345,6 +518,8 @@ class Surfaces:
         damaged = self._take(changed) or damaged
         progress(looked)
         self.names.sync()
+        self._index.complete()
+        self.is_synced, self._damaged = True, damaged
         return taken, damaged
 
     def _found(self) -> Iterator[_Found]:
@@ -380,21 +555,32 @@ class Surfaces:
                     tags[1] = None  # so that it is told each time, until it is replaced
                 surface = _surface(manifest, *(built or (None, None)))
                 before = self._index.find(found.id)
-                if before is not None and before.manifest.write == manifest.write and surface.state == "queued":
-                    # What only the index knows: how often it was tried, and whether and why it waits.
-                    surface = replace(surface, attempts=before.attempts)
-                    if before.state == "waiting":
-                        surface = replace(surface, state="waiting", reason=before.reason)
+                if before is not None and before.manifest.write == manifest.write:
+                    if before.built_tag == surface.built_tag:
+                        surface = before  # with what only the index knows: whether it waits, is built, and how often
+                    elif surface.state == "queued":
+                        surface = replace(surface, attempts=before.attempts)
                 self._index.put(surface, *tags)
         return damaged
 
     def restore(self) -> None:
-        """Make an index that was lost again, from the store."""
+        """Make an index that was lost again, from the store.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read, or the disk of the index is full; to be repeated then.
+        """
         with self._lock:
-            self._index.close()
-            Index.remove(self._path)
-            self._index = Index(self._path, self._identity)
-            self.sync()
+            self._mending, self._mender = True, threading.get_ident()
+            try:
+                self._index.close()
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._open_new()
+                self.sync()
+                self._mending = False
+            finally:
+                self._mender = None
 
     def strays(self, older: float = STRAY) -> list[Entry]:
         """Return the objects that no small object refers to, and that are older than so many seconds.
@@ -405,13 +591,18 @@ class Surfaces:
             If the store cannot be listed.
         """
         before = self.store.probe() - older
-        uses = {UPLOADS: self._uses_upload, CONTAINERS: self._uses_container, BUILT: self._uses_built}
         return [
             entry
-            for prefix, used in uses.items()
+            for prefix in (UPLOADS, CONTAINERS, BUILT)
             for entry in self.store.entries(prefix)
-            if entry.modified < before and not used(entry.key)
+            if entry.modified < before and not self._coming[entry.key] and not self._is_used(entry.key)
         ]
+
+    def _is_used(self, key: str) -> bool:
+        if layout.sha256_of(key) is not None:
+            return bool(self._users(key))
+        id_ = layout.id_of(key)  # of what is none of ours nobody knows who uses it
+        return id_ is None or self._index.find(id_) is not None
 
     def collect(self, older: float = STRAY) -> list[Entry]:
         """Remove strays; return what they were.
@@ -431,21 +622,6 @@ class Surfaces:
             found = self.strays(older)
             self.store.delete([entry.key for entry in found])
         return found
-
-    def _uses_upload(self, key: str) -> bool:
-        sha256 = layout.sha256_of(key)
-        if sha256 is None:
-            return True  # of somebody else
-        number = int(key.split("/")[2])
-        return any(number < len(it.manifest.filenames) for it in self._index.of_upload(sha256))
-
-    def _uses_container(self, key: str) -> bool:
-        sha256 = layout.sha256_of(key)
-        return sha256 is None or bool(self._index.of_container(sha256))
-
-    def _uses_built(self, key: str) -> bool:
-        id_ = layout.id_of(key)
-        return id_ is None or self._index.find(id_) is not None
 
 
 @dataclass(frozen=True)
@@ -527,8 +703,8 @@ def _published(store: Store) -> bool:
 def _surface(manifest: Manifest, built: Built | None, tag: Tag | None) -> Surface:
     if built is None:
         return Surface(manifest, "queued")
-    size = built.bytes if built.container is not None else None
-    return Surface(manifest, state_of(built), built.reason, 0, built.container, size, tag)
+    size = built.container_bytes if built.container is not None else None
+    return Surface(manifest, state_of(built), built.reason, 0, built.container, size, built.summary, tag)
 
 
 def _check_same(known: Manifest, manifest: Manifest) -> None:

@@ -110,6 +110,17 @@ def test_objects_of_any_size_are_written_from_files_whatever_is_there(store: Sto
         assert store.get("containers/a.lode")[0] == data
 
 
+def test_a_file_that_is_given_is_the_object(store: Store, tmp_path: Path) -> None:
+    for data in (b"first", b"second"):
+        path = tmp_path / "given"
+        path.write_bytes(data)
+        store.put_file("containers/a.lode", path, given=True)
+        assert store.get("containers/a.lode")[0] == data
+    with pytest.raises(FileNotFoundError):
+        store.put_file("containers/a.lode", tmp_path / "nothing", given=True)
+    assert [entry.key for entry in store.entries("")] == ["containers/a.lode"]
+
+
 def test_progress_ends_at_the_size_and_may_stop_the_work(store: Store, tmp_path: Path) -> None:
     path = tmp_path / "source"
     told: list[int] = []

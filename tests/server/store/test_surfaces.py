@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import sqlite3
 import tempfile
@@ -26,9 +27,9 @@ from hypothesis.stateful import (
 )
 
 from lodestream.errors import InputError, NotFoundError
-from lodestream.stores import Folder, Store, StoreError, Tag
+from lodestream.stores import Folder, FullError, Store, StoreError, Tag, UnacknowledgedError
 from lodestream_server.store import layout
-from lodestream_server.store.index import Index, IndexLostError
+from lodestream_server.store.index import LEAST, Index, IndexLostError
 from lodestream_server.store.layout import MOST_TEXT, Built, DamagedObjectError, Identity, Manifest
 from lodestream_server.store.states import EDGES, STATES, Event, WrongTurnError, after
 from lodestream_server.store.surfaces import Surfaces, establish
@@ -39,7 +40,9 @@ from .world import CutError, Failing, container, upload
 
 @pytest.fixture
 def surfaces(tmp_path: Path) -> Surfaces:
-    return Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+    found = Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+    found.sync()
+    return found
 
 
 def build(surfaces: Surfaces, manifest: Manifest, folder: Path) -> None:
@@ -55,8 +58,9 @@ def scenario(surfaces: Surfaces, folder: Path, acked: dict[str, bytes], deleted:
     """Uploads, builds and deletes of two owners; each is noted before it begins and after it was acknowledged."""
     for number in range(6):
         manifest, files = upload(folder, number, "ann" if number % 2 else "ben")
+        body = files[0].read_bytes()
         surfaces.accept(manifest, files)
-        acked[manifest.id] = files[0].read_bytes()
+        acked[manifest.id] = body
         if number == 4:
             surfaces.begin(manifest.id)
             surfaces.refused(manifest.id, "no surface")
@@ -85,7 +89,7 @@ def check(store: Store, index: Path, acked: dict[str, bytes], deleted: set[str],
             assert found.container is not None
             with store.open(layout.container_key(found.container)) as blob:
                 assert hashlib.sha256(blob.read(0, blob.size)).hexdigest() == found.container
-            assert surfaces.info(found)["shape"] == [5, 7]
+            assert json.loads(surfaces.info(found))["shape"] == [5, 7]
         else:
             assert found.state == ("failed" if surfaces.index.find(id_) and found.reason else "queued")
     collected = len(surfaces.collect(older=-3600))
@@ -116,6 +120,7 @@ def test_a_cut_at_every_step_loses_nothing_and_brings_nothing_back(
         surfaces = Surfaces(failing, tmp_path / f"{at}.sqlite")
         done = False
         with suppress(CutError):
+            surfaces.sync()
             scenario(surfaces, tmp_path, acked, deleted, begun)
             done = True
         surfaces.close()
@@ -167,12 +172,19 @@ def test_the_same_upload_again(surfaces: Surfaces, tmp_path: Path) -> None:
     assert (again.manifest.write, new) == (manifest.write, False)
     build(surfaces, manifest, tmp_path)
     assert surfaces.accept(*upload(tmp_path, 1)) == (surfaces.get(manifest.id), False)
-    surfaces.lose(manifest.id)
+    sha256 = surfaces.get(manifest.id).container or ""
+    assert not surfaces.lose(sha256), "it is there"
+    surfaces.store.delete([layout.container_key(sha256)])
+    (lost,) = surfaces.lose(sha256)
+    assert lost == surfaces.get(manifest.id)
+    assert (lost.state, lost.container) == ("queued", sha256)
     surfaces.stuck(manifest.id, "its upload is damaged")
     surfaces.store.delete([layout.upload_key(manifest.upload, 0)])
-    assert surfaces.accept(*upload(tmp_path, 1))[1], "it is built again, from the bytes that came"
+    _, files = upload(tmp_path, 1)
+    body = files[0].read_bytes()
+    assert surfaces.accept(manifest, files)[1], "it is built again, from the bytes that came"
     with surfaces.store.open(layout.upload_key(manifest.upload, 0)) as blob:
-        assert blob.read(0, blob.size) == files[0].read_bytes()
+        assert blob.read(0, blob.size) == body
 
 
 def test_an_id_of_other_bytes_is_refused(surfaces: Surfaces, tmp_path: Path) -> None:
@@ -195,7 +207,6 @@ def test_a_build_of_a_deleted_surface_is_dropped(surfaces: Surfaces, tmp_path: P
     assert surfaces.built(manifest.id, *container(tmp_path, manifest)) is None
     assert surfaces.refused(manifest.id, "x") is None
     assert surfaces.stuck(manifest.id, "x") is surfaces.later(manifest.id) is surfaces.begin(manifest.id) is None
-    assert surfaces.lose(manifest.id) is None
     assert not keys(surfaces.store, "built/")
     with pytest.raises(NotFoundError):
         surfaces.get(manifest.id)
@@ -230,8 +241,6 @@ def test_shared_files_stay_until_the_last_surface_is_deleted(surfaces: Surfaces,
     surfaces.delete(ids[0])
     assert not surfaces.collect(older=-3600)
     surfaces.delete(ids[1])
-    assert not surfaces.collect(), "strays are left for a day"
-    assert len(surfaces.collect(older=-3600)) == 2
     assert keys(surfaces.store) == ["lodestream.json"]
 
 
@@ -241,7 +250,7 @@ def test_nothing_is_collected_while_a_small_object_is_damaged(surfaces: Surfaces
     surfaces.accept(manifest, files)
     build(surfaces, manifest, tmp_path)
     surfaces.accept(*upload(tmp_path, 1))
-    surfaces.delete(f"{1:020x}")
+    surfaces.store.delete([layout.manifest_key(f"{1:020x}")])
     before = keys(surfaces.store)
     path = tmp_path / "data" / kind / f"{manifest.id}.json"
     whole = path.read_bytes()
@@ -293,7 +302,7 @@ def test_only_what_has_the_name_of_an_own_object_is_a_stray(surfaces: Surfaces, 
 
 @given(st.data())
 def test_every_changed_bit_of_a_small_object_is_seen(data: st.DataObject) -> None:
-    small = Built("ab" * 16, "cd" * 32, 4711, None, "ef" * 16, {"shape": [5, 7]})
+    small = Built("ab" * 16, "cd" * 32, 4711, None, "ef" * 16, info=b'{"shape": [5, 7]}')
     whole = layout.dump(small)
     assert layout.parse(Built, "built/x.json", whole) == small
     place = data.draw(st.integers(0, 8 * len(whole) - 1))
@@ -305,10 +314,73 @@ def test_every_changed_bit_of_a_small_object_is_seen(data: st.DataObject) -> Non
             layout.parse(Built, "built/x.json", damaged)
 
 
+def test_strays_are_left_for_a_day(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 0)
+    surfaces.accept(manifest, files)
+    build(surfaces, manifest, tmp_path)
+    surfaces.store.delete([layout.manifest_key(manifest.id)])  # a delete that was cut
+    assert not surfaces.collect(), "strays are left for a day"
+    assert len(surfaces.collect(older=-3600)) == 3
+    assert keys(surfaces.store) == ["lodestream.json"]
+
+
+def test_before_the_first_sync_has_ended_a_delete_leaves_its_files(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 0)
+    surfaces.accept(manifest, files)
+    unsynced = Surfaces(surfaces.store, tmp_path / "index.sqlite")
+    unsynced.delete(manifest.id)
+    assert keys(surfaces.store) == ["lodestream.json", layout.upload_key(manifest.upload, 0)]
+    unsynced.sync()
+    assert len(unsynced.collect(older=-3600)) == 1
+
+
+def test_a_delete_leaves_files_while_a_manifest_cannot_be_read(surfaces: Surfaces, tmp_path: Path) -> None:
+    first, second = upload(tmp_path, 0), upload(tmp_path, 3)  # of the same bytes
+    for manifest, files in (first, second):
+        surfaces.accept(manifest, files)
+    path = tmp_path / "data" / layout.manifest_key(first[0].id)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-9])
+    surfaces.restore()
+    surfaces.delete(second[0].id)
+    with pytest.raises(DamagedObjectError, match="nothing is removed"):
+        surfaces.collect(older=-3600)
+    assert layout.upload_key(first[0].upload, 0) in keys(surfaces.store)
+    surfaces.accept(*upload(tmp_path, 0))  # which takes its place
+    surfaces.sync()
+    assert not surfaces.collect(older=-3600)
+    assert surfaces.get(first[0].id).state == "queued"
+
+
+def test_an_upload_that_cannot_be_stored_leaves_nothing(surfaces: Surfaces, tmp_path: Path) -> None:
+    def full(*_: Any) -> Any:
+        raise FullError("full")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces.store, "create", full)
+        with pytest.raises(FullError):
+            surfaces.accept(*upload(tmp_path, 0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces.index, "put", full)
+        with pytest.raises(FullError):
+            surfaces.accept(*upload(tmp_path, 0))
+    assert keys(surfaces.store) == ["lodestream.json"]
+    with pytest.MonkeyPatch.context() as patch:
+
+        def unknown(*_: Any) -> Any:
+            raise UnacknowledgedError("unknown")
+
+        patch.setattr(surfaces.store, "create", unknown)
+        with pytest.raises(UnacknowledgedError):
+            surfaces.accept(*upload(tmp_path, 0))
+    assert len(keys(surfaces.store, "uploads/")) == 1, "there may be a manifest that refers to it"
+
+
 def test_files_that_become_strays_are_put_again(surfaces: Surfaces, tmp_path: Path) -> None:
     manifest, files = upload(tmp_path, 0)
     surfaces.accept(manifest, files)
-    surfaces.delete(manifest.id)
+    surfaces.store.delete([layout.manifest_key(manifest.id)])
+    surfaces.sync()
     (stray,) = surfaces.store.entries("uploads/")
     os.utime(tmp_path / "data" / stray.key, (1, 1))
     surfaces.accept(*upload(tmp_path, 3))
@@ -321,11 +393,11 @@ def test_bytes_of_an_owner_count_once(surfaces: Surfaces, tmp_path: Path) -> Non
         manifest, files = upload(tmp_path, number, "ann")
         surfaces.accept(manifest, files)
     one = manifest.upload_bytes
-    assert surfaces.index.kept("ann") == 2 * one
+    assert surfaces.index.kept("ann") == 2 * one + 3 * LEAST
     build(surfaces, manifest, tmp_path)
     size = surfaces.get(manifest.id).container_bytes
     assert size is not None
-    assert surfaces.index.kept("ann") == 2 * one + size
+    assert surfaces.index.kept("ann") == 2 * one + size + 3 * LEAST
     assert surfaces.index.kept("ben") == surfaces.index.kept(None) == 0
     assert (surfaces.index.count_of("ann"), len(surfaces.index)) == (3, 3)
 
@@ -336,16 +408,20 @@ def test_pages_and_the_queue(surfaces: Surfaces, tmp_path: Path) -> None:
     first = surfaces.index.page((0.0, ""), 2)
     assert [it.manifest.name for it in first] == ["surface 2", "surface 4"]
     assert [it.manifest.name for it in surfaces.index.page(first[-1].position, 2)] == ["surface 9"]
-    queued = surfaces.index.next_build()
+    (oldest, *_), numbers = surfaces.index.queued(), [int(id_, 16) for id_ in surfaces.index.queued()]
+    assert numbers == [2, 4, 9]
+    surfaces.begin(oldest)
+    assert oldest not in surfaces.index.queued()
+    queued = surfaces.later(oldest, "waits for space")
     assert queued is not None
-    assert queued.manifest.name == "surface 2"
-    surfaces.begin(queued.id)
-    surfaces.later(queued.id, "waits for space")
-    assert surfaces.get(queued.id).reason == "waits for space"
-    assert surfaces.index.next_build() == surfaces.get(queued.id), "an attempt that lacked something does not count"
-    nearly = surfaces.index.next_build([queued.id])
-    assert nearly is not None
-    assert nearly.manifest.name == "surface 4"
+    assert surfaces.get(oldest).reason == "waits for space"
+    assert surfaces.index.queued()[0] == oldest, "an attempt that lacked something does not count"
+    surfaces.begin(oldest)
+    surfaces.later(oldest, "it died", counts=True)
+    assert surfaces.index.queued()[-1] == oldest
+    surfaces.begin(oldest)
+    surfaces.stuck(oldest, "it died again")
+    assert surfaces.index.waiting() == [oldest]
     assert surfaces.index.has_size(queued.manifest.upload_bytes)
     assert surfaces.index.has_size(None)
     assert not surfaces.index.has_size(7)
@@ -532,9 +608,7 @@ class Model(RuleBasedStateMachine):
     @precondition(lambda self: self._one_of("queued"))
     @rule(end=st.sampled_from(["built", "refused", "stuck", "later", "death"]))
     def work(self, end: str) -> None:
-        queued = self.surfaces.index.next_build()
-        assert queued is not None
-        id_ = queued.id
+        id_ = self.surfaces.index.queued()[0]
         self.surfaces.begin(id_)
         if end == "built":
             self.surfaces.built(id_, *container(self.root, self.manifests[id_]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import secrets
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +36,9 @@ class Failing:
         if name not in _WRITES:
             return method
 
-        def cut(*given: Any) -> Any:
+        def cut(*given: Any, **named: Any) -> Any:
             self._step()
-            result = method(*given)
+            result = method(*given, **named)
             self._step()
             return result
 
@@ -52,9 +53,8 @@ class Failing:
 def upload(folder: Path, number: int, owner: str | None = None, **other: Any) -> tuple[Manifest, list[Path]]:
     """Return the manifest and the files of an upload; every third number has the same bytes."""
     body = f"body {number % 3}".encode() * 50
-    path = folder / f"upload-{number % 3}"
-    if not path.exists():
-        path.write_bytes(body)
+    path = folder / f"upload-{secrets.token_hex(4)}"  # it is the store's, once it is accepted
+    path.write_bytes(body)
     sha256 = hashlib.sha256(body).hexdigest()
     given = {
         "id": f"{number:020x}",
@@ -76,4 +76,4 @@ def container(folder: Path, manifest: Manifest) -> tuple[Path, str, dict[str, An
     sha256 = hashlib.sha256(data).hexdigest()
     path = folder / f"{sha256}.built"
     path.write_bytes(data)
-    return path, sha256, {"bytes": len(data), "shape": [5, 7]}
+    return path, sha256, {"bytes": len(data), "shape": [5, 7], "levels": []}
