@@ -667,7 +667,7 @@ def establish(store: Store) -> str:
     try:
         store.create(IDENTITY, layout.dump(new))
     except ExistsError:
-        return establish(store)
+        return read_identity(store).identity
     return new.identity
 
 

@@ -1,0 +1,161 @@
+"""Checking the data of a server, in whatever store: is everything there, and whole, that its small objects refer to?
+
+Small objects have checksums, uploads and containers are named by their hashes. A repair builds nothing: it removes what
+says that a surface is built, so that the next start of a server builds it, and only if its upload is whole. Uploads and
+manifests are never touched.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import replace
+
+from lodestream.container import read_index
+from lodestream.container.sections import SIGNATURE, is_container
+from lodestream.errors import LodestreamError
+from lodestream.stores import AbsentError, Store, StoreError
+
+from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
+from ..store import layout
+from ..store.layout import BUILT, IDENTITY, SURFACES, Built, DamagedObjectError, Identity
+from ..store.surfaces import establish, read_identity
+from .facts import Facts, Found
+from .findings import Finding, Report
+
+__all__ = ["check"]
+
+
+def check(
+    store: Store,
+    *,
+    repair: bool = False,
+    waiting: Collection[str] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Report:
+    """Check the data of a server that does not run meanwhile. Without a repair nothing is changed.
+
+    Parameters
+    ----------
+    store : Store
+    repair : bool
+        Whether to remove what keeps a surface with a whole upload from being built again.
+    waiting : collection of str
+        Surfaces that the next start does not build.
+    progress : callable
+        Called with the bytes that were read of uploads and containers, and the bytes of all of them.
+
+    Raises
+    ------
+    LodestreamError
+        If it holds no data of a server, or those of another version.
+    StoreError
+        If it cannot be listed. What cannot be read is a finding.
+    """
+    started = time.monotonic()
+    report = Report(store.describe())
+    judge = _Judge(store, report, repair, waiting)
+    judge.identity()
+    with Facts(store, report, progress) as facts:
+        facts.gather()
+        for found in facts.surfaces():
+            judge.surface(found)
+    report.seconds = time.monotonic() - started
+    return report
+
+
+class _Judge:
+    """Says what facts mean, and repairs what it may."""
+
+    def __init__(self, store: Store, report: Report, repair: bool, waiting: Collection[str]) -> None:
+        self._store, self._report, self._repair, self._waiting = store, report, repair, waiting
+
+    def identity(self) -> None:
+        try:
+            read_identity(self._store)
+            return
+        except AbsentError:
+            if all(next(iter(self._store.entries(prefix)), None) is None for prefix in (SURFACES, BUILT)):
+                raise LodestreamError(
+                    f"expected the data of a server, with {IDENTITY}, got {self._store.describe()}"
+                ) from None
+            found = Finding("identity", IDENTITY, None, "expected the identity of the data, got none")
+        except DamagedObjectError as error:
+            found = Finding("identity", IDENTITY, None, str(error))
+        self._found(found, self._identify, "written again")
+
+    def _identify(self) -> None:
+        # It only tells an index of other data from the one of these.
+        try:
+            tag = self._store.get(IDENTITY)[1]
+        except AbsentError:
+            establish(self._store)
+        else:
+            self._store.replace(IDENTITY, layout.dump(Identity(layout.VERSION, layout.new_write())), tag)
+
+    def surface(self, it: Found) -> None:
+        whole, lacks = it.upload_state == "whole", it.upload_state in ("bad", "missing")
+        again = it.built in ("none", "bad")
+        if not whole:
+            served = it.built == "ready" and it.container_state == "whole"
+            unknown = it.built == "unreadable" or it.container_state == "unreadable"
+            problem = it.upload_problem or f"expected {it.files} files, got none"
+            lost = lacks and not served and not unknown
+            words = "left; its container is whole, and is served" if self._repair and served else None
+            self._found(Finding("upload", layout.upload_key(it.upload, 0), it.id, problem, words, lost=lost))
+        key = layout.built_key(it.id)
+        if it.built in ("bad", "unreadable"):
+            lost = lacks and it.built == "bad"
+            self._again(Finding("built", key, it.id, it.built_problem or "", lost=lost), it.built, whole)
+        elif it.built == "ready" and it.container_state != "whole":
+            assert it.container is not None
+            place, what = layout.container_key(it.container), it.container_state
+            problem, lost = it.container_problem or "expected a container, got none", lacks and what != "unreadable"
+            found = Finding("version" if what == "version" else "container", place, it.id, problem, lost=lost)
+            again = self._again(found, what, whole)
+        elif it.built == "ready" and it.figures != it.container_figures:
+            problem = "expected the description that the container gives, got another"
+            self._found(Finding("figures", key, it.id, problem), lambda: self._describe(it), "taken from the container")
+        self._report.queued += again and whole and it.id not in self._waiting
+
+    def _again(self, found: Finding, state: str, whole: bool) -> bool:
+        """Note a finding because of which a surface must be built again; return whether it will be."""
+        assert found.surface is not None
+        if state == "unreadable" or not whole:
+            self._found(found)
+            return False
+        keys = [layout.built_key(found.surface)]
+        if found.what == "container":
+            keys.append(found.key)  # or the same one is not put again
+
+        def remove() -> None:
+            for key in keys:  # the small object first
+                self._store.delete([key])
+
+        return self._found(found, remove, "removed; the next start of the server builds it again")
+
+    def _describe(self, it: Found) -> None:
+        """Write the description of a container again; who vouches for its errors is known to the old one alone."""
+        assert it.container is not None
+        key = layout.built_key(it.id)
+        data, tag = self._store.get(key)
+        built = layout.parse(Built, key, data)
+        known = built.info if built.info.get(ERRORS) in (CHECKED, TOLD) else {}
+        with suppress(StoreError), self._store.open(layout.upload_key(it.upload, 0)) as blob:
+            if not known and is_container(blob.read(0, len(SIGNATURE))):
+                known = {ERRORS: TOLD}
+        with self._store.open(layout.container_key(it.container)) as blob:
+            info, size = figures_of(read_index(blob.read, blob.size), known, ()), blob.size
+        self._store.replace(key, layout.dump(replace(built, bytes=size, info=info, write=layout.new_write())), tag)
+
+    def _found(self, found: Finding, mend: Callable[[], None] | None = None, done: str = "") -> bool:
+        """Add a finding, mended if that is asked for and possible; return whether it was."""
+        if self._repair and mend is not None:
+            try:
+                mend()
+                found = replace(found, repair=done, repaired=True)
+            except StoreError as error:
+                found = replace(found, repair=f"not repaired: {error}")
+        self._report.findings.append(found)
+        return found.repaired

@@ -1,0 +1,257 @@
+"""What a store has of a server's surfaces: everything is listed and read once, in bounded memory.
+
+What was found is kept in a temporary database, of which one query tells what it means for each surface.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple, Self
+
+from lodestream.container import FrameReader, read_index
+from lodestream.errors import LodestreamError, UnsupportedVersionError
+from lodestream.stores import Store, StoreError
+
+from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
+from ..store import layout
+from ..store.layout import BUILT, CONTAINERS, SURFACES, UPLOADS, Built, DamagedObjectError, Manifest
+from .findings import Finding, Report
+
+__all__ = ["Facts", "Found"]
+
+_CHUNK = 1 << 20
+
+# `built`: none, failed, ready, bad, unreadable. `state` of an upload or a container: whole, bad, unreadable, version
+# (another one than this server reads); what has no row is missing. A manifest that is damaged has no upload.
+_SCHEMA = """
+PRAGMA journal_mode = OFF;
+PRAGMA synchronous = OFF;
+CREATE TABLE surface (
+    id TEXT PRIMARY KEY, write TEXT, upload TEXT, upload_bytes INTEGER, files INTEGER, built TEXT DEFAULT 'none',
+    problem TEXT, container TEXT, container_bytes INTEGER, figures TEXT
+);
+CREATE INDEX by_upload ON surface (upload);
+CREATE INDEX by_container ON surface (container);
+CREATE TABLE part (
+    kind TEXT, sha256 TEXT, state TEXT, problem TEXT, figures TEXT, PRIMARY KEY (kind, sha256)
+) WITHOUT ROWID;
+"""
+_SIZE = """
+SELECT (SELECT coalesce(sum(upload_bytes), 0) FROM (SELECT DISTINCT upload, upload_bytes FROM surface)) +
+(SELECT coalesce(sum(container_bytes), 0) FROM (SELECT DISTINCT container, container_bytes FROM surface))
+"""
+_SURFACES = """
+SELECT surface.id, surface.upload, surface.files, surface.built, surface.problem, surface.container, surface.figures,
+    coalesce(it.state, 'missing'), it.problem, coalesce(made.state, 'missing'), made.problem, made.figures
+FROM surface LEFT JOIN part AS it ON it.kind = 'upload' AND it.sha256 = surface.upload
+LEFT JOIN part AS made ON made.kind = 'container' AND made.sha256 = surface.container
+WHERE surface.upload IS NOT NULL ORDER BY surface.id
+"""
+
+
+class Found(NamedTuple):
+    """A surface with what was found: a row of `_SURFACES`."""
+
+    id: str
+    upload: str
+    files: int
+    built: str
+    built_problem: str | None
+    container: str | None
+    figures: str | None
+    upload_state: str
+    upload_problem: str | None
+    container_state: str
+    container_problem: str | None
+    container_figures: str | None
+
+
+class Facts:
+    """What a store has.
+
+    Parameters
+    ----------
+    store : Store
+    report : Report
+        Its counts are changed, and manifests that cannot be read are added to its findings.
+    progress : callable
+        Called with the bytes that were read of uploads and containers, and the bytes of all of them.
+    """
+
+    def __init__(self, store: Store, report: Report, progress: Callable[[int, int], None]) -> None:
+        self._store, self._report, self._progress = store, report, progress
+        self._done = self._total = 0
+        self._folder = TemporaryDirectory(prefix="lodestream-")
+        self._facts = sqlite3.connect(Path(self._folder.name) / "facts.sqlite", isolation_level=None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._facts.close()
+        self._folder.cleanup()
+
+    def gather(self) -> None:
+        """List and read everything.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be listed.
+        """
+        self._facts.executescript(_SCHEMA)
+        self._facts.execute("BEGIN")
+        self._manifests()
+        self._builts()
+        (self._total,) = self._facts.execute(_SIZE).fetchone()
+        self._uploads()
+        self._containers()
+
+    def surfaces(self) -> Iterator[Found]:
+        """Return what was found of each surface whose manifest can be read, in the order of their ids."""
+        return (Found(*row) for row in self._facts.execute(_SURFACES))
+
+    def _manifests(self) -> None:
+        for entry in self._store.entries(SURFACES):
+            if (id_ := layout.id_of(entry.key)) is None:
+                continue
+            self._report.surfaces += 1
+            self._facts.execute("INSERT INTO surface (id) VALUES (?)", (id_,))
+            try:
+                it = layout.parse(Manifest, entry.key, self._store.get(entry.key)[0])
+            except (DamagedObjectError, StoreError) as error:
+                lost = isinstance(error, DamagedObjectError)
+                self._report.findings.append(Finding("manifest", entry.key, id_, str(error), lost=lost))
+                continue
+            self._facts.execute(
+                "UPDATE surface SET write = ?, upload = ?, upload_bytes = ?, files = ? WHERE id = ?",
+                (it.write, it.upload, it.upload_bytes, len(it.filenames), id_),
+            )
+
+    def _builts(self) -> None:
+        for entry in self._store.entries(BUILT):
+            if (id_ := layout.id_of(entry.key)) is None:
+                continue
+            known = self._facts.execute("SELECT write FROM surface WHERE id = ?", (id_,)).fetchone()
+            if known is None:
+                self._stray(entry.size)
+                continue
+            state, problem, container, size, figures = "ready", None, None, None, None
+            try:
+                built = layout.parse(Built, entry.key, self._store.get(entry.key)[0])
+            except (DamagedObjectError, StoreError) as error:
+                state, problem = "bad" if isinstance(error, DamagedObjectError) else "unreadable", str(error)
+            else:
+                if known[0] not in (None, built.manifest):
+                    continue  # of another manifest: it counts as absent
+                container, size, figures = built.container, built.bytes, _digest(built.bytes, built.info)
+                state = "failed" if container is None else "ready"
+            self._facts.execute(
+                "UPDATE surface SET built = ?, problem = ?, container = ?, container_bytes = ?, figures = ? "
+                "WHERE id = ?",
+                (state, problem, container, size, figures, id_),
+            )
+
+    def _uploads(self) -> None:
+        for sha256, group in itertools.groupby(self._store.entries(UPLOADS), lambda it: layout.sha256_of(it.key)):
+            if sha256 is None:
+                continue
+            expected = "SELECT files, upload_bytes FROM surface WHERE upload = ? LIMIT 1"
+            files, size = self._facts.execute(expected, (sha256,)).fetchone() or (0, 0)
+            sizes: dict[int, int] = {}
+            for entry in group:
+                if (number := int(entry.key.split("/")[2])) < files:
+                    sizes[number] = entry.size
+                else:
+                    self._stray(entry.size)
+            if sizes:
+                self._report.uploads += 1
+                self._report.bytes += sum(sizes.values())
+                self._put("upload", sha256, *self._upload(sha256, files, size, sizes))
+
+    def _upload(self, sha256: str, files: int, size: int, sizes: dict[int, int]) -> tuple[str, str | None]:
+        if len(sizes) < files:
+            return "bad", f"expected {files} files, got {len(sizes)}"
+        if sum(sizes.values()) != size:
+            return "bad", f"expected {size} bytes, got {sum(sizes.values())}"
+        digest = hashlib.sha256()
+        try:
+            for number in range(files):
+                for chunk in self._chunks(layout.upload_key(sha256, number)):
+                    digest.update(chunk)
+                digest.update(sizes[number].to_bytes(8, "big"))  # see `Upload.end`
+        except StoreError as error:
+            return "unreadable", str(error)
+        if digest.hexdigest() != sha256:
+            return "bad", f"expected files with the SHA-256 of their name, got {digest.hexdigest()}"
+        return "whole", None
+
+    def _containers(self) -> None:
+        for entry in self._store.entries(CONTAINERS):
+            if (sha256 := layout.sha256_of(entry.key)) is None:
+                continue
+            if not self._facts.execute("SELECT 1 FROM surface WHERE container = ? LIMIT 1", (sha256,)).fetchall():
+                self._stray(entry.size)
+                continue
+            self._report.containers += 1
+            self._report.bytes += entry.size
+            self._put("container", sha256, *self._container(sha256))
+
+    def _container(self, sha256: str) -> tuple[str, str | None, str | None]:
+        """Return the state of a container, what is wrong with it, and the digest of its figures."""
+        key = layout.container_key(sha256)
+        frames, digest = FrameReader(keeps=()), hashlib.sha256()
+        place: LodestreamError | None = None
+        try:
+            for chunk in self._chunks(key):
+                digest.update(chunk)
+                if place is None:
+                    try:
+                        for _ in frames.feed(chunk):
+                            pass
+                    except LodestreamError as error:
+                        place = error
+            if digest.hexdigest() != sha256:
+                where = f"; {place}" if place else ""
+                return "bad", f"expected bytes with the SHA-256 of the name, got {digest.hexdigest()}{where}", None
+            if place is not None:
+                raise place
+            with self._store.open(key) as blob:
+                index = read_index(blob.read, blob.size)
+                return "whole", None, _digest(blob.size, figures_of(index, None, ()))
+        except StoreError as error:
+            return "unreadable", str(error), None
+        except UnsupportedVersionError as error:
+            return "version", str(error), None
+        except LodestreamError as error:
+            return "bad", str(error), None
+
+    def _chunks(self, key: str) -> Iterator[bytes]:
+        with self._store.open(key) as blob:
+            offset = 0
+            while chunk := blob.read(offset, _CHUNK):
+                yield chunk
+                offset += len(chunk)
+                self._done += len(chunk)
+                self._progress(self._done, self._total)
+
+    def _put(self, kind: str, sha256: str, state: str, problem: str | None, figures: str | None = None) -> None:
+        self._facts.execute("INSERT INTO part VALUES (?, ?, ?, ?, ?)", (kind, sha256, state, problem, figures))
+
+    def _stray(self, size: int) -> None:
+        self._report.strays += 1
+        self._report.stray_bytes += size
+
+
+def _digest(size: int, info: dict[str, Any]) -> str | None:
+    """Return a hash of a description, but for who vouches for the errors; None if nobody may say that of them."""
+    figures = {name: value for name, value in info.items() if name != ERRORS}
+    if info.get(ERRORS) not in (None, CHECKED, TOLD):
+        return None
+    return hashlib.sha256(json.dumps([size, figures], sort_keys=True).encode()).hexdigest()
