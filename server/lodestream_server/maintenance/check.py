@@ -7,6 +7,7 @@ manifests are never touched.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -141,13 +142,15 @@ class _Judge:
         key = layout.built_key(it.id)
         data, tag = self._store.get(key)
         built = layout.parse(Built, key, data)
-        known = built.info if built.info.get(ERRORS) in (CHECKED, TOLD) else {}
+        errors = json.loads(built.info or b"{}").get(ERRORS)
         with suppress(StoreError), self._store.open(layout.upload_key(it.upload, 0)) as blob:
-            if not known and is_container(blob.read(0, len(SIGNATURE))):
-                known = {ERRORS: TOLD}
+            if errors not in (CHECKED, TOLD) and is_container(blob.read(0, len(SIGNATURE))):
+                errors = TOLD
         with self._store.open(layout.container_key(it.container)) as blob:
-            info, size = figures_of(read_index(blob.read, blob.size), known, ()), blob.size
-        self._store.replace(key, layout.dump(replace(built, bytes=size, info=info, write=layout.new_write())), tag)
+            figures, size = figures_of(read_index(blob.read, blob.size), {ERRORS: errors}, ()), blob.size
+        info, summary = layout.describe(figures)
+        new = replace(built, container_bytes=size, info=info, summary=summary, write=layout.new_write())
+        self._store.replace(key, layout.dump(new), tag)
 
     def _found(self, found: Finding, mend: Callable[[], None] | None = None, done: str = "") -> bool:
         """Add a finding, mended if that is asked for and possible; return whether it was."""

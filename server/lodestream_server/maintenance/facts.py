@@ -10,9 +10,10 @@ import itertools
 import json
 import sqlite3
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 from lodestream.container import FrameReader, read_index
 from lodestream.errors import LodestreamError, UnsupportedVersionError
@@ -20,7 +21,18 @@ from lodestream.stores import Store, StoreError
 
 from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
 from ..store import layout
-from ..store.layout import BUILT, CONTAINERS, SURFACES, UPLOADS, Built, DamagedObjectError, Manifest
+from ..store.layout import (
+    BUILT,
+    CONTAINERS,
+    NAMES,
+    SURFACES,
+    UPLOADS,
+    Built,
+    DamagedObjectError,
+    Manifest,
+    Name,
+    Summary,
+)
 from .findings import Finding, Report
 
 __all__ = ["Facts", "Found"]
@@ -79,7 +91,7 @@ class Facts:
     ----------
     store : Store
     report : Report
-        Its counts are changed, and manifests that cannot be read are added to its findings.
+        Its counts are changed, and names and manifests that cannot be read are added to its findings.
     progress : callable
         Called with the bytes that were read of uploads and containers, and the bytes of all of them.
     """
@@ -107,6 +119,7 @@ class Facts:
         """
         self._facts.executescript(_SCHEMA)
         self._facts.execute("BEGIN")
+        self._names()
         self._manifests()
         self._builts()
         (self._total,) = self._facts.execute(_SIZE).fetchone()
@@ -116,6 +129,15 @@ class Facts:
     def surfaces(self) -> Iterator[Found]:
         """Return what was found of each surface whose manifest can be read, in the order of their ids."""
         return (Found(*row) for row in self._facts.execute(_SURFACES))
+
+    def _names(self) -> None:
+        for entry in self._store.entries(NAMES):
+            if layout.name_of(entry.key) is not None:
+                try:
+                    layout.parse(Name, entry.key, self._store.get(entry.key)[0])
+                except (DamagedObjectError, StoreError) as error:
+                    lost = isinstance(error, DamagedObjectError)
+                    self._report.findings.append(Finding("name", entry.key, None, str(error), lost=lost))
 
     def _manifests(self) -> None:
         for entry in self._store.entries(SURFACES):
@@ -150,7 +172,11 @@ class Facts:
             else:
                 if known[0] not in (None, built.manifest):
                     continue  # of another manifest: it counts as absent
-                container, size, figures = built.container, built.bytes, _digest(built.bytes, built.info)
+                container, size, figures = (
+                    built.container,
+                    built.container_bytes,
+                    _digest(built.container_bytes, built.info, built.summary),
+                )
                 state = "failed" if container is None else "ready"
             self._facts.execute(
                 "UPDATE surface SET built = ?, problem = ?, container = ?, container_bytes = ?, figures = ? "
@@ -224,7 +250,7 @@ class Facts:
                 raise place
             with self._store.open(key) as blob:
                 index = read_index(blob.read, blob.size)
-                return "whole", None, _digest(blob.size, figures_of(index, None, ()))
+                return "whole", None, _digest(blob.size, *layout.describe(figures_of(index, None, ())))
         except StoreError as error:
             return "unreadable", str(error), None
         except UnsupportedVersionError as error:
@@ -249,9 +275,9 @@ class Facts:
         self._report.stray_bytes += size
 
 
-def _digest(size: int, info: dict[str, Any]) -> str | None:
+def _digest(size: int, info: bytes, summary: Summary) -> str | None:
     """Return a hash of a description, but for who vouches for the errors; None if nobody may say that of them."""
-    figures = {name: value for name, value in info.items() if name != ERRORS}
-    if info.get(ERRORS) not in (None, CHECKED, TOLD):
+    figures = json.loads(info or b"{}")
+    if figures.pop(ERRORS, None) not in (None, CHECKED, TOLD):
         return None
-    return hashlib.sha256(json.dumps([size, figures], sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([size, figures, asdict(summary)], sort_keys=True).encode()).hexdigest()

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 __all__ = ["Finding", "Report", "What"]
 
-What = Literal["identity", "manifest", "built", "figures", "upload", "container", "version"]
+What = Literal["identity", "manifest", "built", "figures", "upload", "container", "version", "name"]
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,8 @@ class Finding:
     Attributes
     ----------
     what : str
-        ``identity``, ``manifest``, ``built``, ``upload``, ``container``: damaged, missing, or not to be read now.
+        ``identity``, ``manifest``, ``built``, ``upload``, ``container``, ``name``: damaged, missing, or not to be read
+        now.
         ``figures``: ``built`` describes its container otherwise than it is. ``version``: a sound container of another
         format version than this server reads, which does not count as damage.
     key : str
@@ -30,7 +31,8 @@ class Finding:
         What was done about it.
     repaired : bool
     lost : bool
-        Whether the surface can neither be served nor built again from these data.
+        Whether the surface can neither be served nor built again from these data; of a name, whether nobody knows where
+        it led.
     """
 
     what: What
@@ -82,8 +84,8 @@ class Report:
 
     @property
     def lost(self) -> int:
-        """The number of surfaces that are lost."""
-        return len({finding.surface for finding in self.damage if finding.lost})
+        """The number of surfaces and names that are lost."""
+        return len({finding.surface or finding.key for finding in self.damage if finding.lost})
 
     @property
     def clean(self) -> bool:

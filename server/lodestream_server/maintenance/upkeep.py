@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,13 +10,11 @@ from tempfile import TemporaryDirectory
 from lodestream.errors import LodestreamError
 from lodestream.stores import Entry, Store
 
-from ..store.index import Index, IndexLostError, Surface
+from ..store.index import Index, IndexLostError
 from ..store.layout import SURFACES
 from ..store.surfaces import Surfaces, read_identity
 
 __all__ = ["collect", "retry", "waiting"]
-
-_PAGE = 500
 
 
 def collect(store: Store) -> list[Entry]:
@@ -61,7 +58,7 @@ def waiting(store: Store, index: Path) -> dict[str, str]:
             return {}
         try:
             with closing(Index(copy, read_identity(store).identity)) as opened:
-                return {surface.id: surface.reason or "" for surface in _waiting(opened)}
+                return _waiting(opened)
         except IndexLostError:
             return {}
 
@@ -69,7 +66,7 @@ def waiting(store: Store, index: Path) -> dict[str, str]:
 def retry(store: Store, index: Path) -> dict[str, str]:
     """Queue the surfaces that wait for the next start; return them, and why they waited.
 
-    Without an index that can be used, the next start queues them anyway, and none is made here.
+    Without an index that can be used, the next start queues them anyway.
 
     Raises
     ------
@@ -78,19 +75,14 @@ def retry(store: Store, index: Path) -> dict[str, str]:
     """
     if not index.exists():
         return {}
-    found: dict[str, str] = {}
     with closing(Surfaces(store, index)) as surfaces, suppress(IndexLostError):
-        for surface in _waiting(surfaces.index):
-            surfaces.retry(surface.id)
-            found[surface.id] = surface.reason or ""
-        if len(surfaces.index):
-            return found
-    Index.remove(index)  # or a server would believe that there is no surface
-    return found
+        found = _waiting(surfaces.index)
+        for surface in found:
+            surfaces.retry(surface)
+        return found
+    return {}
 
 
-def _waiting(index: Index) -> Iterator[Surface]:
-    last = (float("-inf"), "")
-    while page := index.page(last, _PAGE):
-        yield from (surface for surface in page if surface.state == "waiting")
-        last = page[-1].position
+def _waiting(index: Index) -> dict[str, str]:
+    found = (index.find(surface) for surface in index.waiting())
+    return {surface.id: surface.reason or "" for surface in found if surface is not None}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import os
 import shutil
 import tempfile
@@ -29,7 +30,7 @@ from lodestream_server.maintenance.upkeep import collect, retry, waiting
 from lodestream_server.store import layout
 from lodestream_server.store.index import Index
 from lodestream_server.store.layout import Built, Identity, Manifest
-from lodestream_server.store.surfaces import Surfaces
+from lodestream_server.store.surfaces import Surfaces, read_identity
 
 from .conftest import PLACES, Place
 from .world import CutError, Failing
@@ -83,7 +84,11 @@ class Made:
         if id_ == FAILED:
             surfaces.refused(id_, "no surface")
         elif id_ != QUEUED:
-            surfaces.built(id_, *self.containers[id_])
+            self.build(surfaces, id_)
+
+    def build(self, surfaces: Surfaces, id_: str, like: str | None = None) -> None:
+        path, sha256, info = self.containers[like or id_]
+        surfaces.built(id_, shutil.copyfile(path, path.with_suffix(".built")), sha256, info)
 
     def key(self, kind: str, id_: str) -> str:
         keys = {
@@ -102,8 +107,8 @@ class Made:
             closing(Surfaces(Folder(data), Path(folder) / "index.sqlite")) as surfaces,
         ):
             surfaces.sync()
-            while (queued := surfaces.index.next_build()) and queued.id != QUEUED:
-                surfaces.built(queued.id, *self.containers[queued.id])
+            for queued in set(surfaces.index.queued()) - {QUEUED}:
+                self.build(surfaces, queued)
             return {it.id: it.state for it in surfaces.index.page((0.0, ""), 100)}
 
 
@@ -397,6 +402,21 @@ def test_any_bit_of_any_object(made: Made, kind: str, chosen: st.DataObject) -> 
             assert looked(data).findings == []
 
 
+@pytest.mark.parametrize("how", CHANGED)
+def test_a_name(data: Path, tmp_path: Path, how: str) -> None:
+    with closing(Surfaces(Folder(data), tmp_path / "index.sqlite")) as surfaces:
+        surfaces.sync()
+        for name in ("alps", "andes"):
+            surfaces.names.point(name, ONE, None, lambda owner: True, 60.0)
+    assert looked(data).findings == []
+    CHANGED[how](data / "names" / "alps.json")
+    damaged = contents(data)
+    for report in (looked(data), check(Folder(data), repair=True)):
+        assert [(found.what, found.key) for found in report.findings] == [("name", "names/alps.json")]
+        assert (report.clean, report.lost, report.queued) == (False, 1, 1)
+        assert contents(data) == damaged
+
+
 def test_a_damaged_container_says_where(data: Path, made: Made) -> None:
     path = data / made.key("container", ONE)
     flip(path, 8 * (path.stat().st_size // 2))
@@ -408,8 +428,9 @@ def test_a_container_that_only_some_can_build(data: Path, made: Made, tmp_path: 
     twin = replace(made.manifests[LODE], id=f"{9:020x}", write=layout.new_write(), upload=made.manifests[ONE].upload)
     twin = replace(twin, upload_bytes=made.manifests[ONE].upload_bytes)
     with closing(Surfaces(Folder(data), tmp_path / "index.sqlite")) as surfaces:
-        surfaces.accept(twin, [made.folder / "1-0"])
-        surfaces.built(twin.id, *made.containers[LODE])
+        upload = shutil.copyfile(data / made.key("upload", ONE), tmp_path / "0")
+        surfaces.accept(twin, [upload])
+        made.build(surfaces, twin.id, LODE)
     flip(data / made.key("upload", LODE), 99)
     flip(data / made.key("container", LODE), 99)
     report = check(Folder(data), repair=True)
@@ -417,22 +438,24 @@ def test_a_container_that_only_some_can_build(data: Path, made: Made, tmp_path: 
     assert repaired == {("container", twin.id): True, ("container", LODE): False, ("upload", LODE): False}
     with closing(Surfaces(Folder(data), tmp_path / "index.sqlite")) as surfaces:
         surfaces.sync()
-        surfaces.built(twin.id, *made.containers[LODE])
+        made.build(surfaces, twin.id, LODE)
     assert told(looked(data)) == {("upload", LODE)}
 
 
 @pytest.mark.parametrize("id_", [ONE, LODE])
-@pytest.mark.parametrize("change", ["figures", "errors", "bytes"])
+@pytest.mark.parametrize("change", ["figures", "summary", "errors", "bytes"])
 @pytest.mark.parametrize("upload", [True, False])
 def test_a_description_that_is_not_that_of_the_container(
     data: Path, made: Made, id_: str, change: str, upload: bool
 ) -> None:
     path = data / made.key("built", id_)
     built = layout.parse(Built, made.key("built", id_), path.read_bytes())
+    info = json.loads(built.info)
     wrong = {
-        "figures": replace(built, info=built.info | {"layers": []}),
-        "errors": replace(built, info=built.info | {ERRORS: "believed"}),
-        "bytes": replace(built, bytes=1),
+        "figures": replace(built, info=layout.describe(info | {"layers": []})[0]),
+        "summary": replace(built, summary=replace(built.summary, levels=9)),
+        "errors": replace(built, info=layout.describe(info | {ERRORS: "believed"})[0]),
+        "bytes": replace(built, container_bytes=1),
     }[change]
     path.write_bytes(layout.dump(wrong))
     if not upload:
@@ -443,11 +466,11 @@ def test_a_description_that_is_not_that_of_the_container(
         {} if upload else {"upload": False}
     )
     mended = layout.parse(Built, made.key("built", id_), path.read_bytes())
-    vouched = {ERRORS: "told"} if id_ == LODE and change == "errors" and upload else {}
-    if change == "errors" and not upload:
-        assert ERRORS not in mended.info
-    else:
-        assert replace(mended, write=built.write) == replace(built, info=built.info | vouched)
+    if change == "errors":
+        info.pop(ERRORS, None)
+        info |= {ERRORS: "told"} if id_ == LODE and upload else {}
+    assert (json.loads(mended.info), mended.summary) == (info, built.summary)
+    assert mended.container_bytes == built.container_bytes
     assert ("figures", id_) not in told(looked(data))
 
 
@@ -578,7 +601,8 @@ def test_what_waits_is_queued_again(data: Path, made: Made, tmp_path: Path) -> N
         assert waiting(store, index) == {}
         assert index.read_bytes() == body
         assert retry(store, index) == {}
-        assert list(index.parent.iterdir()) == [], "a server would believe an empty one"
+        with closing(Index(index, read_identity(store).identity)) as left:
+            assert left.is_new, "a server does not believe it"
 
 
 def test_what_is_no_data_of_a_server(data: Path, tmp_path: Path) -> None:
