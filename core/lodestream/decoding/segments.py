@@ -203,14 +203,19 @@ class StoredSegments:
         Of the file.
     index : Index
         Of the container, see `read_index`.
+    chosen : bool, shape (channel,), optional
+        Channels that are not chosen are not read, and are 0. All if not given.
     """
 
-    def __init__(self, read: Callable[[int, int], bytes], index: Index) -> None:
-        self._read, self._index, self.header = read, index, index.header
+    def __init__(
+        self, read: Callable[[int, int], bytes], index: Index, chosen: NDArray[np.bool_] | None = None
+    ) -> None:
+        self._read, self._index, self.header, self._chosen = read, index, index.header, chosen
         self._reading = Lock()
         self._segments: dict[int, list[Segment]] = defaultdict(list)
         for segment in index.segments:
-            self._segments[segment.tile].append(segment)
+            if chosen is None or chosen[segment.channel]:
+                self._segments[segment.tile].append(segment)
         self._complete = np.zeros((len(self.header.layout.tiles), self.header.channels), np.int8)
 
     def values(self, region: Region) -> dict[int, Values]:
@@ -232,9 +237,9 @@ class StoredSegments:
             If a chunk is damaged.
         """
         corrected = region.level == self.header.levels
-        blocks = values_of(self.header, region, channels, self._complete)
+        blocks = values_of(self.header, region, channels, self._complete, self._chosen)
         if corrected and self._index.chunks:
-            restore(self.header, region, blocks, self._chunk)
+            restore(self.header, region, blocks, self._chunk, self._chosen)
         mark_holes(self.header, region, blocks, corrected)
         return blocks
 
