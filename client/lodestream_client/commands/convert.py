@@ -63,7 +63,9 @@ def _options(args: argparse.Namespace) -> ConvertOptions:
         if len(files) > 1:
             args.parser.error(f"expected one container, or files of other formats, got {name} among {len(files)} files")
         if options != replace(_NO_OPTIONS, name=options.name):
-            args.parser.error(f"expected no --closed, --nodata, --format and -o, got one for the container {name}")
+            args.parser.error(
+                f"expected no --closed, --nodata, --crs, --format and -o, got one for the container {name}"
+            )
     return ConvertOptions(files, args.out, options, args.json)
 
 

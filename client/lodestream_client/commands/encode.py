@@ -198,12 +198,17 @@ def read_surface(
     Raises
     ------
     OptionError
-        If an option is none of the format.
+        If an option is none of the format, or there is no such CRS.
     LodestreamError, OSError
         From `lodestream.read`.
     """
     import lodestream as ls
 
+    crs = None
+    if options.crs is not None:
+        from lodestream.maps import crs_wkt
+
+        crs = crs_wkt(options.crs)
     with ExitStack() as stack:
         stack.enter_context(option_hints(names))
         files = stack.enter_context(input_files(names))
@@ -224,6 +229,8 @@ def read_surface(
             surface = read_into(folder, files.paths, memory, able, kept, **given, **format_options)
     if options.name:
         surface.metadata["name"] = options.name
+    if crs is not None:
+        surface.metadata["crs"] = crs
     return surface
 
 

@@ -303,8 +303,8 @@ def _container(file: str, folder: Path, options: PublishOptions) -> Path:
     if holds_container(path):
         if replace(options.surface, name=None) != _NO_OPTIONS:
             raise OptionError(
-                "expected no --precision, --rms, --effort, --closed, --nodata, --format or -o, got one for "
-                f"{file}, which is a container and is published as it is"
+                "expected no --precision, --rms, --effort, --closed, --nodata, --crs, --format or -o, got one "
+                f"for {file}, which is a container and is published as it is"
             )
         return path
     container = folder / "surface.lode"

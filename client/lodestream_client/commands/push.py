@@ -120,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
     options = _options(args)
     if options.each is not None:
         return _run_each(options)
-    surface = _uploaded(options)
+    surface = _sent(options)
     note_details(surface.details, words=option_words)
     if options.json:
         print_json({**surface.details, "url": surface.url})
@@ -164,7 +164,7 @@ def _files(options: PushOptions) -> list[_Upload]:
         (
             _STANDARD_INPUT if name == "-" else name,
             {"file": name},
-            partial(_uploaded, replace(options, files=(name,))),
+            partial(_sent, replace(options, files=(name,))),
         )
         for name in options.files
     ]
@@ -178,16 +178,24 @@ def _parts(options: PushOptions, along: str) -> list[_Upload]:
     ]
 
 
-def _encoded(options: PushOptions, part: Part) -> Description:
-    """Encode a step or variable here, and upload it."""
+def _sent(options: PushOptions) -> Description:
+    """Upload the files; what is asked for and a server does not do is done here."""
+    return _uploaded(options) if options.surface.crs is None else _encoded(options)
+
+
+def _encoded(options: PushOptions, part: Part | None = None) -> Description:
+    """Encode the files, or a step or variable of the only one, here, and upload the container."""
     with tempfile.TemporaryDirectory(prefix="lodestream-") as folder:
         container = Path(folder) / "surface.lode"
         encoding = EncodeOptions(
-            options.files, str(container), part.options, BuildingOptions(None, None, None), json=True
+            options.files,
+            str(container),
+            options.surface if part is None else part.options,
+            BuildingOptions(None, None, None),
+            json=True,
         )
         encode_files(encoding, part, show=lambda _: None)  # the server counts the holes too
-        wanted = replace(options.surface, quality=Quality(), closed="auto", name=None, format_options={}, nodata=None)
-        sent = replace(wanted, format_name=None)
+        sent = SurfaceOptions(Quality(), "auto", None, {})
         return _uploaded(replace(options, files=(str(container),), surface=sent, local=False))
 
 

@@ -41,6 +41,8 @@ class SurfaceOptions:
         The format that the file must have.
     nodata : str or None
         The value that marks holes.
+    crs : str or None
+        The code of a CRS, in place of what the file says.
     """
 
     quality: Quality
@@ -49,6 +51,7 @@ class SurfaceOptions:
     format_options: Mapping[str, str]
     format_name: str | None = None
     nodata: str | None = None
+    crs: str | None = None
 
 
 def add_surface_options(parser: argparse.ArgumentParser) -> None:
@@ -123,6 +126,12 @@ def add_reading_options(group: argparse._ArgumentGroup) -> None:
         "coordinates those that have it in all, such as the 0 0 0 of a depth camera, or else in z; a note says how "
         "many",
     )
+    group.add_argument(
+        "--crs",
+        metavar="EPSG:N",
+        help="CRS of the coordinates, in place of what the file says, which may be nothing: a code such as EPSG:32611, "
+        "or EPSG:32611+5773 with a vertical CRS (needs lodestream[maps]); push then encodes here",
+    )
     group.add_argument("--name", metavar="N", help="name of the surface")
     group.add_argument(
         "--format",
@@ -167,7 +176,7 @@ def reading_options(args: argparse.Namespace, quality: Quality) -> SurfaceOption
             args.parser.error(f"argument -o: {key} given twice")
     # Every format has this one, and the query of an upload has it among the options of the format.
     nodata = options.pop("nodata", None)
-    return SurfaceOptions(quality, args.closed, args.name, options, args.format_name, nodata)
+    return SurfaceOptions(quality, args.closed, args.name, options, args.format_name, nodata, args.crs)
 
 
 def _remeshing(args: argparse.Namespace) -> dict[str, str]:

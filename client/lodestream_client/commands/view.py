@@ -265,10 +265,10 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
 
 def _refuse_options(options: SurfaceOptions, what: str) -> None:
     """Refuse options of encoding for a container, which would have no effect."""
-    if options.quality != Quality() or options.closed != "auto" or options.format_options:
+    if options.quality != Quality() or options.closed != "auto" or options.format_options or options.crs is not None:
         raise OptionError(
-            f"expected a file to encode with --precision, --rms, --effort, --closed or -o, got {what}, which is shown "
-            "as it is"
+            f"expected a file to encode with --precision, --rms, --effort, --closed, --crs or -o, got {what}, which is "
+            "shown as it is"
         )
 
 

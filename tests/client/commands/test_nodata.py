@@ -88,4 +88,4 @@ def test_a_container_takes_none(server: str, container_file: Path, run: Run, tmp
     with pytest.raises(OptionError, match="expected no nodata for a container"):
         sync.upload(server, container_file, nodata=0)
     code, _, stderr = run("convert", container_file, tmp_path / "a.npy", "--nodata", "0")
-    assert (code, "expected no --closed, --nodata, --format and -o" in stderr) == (2, True), stderr
+    assert (code, "expected no --closed, --nodata, --crs, --format and -o" in stderr) == (2, True), stderr
