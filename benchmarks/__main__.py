@@ -25,6 +25,7 @@ SECTIONS = (
     "blocks",
     "formats",
     "patches",
+    "tiles",
     "stream",
 )
 
