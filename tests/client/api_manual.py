@@ -16,6 +16,7 @@ PATH = ROOT / "docs" / "api.md"
 #: What the page has, in its order: a heading, the module, and what is said of it.
 PACKAGES = (
     ("lodestream", "lodestream", "Surfaces, files, containers; no network."),
+    ("lodestream.maps", "lodestream.maps", "Tiles of heights for maps and globes ([maps.md](maps.md)); no network."),
     ("lodestream_client.sync", "lodestream_client.sync", "A server's surfaces, for programs without an event loop."),
     (
         "lodestream_client",
@@ -27,10 +28,10 @@ PACKAGES = (
 _INTRODUCTION = """\
 # Python
 
-Every public name of `lodestream` and `lodestream_client`, from its docstring. The examples run in the tests, in a
-folder with a surface, `terrain.npy`, of 97 x 70 heights, and its container `terrain.lode`, beside a server on
-`http://127.0.0.1:8000` (`lodestream serve`). [python.md](python.md) shows surfaces in xarray, pyvista, trimesh, zarr
-and notebooks; [cli.md](cli.md) has the command line.
+Every public name of `lodestream`, `lodestream.maps` and `lodestream_client`, from its docstring. The examples run in
+the tests, in a folder with a surface, `terrain.npy`, of 97 x 70 heights, and its container `terrain.lode`, beside a
+server on `http://127.0.0.1:8000` (`lodestream serve`). [python.md](python.md) shows surfaces in xarray, pyvista,
+trimesh, zarr and notebooks; [cli.md](cli.md) has the command line.
 
 This page is written by `python -m tests.client.api_manual`; a test checks it.
 """

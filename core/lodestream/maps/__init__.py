@@ -7,7 +7,7 @@ Needs the extra ``maps``. `field` says where the heights of a container lie and 
 from .block_cache import BlockCache
 from .descriptions import layer_json, tile_json
 from .field import HeightField
-from .meshes import mesh_tile, quantized_mesh
+from .meshes import mesh_tile
 from .projection import crs_wkt
 from .web_tiles import png, shaded, terrain_rgb, terrarium, web_tile, webp
 
@@ -18,7 +18,6 @@ __all__ = [
     "layer_json",
     "mesh_tile",
     "png",
-    "quantized_mesh",
     "shaded",
     "terrain_rgb",
     "terrarium",

@@ -63,7 +63,7 @@ class HeightField:
     Attributes
     ----------
     placement : Placement
-        Bounds, cells and zooms.
+        `bounds`, `cell` in metres, `web_zoom(size)` and `mesh_zoom()`, and whether it `meets` a box of degrees.
     name : str
         Of the surface; empty if it has none.
 

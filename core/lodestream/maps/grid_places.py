@@ -38,11 +38,11 @@ class GridPlaces:
     ----------
     shape : (int, int)
     origin : float64, shape (2,)
-        x and y of row 0 and column 0; 0 for a coordinate that has a line.
+        x and y of row 0 and column 0; 0 for a coordinate that is listed.
     matrix : float64, shape (2, 2)
-        x and y, in lines, of a step of rows and of columns; 1 where an axis has a line of its coordinates.
+        x and y, in lines, of a step of rows and of columns; 1 where the coordinates of an axis are listed.
     lines : two of _Line or None
-        Of rows and of columns, where they are not even.
+        Of rows and of columns, where they are not even: of their coordinates, or of how many steps they are.
     turn, west : float or None, float
         What x repeats after, and the least x of the grid.
     """
@@ -56,7 +56,7 @@ class GridPlaces:
 
     @classmethod
     def of(cls, metadata: Mapping[str, Any], shape: tuple[int, int], closed: Closed, turn: float | None) -> GridPlaces:
-        """Take the rules of ``grid``, ``axes`` or ``geotransform`` in the metadata of heights.
+        """Take the rules of ``grid``, ``axes`` or ``geotransform``, and ``nodes``, in the metadata of heights.
 
         Parameters
         ----------
@@ -81,10 +81,13 @@ class GridPlaces:
                 matrix[channel, axis] = 1.0
             else:
                 origin[channel], matrix[channel] = _affine(rule, shape[axis], axis)
-        even = all(line is None for line in lines)
+        for axis, (line, at) in enumerate(zip(lines, _nodes(metadata), strict=True)):
+            if line is None and at is not None:  # a coarser level of another surface, in steps of its even grid
+                lines[axis] = _line([*at, VALUES], shape[axis], float(shape[axis]) if closed[axis] else None)
+        listed = any(rule[-1] == VALUES for rule in rules)
         if not np.isfinite([*origin, *matrix.ravel()]).all() or np.linalg.det(matrix) == 0:
             raise InputError(f"expected coordinates that differ from node to node, got {str(rules)[:80]!a}")
-        if not even and np.count_nonzero(matrix) > 2:
+        if listed and np.count_nonzero(matrix) > 2:
             raise InputError("expected listed coordinates of a grid that is not rotated, got one that is")
         placed = cls(shape, origin, matrix, (lines[0], lines[1]), turn)
         x, _ = placed.positions(*np.meshgrid(*([-0.5, length - 0.5] for length in shape), indexing="ij"))
@@ -129,6 +132,18 @@ def _rules(metadata: Mapping[str, Any]) -> tuple[Sequence[Rule], bool]:
     if isinstance(rules, Sequence) and are_rules([*rules]):
         return rules, swapped
     raise InputError(f"expected two rules of coordinates in the metadata, got {str(rules)[:80]!a}")
+
+
+def _nodes(metadata: Mapping[str, Any]) -> Sequence[Sequence[float] | None]:
+    """Return ``nodes`` of the metadata: of rows and of columns, or None."""
+    nodes = metadata.get("nodes")
+    if nodes is None:
+        return None, None
+    if isinstance(nodes, Sequence) and len(nodes) == 2:
+        as_rules = [[0, 1] if at is None else [*at, VALUES] for at in nodes if at is None or isinstance(at, Sequence)]
+        if are_rules(as_rules):
+            return nodes
+    raise InputError(f"expected nodes of rows and of columns in the metadata, got {str(nodes)[:80]!a}")
 
 
 def _affine(rule: Rule, length: int, axis: int) -> tuple[float, NDArray[np.float64]]:

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..surface import Closed
 from .grid_places import GridPlaces
 from .projection import EARTH_RADIUS, Projection
-from .tile_grids import LATITUDE_LIMIT, MESH_NODES, Box
+from .tile_grids import FINEST_ZOOM, LATITUDE_LIMIT, MESH_NODES, Box
 
 __all__ = ["Placement"]
 
@@ -25,7 +25,7 @@ _SAMPLES = 129
 #: A gap of more degrees between longitudes is outside the field; between samples around the Earth there are fewer.
 _GAP = 6.0
 
-#: Beyond this latitude the meridians of a projected field are too close for bounds from samples.
+#: Beyond this latitude the meridians are too close for bounds from samples, unless they are the columns of the field.
 _POLAR = 85.0
 
 #: How far bounds from samples may be off, in parts of their extent.
@@ -150,17 +150,17 @@ class Placement:
             *(np.linspace(-0.5, length - 0.5, _SAMPLES) for length in self.grid.shape), indexing="ij"
         )
         x, y = self.grid.positions(rows, columns)
-        if (turn := self.projection.turn) is not None:
-            y = np.clip(y, -turn / 4, turn / 4)  # half a cell beyond the pole
+        if self.projection.turn is not None:
+            y = np.clip(y, -self.projection.turn / 4, self.projection.turn / 4)  # half a cell beyond the pole
         longitudes, latitudes = self.projection.to_degrees(x, y)
         known = np.isfinite(longitudes) & np.isfinite(latitudes)
         if not known.any():
             raise InputError("expected a position on the Earth in the CRS of the heights, got none")
         south, north = float(latitudes[known].min()), float(latitudes[known].max())
-        if turn is None:
+        if not self.projection.plain:
             poles = [latitude for latitude in (-90.0, 90.0) if self._has_pole(latitude)]
             south, north = min([south, *poles]), max([north, *poles])
-        around = turn is None and max(-south, north) > _POLAR
+        around = not self.projection.plain and max(-south, north) > _POLAR
         west, east = (-180.0, 180.0) if around else _extent(longitudes[known])
         return west, south, east, north
 
@@ -212,8 +212,11 @@ class Placement:
 
 
 def _zoom(ratio: float) -> int:
-    """Return how often a step must be halved until it is no larger than 1; a little more than 1 is none."""
-    return max(math.ceil(math.log2(ratio) - 1e-6), 0)
+    """Return how often a step must be halved until it is no larger than 1; a little more than 1 is none.
+
+    One zoom more is left, which some tiles have.
+    """
+    return min(max(math.ceil(math.log2(ratio) - 1e-6), 0), FINEST_ZOOM - 1)
 
 
 def _extent(longitudes: NDArray[np.float64]) -> tuple[float, float]:

@@ -64,6 +64,8 @@ class Projection:
     ----------
     turn : float or None
         What x and longitude of a geographic CRS repeat after, in its unit; None for others.
+    plain : bool
+        Whether x and y are longitudes and latitudes of the Earth's own poles.
     vertical : float or None
         Metres upwards of one unit of a compound CRS's heights, negative for depths; None if it has no vertical axis.
 
@@ -82,11 +84,16 @@ class Projection:
                 raise pyproj.exceptions.CRSError("too long")
             crs = pyproj.CRS.from_wkt(wkt)
             flat = next((part for part in crs.sub_crs_list if not part.is_vertical), crs).to_2d()
+            if not (flat.is_geographic or flat.is_projected):
+                raise pyproj.exceptions.CRSError(f"{flat.name[:60]!a} is of type {flat.type_name}")
             self._transformer = pyproj.Transformer.from_crs(_WGS84, flat, always_xy=True)
         except pyproj.exceptions.ProjError as error:
             reason = " ".join(str(error).split())[:120]
             raise InputError(f"expected a CRS that PROJ understands and can place on the Earth: {reason}") from None
-        self.turn = 2 * math.pi / flat.axis_info[0].unit_conversion_factor if flat.is_geographic else None
+        self.turn = None
+        if flat.is_geographic:
+            self.turn = round(2 * math.pi / flat.axis_info[0].unit_conversion_factor, 9)
+        self.plain = bool(flat.is_geographic and not flat.is_derived)
         self.vertical = _vertical(crs)
 
     def to_plane(

@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from ..errors import OptionError
 from .projection import EARTH_RADIUS
 
-__all__ = ["LATITUDE_LIMIT", "MESH_NODES", "TileGrid", "box_of_mesh", "box_of_web", "mesh_grid", "web_grid"]
+__all__ = [
+    "FINEST_ZOOM",
+    "LATITUDE_LIMIT",
+    "MESH_NODES",
+    "TileGrid",
+    "box_of_mesh",
+    "box_of_web",
+    "mesh_grid",
+    "web_grid",
+]
 
 #: Degrees at which Web Mercator ends.
 LATITUDE_LIMIT = math.degrees(math.atan(math.sinh(math.pi)))
@@ -21,7 +30,7 @@ LATITUDE_LIMIT = math.degrees(math.atan(math.sinh(math.pi)))
 MESH_NODES = 65
 
 #: No map has a finer zoom; the numbers of its tiles are exact in float64.
-_FINEST_ZOOM = 30
+FINEST_ZOOM = 30
 
 #: The least cosine of a latitude for the distance of nodes: at the poles meridians meet.
 _LEAST_COSINE = 0.2
@@ -59,7 +68,7 @@ def web_grid(z: int, x: int, y: int, size: int = 256, margin: int = 0) -> TileGr
     OptionError
         If there is no such tile.
     """
-    _check(z, x, y, 1 << z if 0 <= z <= _FINEST_ZOOM else 0)
+    _check(z, x, y, 1 << z if 0 <= z <= FINEST_ZOOM else 0)
     pixels = size << z
     at = np.arange(-margin, size + margin) + 0.5
     longitudes = (x * size + at) * (360 / pixels) - 180
@@ -88,7 +97,7 @@ def mesh_grid(z: int, x: int, y: int, latitude: float, nodes: int = MESH_NODES, 
     OptionError
         If there is no such tile.
     """
-    _check(z, x, y, 1 << z if 0 <= z <= _FINEST_ZOOM else 0, 2)
+    _check(z, x, y, 1 << z if 0 <= z <= FINEST_ZOOM else 0, 2)
     step = 180 / (1 << z) / (nodes - 1)
     at = np.arange(-margin, nodes + margin)
     longitudes, latitudes = (x * (nodes - 1) + at) * step - 180, (y * (nodes - 1) + at) * step - 90
@@ -116,6 +125,6 @@ def _float64(values: NDArray[Any]) -> NDArray[np.float64]:
 def _check(z: int, x: int, y: int, rows: int, wide: int = 1) -> None:
     """Refuse what is no tile of a scheme with so many rows, and ``wide`` times as many columns."""
     if not rows:
-        raise OptionError(f"expected a zoom of 0 to {_FINEST_ZOOM}, got {z}")
+        raise OptionError(f"expected a zoom of 0 to {FINEST_ZOOM}, got {z}")
     if not (0 <= x < wide * rows and 0 <= y < rows):
         raise OptionError(f"expected a tile of zoom {z} of x to {wide * rows - 1} and y to {rows - 1}, got {x}, {y}")

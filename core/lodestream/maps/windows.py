@@ -50,9 +50,11 @@ class HeightWindows:
     def __init__(self, read: Callable[[int, int], bytes], size: int, max_vertices: int | None = None) -> None:
         index = read_index(read, size, Capacity(max_vertices))
         self.header = header = index.header
-        if len(header.blocks) > 1 or header.point_channels != 1:
-            got = f"{len(header.blocks)} blocks" if len(header.blocks) > 1 else "points with an x and a y of their own"
+        if header.arrangement is not None:  # of which no window is decoded by itself
+            got = f"{len(header.blocks)} blocks" if len(header.blocks) > 1 else "a block that meets itself"
             raise InputError(f"expected one block of heights for a map, got {got}")
+        if header.point_channels != 1:
+            raise InputError("expected one block of heights for a map, got points with an x and a y of their own")
         self._segments = StoredSegments(read, index, Selection(attributes=()).channels(header))
         self.metadata = dict(index.metadata_values)
         if header.plane is not None:

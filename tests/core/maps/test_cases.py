@@ -86,6 +86,18 @@ def _by_latitude(code: str, x: float, y: float, step: float, shape: tuple[int, i
     return field_of(heights.astype(np.float32), {"crs": pyproj.CRS(code).to_wkt(), "geotransform": place})
 
 
+def _level_of_another(metadata: dict[str, Any], closed: bool) -> ls.Surface:
+    """A coarser level of a slope as a surface of its own, whose nodes are not even."""
+    rows, columns = np.mgrid[0:43, 0:75]
+    slope = ls.Surface((5.0 * rows + 3.0 * columns).astype(np.float32), (False, closed), metadata=dict(metadata))
+    decoder = ls.Decoder()
+    decoder.feed(ls.encode(slope))
+    assert decoder.header is not None
+    coarse = decoder.surface(decoder.header.levels - 2)
+    assert "nodes" in coarse.metadata
+    return coarse
+
+
 def _rotated() -> HeightField:
     """Columns run to the north-east, rows to the south-east."""
     return field_of(HILL, {"crs": crs_wkt("EPSG:32633"), "geotransform": [5e5, 70, 70, 5e6, 70, -70]})
@@ -181,6 +193,14 @@ CASES = (
         ),
         levels=(-1, -2, -3, -4),
     ),
+    Case(
+        "a level that was decoded and encoded as a surface, with uneven nodes",
+        lambda: field_of(_level_of_another(FAR_UTM, False)),
+        tuple(
+            (*_utm_place(FAR_UTM, "EPSG:32633", row, column), 5.0 * row + 3.0 * column)
+            for row, column in ((0, 0), (42, 74), (41, 73), (37.5, 66.25), (21, 30), (2, 70))
+        ),
+    ),
     Case("uneven latitudes, listed", _uneven_latitudes, ((7, math.degrees(math.asin(0.36)), 607.0), (0, 70, math.nan))),
     Case("a projection around the pole", _polar, ((0, 90, 0.0), (-45, 89, 1000.0), (135, 75.5, 14500.0)), within=30),
     Case(
@@ -200,6 +220,14 @@ CASES = (
         lambda: _by_latitude("EPSG:3832", 2.8e6, 1e6, 1e4, (100, 120)),
         ((175.5, 8, 800.0), (180, 2, 200.0), (-178, 5, 500.0), (-4, 5, math.nan), (150, 5, math.nan)),
         within=0.5,
+    ),
+    Case(
+        "a rotated pole, with the Earth's pole inside",
+        lambda: _by_latitude(
+            "+proj=ob_tran +o_proj=longlat +o_lon_p=0 +o_lat_p=39.25 +lon_0=18", -60, 55, 1, (90, 120)
+        ),
+        ((18, 50.75, 5075.0), (18, 90, 9000.0), (-100, 88.5, 8850.0), (60, 70, 7000.0)),
+        within=50,
     ),
     Case("a rotated grid", _rotated, ((*on_earth("EPSG:32633", 5e5 + 70 * 13, 5e6), 606.0),)),
     Case("points whose x and y follow a rule", _points, ((10.25, 49.5, 402.0),)),
@@ -224,6 +252,17 @@ def test_the_height_at_a_place(case: Case) -> None:
     for level in case.levels:
         found = [at(made, x, y, level=made.levels + 1 + level) for x, y, _ in case.places]
         np.testing.assert_allclose(found, [height for *_, height in case.places], rtol=0, atol=case.within)
+
+
+def test_a_level_around_the_earth_as_a_surface_has_a_shorter_step_over_the_seam() -> None:
+    coarse = _level_of_another({"crs": HERE["crs"], "geotransform": [7.6, 4.8, 0, 50.5, 0, -1]}, True)
+    made = field_of(coarse)
+    columns = [*range(0, 73, 4)]
+    assert coarse.shape[1] == len(columns)
+    for number, column in enumerate(columns):
+        assert at(made, 10 + 4.8 * column, 30) == pytest.approx(float(coarse.points[5, number]))
+    over = (float(coarse.points[5, -1]) + float(coarse.points[5, 0])) / 2
+    assert at(made, 10 + 4.8 * 73.5, 30) == pytest.approx(over)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -296,6 +335,10 @@ def test_the_offset_of_a_geoid_is_added_to_meshes() -> None:
         (HILL, HERE | {"crs": "PROJCS[nothing]"}, "expected a CRS that PROJ understands"),
         (HILL, HERE | {"crs": 'LOCAL_CS["mine",UNIT["metre",1]]'}, "can place on the Earth"),
         (HILL, HERE | {"geotransform": [0, 0, 0, 0, 0, 0]}, "coordinates that differ from node to node"),
+        (HILL, HERE | {"crs": crs_wkt("EPSG:4978")}, "is of type Geocentric CRS"),
+        (HILL, HERE | {"crs": crs_wkt("EPSG:5773")}, "is of type Vertical CRS"),
+        (HILL, HERE | {"nodes": [[0, 1], None]}, "ascend or descend along each axis"),
+        (HILL, HERE | {"nodes": "even"}, "expected nodes of rows and of columns"),
         (HILL, utm("EPSG:32611", 1e12, 1e12, 30), "expected a position on the Earth in the CRS"),
         (HILL, HERE | {"geotransform": ["a", 1, 0, 0, 0, 1]}, "expected two rules of coordinates"),
         (HILL, {"crs": HERE["crs"], "axes": {"x": [1, "values"], "y": [0, 1]}}, "ascend or descend along each axis"),

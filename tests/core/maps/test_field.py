@@ -184,6 +184,31 @@ def test_surfaces_that_are_no_heights_are_refused() -> None:
     blocks = ls.Surface(blocks=[ls.Block(np.random.default_rng(i).random((5, 5, 3))) for i in range(2)])
     with pytest.raises(InputError, match="expected one block of heights for a map, got 2 blocks"):
         windows_of(blocks)
+    ball = np.random.default_rng(0).random((9, 8, 3))
+    ball[0], ball[-1] = ball[0, 0], ball[-1, 0]
+    with pytest.raises(InputError, match="got a block that meets itself"):
+        windows_of(ls.Surface(ball, (False, True)))
+
+
+def test_attributes_are_not_read() -> None:
+    random = np.random.default_rng(0)
+    heights = random.integers(0, 500, (90, 80)).astype(np.int16)
+    plain = ls.Surface(heights)
+    more = ls.Surface(heights, attributes={"colour": random.integers(0, 256, (90, 80, 3)).astype(np.uint8)})
+    taken = []
+    for surface in (plain, more):
+        container, read = ls.encode(surface), [0]
+
+        def reading(offset: int, length: int, container: bytes = container, read: list[int] = read) -> bytes:
+            read[0] += length
+            return container[offset : offset + length]
+
+        windows = HeightWindows(reading, len(container))
+        before = read[0]
+        part = windows.heights(windows.header.levels, ((20, 60), (30, 80)))
+        np.testing.assert_array_equal(part, heights[20:60, 30:80])
+        taken.append(read[0] - before)
+    assert taken[1] < 1.2 * taken[0]
 
 
 @given(

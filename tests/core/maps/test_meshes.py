@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.maps import HeightField, mesh_tile
+from lodestream.maps.meshes import quantized_mesh
 from lodestream.maps.tile_grids import mesh_grid
 
 from .fields import (
@@ -202,16 +203,27 @@ def test_the_head_places_the_tile_on_the_ellipsoid() -> None:
     assert_hidden_only_together(points / axes, mesh.horizon)
 
 
+@pytest.mark.parametrize(("z", "highest"), [(2, 1e6), (4, 2e5), (9, 9000.0)])
+def test_a_high_tile_is_culled_only_if_all_of_it_is_hidden(z: int, highest: float) -> None:
+    grid = mesh_grid(z, 2**z // 3, 2**z // 2, 0, 17, margin=1)
+    heights = np.random.default_rng(z).uniform(0, highest, (19, 19))
+    mesh = read_mesh(quantized_mesh(grid, heights))
+    to_earth = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+    longitudes, latitudes = np.meshgrid(grid.longitudes[1:-1], grid.latitudes[1:-1])
+    points = np.stack(to_earth.transform(longitudes, latitudes, heights[1:-1, 1:-1]), axis=-1).reshape(-1, 3)
+    assert_hidden_only_together(points / np.array([6378137.0, 6378137.0, 6356752.314245]), mesh.horizon)
+
+
 def assert_hidden_only_together(points: NDArray[np.float64], horizon: NDArray[np.float64]) -> None:
     """From wherever the point of horizon culling is hidden by the unit sphere, all points are."""
     random = np.random.default_rng(1)
     hidden = 0
     for _ in range(400):
         direction = random.normal(size=3)
-        eye = direction / np.linalg.norm(direction) * (1 + random.exponential(0.3))
+        eye = direction / np.linalg.norm(direction) * (1 + random.exponential(0.5))
         if is_hidden(horizon[None], eye)[0]:
             hidden += 1
-            assert is_hidden(points[::7], eye).all()
+            assert is_hidden(points, eye).all()
     assert 100 < hidden < 400
 
 
