@@ -63,7 +63,7 @@ LONGEST = (
     "tests/server/builds/test_levels.py",
     "tests/faults/test_sample.py",
     "tests/server/connections/test_crowds.py",
-    "tests/server/storage/test_kills.py",
+    "tests/server/store/test_kills.py",
     "tests/server/access/test_strangers.py",
 )
 

@@ -8,55 +8,75 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import os
+import random
 import shutil
-import subprocess
-import sys
+import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 __all__ = [
-    "APART",
-    "KEPT",
     "PLACES",
+    "age",
+    "built",
     "bytes_of_surfaces",
     "container",
     "contents",
+    "copy_index",
     "copy_rest",
     "copy_small",
-    "damage_after_kill",
+    "damage_index",
     "leave_unfinished",
     "manifest",
+    "move_index",
+    "remove_index",
+    "remove_scratch",
+    "strays",
     "upload_file",
     "warm",
-    "when_fsck_builds",
 ]
 
 #: Files and folders of it, as `tests.faults` tells apart where a call fails.
-PLACES = ("lock", "tokens.json", "records", "uploads", "containers", "incoming", "work", "levels", "damaged")
+PLACES = (
+    "lock",
+    "tokens.json",
+    "lodestream.json",
+    "names",
+    "surfaces",
+    "built",
+    "containers",
+    "uploads",
+    ".lodestream",
+    "scratch",
+    "scratch/index.sqlite",
+    "scratch/incoming",
+    "scratch/work",
+    "scratch/levels",
+)
 
-#: A folder that may be on another file system than the rest.
-APART = "damaged"
+#: What refers to something else; each before what it refers to, so that a copy in this order has all of it.
+_SMALL = ("names", "surfaces", "built")
+_BYTES = ("uploads", "containers")
 
-#: The folders in which everything acknowledged lies, without which no server starts.
-KEPT = ("records", "uploads", "containers")
-
-_SMALL = ("records",)
-_NOT_COPIED = ("incoming", "work", "levels", "lock")
-
-#: Of the files that a repair must not lose, these are none: a marker says only where its folder belongs.
-_NO_BYTES = ("records", "lock", "identity")
+_INDEX = Path("scratch") / "index.sqlite"
+_PAGE = 4096
 
 
 def manifest(data: Path, surface: str) -> Path:
     """The small file that says that there is a surface."""
-    return data / "records" / f"{surface}.json"
+    return data / "surfaces" / f"{surface}.json"
+
+
+def built(data: Path, surface: str) -> Path:
+    """The small file that says what became of its build."""
+    return data / "built" / f"{surface}.json"
 
 
 def upload_file(data: Path, surface: str) -> Path:
     """The first file of a surface's upload."""
-    return data / "uploads" / str(json.loads(manifest(data, surface).read_bytes())["upload"]) / "0"
+    return data / "uploads" / str(_read(manifest(data, surface))["upload"]) / "0"
 
 
 def container(data: Path, sha256: str | None) -> Path:
@@ -64,44 +84,92 @@ def container(data: Path, sha256: str | None) -> Path:
     return data / "containers" / f"{sha256}.lode"
 
 
+def _read(small: Path) -> dict[str, Any]:
+    # The first line, or all of it: a checksum comes after.
+    found: dict[str, Any] = json.JSONDecoder().raw_decode(small.read_text())[0]
+    return found
+
+
 def bytes_of_surfaces(data: Path) -> Counter[str]:
-    """The hashes of all files of uploads and containers, wherever they lie by now, and how many files have each."""
-    return contents(data, without=_NO_BYTES)
+    """The hashes of all files of uploads and containers, and how many files have each."""
+    return contents(data / "uploads") + contents(data / "containers")
 
 
-def contents(folder: Path, *, without: tuple[str, ...] = ()) -> Counter[str]:
-    """The hashes of all files beneath a folder, and how many files have each; without some names."""
-    return Counter(
-        hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*")
-        if path.is_file() and not set(without).intersection(path.relative_to(folder).parts)
-    )
+def contents(folder: Path) -> Counter[str]:
+    """The hashes of all files beneath a folder, and how many files have each."""
+    return Counter(hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file())
 
 
 def leave_unfinished(data: Path, surface: str) -> None:
     """Put there what a server that is killed during an upload, a build and a change leaves behind."""
     ends = "0123456789abcdef"
     for name in ("incoming", "work"):
-        left = data / name / f"{surface}.{ends}"
+        left = data / "scratch" / name / f"{surface}.{ends}"
         left.mkdir(parents=True)
         (left / "0").write_bytes(b"half of an upload")
-    (data / "records" / f"{surface}.json.{ends}.new").write_bytes(b'{"id": ')
+    (data / ".lodestream" / f"{ends}.new").write_bytes(b'{"id": ')
+    for name, stray in (("uploads", f"{ends * 4}/0"), ("containers", f"{ends * 4}.lode")):
+        path = data / name / stray
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"what nothing refers to")
+
+
+def strays(data: Path) -> list[str]:
+    """The files of uploads and containers that no small file refers to."""
+    uploads = {str(_read(path)["upload"]) for path in _listed(data / "surfaces")}
+    containers = {str(_read(path)["container"]) for path in _listed(data / "built")}
+    return [
+        *(f"uploads/{path.name}" for path in _listed(data / "uploads") if path.name not in uploads),
+        *(f"containers/{path.name}" for path in _listed(data / "containers") if path.stem not in containers),
+    ]
+
+
+def age(data: Path, seconds: float) -> None:
+    """Let everything that is there be older."""
+    then = time.time() - seconds
+    for path in data.rglob("*"):
+        os.utime(path, (then, then))
+
+
+# A backup.
 
 
 def copy_small(source: Path, target: Path) -> None:
-    """Begin a backup under load as docs/operating.md says: what says which surfaces there are comes first."""
-    _copy(source, target, lambda name: name in _SMALL)
+    """Begin a backup under load as docs/operating.md says: small files come before what they refer to."""
+    for name in _SMALL:
+        _copy(source / name, target / name)
 
 
 def copy_rest(source: Path, target: Path) -> None:
     """End that backup."""
-    _copy(source, target, lambda name: name not in (*_SMALL, *_NOT_COPIED))
+    for path in _listed(source):
+        if path.is_dir() and path.name in _BYTES:
+            _copy(path, target / path.name)
+    for name in ("lodestream.json", "tokens.json"):
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copy2(source / name, target / name)
 
 
-def _copy(source: Path, target: Path, chosen: Callable[[str], bool] = lambda name: True) -> None:
+def copy_index(source: Path, target: Path) -> None:
+    """Copy the index too."""
+    (target / _INDEX.parent).mkdir(exist_ok=True)
+    for path in _index(source):
+        with contextlib.suppress(FileNotFoundError):
+            shutil.copy2(path, target / _INDEX.parent / path.name)
+
+
+def move_index(source: Path, target: Path) -> None:
+    """Move the index of a folder to another one, in place of what is there; no server is running."""
+    remove_index(target)
+    (target / _INDEX.parent).mkdir(parents=True, exist_ok=True)
+    for path in _index(source):
+        path.rename(target / _INDEX.parent / path.name)
+
+
+def _copy(source: Path, target: Path) -> None:
     # As rsync does: what is gone when its turn comes is left out.
     target.mkdir(parents=True, exist_ok=True)
-    for path in filter(lambda path: chosen(path.name), _listed(source)):
+    for path in _listed(source):
         with contextlib.suppress(FileNotFoundError):
             if path.is_dir():
                 _copy(path, target / path.name)
@@ -114,47 +182,53 @@ def _listed(folder: Path) -> Iterator[Path]:
         yield from sorted(folder.iterdir())
 
 
-def damage_after_kill(data: Path, stored: Collection[str]) -> list[Any]:
-    """What ``lodestream fsck`` finds damaged after a kill, where these surfaces were acknowledged.
+# The index, and the folder in which it lies.
 
-    An upload in its place whose record was not written yet was not acknowledged; the next start takes it up, after
-    which nothing must be found at all.
+
+def _index(data: Path) -> list[Path]:
+    """Its file, and those that the database keeps beside it."""
+    return sorted((data / _INDEX.parent).glob(f"{_INDEX.name}*"))
+
+
+def remove_index(data: Path) -> None:
+    """Take the index away."""
+    for path in _index(data):
+        path.unlink(missing_ok=True)
+
+
+def remove_scratch(data: Path) -> None:
+    """Take the folder away in which the index lies, at one moment."""
+    gone = data.with_name(f"{data.name}.scratch")
+    with contextlib.suppress(FileNotFoundError):
+        (data / _INDEX.parent).rename(gone)
+        shutil.rmtree(gone)
+
+
+def damage_index(data: Path, how: str, random_: random.Random) -> None:
+    """Damage the index.
+
+    Parameters
+    ----------
+    data : Path
+    how : "cut", "head" or "pages"
+        Nothing is left of it; its first page is; any of its pages, and of its log, are other bytes.
+    random_ : Random
     """
-    from lodestream_server.storage.storage import Storage
-
-    findings = [
-        finding
-        for finding in _fsck(data)
-        if finding["what"] not in ("leftover", "version")
-        and (finding["problem"] != "expected a record, got none" or finding["surface"] in stored)
-    ]
-    Storage(data).close()
-    return [*findings, *_fsck(data)]
-
-
-def _fsck(data: Path) -> list[dict[str, Any]]:
-    command = [sys.executable, "-m", "lodestream_client", "fsck", str(data), "--json"]
-    done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
-    findings: list[dict[str, Any]] = json.loads(done.stdout)["findings"]
-    return findings
+    if how == "cut":
+        os.truncate(data / _INDEX, 0)
+        return
+    chosen = [data / _INDEX] if how == "head" else [path for path in _index(data) if not path.name.endswith("-shm")]
+    for path in chosen:
+        with path.open("r+b") as file:
+            pages = -(-path.stat().st_size // _PAGE)
+            for page in range(pages):
+                if random_.random() < 0.5 if how == "pages" else page == 0:
+                    file.seek(page * _PAGE)
+                    file.write(random_.randbytes(_PAGE))
 
 
 def warm() -> None:
     """Make what each process makes first that opens a folder, and that takes as long as looking through a small one."""
-    from lodestream_server.storage import records
+    from lodestream_server.store import layout
 
-    records._adapter()
-
-
-def when_fsck_builds(begin: Callable[[], object]) -> None:
-    """Have something done before ``lodestream fsck`` builds in this process."""
-    from lodestream_server.maintenance import repair
-
-    names: Any = repair
-    rebuild = names.rebuild
-
-    def begin_and_rebuild(*args: Any, **options: Any) -> Any:
-        begin()
-        return rebuild(*args, **options)
-
-    names.rebuild = begin_and_rebuild
+    layout._adapters()

@@ -31,6 +31,7 @@ from .stream.aio_stream import Stream
 from .stream.options import ConnectKeywords, ConnectOptions
 
 if TYPE_CHECKING:
+    from lodestream.errors import LodestreamError
     from lodestream.quality import Effort
 
 __all__ = [
@@ -41,6 +42,7 @@ __all__ = [
     "describe_file",
     "fetch_range",
     "identify",
+    "list_names",
     "list_surfaces",
     "locate",
     "retry",
@@ -86,6 +88,7 @@ async def upload(
     nodata: float | str | None = None,
     local: bool = False,
     effort: Effort = "default",
+    replace: bool = False,
 ) -> Description:
     """Upload a surface; parameters, results and errors are those of `lodestream_client.sync.upload`.
 
@@ -99,18 +102,19 @@ async def upload(
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata, effort)
     check_asked(asked)
+    stays = api.name_to_change(url, name, replace=replace, wait=wait)
     ask = not local and are_files(sources)
     read_there = await _run(api.formats_read(url), url, token) if ask else None
     parcel = await _prepared(sources, asked, progress, read_there, local)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:
-        return await _run(api.upload(url, parcel.parameters, body, wait, progress), url, token)
+        return await _run(api.upload(url, parcel.parameters, body, wait, progress, stays), url, token)
 
 
 async def retry(
     url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None
 ) -> Description:
-    """Ask the server to build a surface again that waits, failed or is missing; see `lodestream_client.sync.retry`.
+    """Ask the server to build a surface again that waits or has failed; see `lodestream_client.sync.retry`.
 
     Examples
     --------
@@ -134,6 +138,19 @@ async def list_surfaces(url: str, *, token: str | None = None) -> tuple[Descript
     True
     """
     return await _run(api.list_surfaces(url), url, token)
+
+
+async def list_names(url: str, *, token: str | None = None) -> tuple[Mapping[str, Any], ...]:
+    """Return all names of a server; see `lodestream_client.sync.list_names`.
+
+    Examples
+    --------
+    >>> import asyncio, lodestream_client
+    >>> names = asyncio.run(lodestream_client.list_names("http://127.0.0.1:8000"))
+    >>> all(set(it) >= {"name", "url", "surface"} for it in names)
+    True
+    """
+    return await _run(api.list_names(url), url, token)
 
 
 async def describe(url: str, *, token: str | None = None) -> Description:
@@ -178,7 +195,7 @@ async def identify(url: str, *, token: str | None = None) -> Identity:
 
 
 async def delete(url: str, *, token: str | None = None) -> None:
-    """Delete a surface from its server; errors as in `lodestream_client.sync`.
+    """Delete a surface from its server, or a name; errors as in `lodestream_client.sync`.
 
     Examples
     --------
@@ -190,7 +207,7 @@ async def delete(url: str, *, token: str | None = None) -> None:
 
 
 async def locate(url: str, *, token: str | None = None) -> str:
-    """Return the URL of the container of a name on a published page; see `lodestream_client.sync.locate`.
+    """Return the URL of the surface or container to which a name leads; see `lodestream_client.sync.locate`.
 
     Examples
     --------
@@ -243,10 +260,11 @@ async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = call
     import httpx
 
     answer: Answer | None = None
+    failure: LodestreamError | None = None
     async with httpx.AsyncClient(**calls.client_options(url, timeout, asynchronous=True)) as client:
         while True:
             try:
-                step = flow.send(answer)
+                step = flow.send(answer) if failure is None else flow.throw(failure)
             except StopIteration as end:
                 result: T = end.value
                 return result
@@ -264,7 +282,8 @@ async def _run(flow: Flow[T], url: str, token: str | None, timeout: float = call
                                 break
                 answer = incoming.answer()
             except httpx.HTTPError as error:
-                raise problems.from_connection(error, url) from error
+                failure = problems.from_connection(error, url)
+                failure.__cause__ = error
 
 
 async def _chunks(body: Body) -> AsyncIterator[bytes]:

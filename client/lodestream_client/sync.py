@@ -29,6 +29,7 @@ from .stream.sync_stream import Stream
 if TYPE_CHECKING:
     import httpx
 
+    from lodestream.errors import LodestreamError
     from lodestream.quality import Effort
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "fetch_range",
     "identify",
     "list",
+    "list_names",
     "list_surfaces",
     "locate",
     "retry",
@@ -57,7 +59,8 @@ def connect(url: str, **options: Unpack[ConnectKeywords]) -> Stream:
     Parameters
     ----------
     url : str
-        URL of the surface, ``http(s)://HOST/v1/surfaces/ID``, or of a container file on any web server.
+        URL of the surface, ``http(s)://HOST/v1/surfaces/ID``; of a name that leads to one,
+        ``http(s)://HOST/v1/names/NAME``; or of a container file on any web server.
     **options
         The following, by keyword; see `ConnectOptions`.
     target : Target or None
@@ -133,6 +136,7 @@ def upload(
     nodata: float | str | None = None,
     local: bool = False,
     effort: Effort = "default",
+    replace: bool = False,
 ) -> Description:
     """Upload a surface.
 
@@ -173,6 +177,9 @@ def upload(
         here, with a `FormatWarning`.
     effort : "fast", "default" or "small"
         What the encoding takes, see `lodestream.encode`; values do not depend on it.
+    replace : bool
+        Once the surface is ready, make the server's name `name` lead to it: ``http(s)://HOST/v1/names/NAME`` stays its
+        URL. The server deletes the surface that the name led to before, a set time later.
 
     Returns
     -------
@@ -182,12 +189,13 @@ def upload(
     Raises
     ------
     OptionError
-        If an option has an invalid value or is not allowed for such a source, or both `precision` and `rms` are given.
+        If an option has an invalid value or is not allowed for such a source, both `precision` and `rms` are given, or
+        `replace` without `wait` or without a name of at most 100 letters, digits and ``._-``.
     InputError, TooLargeError
         If a source has another type or cannot be encoded, or the server cannot read the file or finds it too large.
     RemoteError
         If the server refuses, or the surface does not become ready. The code is ``failed`` if the file cannot be built,
-        and ``waiting`` or ``missing`` if the reason is on the server: it keeps the upload, see `retry`.
+        and ``waiting`` if the reason is on the server: it keeps the upload, see `retry`.
     UnreachableError
         If there is no connection.
 
@@ -203,16 +211,17 @@ def upload(
     """
     asked = Asked(precision, rms, closed, name, options or {}, attribute_precision or {}, filename, nodata, effort)
     check_asked(asked)
+    stays = api.name_to_change(url, name, replace=replace, wait=wait)
     ask = not local and are_files(sources)
     read_there = _run(api.formats_read(url), url, token) if ask else None
     parcel = prepared(sources, asked, progress, read_there, local)
     sent = None if progress is None else (lambda fraction: progress("sending", fraction))
     with opened(parcel, sent) as body:
-        return _run(api.upload(url, parcel.parameters, body, wait, progress), url, token)
+        return _run(api.upload(url, parcel.parameters, body, wait, progress, stays), url, token)
 
 
 def retry(url: str, *, wait: bool = True, progress: Progress | None = None, token: str | None = None) -> Description:
-    """Ask the server to build a surface again that is waiting, failed or missing.
+    """Ask the server to build a surface again that is waiting or has failed.
 
     Parameters
     ----------
@@ -234,7 +243,7 @@ def retry(url: str, *, wait: bool = True, progress: Progress | None = None, toke
     NotFoundError
         If there is no such surface.
     RemoteError
-        If the server refuses, or the surface does not become ready: code ``failed``, ``waiting`` or ``missing``.
+        If the server refuses, or the surface does not become ready: code ``failed`` or ``waiting``.
     UnreachableError
         If there is no connection.
 
@@ -268,8 +277,31 @@ def list_surfaces(url: str, *, token: str | None = None) -> tuple[Description, .
     return _run(api.list_surfaces(url), url, token)
 
 
+def list_names(url: str, *, token: str | None = None) -> tuple[Mapping[str, Any], ...]:
+    """Return all names of a server.
+
+    Each has ``name``, ``url``, ``surface`` (the URL of the surface to which it leads; None: the server cannot read it),
+    ``changed`` (when it came to lead there) and, if the server tells it, ``owner``.
+
+    Raises
+    ------
+    NotFoundError, RemoteError, RemoteProtocolError
+        If the server refuses, or is not a Lodestream server.
+    UnreachableError
+        If there is no connection.
+
+    Examples
+    --------
+    >>> from lodestream_client import sync
+    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy", name="terrain", replace=True).url
+    >>> [it["surface"] == url for it in sync.list_names("http://127.0.0.1:8000") if it["name"] == "terrain"]
+    [True]
+    """
+    return _run(api.list_names(url), url, token)
+
+
 def describe(url: str, *, token: str | None = None) -> Description:
-    """Return the state and the description of one surface.
+    """Return the state and the description of one surface, or of the one to which a name of a server leads now.
 
     Raises
     ------
@@ -333,17 +365,17 @@ def identify(url: str, *, token: str | None = None) -> Identity:
 
 
 def locate(url: str, *, token: str | None = None) -> str:
-    """Return the URL of the container to which a name on a published page leads now; any other URL as it is.
+    """Return the URL of the surface or container to which a name leads now; any other URL as it is.
 
-    `connect` does this itself. A program that makes several requests makes them of one container this way, whatever is
-    published meanwhile.
+    A name is on a server (``HOST/v1/names/NAME``) or on a published page (``PAGE#NAME``). `connect` does this itself. A
+    program that makes several requests makes them of one container this way, whatever the name leads to meanwhile.
 
     Raises
     ------
     NotFoundError
-        If there is no such page, or no such name on it.
+        If there is no such server or page, or no such name on it.
     RemoteError, RemoteProtocolError
-        If the host refuses, or its list cannot be read.
+        If the host refuses, or its answer cannot be read.
     UnreachableError
         If there is no connection.
 
@@ -351,14 +383,14 @@ def locate(url: str, *, token: str | None = None) -> str:
     --------
     >>> from lodestream_client import sync
     >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
-    >>> sync.locate(url) == url  # it is no PAGE#NAME
+    >>> sync.locate(url) == url  # it is no name
     True
     """
     return _run(api.locate(url), url, token)
 
 
 def delete(url: str, *, token: str | None = None) -> None:
-    """Delete a surface from its server.
+    """Delete a surface from its server; or a name, whose surfaces stay.
 
     Raises
     ------
@@ -431,9 +463,10 @@ def run(client: httpx.Client, flow: Flow[T], url: str, token: str | None) -> T:
     import httpx
 
     answer: Answer | None = None
+    failure: LodestreamError | None = None
     while True:
         try:
-            step = flow.send(answer)
+            step = flow.send(answer) if failure is None else flow.throw(failure)
         except StopIteration as end:
             result: T = end.value
             return result
@@ -451,7 +484,8 @@ def run(client: httpx.Client, flow: Flow[T], url: str, token: str | None) -> T:
                             break
             answer = incoming.answer()
         except httpx.HTTPError as error:
-            raise problems.from_connection(error, url) from error
+            failure = problems.from_connection(error, url)
+            failure.__cause__ = error
 
 
 list = list_surfaces

@@ -37,7 +37,7 @@ from lodestream.planning.selection import region_at, selection_of
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target, check_integer
 
-from .requests.addresses import is_surface, is_url, published_name
+from .requests.addresses import is_served, is_url, published_name
 from .viewer.sources import FileSource, RemoteSource, Source
 
 __all__ = ["Container", "LodeBackend"]
@@ -153,7 +153,7 @@ class LodeBackend(BackendEntrypoint):
         return {f"/block_{number}": block_dataset for number, block_dataset in enumerate(datasets)}
 
     def guess_can_open(self, filename_or_obj: Any) -> bool:
-        """Return whether a name ends in ``.lode``, or is the URL of a surface or of a name on a published page."""
+        """Return whether a name ends in ``.lode``, or is the URL of a surface, or of a name that leads to one."""
         if not isinstance(filename_or_obj, str | os.PathLike):
             return False
         name = os.fspath(filename_or_obj)
@@ -162,7 +162,7 @@ class LodeBackend(BackendEntrypoint):
         if is_url(name):
             page = name.partition("#")[0].partition("?")[0]
             named = page.endswith(("/", ".html")) and published_name(name) is not None
-            return page.endswith(".lode") or is_surface(name) or named
+            return page.endswith(".lode") or is_served(name) or named
         return name.endswith(".lode")
 
 

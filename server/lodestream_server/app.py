@@ -22,14 +22,17 @@ from .access.limits import Limits
 from .builds.jobs import Builder
 from .builds.level_files import LevelFiles
 from .builds.level_queue import LevelQueue
+from .builds.work import Work
 from .operation.metrics import Metrics
 from .operation.observation import Observation
 from .operation.pace import Pace, Paced
 from .operation.settings import Settings
-from .routes import files, interface, levels, pages, streams, surfaces
+from .routes import files, interface, levels, names, pages, streams, surfaces
 from .routes.routing import State
-from .storage.containers import Containers
-from .storage.storage import Storage
+from .store.containers import Containers
+from .store.data_folder import DataFolder
+from .store.index import Surface
+from .upkeep import Upkeep
 
 __all__ = ["create_app"]
 
@@ -74,21 +77,40 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
         # A server has opened it before, so that it can say in one line why it does not start.
-        opened: Storage | None = getattr(app.state, "storage", None)
-        storage = await asyncio.to_thread(Storage, chosen.data) if opened is None else opened
-        builder = Builder(storage, chosen, metrics.built)
-        limits = Limits(chosen, storage.root, storage.count_of, builder.pending_of, storage.kept, lambda: access.alone)
-        metrics.watch(storage.root, lambda: len(storage), lambda: builder.pending)
-        files_of_levels = await asyncio.to_thread(_level_files, chosen, storage, limits)
-        levels = LevelQueue(chosen, storage, files_of_levels, builder.fork_server, limits.check_share)
-        app.state.parts = State(chosen, storage, builder, Containers(storage), access, limits, metrics, levels, pace)
+        opened: DataFolder | None = getattr(app.state, "folder", None)
+        folder = await asyncio.to_thread(DataFolder, chosen.data, chosen.scratch) if opened is None else opened
+        surfaces, loop = folder.surfaces, asyncio.get_running_loop()
+        builder = Builder(surfaces, Work(folder.work), chosen, metrics.built)
+
+        def queue_again(lost: list[Surface]) -> None:
+            for surface in lost:
+                loop.call_soon_threadsafe(builder.submit, surface)
+
+        def count(owner: str | None) -> tuple[int, int]:
+            named, named_by_owner = surfaces.index.count_names(owner)
+            return len(surfaces.index) + named, surfaces.index.count_of(owner) + named_by_owner
+
+        def kept(owner: str | None) -> int:
+            return surfaces.index.kept(owner)
+
+        containers = Containers(surfaces, lost=queue_again)
+        limits = Limits(chosen, (folder.root, folder.scratch), count, builder.pending_of, kept, lambda: access.alone)
+        metrics.watch(folder.root, lambda: len(surfaces.index), lambda: builder.pending)
+        files_of_levels = await asyncio.to_thread(_level_files, chosen, folder, limits)
+        levels = LevelQueue(chosen, containers, files_of_levels, builder.fork_server, limits.check_share)
+        upkeep = Upkeep(surfaces, builder, levels)
+        app.state.parts = State(
+            chosen, folder, surfaces, upkeep, builder, containers, access, limits, metrics, levels, pace
+        )
         try:
-            builder.start(limits.check_owner)
+            await builder.start(limits.check_owner)
+            upkeep.start()
             yield
         finally:
+            await upkeep.close()
             await levels.close()
             await builder.close()
-            storage.close()
+            await asyncio.to_thread(folder.close)
 
     app = FastAPI(
         title="Lodestream",
@@ -103,7 +125,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     problems.install(app)
-    routers = (pages.router, surfaces.router, files.router, levels.router, streams.router)
+    routers = (pages.router, surfaces.router, names.router, files.router, levels.router, streams.router)
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]
@@ -115,7 +137,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=chosen.origins,
-            allow_methods=["DELETE", "GET", "HEAD", "POST"],
+            allow_methods=["DELETE", "GET", "HEAD", "POST", "PUT"],
             allow_headers=["authorization", "if-none-match", "if-range", "range"],
             expose_headers=["content-range", "etag", "location", "retry-after", "x-request-id"],
         )
@@ -124,13 +146,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-def _level_files(settings: Settings, storage: Storage, limits: Limits) -> LevelFiles:
+def _level_files(settings: Settings, folder: DataFolder, limits: Limits) -> LevelFiles:
     most = settings.level_disk
     if most is None:
         try:
-            size = shutil.disk_usage(storage.root).total
+            size = shutil.disk_usage(folder.scratch).total
         except OSError as error:  # level files can be made again: no reason not to start
             _log.warning("the size of the disk is unknown, so that few level files are kept: %s", error)
             size = 0
         most = max(min(_LEVEL_DISK, size // 20), _LEAST_LEVEL_DISK)
-    return LevelFiles(storage.levels, most, limits.room)
+    return LevelFiles(folder.levels, most, limits.room)

@@ -17,6 +17,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Route
 
+from lodestream import stores
 from lodestream.errors import (
     FormatError,
     InputError,
@@ -33,10 +34,10 @@ __all__ = [
     "BadTokenError",
     "BuildFailedError",
     "BusyError",
+    "DamagedNameError",
     "ForeignOriginError",
     "FullError",
     "LargeLevelError",
-    "MissingError",
     "NoTokenError",
     "NotOwnerError",
     "NotReadyError",
@@ -78,14 +79,12 @@ class PostponedError(LodestreamError):
     """The surface could not be built for a reason that may pass; it waits for a retry."""
 
 
-class MissingError(LodestreamError):
-    """Data that the server should have are not on its disk now."""
-
-    headers: ClassVar = {"retry-after": "60"}
-
-
 class NotOwnerError(LodestreamError):
     """The surface, or the name, belongs to another owner."""
+
+
+class DamagedNameError(LodestreamError):
+    """What is stored of a name cannot be read."""
 
 
 class SlowUploadError(LodestreamError):
@@ -145,6 +144,8 @@ class _Answer:
     title: str
 
 
+_FULL = _Answer(507, "disk-full", "The disk is full")
+
 #: The first row whose class fits says what is answered. The codes of streams (`lodestream.protocol.messages.CODES`) are
 #: the same words where they mean the same.
 _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
@@ -169,11 +170,14 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
     (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),
     (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; it waits for a retry")),
-    (MissingError, _Answer(503, "missing", "The surface is not on the server's disk now")),
+    (DamagedNameError, _Answer(503, "damaged-name", "It cannot be read where the name leads")),
+    (stores.FullError, _FULL),
+    (stores.UnacknowledgedError, _Answer(503, "busy", "It is not known whether that was done; try again")),
+    (stores.StoreError, _Answer(503, "busy", "The server's store cannot be used now; try again later")),
     (StreamError, _Answer(500, "damaged", "The stored container is damaged")),
 )
-_FULL = _Answer(507, "disk-full", "The disk is full")
 _INTERNAL = _Answer(500, "internal", "The server failed")
+_NO_ROOM, _SEE_LOG = "nothing was stored; delete surfaces or enlarge the disk", "the server's log says more"
 
 PROBLEM_EXAMPLE = {
     "type": "urn:lodestream:not-found",
@@ -197,12 +201,15 @@ def install(app: FastAPI) -> None:
 
 def problem(error: Exception) -> tuple[int, str, str, str]:
     """Return status, code, title and detail for an exception; an unexpected one reveals nothing about the server."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        error = stores.FullError()
     for kind, answer in _ANSWERS:
         if isinstance(error, kind):
-            return answer.status, answer.code, answer.title, str(error)
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return _FULL.status, _FULL.code, _FULL.title, "nothing was stored; delete surfaces or enlarge the disk"
-    return _INTERNAL.status, _INTERNAL.code, _INTERNAL.title, "the server's log says more"
+            detail = str(error)
+            if isinstance(error, stores.StoreError):  # it says where the data of the server are
+                detail = _NO_ROOM if answer is _FULL else _SEE_LOG
+            return answer.status, answer.code, answer.title, detail
+    return _INTERNAL.status, _INTERNAL.code, _INTERNAL.title, _SEE_LOG
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -230,7 +237,8 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
     status, code, title, detail = problem(error)
     if status >= 500 and not isinstance(error, StreamError):  # whoever found the damage has told of it
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
-    headers = getattr(error, "headers", FullError.headers if status == 507 else {})
+    usual = {503: BusyError.headers, 507: FullError.headers}
+    headers = getattr(error, "headers", usual.get(status, {}))
     return _document(request, status, code, title, detail, headers)
 
 

@@ -24,7 +24,7 @@ from .connections.frames import stream_connections
 from .connections.places import Places
 from .operation.logs import drain
 from .operation.settings import Settings
-from .storage.storage import Storage
+from .store.data_folder import DataFolder
 
 __all__ = ["Server", "make_server", "running_server", "serve_alone"]
 
@@ -45,10 +45,10 @@ class Server(uvicorn.Server):
         Why it did not start: its data folder could not be opened, or it cannot listen at its address.
     """
 
-    def __init__(self, config: uvicorn.Config, data: Path, listening: Callable[[str], None]) -> None:
+    def __init__(self, config: uvicorn.Config, settings: Settings, listening: Callable[[str], None]) -> None:
         super().__init__(config)
         self.refusal: LodestreamError | OSError | None = None
-        self._data = data
+        self._settings = settings
         self._listening = listening
         self._state = getattr(config.app, "state", None)
 
@@ -56,7 +56,7 @@ class Server(uvicorn.Server):
         """Open the data folder, listen, start, then report the address."""
         assert self._state is not None, "the application is that of `create_app`"
         try:
-            storage = await asyncio.to_thread(Storage, self._data)
+            folder = await asyncio.to_thread(DataFolder, self._settings.data, self._settings.scratch)
         except (LodestreamError, OSError) as error:
             self._refuse(error)
             return
@@ -64,10 +64,10 @@ class Server(uvicorn.Server):
             # uvicorn would write what is wrong into its log, and end the process with a code of its own.
             listening = await _listen(self.config.host, self.config.port, self.config.backlog)
         except LodestreamError as error:
-            storage.close()
+            folder.close()
             self._refuse(error)
             return
-        self._state.storage = storage
+        self._state.folder = folder
         await super().startup(listening)
         if self.started:
             host, port = self.servers[0].sockets[0].getsockname()[:2]
@@ -141,7 +141,7 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         proxy_headers=bool(settings.trusted_proxies),
         forwarded_allow_ips=list(settings.trusted_proxies),
     )
-    return Server(config, settings.data, listening)
+    return Server(config, settings, listening)
 
 
 def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:

@@ -16,11 +16,12 @@ __all__ = ["Answer", "Asked", "Scripted", "document", "problem", "redirect", "sc
 
 @dataclass(frozen=True)
 class Asked:
-    """A request: method, path with its query, and headers."""
+    """A request: method, path with its query, headers, and body."""
 
     method: str
     path: str
     headers: Mapping[str, str]
+    body: bytes = b""
 
     @property
     def token(self) -> str | None:
@@ -75,8 +76,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         length = int(self.headers.get("Content-Length") or 0)
-        self.rfile.read(length)
-        asked = Asked(self.command, self.path, dict(self.headers.items()))
+        body = self.rfile.read(length)
+        asked = Asked(self.command, self.path, dict(self.headers.items()), body)
         self.server.asked.append(asked)
         answer = self.server.script(asked)
         self.send_response(answer.status)
@@ -92,6 +93,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.do_GET()
 
     def do_POST(self) -> None:
+        self.do_GET()
+
+    def do_PUT(self) -> None:
         self.do_GET()
 
     def do_DELETE(self) -> None:

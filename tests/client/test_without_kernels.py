@@ -14,6 +14,7 @@ import pytest
 import lodestream as ls
 from lodestream.library import library_name
 from lodestream_client import sync
+from lodestream_server import running_server
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
@@ -92,10 +93,19 @@ def test_a_server_does_not_start(bare: Bare, tmp_path: Path) -> None:
     assert "serving surfaces is not possible here" in bare.refused("serve", "--data", data, "--port", "0")
     assert not data.exists()
     assert "serving surfaces is not possible here" in bare.refused("demo", "--out", tmp_path / "demo")
-    (data / "records").mkdir(parents=True)
-    for change in ("--repair", "--adopt", "--retry"):
-        bare.refused("fsck", data, change)
-    assert [path.name for path in data.rglob("*")] == ["records"]
+
+
+def test_the_data_of_a_server_are_checked_and_nothing_of_them_is_damage(
+    bare: Bare, tmp_path: Path, terrain_file: Path
+) -> None:
+    data = tmp_path / "data"
+    with running_server(data, workers=1) as url:
+        sync.upload(url, terrain_file)
+    before = {path: path.read_bytes() for path in data.glob("*/*") if path.is_file()}
+    assert any(path.suffix == ".lode" for path in before)
+    done = bare.run("-m", "lodestream_client", "fsck", data, "--repair", "--collect", "--retry")
+    assert (done.returncode, "nothing is damaged" in done.stdout) == (0, True), done.stdout + done.stderr
+    assert {path: path.read_bytes() for path in data.glob("*/*") if path in before} == before
 
 
 def test_the_copy_has_no_kernels_and_this_package_has(bare: Bare) -> None:

@@ -1,7 +1,7 @@
 """``python -m tests.faults [WORDS]``: every case whose name contains the words, or with ``--list`` only their names.
 
 ``python -m tests.faults 'repair, flipped upload' --seconds 300``
-``python -m tests.faults upload 'fsync records' --part 0.2``
+``python -m tests.faults upload 'fsync surfaces' --part 0.2``
 
 All of them take some time. With ``--journal FILE`` each run goes on where the last one with that file has ended.
 """

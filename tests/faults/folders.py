@@ -20,9 +20,10 @@ from .oracle import Ledger, Talk
 from .programs import Programs, Server
 from .shim import Fault
 
-__all__ = ["DAMAGES", "Folder", "Made"]
+__all__ = ["DAMAGES", "HARMLESS", "Folder", "Made"]
 
 _ALWAYS = 1 << 31
+_LONG = 2 * 86400.0
 
 
 @dataclass
@@ -96,11 +97,12 @@ def _mixed(programs: Programs, folder: Folder) -> Folder:
             talk.quiet(surface)
     with ExitStack() as held:
         # A build that finds the disk full waits in the queue for as long as this server lives.
-        held.enter_context(programs.shim.failing(Fault("mkdir", "work/ID", 0, "ENOSPC", times=_ALWAYS)))
+        held.enter_context(programs.shim.failing(Fault("mkdir", "scratch/work/ID", 0, "ENOSPC", times=_ALWAYS)))
         talk = _serve(programs, folder, held)
         for seed in (5, 6):
             queued = _push(talk, hills(12, 11, seed=seed))
     _container(folder, 1).unlink()
+    folder.ledger.kept[_surface(folder, 1)].bare = True
     data_folder.leave_unfinished(folder.data, queued)
     return folder
 
@@ -137,17 +139,30 @@ def _flip(path: Path) -> None:
     path.write_bytes(data)
 
 
-def _cut_record(folder: Folder) -> None:
-    path = data_folder.manifest(folder.data, _surface(folder, 0))
-    path.write_bytes(path.read_bytes()[:-9])
+def _lose(folder: Folder) -> None:
+    # What was uploaded is nobody's then, and must stay: somebody may bring the manifest back.
+    surface = _surface(folder, 0)
+    _flip(data_folder.manifest(folder.data, surface))
+    del folder.ledger.kept[surface]
 
 
-#: What befalls a copy of the plain folder: after each of these a repair brings everything back.
+def _leave_strays(folder: Folder) -> None:
+    data_folder.leave_unfinished(folder.data, _surface(folder, 0))
+    data_folder.age(folder.data, _LONG)
+
+
+#: What befalls a copy of the plain folder: after each of these a repair brings everything back, but a manifest.
 DAMAGES: dict[str, Callable[[Folder], None]] = {
     "whole": lambda folder: None,
+    "strays": _leave_strays,
     "flipped container": lambda folder: _flip(_container(folder, 0)),
     "missing container": lambda folder: _container(folder, 0).unlink(),
     "flipped upload": lambda folder: _flip(_upload(folder)),
     "missing upload": lambda folder: _upload(folder).unlink(),
-    "broken record": _cut_record,
+    "flipped built": lambda folder: _flip(data_folder.built(folder.data, _surface(folder, 0))),
+    "missing built": lambda folder: data_folder.built(folder.data, _surface(folder, 0)).unlink(),
+    "flipped manifest": _lose,
 }
+
+#: Those of them that are no damage: what was not built yet is no more than that.
+HARMLESS = ("whole", "strays", "missing built")

@@ -181,10 +181,8 @@ def _be(arguments: list[str], log: str) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for theirs, ours in ((nothing, 0), (said, 1), (said, 2)):
         os.dup2(theirs, ours)
-    # A fork server is forked while this process has one thread; for fsck only where it builds, at last.
     if "serve" in arguments:
-        _fork_server()
-    data_folder.when_fsck_builds(_fork_server)
+        _fork_server()  # while this process has one thread
     return main(arguments)
 
 

@@ -103,6 +103,7 @@ class Operation:
         try:
             with self._arm():
                 yield
+            self.talk.awaited()  # a server that has lost its index makes it again
         finally:
             self.talk.lenient = False
 

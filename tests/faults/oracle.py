@@ -5,6 +5,7 @@ Nothing here knows how the server keeps anything.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import time
 from dataclasses import dataclass, field
@@ -63,11 +64,14 @@ class Kept:
         The fault that concerns it.
     container : str or None
         The SHA-256 of its container, once that was told.
+    bare : bool
+        Its container is not there, which a server sees when it is asked for it: then it builds it again.
     """
 
     points: NDArray[Any] | None
     case: str
     container: str | None = None
+    bare: bool = False
 
 
 @dataclass
@@ -165,6 +169,16 @@ class Talk:
     def _kind(self, answer: httpx.Response) -> str:
         return "lost" if answer.status_code == 404 else "answer"
 
+    def awaited(self) -> None:
+        """Wait until the server says what there is."""
+        until = time.monotonic() + PATIENCE
+        with contextlib.suppress(httpx.TransportError):  # others see that it has died
+            while self.http.get("/v1/surfaces?limit=1").status_code == 503:
+                if time.monotonic() > until:
+                    self.say("hangs", f"no list within {PATIENCE:g} s")
+                    return
+                time.sleep(0.05)
+
     def look(self, surface: str) -> dict[str, Any] | None:
         """What the server says of a surface."""
         answer = self.ask("GET", f"/v1/surfaces/{surface}", (200,))
@@ -227,6 +241,10 @@ class Talk:
             if entry is not None and entry["state"] == "ready":
                 self.say("wrong", f"{surface} was no surface, and is ready")
             return
+        if kept.bare:
+            self.lenient = True
+            self.ask("GET", f"/v1/surfaces/{surface}/container", (200,))
+            self.lenient = False
         entry = self.ready(surface)
         if entry is None:
             return

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 import shutil
-from contextlib import AbstractContextManager, nullcontext
+from collections import Counter
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import httpx
 
-from tests.data_folder import APART, bytes_of_surfaces, contents
+from tests.data_folder import bytes_of_surfaces, contents
 
 from .cases import Case, Outcome, stopped
-from .folders import DAMAGES, Folder, Made
+from .folders import DAMAGES, HARMLESS, Folder, Made
 from .forking import DIED
 from .oracle import Problem, Talk
 from .programs import Program, Programs, Server
@@ -20,20 +21,14 @@ from .shim import SHORT, Site
 
 __all__ = ["REPAIRS", "Rest"]
 
-_FAR = "another file system"
-
 #: Options of ``lodestream fsck``; those that it does not have are left out.
-_OPTIONS = ("--repair", "--adopt", "--retry")
+_OPTIONS = ("--repair", "--collect", "--retry")
 
-#: Each damage, looked at and repaired, with all of the folder in one file system and with a part of it in another.
+#: Each damage, looked at and repaired.
 REPAIRS = tuple(
     ", ".join(words)
     for damage in DAMAGES
-    for words in (
-        (damage, "fsck"),
-        *((damage, f"fsck {option}") for option in _OPTIONS),
-        (damage, "fsck --repair", f"{APART}/ in {_FAR}"),
-    )
+    for words in ((damage, "fsck"), *((damage, f"fsck {option}") for option in _OPTIONS))
 )
 
 
@@ -85,12 +80,13 @@ class Rest:
                 self._shim.beneath(folder.data)
                 self._start(folder, fault, case)
             else:
-                damage, command, *where = step.split(", ")
+                damage, command = step.split(", ")
                 folder = self._made.plain.copy(self._folder)
+                precious = bytes_of_surfaces(folder.data)
                 DAMAGES[damage](folder)
+                precious &= contents(folder.data)
                 self._shim.beneath(folder.data)
-                with self._shim.apart(APART) if where else nullcontext():
-                    self._repair(folder, damage, command.split()[1:], fault, case, fails=fails)
+                self._repair(folder, damage, command.split()[1:], fault, case, precious, fails=fails)
         finally:
             shutil.rmtree(self._folder)
 
@@ -144,17 +140,18 @@ class Rest:
         options: list[str],
         fault: AbstractContextManager[None],
         case: str,
+        precious: Counter[str],
         *,
         fails: bool,
     ) -> None:
-        everything, precious = contents(folder.data), bytes_of_surfaces(folder.data)
+        everything = contents(folder.data)
         with fault:
             first = self._programs.run("fsck", str(folder.data), *options)
         self._note()
         self._ended(first, case)
-        if damage != "whole" and not options and first.code == 0:
+        if damage not in HARMLESS and not options and first.code == 0:
             self._say(case, "wrong", f"fsck finds nothing: {first.text()[-300:]}")
-        if damage == "whole" and not fails and first.code != 0:
+        if damage in HARMLESS and not fails and first.code != 0:
             self._say(case, "wrong", f"fsck finds damage where there is none: {first.text()[-300:]}")
         if not options and contents(folder.data) != everything:
             self._say(case, "wrong", "fsck has changed the folder, and was not told to")

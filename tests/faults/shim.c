@@ -87,7 +87,6 @@ struct control {
     uint32_t number;     /* from which occurrence on, the first being 0, */
     uint32_t times;      /* how often, */
     int32_t error;       /* and with which errno; SHORT falls short */
-    int32_t apart;       /* the number of a top that is on a file system of its own, in every mode; 0 is none */
     uint32_t hits;       /* how often it has failed */
     uint32_t writing;    /* somebody writes into the file of calls */
     uint32_t counts[CALL_COUNT][PLACE_COUNT];
@@ -104,11 +103,9 @@ extern const char *lode_call(int number);
 extern int lode_calls(void);
 int lode_calls(void) { return calls; }
 extern const char *lode_place(int number);
-extern const char *lode_top(int number);
 extern size_t lode_size(void);
 extern int lode_leave_signal_stack(void);
 const char *lode_call(int number) { return number < CALL_COUNT ? call_names[number] : NULL; }
-const char *lode_top(int number) { return number < TOP_COUNT ? top_names[number] : NULL; }
 size_t lode_size(void) { return sizeof(struct control); }
 const char *lode_place(int number)
 {
@@ -325,10 +322,6 @@ static int names_fault(int call, int from, const char *old, int to, const char *
     if (page == NULL)
         return NO_FAULT;
     int place = place_at(to, new);
-    if (page->apart && (place_at(from, old) / KIND_COUNT == page->apart) != (place / KIND_COUNT == page->apart)) {
-        errno = EXDEV;
-        return EXDEV;
-    }
     return place >= 0 ? path_fault(call, to, new) : path_fault(call, from, old);
 }
 

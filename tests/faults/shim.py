@@ -133,7 +133,7 @@ class Shim:
     def __init__(self, library: Path, page: Path) -> None:
         names = ctypes.CDLL(str(library))
         self._calls = _names(names.lode_call)
-        self._tops, self._places = _names(names.lode_top), _names(names.lode_place)
+        self._places = _names(names.lode_place)
         names.lode_size.restype = ctypes.c_size_t
         kind = _layout(len(self._calls), len(self._places))
         assert ctypes.sizeof(kind) == names.lode_size(), "expected the page of shim.c"
@@ -156,15 +156,6 @@ class Shim:
         """Say in which folder calls are counted and fail."""
         self._page.mode = _PASS
         self._page.root = os.fsencode(os.path.realpath(root))
-
-    @contextmanager
-    def apart(self, folder: str) -> Iterator[None]:
-        """Let a folder be on a file system of its own meanwhile: nothing is renamed into it."""
-        self._page.apart = self._tops.index(folder)
-        try:
-            yield
-        finally:
-            self._page.apart = 0
 
     @contextmanager
     def counting(self) -> Iterator[None]:
@@ -281,7 +272,6 @@ def _layout(calls: int, places: int) -> type[ctypes.Structure]:
             ("number", ctypes.c_uint32),
             ("times", ctypes.c_uint32),
             ("error", ctypes.c_int32),
-            ("apart", ctypes.c_int32),
             ("hits", ctypes.c_uint32),
             ("writing", ctypes.c_uint32),
             ("counts", ctypes.c_uint32 * places * calls),

@@ -152,6 +152,17 @@ def _delete(work: Operation) -> None:
     work.talk.check(surface)
 
 
+def _delete_and_push(work: Operation) -> None:
+    # Whoever does not know whether it is deleted pushes it again: what is answered then holds.
+    body, points = work.fresh()
+    surface = work.sent(body, points)
+    work.settle(surface)
+    with work.armed():
+        work.delete(surface)
+    _settle(work, work.send(body, points))
+    work.talk.check(surface)
+
+
 def _delete_shared(work: Operation) -> None:
     # The same bytes under another option are another surface with the same container.
     body, points = work.fresh()
@@ -242,6 +253,7 @@ STEPS: dict[str, Step] = {
     "level": _level,
     "stream": _stream,
     "delete": _delete,
+    "delete and push": _delete_and_push,
     "delete shared": _delete_shared,
     "delete unfinished": _delete_unfinished,
     "retry": _retry,

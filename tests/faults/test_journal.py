@@ -11,7 +11,7 @@ from tests.faults.shim import Fault, Site
 
 
 def case(number: int) -> Case:
-    return Case("start", "serve", Fault("read", "records/ID", number, "EIO"), Site("read", "records/ID", "a.py:1"))
+    return Case("start", "serve", Fault("read", "surfaces/ID", number, "EIO"), Site("read", "surfaces/ID", "a.py:1"))
 
 
 def test_a_journal_gives_what_came_of_cases_and_leaves_the_others(tmp_path: Path) -> None:

@@ -145,14 +145,6 @@ def test_one_call_fails_and_only_that_one(bench: Bench, fault: Fault, changes: S
         assert bench.run(elsewhere) == bench.well(elsewhere)
 
 
-def test_a_folder_on_another_file_system_takes_no_names(bench: Bench) -> None:
-    root = bench.new()
-    with bench.shim.apart("damaged"):
-        says = bench.run(root)
-    assert says["rename"] == "Invalid-cross-device-link"
-    assert bench.run(bench.new())["rename"] != says["rename"]
-
-
 def test_each_site_has_every_error_its_call_can_return_and_later_one() -> None:
     site, other = Site("rename", "records/ID", "a.py:1"), Site("fsync", "records", "a.py:2")
     seen: set[Site] = set()

@@ -43,7 +43,8 @@ def main() -> int:
         print(finding)
     print(
         f"{done.operations} operations in {done.seconds:.0f} s, {done.unanswered} of them without an answer: "
-        f"{done.uploads} uploads, {done.deletes} deletes, {done.reads} reads, {done.refused} refused for lack of room; "
+        f"{done.uploads} uploads, {done.deletes} deletes, {done.pointed} changes of names, "
+        f"{done.reads} reads, {done.refused} refused for lack of room; "
         f"{dict(done.disasters)}; {done.ready} surfaces at the end; {len(done.findings)} findings"
     )
     return 1 if done.findings else 0

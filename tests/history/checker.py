@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from .events import Answer, Finding, History, Operation, Seen, Subject
-from .order import ABSENT, PRESENT, Step, Unexplained, unexplained
+from .order import ABSENT, BARE, PRESENT, Step, Unexplained, unexplained
 
 __all__ = ["check"]
 
-# 429 and 503 come from a server that has too much to do or ends; 503 of bytes also says that they are missing.
+# From a server that has too much to do, makes its index again, or ends.
 _BUSY = {429, 503}
 _FILES = {200, 404, 409, 424} | _BUSY
 _ALLOWED = {
@@ -27,17 +27,19 @@ _ALLOWED = {
     "list": {200} | _BUSY,
     "fetch": _FILES,
     "values": _FILES | {507},  # there has to be room for the file of a level
+    "point": {200, 201, 404, 409, 424, 507} | _BUSY,  # it leads to nothing that is not ready
+    "unpoint": {204, 404} | _BUSY,
+    "follow": {200, 404} | _BUSY,
+    "names": {200} | _BUSY,
 }
-# Codes of a 503 that say nothing of the surface.
-_ABOUT_THE_SERVER = {"busy", "restarting"}
-
 # What says that something was done, and what says nothing of it: such a one has until its server ends.
-_DONE = {"upload": {200, 202}, "delete": {204}, "retry": {200, 202}}
+_DONE = {"upload": {200, 202}, "delete": {204}, "retry": {200, 202}, "point": {200, 201}, "unpoint": {204}}
 _UNKNOWN = {500, 502, 503, 504}
+
+_OF_NAMES = ("point", "unpoint", "follow", "names")
 
 # The states of a surface whose bytes are answered so.
 _BYTES = {200: {"ready"}, 404: {ABSENT}, 409: {"queued", "building", "waiting"}, 424: {"failed", "waiting"}}
-_NO_BYTES = frozenset({"missing", "waiting"})
 
 _SHOWN = 12
 
@@ -58,6 +60,7 @@ def check(history: History) -> list[Finding]:
         *_answers(history, surfaces),
         *surfaces.findings(),
         *_orders(history, surfaces),
+        *_names(history),
     ]
 
 
@@ -177,33 +180,56 @@ def _more_than_one(rule: str, expected: str, found: Mapping[T, Operation]) -> It
 
 def _orders(history: History, surfaces: _Surfaces) -> Iterator[Finding]:
     steps: dict[Subject, list[Step]] = {subject: [] for subject in surfaces.ids}
-    shared: set[tuple[Subject, int]] = set()
     for operation in history.operations:
-        if operation.subject is not None:
+        if operation.kind in _OF_NAMES:
+            for seen in operation.answer.seen if operation.answer is not None else ():
+                if (of := surfaces.only(seen.id)) is not None:
+                    steps[of].append(_seen_as(operation, seen.state))
+        elif operation.subject is not None:
             steps.setdefault(operation.subject, []).extend(_steps(operation, history))
-            for subject in _sharing(operation, steps):
-                # One is enough between what is restored and what is restored next: nothing else makes bytes missing.
-                restored = sum(mark.kind == "restored" and mark.moment <= operation.begun for mark in history.marks)
-                if (subject, restored) not in shared:
-                    shared.add((subject, restored))
-                    steps[subject].append(Step("shared", operation.begun, operation=operation))
         elif operation.answer is not None and operation.answer.status == 200:
             listed = {seen.id: seen.state for seen in operation.answer.seen}
             for subject, ids in surfaces.ids.items():
                 state = next((listed[surface] for surface in ids if surface in listed), ABSENT)
-                steps[subject].append(_read(operation, {state}))
+                steps[subject].append(_seen_as(operation, state))
     for subject, own in steps.items():
         found = unexplained(own, history.marks)
         if found is not None:
             yield _out_of_order(subject, found, own)
 
 
-def _sharing(operation: Operation, subjects: Iterable[Subject]) -> list[Subject]:
-    """Whose bytes an upload brings too, if they are missing. At which start they are found is open."""
-    if operation.kind != "upload":
-        return []
-    own = operation.subject
-    return [other for other in subjects if own is not None and other != own and other.sha256 == own.sha256]
+def _names(history: History) -> Iterator[Finding]:
+    """Where the answers about a name have no order."""
+    names = {operation.name for operation in history.operations if operation.name is not None}
+    steps: dict[str, list[Step]] = {name: [] for name in sorted(names)}
+    for operation in history.operations:
+        if operation.kind == "names":
+            if operation.answer is not None and operation.answer.status == 200:
+                found = dict(operation.answer.names)
+                for name, own in steps.items():
+                    own.append(_read(operation, {found.get(name, ABSENT)}))
+        elif operation.name is not None:
+            steps[operation.name].extend(_steps_of_name(operation, history))
+    for name, own in steps.items():
+        unexplained_ = unexplained(own, history.marks)
+        if unexplained_ is not None:
+            yield _out_of_order(name, unexplained_, own)
+
+
+def _steps_of_name(operation: Operation, history: History) -> Iterator[Step]:
+    answer, kind = operation.answer, operation.kind
+    status = None if answer is None else answer.status
+    if kind == "follow":
+        # That it leads to a surface that was deleted meanwhile is told with 404 too.
+        for seen in answer.seen if answer is not None else ():
+            yield _read(operation, {seen.id})
+    elif status in _DONE[kind] or status is None or status in _UNKNOWN:
+        done = status in _DONE[kind]
+        ended, latest = (operation.ended, None) if done else (None, history.ends.get(operation.server))
+        as_: Literal["point", "delete"] = "point" if kind == "point" else "delete"
+        yield Step(as_, operation.begun, ended, latest, operation=operation, value=operation.surface)
+    elif kind == "unpoint" and status == 404:
+        yield _read(operation, {ABSENT})
 
 
 def _steps(operation: Operation, history: History) -> Iterator[Step]:
@@ -220,13 +246,12 @@ def _steps(operation: Operation, history: History) -> Iterator[Step]:
     elif kind in ("fetch", "values") and answer is not None:
         if answer.status in _BYTES and not answer.seen:
             yield _read(operation, _BYTES[answer.status])
-        elif answer.status == 503 and answer.code not in _ABOUT_THE_SERVER:
-            yield _read(operation, _NO_BYTES)
     elif status == 404:
         yield _read(operation, {ABSENT})
     # Apart from what it did: the answer may be older than the end of it.
     for seen in answer.seen if answer is not None else ():
-        yield _read(operation, {seen.state})
+        # Whoever has pushed and is told that it is ready does not push again.
+        yield _read(operation, {seen.state}) if kind == "upload" else _seen_as(operation, seen.state)
 
 
 def _write(operation: Operation, ended: float | None, latest: float | None) -> Step:
@@ -238,7 +263,11 @@ def _read(operation: Operation, observed: Iterable[str]) -> Step:
     return Step("read", operation.begun, operation.ended, observed=frozenset(observed), operation=operation)
 
 
-def _out_of_order(subject: Subject, found: Unexplained, steps: list[Step]) -> Finding:
+def _seen_as(operation: Operation, state: str) -> Step:
+    return _read(operation, {state, BARE} if state == "ready" else {state})
+
+
+def _out_of_order(subject: Subject | str, found: Unexplained, steps: list[Step]) -> Finding:
     step, possible = found.step, found.possible
     observed = step.observed if step.kind == "read" else frozenset({f"a {step.kind} that was acknowledged"})
     if ABSENT in observed and ABSENT not in possible:

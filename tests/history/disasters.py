@@ -1,10 +1,8 @@
-"""What may befall a server: ended, killed, out of room, without a folder, lost and restored, without an extra."""
+"""What may befall a server: ended, killed, out of room, lost and restored, without its index, without an extra."""
 
 from __future__ import annotations
 
-import itertools
 import random
-import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,6 +20,12 @@ from .site import Site
 __all__ = ["KINDS", "Disasters"]
 
 T = TypeVar("T")
+
+#: What may become of an index.
+_INDICES = ("removed", "scratch", "cut", "head", "pages")
+
+#: Seconds after which what nothing refers to may be removed, and more.
+_LONG = 2 * 86400.0
 
 
 _MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
@@ -115,47 +119,75 @@ class Disasters:
             self._calm()
         disk.empty()
 
-    def unmounted(self) -> None:
-        """One of the folders, or two, are not there when the server starts: it must refuse, and lose nothing."""
-        names = self._next("unmounted", _unmounted())
-        self._end(self._random.choice(("kill", "stop")))
-        data, aside = self._site.data, self._site.aside
-        aside.mkdir()
-        for name in names:
-            (data / name).rename(aside / name)
-        self._refused(f"without {' and '.join(names)}")
-        for name in names:
-            # Where a disk is not mounted there is the folder that it is mounted on.
-            (data / name).mkdir(exist_ok=True)
-        self._refused(f"with {' and '.join(names)} empty")
-        for name in names:
-            shutil.rmtree(data / name)
-            (aside / name).rename(data / name)
-        aside.rmdir()
-        self._site.start()
-
-    def _refused(self, words: str) -> None:
-        arguments = ("serve", "--data", str(self._site.inside), "--host", "127.0.0.1", "--port", "0")
-        result = self._site.command(*arguments)
-        lines = result.stderr.strip().splitlines()
-        if result.returncode != 1 or len(lines) != 1:
-            said = " / ".join(lines[-3:])
-            expected = f"{words}: expected a server that ends with 1 and one line"
-            self._history.found("start", f"{expected}, got {result.returncode} and {len(lines)} lines: {said}")
-
     def backup(self) -> None:
-        """The folder is copied under load as docs/operating.md says, lost later, and restored from the copy."""
+        """The folder is copied under load as docs/operating.md says, lost later, and restored from the copy.
+
+        With no index, with one that was copied under load too, or with the one of the folder that was lost.
+        """
         site, history = self._site, self._history
+        index = self._next("backup", ("none", "copied", "later"))
         history.mark("backup begins")
         data_folder.copy_small(site.data, site.backup)
         self._calm()
         data_folder.copy_rest(site.data, site.backup)
+        if index == "copied":
+            data_folder.copy_index(site.data, site.backup)
         history.mark("backup ends")
         self._calm()
         self._end(self._random.choice(("kill", "stop")))
+        if index == "later":
+            data_folder.move_index(site.data, site.backup)
         history.mark("restored")
         site.move_to(site.backup)
+        site.start(ready=True)
+
+    def index(self) -> None:
+        """A server starts without its index, with a damaged one, or with one of long ago."""
+        how = self._next("index", (*_INDICES, "older"))
+        self._end(self._random.choice(("kill", "stop")))
+        data, aside = self._site.data, self._site.aside
+        if how == "older":
+            data_folder.move_index(aside, data)
+        elif how == "removed":
+            data_folder.move_index(data, aside)
+        else:
+            self._harm(how)
+        self._site.start(ready=True)
+
+    def live_index(self) -> None:
+        """The same while the server runs: it asks for a little patience, and makes the index again."""
+        self._harm(self._next("live index", _INDICES))
+        eventually(self._lists, "a server to make its index again")
+
+    def _harm(self, how: str) -> None:
+        data = self._site.data
+        if how == "removed":
+            data_folder.remove_index(data)
+        elif how == "scratch":
+            data_folder.remove_scratch(data)
+        else:
+            data_folder.damage_index(data, how, self._random)
+
+    def _lists(self) -> bool:
+        answer = self._operator.list(next(iter(self._history.admins), None))
+        return answer is not None and answer.status == 200
+
+    def collect(self) -> None:
+        """Everything is old, and what nothing refers to is removed while no server runs."""
+        site = self._site
+        self._end(self._random.choice(("kill", "stop")))
+        data_folder.age(site.data, _LONG)
+        self._fsck("--collect")
+        if left := data_folder.strays(site.data):
+            self._history.found("collect", f"expected no strays, got {len(left)}: {', '.join(left[:3])}")
         site.start()
+
+    def _fsck(self, option: str) -> None:
+        result = self._site.command("fsck", str(self._site.inside), option)
+        if result.returncode != 0:
+            said = " / ".join(result.stderr.strip().splitlines()[-3:])
+            expected = f"expected lodestream fsck {option} to end with 0"
+            self._history.found("fsck", f"{expected}, got {result.returncode}: {said}")
 
     def extra(self) -> None:
         """A server starts without rasterio: what needs it waits, and is built once it is there again."""
@@ -171,11 +203,7 @@ class Disasters:
         self._reaches(picture, "waiting", "without rasterio")
         self._end(self._random.choice(("kill", "stop")))
         if self._next("extra", ("request", "command")) == "command":
-            result = site.command("fsck", str(site.inside), "--retry")
-            if result.returncode != 0:
-                said = " / ".join(result.stderr.strip().splitlines()[-3:])
-                expected = "expected lodestream fsck --retry to end with 0"
-                self._history.found("retry", f"{expected}, got {result.returncode}: {said}")
+            self._fsck("--retry")
             site.start()
         else:
             site.start()
@@ -187,10 +215,14 @@ class Disasters:
         until, ready = time.monotonic() + 2 * _PATIENCE, 0
         operator = self._operator
         operator.list(None if not subjects else subjects[0].owner)
+        operator.names(None if not subjects else subjects[0].owner)
         for subject in subjects:
             state = operator.settled(subject, until)
             if state == "waiting":
                 operator.retry(subject)
+                state = self._after_retry(subject, until)
+            if state == "waiting" and self.done["backup"]:  # half of it was restored: somebody has to push it again
+                operator.upload(subject)
                 state = self._after_retry(subject, until)
             if state is None or state == "waiting":
                 self._history.found("never built", f"{subject}: expected its build to come to an end, got {state}")
@@ -230,18 +262,14 @@ class Disasters:
         return left.pop()
 
 
-def _unmounted() -> list[tuple[str, ...]]:
-    """Each of the folders by itself, and each pair of neighbours."""
-    names = data_folder.KEPT
-    return [*((name,) for name in names), *itertools.pairwise(names)]
-
-
 #: What may happen, by name.
 KINDS: dict[str, Callable[[Disasters], None]] = {
     "restart": Disasters.restart,
     "kill": Disasters.kill,
     "full": Disasters.full,
-    "unmounted": Disasters.unmounted,
     "backup": Disasters.backup,
+    "index": Disasters.index,
+    "live-index": Disasters.live_index,
+    "collect": Disasters.collect,
     "extra": Disasters.extra,
 }

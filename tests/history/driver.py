@@ -18,7 +18,10 @@ from .events import Answer, History, Kind, Operation, Seen, Subject
 
 __all__ = ["Client", "Crowd", "Goods", "Server"]
 
-_SETTLED = ("ready", "failed", "missing", "waiting")
+_SETTLED = ("ready", "failed", "waiting")
+
+# What is asked of a surface by its id.
+_OF_ONE = ("delete", "retry", "look", "fetch", "values", "point")
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,14 @@ class Goods:
         The text of each token, by its name; empty where there are none.
     arrays : set of Subject
         Those whose bytes are an NPY file, which the finest level comes back as.
+    names : dict
+        Names that stay, each with its owner.
     """
 
     bodies: dict[Subject, bytes] = field(default_factory=dict)
     tokens: Mapping[str, str] = field(default_factory=dict)
     arrays: set[Subject] = field(default_factory=set)
+    names: dict[str, str | None] = field(default_factory=dict)
 
     def add(self, owner: str | None, name: str, body: bytes, *, sound: bool = True, array: bool = False) -> Subject:
         """One thing more."""
@@ -173,6 +179,48 @@ class Client:
 
         return self._do("list", caller, None, None, ask)
 
+    def point(self, name: str, subject: Subject) -> Answer | None:
+        """Let a name lead to a surface."""
+
+        def ask(url: str, headers: dict[str, str]) -> Answer:
+            wanted = {"surface": self._ids[subject]}
+            return _entry(self._http.put(f"{url}/v1/names/{name}", json=wanted, headers=headers), entries=False)
+
+        return self._do("point", self._goods.names[name], subject, self._ids.get(subject), ask, name)
+
+    def unpoint(self, name: str) -> Answer | None:
+        """Let a name lead nowhere."""
+
+        def ask(url: str, headers: dict[str, str]) -> Answer:
+            return _entry(self._http.delete(f"{url}/v1/names/{name}", headers=headers))
+
+        return self._do("unpoint", self._goods.names[name], None, None, ask, name)
+
+    def follow(self, name: str) -> Answer | None:
+        """Ask for the surface to which a name leads."""
+
+        def ask(url: str, headers: dict[str, str]) -> Answer:
+            return _entry(self._http.get(f"{url}/v1/names/{name}", headers=headers))
+
+        return self._do("follow", self._goods.names[name], None, None, ask, name)
+
+    def names(self, caller: str | None) -> Answer | None:
+        """Ask which names there are."""
+
+        def ask(url: str, headers: dict[str, str]) -> Answer:
+            names: list[tuple[str, str]] = []
+            place = "/v1/names?limit=1000"
+            while place:
+                answer = self._http.get(f"{url}{place}", headers=headers)
+                if answer.status_code != 200:
+                    return _entry(answer)
+                page = answer.json()
+                names += ((each["name"], each["surface"].rpartition("/")[2]) for each in page["names"])
+                place = page["next"]
+            return Answer(200, names=tuple(names))
+
+        return self._do("names", caller, None, None, ask)
+
     def settled(self, subject: Subject, until: float) -> str | None:
         """The state in which a surface stays, "absent" if there is none; None if there is no answer until then."""
         while time.monotonic() < until:
@@ -204,15 +252,16 @@ class Client:
         subject: Subject | None,
         surface: str | None,
         ask: Callable[[str, dict[str, str]], Answer],
+        name: str | None = None,
     ) -> Answer | None:
         servers = self._servers()
-        if not servers or (kind not in ("upload", "list") and surface is None):
+        if not servers or (kind in _OF_ONE and surface is None):
             time.sleep(0.02)
             return None
         server = self._random.choice(servers)
         token = self._goods.tokens.get(caller or "")
         headers = {} if token is None else {"authorization": f"Bearer {token}"}
-        operation = self._history.begin(self._name, server.name, kind, caller, subject, surface)
+        operation = self._history.begin(self._name, server.name, kind, caller, subject, surface, name)
         answer = self._asked(operation, lambda: ask(server.url, headers))
         if answer is not None:
             self._history.end(operation, answer)
@@ -238,11 +287,11 @@ def _seen(entry: dict[str, Any]) -> Seen:
     return Seen(entry["id"], entry["state"], entry["name"], entry["container"])
 
 
-def _entry(answer: httpx.Response) -> Answer:
-    """A surface, or a problem."""
+def _entry(answer: httpx.Response, *, entries: bool = True) -> Answer:
+    """A surface, or a problem; without entries something else."""
     if answer.headers.get("content-type", "").startswith("application/problem+json"):
         return Answer(answer.status_code, code=str(answer.json()["code"]))
-    if answer.status_code in (200, 202) and answer.content:
+    if answer.status_code in (200, 202) and answer.content and entries:
         return Answer(answer.status_code, (_seen(answer.json()),))
     return Answer(answer.status_code)
 
@@ -282,6 +331,7 @@ class Crowd:
         self._subjects = list(subjects)
         self._all = list(goods.bodies)
         self._callers: list[str | None] = [*goods.tokens] or [None]
+        self._names = [*goods.names] or [""]
         self._over = threading.Event()
         self._failures: list[BaseException] = []
         self._clients = []
@@ -317,7 +367,8 @@ class Crowd:
     def _act(self, client: Client, random_: random.Random) -> None:
         subject = random_.choice(self._subjects)
         any_ = random_.choice(self._all)
-        match random_.choices(range(6), (35, 16, 20, 8, 15, 6))[0]:
+        name = random_.choice(self._names)
+        match random_.choices(range(10), (35, 16, 20, 8, 15, 6, *((9, 2, 6, 3) if name else (0, 0, 0, 0))))[0]:
             case 0:
                 client.upload(subject)
             case 1:
@@ -329,5 +380,14 @@ class Crowd:
                 client.list(random_.choice(self._callers))
             case 4:
                 client.fetch(any_)
-            case _:
+            case 5:
                 client.values(any_)
+            case 6:
+                owner = self._goods.names[name]
+                client.point(name, random_.choice([each for each in self._subjects if each.owner == owner]))
+            case 7:
+                client.unpoint(name)
+            case 8:
+                client.follow(name)
+            case _:
+                client.names(random_.choice(self._callers))

@@ -10,7 +10,9 @@ from typing import Literal, TypeAlias
 
 __all__ = ["Answer", "Finding", "History", "Kind", "Mark", "Operation", "Seen", "Subject"]
 
-Kind: TypeAlias = Literal["upload", "delete", "retry", "look", "list", "fetch", "values"]
+Kind: TypeAlias = Literal[
+    "upload", "delete", "retry", "look", "list", "fetch", "values", "point", "unpoint", "follow", "names"
+]
 MarkKind: TypeAlias = Literal["backup begins", "backup ends", "restored"]
 
 
@@ -71,6 +73,8 @@ class Answer:
         Of the bytes of a container, or of the values.
     named : str or None
         The SHA-256 under which the server showed a container.
+    names : tuple of (str, str)
+        Names that stay, and the ids of the surfaces to which they lead.
     """
 
     status: int
@@ -78,6 +82,7 @@ class Answer:
     code: str | None = None
     sha256: str | None = None
     named: str | None = None
+    names: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(eq=False)
@@ -92,7 +97,7 @@ class Operation:
     caller : str or None
         Name of the token with which it was asked.
     subject : Subject or None
-        None for a list.
+        None for a list, and of a name for all but where it is to lead.
     surface : str or None
         The id that was asked for.
     begun : float
@@ -100,6 +105,8 @@ class Operation:
     ended : float or None
         When the answer had come; None when none came.
     answer : Answer or None
+    name : str or None
+        A name that stays, and leads to one surface after another.
     """
 
     client: str
@@ -111,10 +118,13 @@ class Operation:
     begun: float
     ended: float | None = None
     answer: Answer | None = None
+    name: str | None = None
 
     def __str__(self) -> str:
         ended = "" if self.ended is None else f"{self.ended:.4f}"
         words = f"{self.begun:10.4f} to {ended:>9} {self.client} at {self.server}: {self.kind}"
+        if self.name is not None:
+            words += f" {self.name}" + (f" to {self.subject}" if self.subject is not None else "")
         if self.caller is not None:
             words += f" as {self.caller}"
         if self.answer is None:
@@ -166,7 +176,7 @@ class History:
     operations : list of Operation
     marks : list of Mark
     ends : dict
-        When each server had ended: what it had not answered by then has happened before that moment or never.
+        When another server was ready after each of them: what it had not answered has happened by then, or never.
     findings : list of Finding
         What was seen to be wrong while it was recorded.
     """
@@ -187,10 +197,11 @@ class History:
         caller: str | None = None,
         subject: Subject | None = None,
         surface: str | None = None,
+        name: str | None = None,
     ) -> Operation:
         """Note that something is about to be asked."""
         with self._lock:
-            operation = Operation(client, server, kind, caller, subject, surface, self.clock())
+            operation = Operation(client, server, kind, caller, subject, surface, self.clock(), name=name)
             self.operations.append(operation)
             return operation
 
@@ -211,9 +222,9 @@ class History:
             return sum(operation.answer is not None and operation.answer.status == 507 for operation in self.operations)
 
     def server_ended(self, server: str) -> None:
-        """Note that a server has ended, with all that it was doing."""
+        """Note that a server has ended, and that all it was doing has happened by now, or never will."""
         with self._lock:
-            self.ends[server] = self.clock()
+            self.ends.setdefault(server, self.clock())
 
     def mark(self, kind: MarkKind) -> None:
         """Note that a backup begins or has ended, or that a server is about to start in what was restored from it."""

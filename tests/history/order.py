@@ -8,24 +8,39 @@ objects", 1990). All orders are tried at once, answer by answer (Lowe, "Testing 
 kept are the ways in which everything up to now can have happened, and an operation is put in order only when its own
 answer, or another one, asks for it.
 
+A name that stays is a register too: it leads nowhere, or to one surface, whose id is its state.
+
 A backup is not a moment: files are copied one after another. It holds what the surface was at any moment of it, and if
 the surface was deleted or uploaded meanwhile, perhaps half of it.
-
-Uploads of the same bytes are stored once. What is missing is found again at any later start, once another owner has
-uploaded it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
 
 from .events import Mark, Operation
 
-__all__ = ["ABSENT", "PRESENT", "SPONTANEOUS", "Step", "Unexplained", "apply", "later", "restored", "unexplained"]
+__all__ = [
+    "ABSENT",
+    "BARE",
+    "PRESENT",
+    "SPONTANEOUS",
+    "Step",
+    "Unexplained",
+    "apply",
+    "later",
+    "restored",
+    "unexplained",
+]
 
 ABSENT = "absent"
+
+#: After a restore: it looks ready until somebody asks for its bytes, which are not there.
+BARE = "bare"
+
 _UNSETTLED = frozenset({"queued", "building", "waiting", "ready", "failed"})
 
 #: What each state may turn into while nobody asks for anything; `ready` and `failed` are for good.
@@ -36,7 +51,7 @@ SPONTANEOUS = {
     "waiting": _UNSETTLED,
     "ready": frozenset({"ready"}),
     "failed": frozenset({"failed"}),
-    "missing": frozenset({"missing"}),
+    BARE: frozenset({BARE}) | _UNSETTLED,
 }
 
 #: The states of a surface that is there.
@@ -51,8 +66,7 @@ class Step:
 
     Attributes
     ----------
-    kind : "read", "upload", "delete", "retry" or "shared"
-        "shared": another owner's upload of the same bytes.
+    kind : "read", "upload", "delete", "retry" or "point"
     begun : float
     ended : float or None
         When its answer had come. None: it may have happened or not.
@@ -62,14 +76,17 @@ class Step:
         Of a read, the states of which the surface was in one.
     operation : Operation or None
         Where it comes from.
+    value : str or None
+        To which surface a name leads from then on.
     """
 
-    kind: Literal["read", "upload", "delete", "retry", "shared"]
+    kind: Literal["read", "upload", "delete", "retry", "point"]
     begun: float
     ended: float | None = None
     latest: float | None = None
     observed: States = frozenset()
     operation: Operation | None = None
+    value: str | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +115,7 @@ class _Way(NamedTuple):
 
 def later(states: States) -> States:
     """The states that these may have turned into by themselves."""
-    return frozenset().union(*(SPONTANEOUS[state] for state in states))
+    return frozenset().union(*(SPONTANEOUS.get(state, {state}) for state in states))
 
 
 def apply(step: Step, states: States) -> States:
@@ -107,25 +124,25 @@ def apply(step: Step, states: States) -> States:
         return later(states) & step.observed
     if step.kind == "delete":
         # Only an answer says that there was something to delete.
-        return frozenset({ABSENT}) if step.ended is None or states & PRESENT else frozenset()
+        return frozenset({ABSENT}) if step.ended is None or states - {ABSENT} else frozenset()
+    if step.kind == "point":
+        return frozenset({step.value or ABSENT})
     return frozenset().union(*(_taken_up(step.kind, state) for state in states))
 
 
 def _taken_up(kind: str, state: str) -> States:
-    if state == "failed" and kind != "shared":
+    if state == "failed":
         return frozenset({"failed", "queued"})
-    if kind == "upload" and state in (ABSENT, "missing"):
+    if kind == "upload" and state in (ABSENT, BARE):
         return frozenset({"queued"})
-    if kind == "shared" and state == "missing":
-        return frozenset({"missing", "queued"})
     return frozenset({state})
 
 
 def restored(saved: States) -> States:
     """The states of a surface in what was restored, given those that it had during the backup."""
     if ABSENT in saved and saved & PRESENT:
-        # It came or went meanwhile: its record, its upload and its container may be from different moments.
-        return saved | {"queued", "missing"}
+        # It came or went meanwhile: some of its files may be of another upload of it, or may not be there.
+        return saved | {"queued", BARE}
     return saved
 
 
@@ -207,23 +224,23 @@ def _all_orders(ways: Iterable[_Way], steps: Sequence[Step], without: int | None
 
 
 def _distinct(pending: frozenset[int], steps: Sequence[Step]) -> Iterator[int]:
-    # Of steps without an answer that do the same and never end, one is as good as another.
-    seen = set()
+    # Of steps without an answer that do the same, the one that may happen for the shortest time is as good as another.
+    first: dict[tuple[str, str | None], tuple[float, int]] = {}
     for number in sorted(pending):
         step = steps[number]
-        if step.ended is None and step.latest is None:
-            if step.kind in seen:
-                continue
-            seen.add(step.kind)
-        yield number
+        if step.ended is not None:
+            yield number
+            continue
+        until = math.inf if step.latest is None else step.latest
+        what = (step.kind, step.value)
+        first[what] = min(first.get(what, (math.inf, number)), (until, number))
+    yield from (number for _, number in first.values())
 
 
 def _happened(way: _Way, number: int, steps: Sequence[Step]) -> _Way | None:
-    if steps[number].kind == "shared" and steps[number].ended is None and "missing" not in way.states:
-        return None  # it would change nothing, and may come later or never
     states = apply(steps[number], way.states)
-    if not states:
-        return None
+    if not states or (steps[number].ended is None and states == way.states):
+        return None  # it cannot happen, or it need not
     saved = way.saved | states if way.saving and way.saved is not None else way.saved
     return _Way(states, saved, way.saving, way.pending - {number})
 

@@ -11,10 +11,12 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 
 from lodestream_server.access.tokens import TokenFile
@@ -115,6 +117,7 @@ class Site:
         self._outside = self.disk.root if self.disk is not None else root
         self._history = history
         self._number = 0
+        self._ended: list[str] = []
         self._folder = "data"
         self._running: tuple[programs.Server, Server] | None = None
         self.data.mkdir()
@@ -126,8 +129,8 @@ class Site:
 
     @property
     def aside(self) -> Path:
-        """A place beside the server's folder, for what is taken away from it."""
-        return self._outside / f"{self._folder}.aside"
+        """A place beside the server's folder, for an index that is taken away from it."""
+        return self._outside / "aside"
 
     @property
     def backup(self) -> Path:
@@ -143,13 +146,15 @@ class Site:
         """A token, as ``lodestream token create`` makes it."""
         return TokenFile(self.data / "tokens.json").create(name, (scope,))[0]
 
-    def start(self, without: Path | None = None, **settings: Any) -> None:
+    def start(self, without: Path | None = None, *, ready: bool = False, **settings: Any) -> None:
         """Start a server.
 
         Parameters
         ----------
         without : Path or None
             A folder with modules that stand before those that are installed.
+        ready : bool
+            Nobody asks it before it says that it is ready: what it knew at first may be of another folder.
         **settings
             Fields of `Settings`.
         """
@@ -162,13 +167,31 @@ class Site:
         except pytest.fail.Exception as failure:
             self._history.found("start", f"{name}: expected a server that starts, got {failure}")
             raise AssertionError(str(failure)) from None
-        self._running = (server, Server(name, server.url))
+        known, before = Server(name, server.url), list(self._ended)
+        if ready:
+            self._settle(server, known, before)
+        self._running = (server, known)
+        if not ready:
+            threading.Thread(target=self._settle, args=(server, known, before), daemon=True).start()
+
+    def _settle(self, server: programs.Server, known: Server, before: Sequence[str]) -> None:
+        """Wait until a server has taken up what others had begun: that has happened by then, or never will."""
+        with httpx.Client(trust_env=False, verify=False, timeout=_PATIENCE) as http:
+            while programs.alive(server.pid):
+                with contextlib.suppress(httpx.TransportError):
+                    if http.get(f"{known.url}/readyz").status_code == 200:
+                        break
+                time.sleep(0.05)
+            else:
+                return
+        for name in before:
+            self._history.server_ended(name)
 
     def stop(self) -> None:
         """Tell the server to end."""
         server, known = self._gone()
         code = server.stop()
-        self._history.server_ended(known.name)
+        self._ended.append(known.name)
         if code not in (0, -signal.SIGTERM):
             self._history.found("end", f"{known.name}: expected an end with 0 or by SIGTERM, got {code}")
 
@@ -178,7 +201,7 @@ class Site:
         children = programs.descendants(server.pid)
         server.kill()
         eventually(lambda: not any(map(programs.alive, children)), "the server's processes to end with it")
-        self._history.server_ended(known.name)
+        self._ended.append(known.name)
 
     def kill_builds(self) -> int:
         """Kill the processes that build; how many there were."""
@@ -192,28 +215,18 @@ class Site:
         return killed
 
     def command(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run the command ``lodestream`` and keep its standard error; a server is told to end as soon as it serves."""
+        """Run the command ``lodestream``, and keep what it says."""
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         command = [*self._wrapper(), sys.executable, "-m", "lodestream_client", *arguments]
-        with subprocess.Popen(
+        return subprocess.run(
             command,
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
+            capture_output=True,
             env=environment,
             text=True,
-        ) as process:
-            patience = threading.Timer(_PATIENCE, process.kill)
-            patience.start()
-            lines = []
-            assert process.stderr is not None
-            for line in process.stderr:
-                lines.append(line)
-                if line.startswith("Lodestream serving "):
-                    process.terminate()
-            process.wait()
-            patience.cancel()
-        return subprocess.CompletedProcess(command, process.returncode, None, "".join(lines))
+            timeout=_PATIENCE,
+            check=False,
+        )
 
     @property
     def inside(self) -> Path:

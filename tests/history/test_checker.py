@@ -35,6 +35,8 @@ class Story:
         caller: str | None = None,
         seen: Sequence[Seen] = (),
         server: str = "server 1",
+        name: str | None = None,
+        names: tuple[tuple[str, str], ...] = (),
         **answer: str,
     ) -> Operation:
         begun, ended = at or (self.now + 1, self.now + 2)
@@ -43,9 +45,9 @@ class Story:
             assert subject is not None
             seen = (entry(subject, state),)
         asks = caller or (subject.owner if subject is not None else "ann")
-        operation = Operation("client", server, kind, asks, subject, surface, begun)
+        operation = Operation("client", server, kind, asks, subject, surface, begun, name=name)
         if status is not None:
-            operation.ended, operation.answer = ended, Answer(status, tuple(seen), **answer)
+            operation.ended, operation.answer = ended, Answer(status, tuple(seen), names=names, **answer)
         self.history.operations.append(operation)
         self.now = max(self.now, ended)
         return operation
@@ -153,10 +155,12 @@ def test_ready_then_gone(story: Story) -> None:
     assert story.rules == ["lost"]
 
 
-def test_ready_then_missing(story: Story) -> None:
+def test_ready_then_without_its_bytes(story: Story) -> None:
     story.upload()
     story.look()
-    story("fetch", ANN, 503, code="missing")
+    story("fetch", ANN, 503, code="not-now")
+    assert story.rules == []
+    story("fetch", ANN, 409, code="not-ready")
     assert story.rules == ["went back"]
 
 
@@ -348,23 +352,19 @@ def test_what_was_acknowledged_before_a_backup_is_restored(story: Story) -> None
     story.look()
     assert story.findings == []
     story.history.operations.pop()
-    story.look(state="missing")
+    story.look(state="queued")
     assert story.rules == ["went back"]
     story.history.operations.pop()
     story.look(state=None)
     assert story.rules == ["lost"]
 
 
-@pytest.mark.parametrize("state", ["queued", "missing", "ready", None])
-def test_what_was_deleted_during_a_backup_is_there_or_not_or_half(story: Story, state: str | None) -> None:
+@pytest.mark.parametrize("state", ["queued", "ready", None])
+def test_what_was_deleted_during_a_backup_is_there_or_not_or_not_built(story: Story, state: str | None) -> None:
     backup(story, "delete")
     story.end()
     story.mark("restored")
     story.look(state=state)
-    if state == "missing":
-        story("fetch", ANN, 503, code="missing")
-        story.upload()
-        story.look()
     assert story.findings == []
 
 
@@ -388,28 +388,96 @@ def test_what_was_uploaded_after_a_backup_is_not_restored(story: Story) -> None:
     assert story.rules == ["came back"]
 
 
-def test_what_is_missing_stays_so_until_it_is_pushed_again(story: Story) -> None:
+def test_half_a_surface_that_was_restored_is_whole_once_it_is_pushed_again(story: Story) -> None:
     backup(story, "delete")
     story.end()
     story.mark("restored")
-    story.look(state="missing")
     story.look(state="ready")
+    story("fetch", ANN, 409, code="not-ready")
+    story.look(state="waiting")
+    story.upload()
+    story.look(state="ready")
+    assert story.findings == []
+    story("fetch", ANN, 409, code="not-ready")
+    assert story.rules == ["went back"]
+
+
+def test_half_a_surface_that_was_restored_and_that_a_push_leaves_so(story: Story) -> None:
+    backup(story, "delete")
+    story.end()
+    story.mark("restored")
+    story.upload(state="ready")
+    story("fetch", ANN, 409, code="not-ready")
+    assert story.rules == ["went back"]
+
+
+def named(story: Story, status: int | None = 200, subject: Subject = ANN) -> None:
+    story("point", subject, status, name="latest")
+
+
+def test_a_name_leads_to_what_it_was_pointed_to_last(story: Story) -> None:
+    story.upload()
+    story.upload(OTHER)
+    named(story)
+    story("follow", None, 200, name="latest", seen=(entry(ANN, "ready"),))
+    named(story, subject=OTHER)
+    story("follow", None, 200, name="latest", seen=(entry(OTHER, "ready"),))
+    story("names", None, 200, names=(("latest", IDS[OTHER]),))
+    story("unpoint", None, 204, name="latest")
+    story("names", None, 200)
+    story("unpoint", None, 404, name="latest")
+    assert story.findings == []
+    story("names", None, 200, names=(("latest", IDS[OTHER]),))
+    assert story.rules == ["came back"]
+
+
+def test_a_name_that_is_lost_or_goes_back(story: Story) -> None:
+    story.upload()
+    story.upload(OTHER)
+    named(story)
+    named(story, subject=OTHER)
+    story("names", None, 200)
+    assert story.rules == ["lost"]
+    story.history.operations.pop()
+    story("follow", None, 200, name="latest", seen=(entry(ANN, "ready"),))
     assert story.rules == ["order"]
 
 
-def test_what_is_missing_is_there_again_once_another_owner_has_pushed_it(story: Story) -> None:
-    backup(story, "delete")
+def test_a_change_of_a_name_without_an_answer_is_done_or_not(story: Story) -> None:
+    story.upload()
+    named(story, None)
+    story("unpoint", None, 503, name="latest")
+    for names in ((), (("latest", IDS[ANN]),), ()):
+        story("names", None, 200, names=names)
+    assert story.findings == []
+    story.end()
+    story("names", None, 200, names=(("latest", IDS[ANN]),))
+    assert story.rules == ["came back"]
+
+
+def test_what_a_name_shows_of_a_surface_is_in_its_order(story: Story) -> None:
+    story.upload()
+    named(story)
+    story.look()
+    story("fetch", ANN, 200, sha256="container of one of ann", named="container of one of ann")
+    story("follow", None, 200, name="latest", seen=(entry(ANN, "queued"),))
+    assert story.rules == ["went back"]
+
+
+def test_a_name_is_restored_as_it_was_during_the_backup(story: Story) -> None:
+    story.upload()
+    story.upload(OTHER)
+    named(story)
+    story.mark("backup begins")
+    story.mark("backup ends")
+    named(story, subject=OTHER)
     story.end()
     story.mark("restored")
-    story.look(state="missing")
-    story.upload(BEN)
-    story.look(state="missing")
-    story.end()
-    story.look(state="queued")
-    story.look()
+    story("names", None, 200, names=(("latest", IDS[ANN]),))
     assert story.findings == []
-    story.look(state="missing")
-    assert story.rules == ["went back"]
+    story.history.operations.pop()
+    story("names", None, 200, names=(("latest", IDS[OTHER]),))
+    assert story.rules == ["order"]
 
 
 def test_nothing_is_restored_without_a_backup(story: Story) -> None:

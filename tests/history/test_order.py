@@ -9,10 +9,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.history.events import Mark
-from tests.history.order import ABSENT, PRESENT, SPONTANEOUS, Step, apply, restored, unexplained
+from tests.history.order import ABSENT, BARE, PRESENT, SPONTANEOUS, Step, apply, restored, unexplained
 
 STATES = sorted(SPONTANEOUS)
-KINDS = ("read", "upload", "delete", "retry", "shared")
+KINDS = ("read", "upload", "delete", "retry")
 
 
 @st.composite
@@ -83,7 +83,6 @@ def lived(draw: st.DrawFn) -> tuple[list[Step], list[Mark]]:
         "retry",
         "lost upload",
         "lost delete",
-        "shared",
         "end",
         "backup",
         "restore",
@@ -100,9 +99,6 @@ def lived(draw: st.DrawFn) -> tuple[list[Step], list[Mark]]:
             happens = draw(st.booleans())
             steps.append(Step(kind, begun))  # type: ignore[arg-type]
             state = acted(draw, kind, state) if happens else state
-        elif action == "shared":
-            state = acted(draw, kind, state)
-            steps.append(Step("shared", begun))
         elif action in ("upload", "retry") or (action == "delete" and state != ABSENT):
             state = acted(draw, kind, state)
             steps.append(Step(kind, begun, end))  # type: ignore[arg-type]
@@ -129,10 +125,8 @@ def lived(draw: st.DrawFn) -> tuple[list[Step], list[Mark]]:
 def acted(draw: st.DrawFn, kind: str, state: str) -> str:
     if kind == "delete":
         return ABSENT
-    if kind == "upload" and state in (ABSENT, "missing"):
+    if kind == "upload" and state in (ABSENT, BARE):
         return "queued"
-    if kind == "shared":
-        return draw(st.sampled_from(("missing", "queued"))) if state == "missing" else state
     return draw(st.sampled_from(("failed", "queued"))) if state == "failed" else state
 
 
@@ -167,7 +161,7 @@ def impossible_after(step: Step) -> list[str]:
     if step.kind == "read":
         (seen,) = step.observed
         return [state for state in STATES if state not in SPONTANEOUS[seen]]
-    return {"upload": [ABSENT, "missing"], "delete": sorted(PRESENT), "retry": [], "shared": []}[step.kind]
+    return {"upload": [ABSENT, BARE], "delete": sorted(PRESENT), "retry": []}[step.kind]
 
 
 @given(alone(), st.data())

@@ -27,8 +27,12 @@ def told(folder: Path, *kinds: str, owners: bool = False) -> history.Done:
     return done
 
 
-def test_a_server_that_is_ended_and_does_not_find_a_folder_or_an_extra(tmp_path: Path) -> None:
-    assert told(tmp_path, "restart", "unmounted", "extra").uploads > 0
+def test_a_server_that_is_ended_and_does_not_find_its_index_or_an_extra(tmp_path: Path) -> None:
+    assert told(tmp_path, "restart", "index", "extra").uploads > 0
+
+
+def test_a_server_whose_index_is_lost_while_it_runs_and_whose_strays_are_removed(tmp_path: Path) -> None:
+    assert told(tmp_path, "live-index", "collect", owners=True).uploads > 0
 
 
 @pytest.mark.skipif("full" not in history.possible(), reason="no small disk can be mounted on this machine")
@@ -41,7 +45,7 @@ def test_two_owners_a_server_that_is_killed_and_a_backup_under_load_that_is_rest
 
 
 def test_every_kind_has_a_run() -> None:
-    assert {"restart", "kill", "full", "unmounted", "backup", "extra"} == KINDS.keys()
+    assert {"restart", "kill", "full", "index", "live-index", "collect", "backup", "extra"} == KINDS.keys()
 
 
 TOKENS = {name: f"token of {name}" for name in ("ann", "ben", "admin")}

@@ -20,7 +20,6 @@ from websockets.sync.client import ClientConnection, connect
 
 from lodestream.protocol.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
 from lodestream.protocol.wire import parse, serialize
-from lodestream_server.storage.markers import MARKER
 from tests.patience import PATIENCE as PATIENCE
 
 T = TypeVar("T")
@@ -62,19 +61,19 @@ def settled(http: httpx.Client, location: str) -> dict[str, Any]:
 
     def look() -> dict[str, Any] | None:
         surface: dict[str, Any] = http.get(location).raise_for_status().json()
-        return surface if surface["state"] in ("ready", "failed", "waiting", "missing") else None
+        return surface if surface["state"] in ("ready", "failed", "waiting") else None
 
     return eventually(look, "the build to end")
 
 
 def kept(data: Path, folder: str) -> list[str]:
-    """The names in a folder of the data folder, its marker aside."""
-    return sorted(path.name for path in (data / folder).iterdir() if path.name != MARKER)
+    """The names in a folder of the data folder, which is not there before the first of them."""
+    return sorted(path.name for path in (data / folder).iterdir()) if (data / folder).is_dir() else []
 
 
 def upload_of(data: Path, surface: dict[str, Any]) -> Path:
     """The folder with the uploaded files of a surface."""
-    return data / "uploads" / str(json.loads((data / "records" / f"{surface['id']}.json").read_text())["upload"])
+    return data / "uploads" / str(json.loads((data / "surfaces" / f"{surface['id']}.json").read_text())["upload"])
 
 
 def push(http: httpx.Client, data: bytes, **query: str) -> dict[str, Any]:

@@ -43,7 +43,7 @@ _INSTRUMENTED = [
     "lodestream.transfer.sender",
     "lodestream.protocol.wire",
     "lodestream_server.builds.options",
-    "lodestream_server.storage.uploads",
+    "lodestream_server.store.uploads",
     "python_multipart",
 ]
 

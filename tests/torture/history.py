@@ -31,6 +31,7 @@ __all__ = ["CLIENTS", "Done", "possible", "run"]
 CLIENTS = 5
 
 _BODIES = 8
+_NAMES = 3
 _SHOWN = 10
 
 
@@ -42,7 +43,7 @@ class Done:
     ----------
     operations : int
         Asked, and not refused by a server that was down.
-    uploads, deletes, reads : int
+    uploads, deletes, reads, pointed : int
         Acknowledged, or answered with what they asked for.
     refused : int
         Answered 507.
@@ -61,6 +62,7 @@ class Done:
     uploads: int = 0
     deletes: int = 0
     reads: int = 0
+    pointed: int = 0
     refused: int = 0
     unanswered: int = 0
     owners: int = 0
@@ -156,6 +158,8 @@ def _goods(site: Site, owners: bool, *, with_picture: bool) -> tuple[Goods, list
             goods.add(owner, f"hills {number}", body, array=True)
         if owners:
             goods.add(names[number % 2], f"other {number}", body, array=True)
+        if number < _NAMES:
+            goods.names[f"latest-{number}"] = names[number % 2] if owners else None
     goods.add(names[0] if owners else None, "cut short", npy(hills(seed=77))[:-1], sound=False)
     subjects = list(goods.bodies)
     if not with_picture:
@@ -177,4 +181,5 @@ def _count(history: History, done: Done) -> None:
         done.refused += status == 507
         done.uploads += operation.kind == "upload" and status in (200, 202)
         done.deletes += operation.kind == "delete" and status == 204
-        done.reads += operation.kind in ("look", "list", "fetch", "values") and status == 200
+        done.reads += operation.kind in ("look", "list", "fetch", "values", "follow", "names") and status == 200
+        done.pointed += operation.kind in ("point", "unpoint") and status in (200, 204)

@@ -202,8 +202,9 @@ def _history(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
     cases = sum(done.disasters[kind] for kind in history.possible())
     facts = (
         f"{done.operations:,} operations of {history.CLIENTS} clients, with the tokens of {done.owners} owners and an "
-        f"admin: {done.uploads:,} uploads and {done.deletes:,} deletes acknowledged, {done.refused:,} uploads answered "
-        f"507, {done.reads:,} reads answered, {done.unanswered:,} without an answer",
+        f"admin: {done.uploads:,} uploads, {done.deletes:,} deletes and {done.pointed:,} changes of names "
+        f"acknowledged, {done.refused:,} uploads answered 507, {done.reads:,} reads answered, {done.unanswered:,} "
+        "without an answer",
         ", ".join(f"{kind} {number}" for kind, number in sorted(done.disasters.items())),
         f"at the end {done.ready} surfaces ready; findings: {len(done.findings)}",
     )

@@ -8,7 +8,7 @@ import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import httpx
 import numpy as np
@@ -76,12 +76,12 @@ def run(folder: Path, count: int, seconds: float | None = None, *, seed: int = 1
                 break
             if stored and random_.random() < 0.3:
                 location = random_.choice(sorted(stored))
-                http.delete(location).raise_for_status()
+                _asked(http, "DELETE", location).raise_for_status()
                 del stored[location]
                 done.deletes += 1
                 continue
             points = hills(random_.randrange(20, 200), random_.randrange(20, 200), seed=number)
-            answer = http.post("/v1/surfaces", content=npy(points))
+            answer = _asked(http, "POST", "/v1/surfaces", content=npy(points))
             # Either the server saw that there is too little room, or the disk said so.
             assert answer.status_code in (202, 507), answer.text
             if answer.status_code == 202:
@@ -97,15 +97,15 @@ def run(folder: Path, count: int, seconds: float | None = None, *, seed: int = 1
 def _compare(
     http: httpx.Client, stored: dict[str, NDArray[np.float32]], done: SmallDisk, random_: random.Random
 ) -> None:
-    entries = http.get("/v1/surfaces?limit=1000").raise_for_status().json()["surfaces"]
+    entries = _asked(http, "GET", "/v1/surfaces?limit=1000").raise_for_status().json()["surfaces"]
     assert sorted(entry["url"] for entry in entries) == sorted(stored)
     # Where there is no room for a container its build waits until there is: that is made here.
     while waiting := [location for location in stored if _waits(http, location)]:
         location = random_.choice(waiting)
-        http.delete(location).raise_for_status()
+        _asked(http, "DELETE", location).raise_for_status()
         del stored[location]
     for location, points in stored.items():
-        container = http.get(f"{location}/container", follow_redirects=True).raise_for_status().content
+        container = _asked(http, "GET", f"{location}/container", follow_redirects=True).raise_for_status().content
         assert np.array_equal(ls.decode(container).points, points)
     done.kept = len(stored)
 
@@ -115,12 +115,22 @@ def _waits(http: httpx.Client, location: str) -> bool:
 
 
 def _settled(http: httpx.Client, location: str) -> str | None:
-    entry = http.get(location).raise_for_status().json()
+    entry = _asked(http, "GET", location).raise_for_status().json()
     assert entry["state"] != "failed", entry
-    if entry["state"] == "queued" and entry["reason"] is not None:
-        # What has room may not have been tried again since another was deleted.
+    if entry["state"] == "queued":
+        # What has room may not have been tried again since another was deleted. Where there is none, there may be none
+        # to note the reason either.
         return "waits" if _free(http) < _MARGIN * entry["upload_bytes"] + _MARGIN_BYTES else None
     return "ready" if entry["state"] == "ready" else None
+
+
+def _asked(http: httpx.Client, method: str, url: str, **given: Any) -> httpx.Response:
+    """Ask, and again while the index is made again: where there is no room for it at all, it is removed."""
+    return eventually(lambda: _unless_busy(http.request(method, url, **given)), "an answer")
+
+
+def _unless_busy(answer: httpx.Response) -> httpx.Response | None:
+    return None if answer.status_code == 503 else answer
 
 
 def _free(http: httpx.Client) -> float:

@@ -52,7 +52,7 @@ from lodestream.protocol.messages import (
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.sender import Sender
 from lodestream_server.builds.options import SurfaceOptions, check
-from lodestream_server.storage.uploads import Upload, take_apart
+from lodestream_server.store.uploads import Upload, take_apart
 
 __all__ = ["EDGES", "KINDS", "TARGETS", "Edit", "Target", "edit", "mutate"]
 

@@ -39,6 +39,39 @@ def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path)
     expect(tab.page.locator("header .facts")).to_contain_text("60 \N{MULTIPLICATION SIGN} 80 points")
 
 
+def test_a_name_opens_what_it_leads_to(tabs: Tabs, shelf: Shelf, tmp_path: Path) -> None:
+    for number in range(2):
+        np.save(tmp_path / "hills.npy", (HEIGHTS[: 30 + number, :40] + np.float32(number)).astype(np.float32))
+        upload(shelf.server, tmp_path / "hills.npy", name="dem", replace=True)
+        tab = tabs(f"{shelf.server}/#n=dem")
+        tab.everything()
+        expect(tab.page.locator("header .facts")).to_contain_text(f"{30 + number} \N{MULTIPLICATION SIGN} 40 points")
+        expect(tab.page.get_by_role("heading", name="dem")).to_be_visible()
+        assert "#n=dem" in tab.page.url, "its address stays"
+
+
+def test_the_element_follows_a_name(tabs: Tabs, shelf: Shelf, tmp_path: Path) -> None:
+    np.save(tmp_path / "hills.npy", HEIGHTS[:30, :40].astype(np.float32))
+    upload(shelf.server, tmp_path / "hills.npy", name="hills", replace=True)
+    tab = tabs(shelf.server)
+    tab.page.get_by_role("heading", name="Surfaces").wait_for()
+    tab.page.evaluate(
+        """(src) => {
+          const view = document.createElement("lodestream-view");
+          view.src = src;
+          document.querySelector("main").replaceChildren(view);
+        }""",
+        f"{shelf.server}/v1/names/hills",
+    )
+    tab.everything()
+
+
+def test_a_name_that_leads_nowhere_is_told(tabs: Tabs, shelf: Shelf, heard: Heard) -> None:
+    heard.allow("status of 404")
+    tab = tabs(f"{shelf.server}/#n=nowhere")
+    expect(tab.page.get_by_role("alert")).to_contain_text("expected a name on this server, got nowhere")
+
+
 def drop(tab: Tab, name: str, data: bytes, place: str = ".drop") -> None:
     """Let go of a file above the page's place for files, or another element."""
     tab.page.locator(place).wait_for()

@@ -71,7 +71,7 @@ def _of_url(options: InfoOptions) -> Mapping[str, Any]:
     from .. import sync
 
     url = addresses.source_url(options.what)
-    if not addresses.is_surface(url):
+    if not addresses.is_served(url):
         return sync.describe_file(url, token=options.token, max_vertices=options.max_vertices)
     surface = sync.describe(url, token=options.token)
     return {**surface.details, "url": surface.url}

@@ -165,7 +165,7 @@ class PullOptions:
 def _options(args: argparse.Namespace) -> PullOptions:
     """Return the options; end the program if the command line is wrong."""
     target = target_of(args)
-    if args.transport == "ws" and not addresses.is_surface(args.url):
+    if args.transport == "ws" and not addresses.is_served(args.url):
         args.parser.error("argument --transport: the URL of a file has no WebSocket")
     standard_output_once(args, "surface")
     if args.watch and args.out == "-":
@@ -205,10 +205,10 @@ def run(args: argparse.Namespace) -> int:
     if options.picture is not None:
         check_picture(options.picture)
     with interruptible(), Kept(options.resume) as kept:
-        if addresses.published_name(options.url) is not None:
+        if addresses.is_named(options.url):
             from .. import sync
 
-            # Once: all requests are of one container, whatever is published meanwhile.
+            # Once: all requests are of one container, whatever the name leads to meanwhile.
             options = replace(options, url=sync.locate(options.url, token=options.token))
         with _drawing(options) as drawing:
             return _pull(options, kept, drawing)

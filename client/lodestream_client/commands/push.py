@@ -11,10 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.errors import LodestreamError
+from lodestream.errors import LodestreamError, OptionError
 from lodestream.quality import Quality
 
 from ..errors import UnreachableError
+from ..requests.addresses import name_url
 from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
 from ..terminal.shared_notes import SharedNotes
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
@@ -44,7 +45,8 @@ def register(subparsers: Subparsers) -> None:
         "push",
         run,
         "upload one or several files to a server as a surface",
-        "Waits until the server has built the surface. The last line of standard output is its URL.\n"
+        "Waits until the server has built the surface. The last line of standard output is its URL (that of its name\n"
+        "with --replace).\n"
         "A container (.lode) is kept unchanged; --name is the only surface option it takes.\n"
         "If the server cannot build the surface now, push fails, and the server keeps the upload (lodestream retry).",
     )
@@ -67,6 +69,12 @@ def register(subparsers: Subparsers) -> None:
         action="store_true",
         help="encode here and upload the container (default: only files of a format that the server does not read)",
     )
+    parser.add_argument(
+        "--replace",
+        action="store_true",
+        help="once the surface is ready, make the server's name N of --name lead to it, and print the name's URL, "
+        "which stays. The surface that the name led to before is deleted a day later, or when the server is set to",
+    )
     parser.add_argument("--no-wait", action="store_true", help="return as soon as the server has stored the upload")
     add_token_option(parser)
     add_json_option(parser)
@@ -79,6 +87,7 @@ class PushOptions:
     Names of `files`, ``-`` for standard input, to the server at `url`.
 
     `each` is what there is a surface for: `FILE`, a dimension, or ``variable``; None: the files are one surface.
+    `name_url` is the URL of the name that is to lead to the surface, if one is.
     """
 
     files: tuple[str, ...]
@@ -86,6 +95,7 @@ class PushOptions:
     surface: SurfaceOptions
     each: str | None
     local: bool
+    name_url: str | None
     wait: bool
     token: str | None
     json: bool
@@ -103,12 +113,19 @@ def _options(args: argparse.Namespace) -> PushOptions:
         args.parser.error("argument --name: not allowed with --each, since all surfaces would have one name")
     if args.each not in (None, FILE) and (len(files) > 1 or files[0] == "-"):
         args.parser.error(f"argument --each: expected one FILE for each {args.each}, got {' '.join(files)}")
+    if args.replace and (args.name is None or args.no_wait or args.each is not None):
+        args.parser.error("argument --replace: needs --name, and is not allowed with --no-wait or --each")
+    try:
+        address = name_url(url, args.name) if args.replace else None
+    except OptionError as error:
+        args.parser.error(f"argument --name: {error}")
     return PushOptions(
         standard_input_once(args, files),
         url,
         surface_options(args),
         args.each,
         args.local,
+        address,
         not args.no_wait,
         token_of(args),
         args.json,
@@ -122,10 +139,11 @@ def run(args: argparse.Namespace) -> int:
         return _run_each(options)
     surface = _sent(options)
     note_details(surface.details, words=option_words)
+    named = {} if options.name_url is None else {"name_url": options.name_url}
     if options.json:
-        print_json({**surface.details, "url": surface.url})
+        print_json({**surface.details, "url": surface.url, **named})
     else:
-        say(surface.url)
+        say(options.name_url or surface.url)
     return 0
 
 
@@ -255,4 +273,5 @@ def _uploaded(options: PushOptions) -> Description:
             wait=options.wait,
             progress=progress,
             token=options.token,
+            replace=options.name_url is not None,
         )

@@ -18,7 +18,7 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "retry",
         run,
-        "ask a server to build a surface again that is waiting, failed or missing",
+        "ask a server to build a surface again that is waiting or has failed",
         "Use it when the cause of the failure is removed. Waits until the surface is ready. The last line of\n"
         "standard output is its URL.",
     )

@@ -1,4 +1,4 @@
-"""``lodestream list`` and ``lodestream rm``: the surfaces of a server."""
+"""``lodestream list`` and ``lodestream rm``: the surfaces and names of a server."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..requests.states import STATES
 from ..terminal.output import human_size, note, print_json, say_columns
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
-from .values import parse_server, parse_surface
+from .values import parse_served, parse_server
 
 if TYPE_CHECKING:
     from ..requests.api import Description
@@ -23,26 +23,37 @@ def register(subparsers: Subparsers) -> None:
         subparsers,
         "list",
         run_list,
-        "list the surfaces of a server",
+        "list the surfaces of a server, or its names",
         "One line for each: URL, state, shape, size of the container (of the upload, before there is one), name,\n"
         "series (where there are any: its name, and the number of the step or variable), owner (where the server\n"
         "tells owners; - if it has none), and why it is not ready. Surfaces of a series stand together, by their\n"
-        "numbers, unless --sort is given.",
+        "numbers, unless --sort is given. With --names: one line for each name that stays.",
     )
     parser.add_argument("url", type=parse_server, metavar="URL", help="URL of the server")
     parser.add_argument(
         "--search",
         metavar="TEXT",
-        help="only those with this text in their name, series, file names, owner, URL or reason, in upper or lower "
-        "case",
+        help="only those with this text in their name, series, owner, URL or reason, in upper or lower case; of names "
+        "in the name, owner or URL of the surface",
+    )
+    parser.add_argument(
+        "--names",
+        action="store_true",
+        help="list the names that lead to surfaces instead: URL of the name, URL of the surface (- if the server "
+        "cannot read the name), when that was changed, owner (where the server tells owners)",
     )
     parser.add_argument("--state", choices=STATES, help="only those in this state")
     parser.add_argument("--sort", choices=tuple(_KEYS), help="order of the lines (default: the server's)")
     parser.add_argument("--reverse", action="store_true", help="the other way round")
     add_token_option(parser)
     add_json_option(parser)
-    parser = add_command(subparsers, "rm", run_rm, "delete a surface from a server")
-    parser.add_argument("url", type=parse_surface, metavar="URL", help="URL of the surface")
+    parser = add_command(subparsers, "rm", run_rm, "delete a surface from a server, or a name that leads to one")
+    parser.add_argument(
+        "url",
+        type=parse_served,
+        metavar="URL",
+        help="URL of the surface; or of the name, which leads to none then: no surface is deleted",
+    )
     add_token_option(parser)
     add_json_option(parser)
 
@@ -51,6 +62,8 @@ def run_list(args: argparse.Namespace) -> int:
     """Print one line for each surface: address, state, shape, bytes, name, series, owner, and why it is not ready."""
     from .. import sync
 
+    if args.names:
+        return _run_names(args)
     surfaces = _chosen(sync.list_surfaces(args.url, token=token_of(args)), args)
     if args.json:
         print_json({"surfaces": [{**surface.details, "url": surface.url} for surface in surfaces]})
@@ -65,6 +78,30 @@ def run_list(args: argparse.Namespace) -> int:
     return 0
 
 
+def _run_names(args: argparse.Namespace) -> int:
+    from .. import sync
+
+    if args.state or args.sort or args.reverse:
+        args.parser.error("argument --names: not allowed with --state, --sort or --reverse")
+    text = (args.search or "").casefold()
+    names = [
+        name
+        for name in sync.list_names(args.url, token=token_of(args))
+        if any(text in str(name.get(key) or "").casefold() for key in ("name", "surface", "owner"))
+    ]
+    if args.json:
+        print_json({"names": names})
+    elif names:
+        say_columns([tuple(str(name.get(key) or empty) for key, empty in _NAME_COLUMNS) for name in names])
+    else:
+        note("no such names" if text else "no names")
+    return 0
+
+
+#: What is told of a name, and what stands for nothing.
+_NAME_COLUMNS = (("url", ""), ("surface", "-"), ("changed", "-"), ("owner", ""))
+
+
 def _row(surface: Description, owned: bool) -> tuple[str, ...]:
     details = surface.details
     shape = " x ".join(map(str, details.get("shape") or ())) or ("blocks" if "shape" in details else "-")
@@ -75,8 +112,7 @@ def _row(surface: Description, owned: bool) -> tuple[str, ...]:
 
 
 def _name(surface: Description) -> str:
-    names = [str(name) for name in surface.details.get("filenames") or () if name]
-    return str(surface.details.get("name") or ", ".join(names))
+    return str(surface.details.get("name") or "")
 
 
 def _size(surface: Description) -> Any:
@@ -133,18 +169,16 @@ def _series(surface: Description) -> str:
 
 def _words(surface: Description) -> list[str]:
     details = surface.details
-    names = [str(name) for name in details.get("filenames") or ()]
     return [
         surface.url,
         _name(surface),
         _series(surface),
-        *names,
         *(str(details.get(key) or "") for key in ("owner", "reason")),
     ]
 
 
 def run_rm(args: argparse.Namespace) -> int:
-    """Delete surfaces."""
+    """Delete a surface, or a name."""
     from .. import sync
 
     sync.delete(args.url, token=token_of(args))

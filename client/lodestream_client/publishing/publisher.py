@@ -44,7 +44,7 @@ KEEP = timedelta(days=7)
 # Of others: what would be written over, and where files are that would be taken for old ones of this program, such as
 # the data of a server.
 _FOREIGN = ("lodestream.json", INDEX)
-_FOREIGN_FOLDERS = ("containers/", "levels/", "records/", "surfaces/", "uploads/")
+_FOREIGN_FOLDERS = ("built/", "containers/", "levels/", "names/", "surfaces/", "uploads/")
 
 # What no list names may belong to a command that runs now, and has not come to the list yet.
 _STRAY = timedelta(days=1)

@@ -1,4 +1,4 @@
-"""URLs of servers, surfaces and container files."""
+"""URLs of servers, surfaces, names that lead to surfaces, and container files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ __all__ = [
     "counterpart",
     "formats_url",
     "is_loopback",
+    "is_named",
+    "is_served",
     "is_surface",
     "is_url",
+    "name_url",
+    "names_url",
     "origin",
     "published_name",
     "resolved",
     "same_origin",
+    "served_url",
     "source_url",
     "stream_url",
     "surface_url",
@@ -27,6 +32,8 @@ __all__ = [
 ]
 
 _SURFACES = "/v1/surfaces"
+_NAMES = "/v1/names"
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 _SCHEMES = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
 _PORTS = {"http": 80, "https": 443}
@@ -71,10 +78,43 @@ def surface_url(url: str) -> str:
     return base
 
 
+def names_url(url: str) -> str:
+    """Return the URL of a server's collection of names, from the server's URL or from that of its surfaces."""
+    return surfaces_url(url).removesuffix(_SURFACES) + _NAMES
+
+
+def name_url(url: str, name: str) -> str:
+    """Return the URL of a name that stays, on a server or on that of a collection of surfaces.
+
+    Raises
+    ------
+    OptionError
+        If it cannot be such a name.
+    """
+    if not _NAME.fullmatch(name):
+        raise OptionError(
+            "expected a name of at most 100 letters, digits and ._- that begins with a letter or a digit, "
+            f"got {name[:100]!a}"
+        )
+    return f"{names_url(url)}/{name}"
+
+
+def served_url(url: str) -> str:
+    """Return the URL of a surface on a server, or of a name that leads to one, without a slash at its end.
+
+    Raises
+    ------
+    OptionError
+        If this is neither ``http(s)://HOST/v1/surfaces/ID`` nor ``http(s)://HOST/v1/names/NAME``.
+    """
+    return _clean(url) if is_served(url) else surface_url(url)
+
+
 def source_url(url: str) -> str:
     """Return the URL of something that can be pulled.
 
-    That is a surface on a server, a container file on any web server, or a name on a published page: ``PAGE#NAME``.
+    That is a surface on a server, a name there that leads to one, a container file on any web server, or a name on a
+    published page: ``PAGE#NAME``.
 
     Raises
     ------
@@ -82,7 +122,7 @@ def source_url(url: str) -> str:
         If this is none of them.
     """
     base = _clean(url)
-    if is_surface(base):
+    if is_served(base):
         return base
     if published_name(url) is not None:
         return url
@@ -91,7 +131,7 @@ def source_url(url: str) -> str:
         raise OptionError(
             f"expected a name after the page's address, such as {base}#NAME: lodestream published lists them"
         )
-    if not path or path.endswith(_SURFACES):
+    if not path or path.endswith((_SURFACES, _NAMES)):
         raise OptionError(
             f"expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as "
             f"http://HOST/NAME.lode, or a published name's such as http://HOST/#NAME, got {url}"
@@ -108,7 +148,7 @@ def published_name(url: str) -> tuple[str, str] | None:
     """
     page, _, fragment = url.partition("#")
     name = fragment.partition("&")[0]
-    if not name or "=" in name or is_surface(page):
+    if not name or "=" in name or is_served(page):
         return None
     # What is not ASCII is as a browser sends it.
     return urljoin(quote(page.partition("?")[0], safe=string.punctuation), "view.json"), unquote(name)
@@ -117,6 +157,21 @@ def published_name(url: str) -> tuple[str, str] | None:
 def is_surface(url: str) -> bool:
     """Return whether a URL is that of a surface, not of a file."""
     return _clean(url).rpartition("/")[0].endswith(_SURFACES)
+
+
+def is_served(url: str) -> bool:
+    """Return whether a URL is that of a surface on a server, or of a name that leads to one."""
+    return is_surface(url) or _leads(url)
+
+
+def is_named(url: str) -> bool:
+    """Return whether a URL leads to one surface now and perhaps to another one later: a name on a server or a page."""
+    return _leads(url) or published_name(url) is not None
+
+
+def _leads(url: str) -> bool:
+    collection, _, name = _clean(url).rpartition("/")
+    return collection.endswith(_NAMES) and bool(name)
 
 
 def stream_url(url: str, query: str | None = None) -> str:

@@ -13,7 +13,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-from lodestream.errors import CorruptStreamError, NotFoundError, RemoteError, RemoteProtocolError
+from lodestream.errors import (
+    CorruptStreamError,
+    LodestreamError,
+    NotFoundError,
+    OptionError,
+    RemoteError,
+    RemoteProtocolError,
+)
 from lodestream.target import Target
 
 from . import addresses, problems
@@ -33,8 +40,10 @@ __all__ = [
     "formats_read",
     "identify",
     "identity_of_file",
+    "list_names",
     "list_surfaces",
     "locate",
+    "name_to_change",
     "published_surfaces",
     "retry",
     "upload",
@@ -102,8 +111,7 @@ class Description:
         Id of the surface on its server.
     state : str
         ``queued``, ``building``, ``ready``; ``failed``: the reader rejected the file; ``waiting``: it could not be
-        built for a reason on the server; ``missing``: it is not on the server's disk now. For the last three see
-        `retry`.
+        built for a reason on the server. For the last two see `retry`.
     details : mapping
         The complete description, by the server's keys: build progress, or what ``info --json`` prints.
 
@@ -126,14 +134,46 @@ class Description:
         return self.state == "ready"
 
 
+def name_to_change(url: str, name: str | None, *, replace: bool, wait: bool) -> str | None:
+    """Return the URL of the name that an upload is to make lead to its surface; None if it is to change none.
+
+    Raises
+    ------
+    OptionError
+        If there is no name, it cannot be one that stays, or nobody waits until the surface is ready.
+    """
+    if not replace:
+        return None
+    if name is None or not wait:
+        raise OptionError("expected a name, and to wait until the surface is ready, with replace")
+    return addresses.name_url(url, name)
+
+
 def upload(
-    url: str, parameters: Mapping[str, str | list[str]], body: Body, wait: bool, progress: Progress | None
+    url: str,
+    parameters: Mapping[str, str | list[str]],
+    body: Body,
+    wait: bool,
+    progress: Progress | None,
+    name: str | None = None,
 ) -> Flow[Description]:
-    """Send files, and wait until their surface is ready."""
+    """Send files, and wait until their surface is ready; then make the name with the URL `name` lead to it.
+
+    Whether the caller may do that is asked before, since an upload that no name leads to takes room on the server.
+    """
     collection = addresses.surfaces_url(url)
+    if name is not None:
+        _refuse((yield Call("PUT", name, json={"surface": None})), name)
     answer = yield Call("POST", collection, _named(parameters, body), body=body)
     surface = _described(_checked(answer, collection), _location(answer, collection))
-    return (yield from _followed(surface, wait, progress))
+    surface = yield from _followed(surface, wait, progress)
+    if name is not None:
+        try:
+            _refuse((yield Call("PUT", name, json={"surface": surface.id})), name)
+        except LodestreamError as error:
+            error.args = (f"{error}; the surface is stored, as {surface.url}", *error.args[1:])
+            raise
+    return surface
 
 
 def formats_read(url: str) -> Flow[frozenset[str] | None]:
@@ -188,8 +228,26 @@ def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
     RemoteProtocolError
         If there are too many pages, one of another server, or one that is no list.
     """
-    page: str | None = addresses.surfaces_url(url)
-    surfaces: list[Description] = []
+    entries = yield from _listed(url, addresses.surfaces_url(url), "surfaces")
+    return tuple(_described(entry, _own_address(entry, page)) for entry, page in entries)
+
+
+def list_names(url: str) -> Flow[tuple[Mapping[str, Any], ...]]:
+    """Return what a server tells of all its names, page by page; addresses are complete.
+
+    Raises
+    ------
+    RemoteProtocolError
+        If there are too many pages, one of another server, or one that is no list of names.
+    """
+    entries = yield from _listed(url, addresses.names_url(url), "names")
+    return tuple(_named_entry(entry, page) for entry, page in entries)
+
+
+def _listed(url: str, first: str, what: str) -> Flow[list[tuple[Mapping[str, Any], str]]]:
+    """Return the entries of a list of a server, each with the URL of the page that it stands on."""
+    page: str | None = first
+    found: list[tuple[Mapping[str, Any], str]] = []
     seen = set[str]()
     left = _LONGEST_LIST
     while page is not None and page not in seen:
@@ -199,20 +257,33 @@ def list_surfaces(url: str) -> Flow[tuple[Description, ...]]:
         answer = yield Call("GET", page, most=min(left, LONGEST_ANSWER))
         document = _checked(answer, page)
         left -= len(answer.content) if answer is not None else 0
-        entries = document.get("surfaces")
+        entries = document.get(what)
         if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-            raise RemoteProtocolError(f"expected a list of surfaces from {page}, got something else")
-        surfaces += [_described(entry, _own_address(entry, page)) for entry in entries]
+            raise RemoteProtocolError(f"expected a list of {what} from {page}, got something else")
+        found += [(entry, page) for entry in entries]
         following = document.get("next")
         page = addresses.resolved(page, following) if isinstance(following, str) and following else None
-    return tuple(surfaces)
+    return found
+
+
+def _named_entry(entry: Mapping[str, Any], page: str) -> Mapping[str, Any]:
+    """Return what a list tells of a name, with the complete addresses of it and of the surface to which it leads."""
+    name, url, surface = (entry.get(key) for key in ("name", "url", "surface"))
+    if not isinstance(name, str) or not isinstance(url, str) or not isinstance(surface, str | None):
+        raise RemoteProtocolError(f"expected a name and where it leads from {page}, got {dict(entry)!a:.200}")
+    leads = None if surface is None else addresses.resolved(page, surface)
+    return {**entry, "url": addresses.resolved(page, url), "surface": leads}
 
 
 def describe(url: str) -> Flow[Description]:
-    """Return the state and the description of one surface."""
-    address = addresses.surface_url(url)
-    answer = yield Call("GET", address)
-    return _described(_checked(answer, address), address)
+    """Return the state and the description of one surface, or of the one to which a name leads now."""
+    address = addresses.served_url(url)
+    document = _checked((yield Call("GET", address)), address)
+    if not addresses.is_surface(address):
+        address = _own_address(document, address)
+        if not addresses.is_surface(address) or not addresses.same_origin(address, url):
+            raise RemoteProtocolError(f"expected a surface on {addresses.origin(url)}, got {address!a:.300}")
+    return _described(document, address)
 
 
 def describe_file(url: str, max_vertices: int | None = None) -> Flow[Mapping[str, Any]]:
@@ -271,18 +342,20 @@ def identity_of_file(url: str, version: str | None, size: int | None) -> Identit
 
 
 def locate(url: str) -> Flow[str]:
-    """Return the URL of the container to which a name on a published page leads now; any other URL as it is.
+    """Return the URL of the surface or container to which a name leads now; any other URL as it is.
 
     Raises
     ------
     NotFoundError
-        If there is no such page, or no such name on it.
+        If there is no such page or server, or no such name on it.
     RemoteProtocolError
-        If the page's list cannot be read, or leads to another host.
+        If the answer cannot be read, or leads to another host.
     """
+    if not addresses.is_named(url):
+        return url
     place = addresses.published_name(url)
     if place is None:
-        return url
+        return (yield from describe(url)).url
     page, name = place
     surfaces = yield from published_surfaces(url)
     entry = next((entry for entry in surfaces if entry["name"] == name), None)
@@ -318,8 +391,8 @@ def _is_entry(entry: Any) -> bool:
 
 
 def delete(url: str) -> Flow[None]:
-    """Delete one surface from its server."""
-    address = addresses.surface_url(url)
+    """Delete one surface from its server, or a name."""
+    address = addresses.served_url(url)
     answer = yield Call("DELETE", address)
     _refuse(answer, address)
 

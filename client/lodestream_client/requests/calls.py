@@ -28,7 +28,8 @@ class Call:
     """A request to make; the complete answer is sent back.
 
     With ``partial``, an answer that is a whole file is sent back without being read. Of other answers at most `most`
-    bytes are read. Redirects are followed if `redirected` says so, and never where the request changes something.
+    bytes are read. Redirects are followed if `redirected` says so, and never where the request changes something. What
+    is sent is `body`, or `json`.
     """
 
     method: str
@@ -36,6 +37,7 @@ class Call:
     parameters: Mapping[str, str | list[str]] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     body: Body | None = None
+    json: Mapping[str, str | None] | None = None
     partial: bool = False
     most: int = LONGEST_ANSWER
     redirected: bool = True
@@ -103,6 +105,8 @@ def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
         options["follow_redirects"] = False  # nothing is changed, and no file sent, where nobody said so
     if call.parameters:
         options["params"] = dict(call.parameters)
+    if call.json is not None:
+        options["json"] = dict(call.json)
     if call.body is not None and len(call.body.files) > 1:
         options["files"] = call.body.form()
     elif call.body is not None:

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 from lodestream.errors import InputError, LodestreamError, NotFoundError, RemoteError, TruncatedStreamError
 
 from ..errors import SilenceError, UnreachableError
+from ..requests import addresses
 from . import over_http, over_websocket
 from .effects import Ahead, Dial, Effect, Flow, Get, HangUp, Hear, Read, Send, Wait
+from .locating import located
 from .session import Session
 
 if TYPE_CHECKING:
@@ -130,6 +132,9 @@ class Core:
         while True:
             before, session.withheld = session.reception.cached.total, ""
             try:
+                if addresses.is_named(session.url):
+                    # Once: the stream ends on the container that it begins, whatever the name leads to by then.
+                    session.url = yield from located(session)
                 if session.transports.transport == "ws":
                     yield from over_websocket.receive(session)
                 else:

@@ -10,9 +10,8 @@ from lodestream.protocol.messages import MIN_WINDOW
 from lodestream.transfer.range_download import RangeDownload
 
 from ..errors import SilenceError
-from ..requests import addresses, api, problems
-from ..requests.answers import LONGEST_PROBLEM, Answer, Head, Incoming
-from ..requests.calls import Call
+from ..requests import addresses, problems
+from ..requests.answers import LONGEST_PROBLEM, Head, Incoming
 from .effects import Ahead, Flow, Get, HangUp, Read
 
 if TYPE_CHECKING:
@@ -37,9 +36,6 @@ def receive(session: Session) -> Flow[None]:
     LodestreamError
         What the server refuses, or what is wrong with what it sent.
     """
-    if addresses.published_name(session.url) is not None:
-        # Once: the stream ends on the container that it begins, whatever the name leads to by then.
-        session.url = yield from _located(session)
     if session.ranges is None:
         session.ranges = RangeDownload(session.reception)
     download, url = session.ranges, addresses.container_url(session.url)
@@ -77,40 +73,6 @@ def receive(session: Session) -> Flow[None]:
         else:
             download.finish(session.clock())
     yield HangUp()
-
-
-def _located(session: Session) -> Flow[str]:
-    """Return the URL of the container to which a name on a published page leads."""
-    steps = api.locate(session.url)
-    answer: Answer | None = None
-    while True:
-        try:
-            call = steps.send(answer)
-        except StopIteration as end:
-            url: str = end.value
-            return url
-        assert isinstance(call, Call), "it waits for nothing but answers"
-        answer = yield from _read(session, call)
-
-
-def _read(session: Session, call: Call) -> Flow[Answer]:
-    """Return a short answer, which takes no longer than a server may be silent."""
-    import httpx
-
-    until = session.clock() + session.silence
-    try:
-        headers = {"Accept-Encoding": "identity", **call.headers, **session.authorization(call.url)}
-        head: Head = yield Get(call.url, headers, session.patience(session.tick()))
-        session.landed(call.url, head.url)
-        incoming = Incoming(head, call.most, call.url, session.url, None)
-        while (chunk := (yield Read())) and incoming.take(chunk):
-            if session.tick() == 0:
-                raise TruncatedStreamError(f"expected the list of {session.url}, but its time is over")
-            if session.clock() >= until:
-                raise session.silent()
-    except httpx.HTTPError as error:
-        raise problems.from_connection(error, session.url) from error
-    return incoming.answer()
 
 
 def _get(session: Session, url: str, request: RangeRequest, left: float | None) -> Get:

@@ -111,7 +111,7 @@ class Transports:
 
 
 def _allowed(url: str, transport: Transport) -> tuple[Literal["ws", "http"], ...]:
-    if not addresses.is_surface(url):
+    if not addresses.is_served(url):
         if transport == "ws":
             raise OptionError(f"expected a surface's address for a WebSocket, got that of a file: {url}")
         return ("http",)

@@ -120,7 +120,7 @@ class RemoteSource:
     Parameters
     ----------
     url : str
-        Of a surface of a server, of a container file, or of a name on a published page.
+        Of a surface of a server, of a container file, or of a name on a server or a published page.
     token : str or None
 
     Attributes

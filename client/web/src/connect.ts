@@ -270,8 +270,8 @@ export class SurfaceStream implements AsyncIterableIterator<SurfaceView> {
 /**
  * Receive a surface.
  *
- * @param source URL of a surface on a server (`.../v1/surfaces/ID`) or of a container file on any web server that knows
- * Range; or a `File` or `Blob`. In a page a URL may be relative.
+ * @param source URL of a surface on a server (`.../v1/surfaces/ID`), of a name there that leads to one
+ * (`.../v1/names/NAME`), or of a container file on any web server that knows Range; or a `File` or `Blob`. In a page a URL may be relative.
  * @param target What to receive, where to stop, and in which order; by default the whole surface.
  * @throws OptionError if the target or the URL is not valid; other errors are thrown by the iteration.
  */

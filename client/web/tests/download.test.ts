@@ -449,7 +449,7 @@ describe("what a server says that is not so", () => {
 
   it("a close code says what went wrong", () => {
     const link = begun();
-    expect(() => link.client.connectionLost(4503, "missing: gone")).toThrow(/missing: gone/);
+    expect(() => link.client.connectionLost(4503, "busy: later")).toThrow(/busy: later/);
     expect(() => link.client.connectionLost(4429)).toThrow(/too much in progress/);
     expect(() => link.client.connectionLost(1006)).toThrow(TruncatedStreamError);
   });

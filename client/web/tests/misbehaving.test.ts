@@ -145,7 +145,7 @@ describe("a server", () => {
       /at once|expected segments.offset/,
     ],
     ["answers as another one", (socket) => socket.send(serialize({ type: "bye" })), RemoteProtocolError, /got bye/],
-    ["is missing its file", (socket) => socket.close(4503, "missing: gone"), RemoteError, /missing: gone/],
+    ["is busy", (socket) => socket.close(4503, "busy: later"), RemoteError, /busy: later/],
     [
       "refuses",
       (socket) => socket.send(serialize({ type: "error", code: "damaged", title: "Damaged", detail: "at byte 7" })),

@@ -12,20 +12,20 @@ const surface: ListedSurface = {
   progress: 1,
   reason: null,
   created: "2026-01-31T12:00:00.000+00:00",
-  filenames: ["fault_dem.npz"],
   upload_bytes: 1,
 };
 
 describe("the list", () => {
-  it("is searched by words of names, files and ids", () => {
-    for (const search of ["", "jacks", "DEM jack", "5f1c"]) expect(matches(surface, search)).toBe(true);
-    for (const search of ["jackson", "dem tif"]) expect(matches(surface, search)).toBe(false);
+  it("is searched by words of names and ids", () => {
+    for (const search of ["", "jacks", "5f1c JACK", "boro"]) expect(matches(surface, search)).toBe(true);
+    for (const search of ["jackson", "jacks tif"]) expect(matches(surface, search)).toBe(false);
+    expect(matches({ ...surface, name: null }, "5f1c")).toBe(true);
+    expect(matches({ ...surface, name: null }, "null")).toBe(false);
   });
 
-  it("calls a surface by its name, its files or its id", () => {
+  it("calls a surface by its name or its id", () => {
     expect(nameOf(surface)).toBe("Jacksboro");
-    expect(nameOf({ ...surface, name: "" })).toBe("fault_dem.npz");
-    expect(nameOf({ ...surface, name: "", filenames: [""] })).toBe(surface.id);
+    for (const name of [null, ""]) expect(nameOf({ ...surface, name })).toBe(surface.id);
   });
 });
 

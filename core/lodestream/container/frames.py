@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Collection, Iterator
-from typing import BinaryIO, NamedTuple
+from collections.abc import Callable, Collection, Iterator
+from typing import NamedTuple
 
 from ..errors import CorruptStreamError, UnsupportedVersionError
 from . import limits, sections
@@ -209,15 +209,21 @@ class FrameReader:
         return consumed
 
 
-def section_lengths(file: BinaryIO) -> Iterator[tuple[int, int]]:
-    """Return the kind of each section of a container in a file, and its announced payload length in bytes.
+def section_lengths(read: Callable[[int, int], bytes], size: int) -> Iterator[tuple[int, int]]:
+    """Return the kind of each section of a container, and its announced payload length in bytes.
 
     Nothing else is read or checked; it ends with the root of the index, or where the bytes are no section any more.
+
+    Parameters
+    ----------
+    read : callable (offset, length) -> bytes
+        Gives fewer bytes where the container ends.
+    size : int
+        Bytes of the container.
     """
-    place, size = _SIGNATURE_BYTES, file.seek(0, 2)
+    place = _SIGNATURE_BYTES
     while place < size:
-        file.seek(place)
-        head = file.read(10)
+        head = read(place, 10)
         length = 0
         for number, byte in enumerate(head[1:]):
             length |= (byte & 127) << 7 * number

@@ -91,7 +91,6 @@ CODES: Mapping[str, Code] = {
     "message-too-large": Code(1009, "The message is too large"),
     "damaged": Code(4500, "The stored container is damaged"),
     "busy": Code(4503, "The server is busy; try again later"),
-    "missing": Code(4503, "The surface is not on the server's disk now"),
     "internal": Code(1011, "The server failed"),
     "restarting": Code(1012, "The server is restarting; try again"),
 }

@@ -63,11 +63,14 @@ class Folder:
     ----------
     root : Path
         It need not exist: the first write makes it.
+    private : bool
+        Whether only the user who writes may access what is made; otherwise the umask of the process says who may.
     """
 
-    def __init__(self, root: str | os.PathLike[str]) -> None:
+    def __init__(self, root: str | os.PathLike[str], *, private: bool = False) -> None:
         self.root = Path(root).absolute()
         self._own = self.root / OWN
+        self._private = private
         self._one_at_a_time = threading.Lock()
         self._on_disk: set[Path] = set()  # the store and folders directly in it, whose names are on disk and stay
 
@@ -248,7 +251,7 @@ class Folder:
         new = self._own / f"{secrets.token_hex(8)}.new"
         try:
             self._make(self._own)
-            with new.open("xb") as file:
+            with open(new, "xb", opener=self._create) as file:
                 write(file)
                 file.flush()
                 synchronise_file(file.fileno())
@@ -259,6 +262,9 @@ class Folder:
             _discard(new)
             raise
         return new
+
+    def _create(self, path: str, flags: int) -> int:
+        return os.open(path, flags, 0o600 if self._private else 0o666)
 
     def _moved(self, key: str, path: Path) -> Path | None:
         """Move a file to the store's own folder and synchronise it; return its path, None if it is on another disk."""
@@ -355,7 +361,7 @@ class Folder:
         else:
             self._make(folder.parent)
             with suppress(FileExistsError):
-                folder.mkdir(0o700 if folder == self._own else 0o777)
+                folder.mkdir(0o700 if self._private or folder == self._own else 0o777)
             if folder.parent != self.root:
                 return
             synchronise_folder(self.root, must=True)
@@ -369,7 +375,7 @@ class Folder:
         missing = [self.root, *self.root.parents]
         missing = missing[: next(count for count, folder in enumerate(missing) if folder.exists())]
         for folder in reversed(missing):
-            folder.mkdir(exist_ok=True)
+            folder.mkdir(0o700 if self._private and folder == self.root else 0o777, exist_ok=True)
             synchronise_folder(folder.parent, must=True)
         if not missing:
             synchronise_folder(self.root.parent)  # which may be nobody's to read

@@ -3,7 +3,7 @@
 A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds, surfaces, bytes
 on disk and streams as it leaves free for the others (`fair_share`). The rule does not apply if nobody else can write.
 
-Everything here runs in the event loop, between two awaits, so no lock is needed.
+Everything here but the check of names runs in the event loop, between two awaits, so no lock is needed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,14 +48,15 @@ class Limits:
     Parameters
     ----------
     settings : Settings
-    folder : Path
-        A folder on the disk whose space is limited.
+    folders : sequence of Path
+        Folders on the disks whose space is limited: of the data, and of what is in progress.
     surfaces : callable (owner) -> (int, int)
-        Returns how many surfaces there are: all of them, and those of an owner.
+        Returns how many surfaces and names there are: all of them, and those of an owner. It and `kept` are called in
+        threads.
     builds : callable (caller) -> (int, int)
         Returns how many builds wait or run: all of them, and those of the caller with this key.
     kept : callable (owner) -> int
-        Returns the bytes on disk of an owner's surfaces.
+        Returns the bytes on disk of an owner's surfaces and names.
     alone : callable
         Returns whether there is nobody to share with.
     """
@@ -63,14 +64,14 @@ class Limits:
     def __init__(
         self,
         settings: Settings,
-        folder: Path,
+        folders: Sequence[Path],
         surfaces: Callable[[str | None], tuple[int, int]],
         builds: Callable[[str], tuple[int, int]],
         kept: Callable[[str | None], int],
         alone: Callable[[], bool],
     ) -> None:
         self._settings = settings
-        self._folder = folder
+        self._folders = folders
         self._surfaces = surfaces
         self._builds = builds
         self._kept = kept
@@ -158,7 +159,6 @@ class Limits:
         self.check_share("uploads in progress", self._settings.max_uploads, there, caller)
         if stored:
             self.check_builds(caller)
-            self._check_surfaces(caller)
         size = request.headers.get("content-length", "")
         promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
         # One that is too large anyway is refused for that.
@@ -169,6 +169,7 @@ class Limits:
         try:
             async with clock:
                 if stored:
+                    await self._check_surfaces(caller, 1)
                     await self.check_disk(caller, new=True)
                 yield Request(request.scope, _watched(request, room, self._settings))
         except TimeoutError:
@@ -219,12 +220,12 @@ class Limits:
                 f"{max(free, 0)} bytes for all uploads of {caller.name}; delete surfaces or enlarge the disk"
             )
         if new:
-            self._check_bytes(caller.owner, free, promised)
+            await self._check_bytes(caller.owner, free, promised)
 
     async def check_owner(self, owner: str | None) -> None:
         """Check that an owner uses no more disk space than allowed; FullError is raised otherwise."""
         free, _ = await self._free()
-        self._check_bytes(owner, free, 0)
+        await self._check_bytes(owner, free, 0)
 
     async def room(self) -> int:
         """Return bytes of free disk space, without the space to keep free; announced sizes are not subtracted."""
@@ -232,18 +233,18 @@ class Limits:
 
     async def _free(self) -> tuple[int, int]:
         """Return the bytes that may be taken, and the bytes that stay free."""
-        disk = await asyncio.to_thread(shutil.disk_usage, self._folder)
-        kept = self._settings.keep_free
-        if kept is None:
-            kept = min(_KEPT, disk.total // 20)
-        return disk.free - kept, kept
+        disks = [await asyncio.to_thread(shutil.disk_usage, folder) for folder in self._folders]
+        kept = [min(_KEPT, disk.total // 20) for disk in disks]
+        if self._settings.keep_free is not None:
+            kept = [self._settings.keep_free] * len(disks)
+        return min((disk.free - part, part) for disk, part in zip(disks, kept, strict=True))
 
-    def _check_bytes(self, owner: str | None, free: int, promised: int) -> None:
-        has = self._kept(owner) + self._taken[owner]
+    async def _check_bytes(self, owner: str | None, free: int, promised: int) -> None:
         most, why = self._settings.owner_bytes, ""
+        if most is None and self._alone():
+            return
+        has = await asyncio.to_thread(self._kept, owner) + self._taken[owner]
         if most is None:
-            if self._alone():
-                return
             most, why = (has + free) // 2, ", half of what they use there plus what is free"
         if has + promised > most:
             raise FullError(
@@ -301,13 +302,25 @@ class Limits:
                 f"got {size >> 10} KiB, and {(most - everybody) >> 10} KiB would be left; try again when some are done"
             )
 
-    def _check_surfaces(self, caller: Caller) -> None:
-        """Check that one more surface is allowed; uploads in progress count as surfaces."""
-        most = self._settings.max_surfaces
+    def names(self, caller: Caller) -> Callable[[], None]:
+        """Return a check, for a thread, that one more name is allowed; names count as surfaces.
+
+        It raises `FullError` if there are as many surfaces as allowed.
+        """
         uploads = list(self._uploads.values())
-        kept, kept_of_owner = self._surfaces(caller.owner)
-        everybody = kept + len(uploads)
-        count = kept_of_owner + sum(other.owner == caller.owner for other in uploads)
+        return lambda: self._check_count(caller, uploads, self._surfaces(caller.owner), 0)
+
+    async def _check_surfaces(self, caller: Caller, own: int) -> None:
+        """Check that one more surface is allowed; uploads in progress count as surfaces, but `own` of the caller's."""
+        # Before the surfaces: one that ends meanwhile counts twice, and never not at all.
+        uploads = list(self._uploads.values())
+        self._check_count(caller, uploads, await asyncio.to_thread(self._surfaces, caller.owner), own)
+
+    def _check_count(self, caller: Caller, uploads: list[Caller], there: tuple[int, int], own: int) -> None:
+        """Check that one more surface or name is allowed beside uploads in progress and what is there."""
+        most, (kept, kept_of_owner) = self._settings.max_surfaces, there
+        everybody = kept + len(uploads) - own
+        count = kept_of_owner + sum(other.owner == caller.owner for other in uploads) - own
         if everybody >= most:
             raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
         if exceeds_share(most, everybody, count) and not self._alone():

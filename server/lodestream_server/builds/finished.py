@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING, Any
+import math
+import os
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lodestream.errors import CorruptStreamError, FormatError, OptionError, TooLargeError
 
-from ..storage.records import plain
 from ..store.durable import NewFile
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
     from lodestream.container import Index
@@ -86,11 +89,17 @@ def _check_sections(path: Path) -> None:
     from lodestream.container.sections import METADATA
 
     with path.open("rb") as file:
-        for number, (kind, length) in enumerate(section_lengths(file)):
+        size = os.fstat(file.fileno()).st_size
+        for number, (kind, length) in enumerate(section_lengths(partial(_read, file), size)):
             if number == MOST_SECTIONS:
                 raise TooLargeError(f"expected at most {MOST_SECTIONS:,} sections in a container, got more")
             if kind == METADATA and length > MAX_BYTES:
                 raise TooLargeError(f"expected at most {MAX_BYTES} bytes of metadata in a container, got {length}")
+
+
+def _read(file: BinaryIO, offset: int, length: int) -> bytes:
+    file.seek(offset)
+    return file.read(length)
 
 
 def keep(job: Job, path: Path, progress: Callable[[float], None]) -> tuple[str, str]:
@@ -145,6 +154,19 @@ def figures_of(index: Index, known: Mapping[str, Any] | None, files: Sequence[Pa
     elif any(path.is_file() and is_container(path) for path in files):
         info[ERRORS] = TOLD
     return info
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON would return it: numbers that are not finite as null, bytes as hexadecimal digits."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
 
 
 def checked(index: Index, info: dict[str, Any]) -> dict[str, Any]:

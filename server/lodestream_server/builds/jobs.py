@@ -1,21 +1,21 @@
 """Builds: a queue of surfaces, and processes that may die or be killed without harm to the server.
 
-The queue is on disk: it consists of the records whose state is queued. What can happen to a build:
+The queue consists of the surfaces whose state is queued (`store.states`). What can happen to a build:
 
 ======================================  ================================================================================
-the reader rejects the file             the surface is failed, for good, once that is recorded
+the reader rejects the file             the surface is failed, for good, once that is stored
 the surface is deleted                  its process is killed
-the process dies, or lacks memory       one more attempt in another process, then the surface waits
-the process gets SIGTERM                another attempt, at most `_ENDINGS` in all: a service is being stopped
+the process dies, lacks memory, or      that counts as an attempt; after `_ATTEMPTS` of them the surface waits
+gets SIGTERM; the server dies
 it takes too long                       the surface waits
 a library is missing, a limit or        the surface waits
 setting of this server prevents it, or
 an uploaded container has a version
 that this server does not read
+its upload is gone, or damaged          the surface waits, unless its container is there again
 the disk is full, or the owner exceeds  it stays in the queue until there is room
 its share of the disk
-the server dies                         the next server builds it, after the caller's builds with fewer attempts; when
-                                        `_CRASHES` servers have died during it, the surface waits
+the server ends                         the next server builds it
 ======================================  ================================================================================
 
 Callers (tokens, or addresses without a token) take turns: the next build is that of the caller with the fewest running
@@ -31,7 +31,6 @@ import asyncio
 import errno
 import logging
 import os
-import signal
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
@@ -41,16 +40,21 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from lodestream import stores
 from lodestream.confinement import missing
 from lodestream.errors import InputError, TooLargeError
+from lodestream.stores import AbsentError, StoreError
 
 from ..access.access import key_of
+from ..operation.logs import event
 from ..operation.settings import Settings
-from ..problems import FullError, MissingError
-from ..storage.records import Record, State
-from ..storage.storage import Storage
-from ..storage.uploads import check_upload
+from ..problems import FullError
 from ..store.durable import discard
+from ..store.index import IndexLostError, Surface
+from ..store.layout import Manifest
+from ..store.states import State
+from ..store.surfaces import Surfaces
+from ..store.uploads import check_upload
 from . import results, worker
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason_of
 from .cluster_build import ClusterJob
@@ -58,26 +62,24 @@ from .clusters import build_by_cluster
 from .fork_server import Allowed
 from .processes import Call, ForkServer, Pool
 from .shares import Turns
+from .work import Work
 
 __all__ = ["Builder"]
 
 _log = logging.getLogger(__name__)
 _STARTED_AGAIN = "the build of %s starts again from the beginning; continuing it failed: %s"
 
-_DEATHS = 2
-_ENDINGS = 3
-_CRASHES = 3
+# So often a build may begin and come to no end: its process dies, or the server does.
+_ATTEMPTS = 3
 
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
 _PASSING = (*worker.NO_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+_ROOM = "space on the server's disk"
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
 
 # Of the points of a surface, in the largest type.
 _BYTES = 24
-
-# So often a build is tried that lacks them, where somebody waits for its end.
-_ATTEMPTS = 3
 
 # For so many seconds it counts whose builds have had a process.
 _REMEMBERED = 600.0
@@ -98,7 +100,7 @@ _HELD_SECONDS = 600.0
 
 
 class _LaterError(Exception):
-    """The system has no room, or nothing else that a build needs, now.
+    """A build lacks something now, such as room on a disk.
 
     Attributes
     ----------
@@ -114,11 +116,13 @@ class _LaterError(Exception):
     def of(cls, number: int | None) -> _LaterError:
         """Return the error for a system error with this number."""
         return cls(
-            "space on the server's disk"
-            if number in worker.NO_ROOM
-            else f"the server's system ({os.strerror(number or 0)})",
+            _ROOM if number in worker.NO_ROOM else f"the server's system ({os.strerror(number or 0)})",
             held=number == errno.EAGAIN,
         )
+
+
+class _OverError(Exception):
+    """A surface was deleted, or it is known by now what became of it."""
 
 
 class Builder:
@@ -126,13 +130,12 @@ class Builder:
 
     Parameters
     ----------
-    storage : Storage settings : Settings
+    surfaces : Surfaces
+    work : Work
+    settings : Settings
     finished : callable (state, seconds) or None
-        Called when a build ends, with the state (``ready``, ``failed``, ``waiting``, ``missing``) and the duration of
-        its last attempt.
-    patient : bool
-        Whether builds that find the disk full wait until there is space. Otherwise they are given up after a few
-        attempts and stay in the queue, for the next server.
+        Called when a build ends, with the state (``ready``, ``failed``, ``waiting``) and the duration of its last
+        attempt.
 
     Attributes
     ----------
@@ -144,15 +147,14 @@ class Builder:
 
     def __init__(
         self,
-        storage: Storage,
+        surfaces: Surfaces,
+        work: Work,
         settings: Settings,
         finished: Callable[[State, float], None] | None = None,
-        *,
-        patient: bool = True,
     ) -> None:
         self.ready = False
-        self._patient = patient
-        self._storage = storage
+        self._surfaces = surfaces
+        self._work = work
         self._settings = settings
         self._finished = finished
         self._memory, self._threads = settings.memory_of_build, settings.threads_of_build
@@ -180,7 +182,7 @@ class Builder:
         """Return the number of builds that wait or run: all of them, and those of the caller with this key."""
         return len(self._tasks), self._pending.get(caller, 0)
 
-    def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
+    async def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
         """Start the process that builds come from, and continue builds queued when the server last ended.
 
         Parameters
@@ -190,63 +192,88 @@ class Builder:
         """
         self._check_owner = check_owner
         self._preloading = asyncio.create_task(self._preload())
-        queued = [record for record in self._storage.records() if record.state == "queued"]
-        # What may have killed a server comes last: everything else is built before it does so again.
-        for record in sorted(queued, key=lambda record: record.attempts):
-            self.submit(record)
+        try:
+            queued = await asyncio.to_thread(self._surfaces.index.queued)
+        except (StoreError, IndexLostError) as error:  # they are found once it is there again, see `resume`
+            _log.error("%s", error)
+            return
+        await asyncio.to_thread(self._work.clean, set(queued))
+        self._submit_all(queued)
 
-    async def accept(self, record: Record, upload: Path, caller: str | None = None) -> tuple[Record, bool]:
-        """Store an upload and build its surface, see `Storage.add`; both happen even if the calling task is cancelled.
+    async def resume(self) -> None:
+        """Queue the builds of all surfaces that are queued: more may have been found in the store."""
+        self._submit_all(await asyncio.to_thread(self._surfaces.index.queued))
+
+    def _submit_all(self, queued: Sequence[str]) -> None:
+        for surface in queued:
+            self._submit(surface, None)
+
+    async def accept(
+        self, manifest: Manifest, files: Sequence[Path], folder: Path, caller: str | None = None
+    ) -> Surface:
+        """Store an upload and build its surface, see `Surfaces.accept`; both happen even if the task is cancelled.
 
         Parameters
         ----------
-        record : Record
-        upload : Path
-            Folder of the files. This function takes it over, and removes it if it is not kept.
+        manifest : Manifest
+        files : sequence of Path
+        folder : Path
+            Folder of the files. This function takes it over, and removes what is not kept.
         caller : str or None
             Key of the caller for whom the build runs; None: its owner.
         """
-        return await asyncio.shield(asyncio.create_task(self._accept(record, upload, caller)))
+        return await asyncio.shield(asyncio.create_task(self._accept(manifest, files, folder, caller)))
 
-    async def _accept(self, record: Record, upload: Path, caller: str | None) -> tuple[Record, bool]:
+    async def _accept(self, manifest: Manifest, files: Sequence[Path], folder: Path, caller: str | None) -> Surface:
         try:
-            record, new = await asyncio.to_thread(self._storage.add, record, upload)
+            surface, new = await asyncio.to_thread(self._surfaces.accept, manifest, files)
         finally:
             # By nobody else, and not before: it may be on its way to its place.
-            await asyncio.to_thread(discard, upload)
+            await asyncio.to_thread(discard, folder)
         if new:
-            self.submit(record, caller)
-        return record, new
+            self.submit(surface, caller)
+        return surface
 
-    def submit(self, record: Record, caller: str | None = None) -> None:
+    def submit(self, surface: Surface, caller: str | None = None) -> None:
         """Queue a build. It runs when a process is free and it is the turn of the caller (by default, of its owner)."""
-        if record.id not in self._tasks and not self._closing:
-            task = asyncio.create_task(self._build(record))
-            self._tasks[record.id] = task
-            self._callers[record.id] = key = caller or key_of(record.owner)
-            self._pending[key] += 1
-            task.add_done_callback(lambda _: self._ended(record.id))
+        self._submit(surface.id, caller or key_of(surface.manifest.owner))
+
+    def _submit(self, surface: str, caller: str | None) -> None:
+        if surface not in self._tasks and not self._closing:
+            task = asyncio.create_task(self._build(surface))
+            self._tasks[surface] = task
+            if caller is not None:
+                self._count(surface, caller)
+            task.add_done_callback(lambda _: self._ended(surface))
+
+    def _count(self, surface: str, caller: str) -> None:
+        self._callers[surface] = caller
+        self._pending[caller] += 1
 
     def _ended(self, surface: str) -> None:
         self._tasks.pop(surface, None)
         self._held.pop(surface, None)
-        caller = self._callers.pop(surface)
-        self._pending[caller] -= 1
-        if not self._pending[caller]:
-            del self._pending[caller]
+        caller = self._callers.pop(surface, None)
+        if caller is not None:
+            self._pending[caller] -= 1
+            if not self._pending[caller]:
+                del self._pending[caller]
         # Whoever saw the build end may have asked for another before its task was over.
-        record = self._storage.find(surface)
-        if self._patient and record is not None and surface not in self._deleting:
-            self._resume(record, caller)
+        if surface not in self._deleting and (known := self._find(surface)) is not None:
+            self._resume(known, caller)
 
-    def _resume(self, record: Record, caller: str | None = None) -> None:
-        if record.state == "queued":
-            self.submit(record, caller)
+    def _find(self, surface: str) -> Surface | None:
+        try:
+            return self._surfaces.index.find(surface)
+        except (IndexLostError, StoreError):  # all are found again once the index is
+            return None
 
-    async def retry(self, surface: str, caller: str | None = None) -> Record:
-        """Build a surface again that failed, waits or is missing, if there is something to build it from.
+    def _resume(self, surface: Surface, caller: str | None = None) -> None:
+        if surface.state in ("queued", "building"):  # that the last attempt has ended may not have been noted
+            self.submit(surface, caller)
 
-        Return its record.
+    async def retry(self, surface: str, caller: str | None = None) -> Surface:
+        """Build a surface again that failed or waits; return it.
 
         Parameters
         ----------
@@ -258,21 +285,19 @@ class Builder:
         ------
         NotFoundError
             If there is no such surface.
-        OSError
-            If its record cannot be written.
+        StoreError
+            If that cannot be stored.
         """
-        record = await asyncio.to_thread(self._storage.retry, surface)
-        self._resume(record, caller)
-        return record
+        again = await asyncio.to_thread(self._surfaces.retry, surface)
+        self._resume(again, caller)
+        return again
 
-    def state(self, record: Record) -> tuple[State, float]:
-        """Return the current state of a surface, and the fraction of its build that is done."""
-        if record.state != "queued":
-            return record.state, float(record.state == "ready")
-        running = self._running.get(record.id)
-        if running is None or not running.call.begun.is_set():
-            return "queued", 0.0
-        return "building", worker.read_progress(running.folder)
+    def progress(self, surface: Surface) -> float:
+        """Return the fraction of a surface's build that is done."""
+        running = self._running.get(surface.id)
+        if surface.state != "building" or running is None:
+            return float(surface.state == "ready")
+        return worker.read_progress(running.folder)
 
     async def delete(self, surface: str) -> None:
         """Delete a surface; a running build of it is killed. Builds that wait for disk space try again.
@@ -281,23 +306,29 @@ class Builder:
         ------
         NotFoundError
             If there is no such surface.
-        OSError
+        StoreError
             If it could not be deleted; it still exists, and is built as before.
         """
-        self._storage.get(surface)
+        self._surfaces.get(surface)
         self._deleting.add(surface)
         try:
             task = self._tasks.get(surface)
             if task is not None:
-                task.cancel()
+                if not task.cancelling():  # a second time it would not wait for the end of its process
+                    task.cancel()
                 with suppress(asyncio.CancelledError):
                     await task
-            await asyncio.to_thread(self._storage.delete, surface)
+            await asyncio.to_thread(self._surfaces.delete, surface)
+            await asyncio.to_thread(self._work.forget, surface)
         finally:
             self._deleting.discard(surface)
-            kept = self._storage.find(surface)
+            kept = self._find(surface)
             if kept is not None:  # it could not be deleted
                 self._resume(kept)
+        self.room_was_made()
+
+    def room_was_made(self) -> None:
+        """Try again what waits for disk space."""
         room, self._room = self._room, asyncio.Event()
         room.set()
 
@@ -351,132 +382,163 @@ class Builder:
         else:
             _log.error("the libraries of builds could not be loaded: %s", problem)
 
-    async def _build(self, record: Record) -> None:
-        delay, reason, attempts = _FIRST_DELAY, "", 0
+    async def _build(self, surface: str) -> None:
+        delay, reason = _FIRST_DELAY, None
         while True:
-            attempts += 1
             started = time.monotonic()
             try:
-                state = await self._insist(record)
-            except _LaterError as error:
-                if str(error) != reason:
-                    reason = str(error)
-                    _log.error("the build of %s %s", record.id, reason)
-                    self._storage.note(record.id, reason)
-                if not self._patient and attempts == _ATTEMPTS:
-                    return
+                state = await self._insist_or_postpone(surface)
+            except (_LaterError, StoreError, IndexLostError) as error:
+                if _lacking(error) != reason:
+                    reason = _lacking(error)
+                    _log.error("the build of %s %s", surface, reason if reason == str(error) else f"{reason}: {error}")
+                await self._try(partial(self._surfaces.later, surface, reason))
                 with suppress(TimeoutError):
                     async with asyncio.timeout(delay):
                         await self._room.wait()
                 delay = min(2 * delay, _LONGEST_DELAY)
                 continue
-            except Exception:
-                _log.exception("the build of %s failed unexpectedly", record.id)
-                state = await self._postpone(record, "the build failed with an internal error")
-            if self._finished is not None:
-                self._finished(state, time.monotonic() - started)
+            if state is not None:
+                seconds = time.monotonic() - started
+                event(_log, "build ended", surface=surface, state=state, seconds=seconds)
+                if self._finished is not None:
+                    self._finished(state, seconds)
             return
 
-    async def _insist(self, record: Record) -> State:
-        """Retry a build until the surface is ready or refused."""
-        if record.attempts >= _CRASHES:
-            return await self._postpone(record, f"the server ended {record.attempts} times while this was being built")
-        deaths = endings = 0
+    async def _insist_or_postpone(self, surface: str) -> State | None:
+        try:
+            return await self._insist(surface)
+        except (_LaterError, StoreError, IndexLostError):
+            raise
+        except Exception:
+            _log.exception("the build of %s failed unexpectedly", surface)
+            return await self._postpone(surface, "the build failed with an internal error")
+
+    async def _insist(self, surface: str) -> State | None:
+        """Build a surface until it is ready or refused, or waits; return its state, None if it was deleted."""
+        reason = "the server ended"
         while True:
+            known = await asyncio.to_thread(self._surfaces.index.find, surface)
+            if known is not None and known.state == "building":  # that the last attempt had ended could not be noted
+                known = await asyncio.to_thread(self._surfaces.later, surface)
+            if known is None or known.state != "queued":
+                return None
+            if known.attempts >= _ATTEMPTS:
+                return await self._postpone(surface, f"{reason}: {known.attempts} builds began and did not end")
+            if surface not in self._callers:
+                self._count(surface, key_of(known.manifest.owner))
             try:
-                async with self._turns.turn(self._callers[record.id], record.attempts):
-                    await self._check_share(record)
-                    state = await self._check_upload(record) or await self._attempt(record)
+                async with self._turns.turn(self._callers[surface], known.attempts):
+                    await self._check_share(known)
+                    with self._surfaces.upload(known) as files:
+                        problem = await self._damage(known, files)
+                        if problem is not None:
+                            return await self._do_without(surface, problem)
+                        state = await self._attempt(known, files)
                     if state is not None:
                         return state
-                    continue
-            except MemoryError:
-                deaths, reason = deaths + 1, self._out_of_memory()
-            except ProcessDiedError as error:
-                if abs(error.exitcode or 0) == signal.SIGTERM:
-                    endings += 1
-                else:
-                    deaths += 1
-                reason = f"the build failed: {error}"
-            _log.warning("%s: %s", record.id, reason)
-            if deaths == _DEATHS or endings == _ENDINGS:
-                return await self._postpone(record, f"{reason}, {deaths + endings} times")
+            except _OverError:
+                return None
+            except AbsentError:
+                return await self._do_without(surface, "its upload is not in the server's store")
+            except (MemoryError, ProcessDiedError) as error:
+                reason = self._out_of_memory() if isinstance(error, MemoryError) else f"the build failed: {error}"
+                _log.warning("%s: %s", surface, reason)
+                await self._try(partial(self._surfaces.later, surface, reason, counts=True))
 
-    async def _check_upload(self, record: Record) -> State | None:
-        """Return the new state of a surface whose upload is gone or differs from the acknowledged one.
+    async def _try(self, note: Callable[[], object]) -> None:
+        """Note something of a build that is found out again if it is lost."""
+        try:
+            await asyncio.to_thread(note)
+        except (StoreError, IndexLostError) as error:
+            _log.warning("what became of a build could not be noted: %s", error)
 
-        None if it is intact.
-        """
-        if not await asyncio.to_thread(self._storage.has_upload, record):
-            await asyncio.to_thread(self._storage.lose, record.id)
-            await asyncio.to_thread(self._storage.forget_work, record.id)
-            return "missing"
-        problem = await self._damage(record)
-        return None if problem is None else await self._postpone(record, problem)
+    async def _do_without(self, surface: str, problem: str) -> State:
+        """Return the state of a surface whose upload is of no use: somebody may have restored its container."""
+        if await asyncio.to_thread(self._surfaces.found, surface) is not None:
+            return "ready"
+        return await self._postpone(surface, problem)
 
-    async def _check_share(self, record: Record) -> None:
+    async def _check_share(self, surface: Surface) -> None:
         # What was ready once had its share, and is given it back.
-        if self._check_owner is not None and record.container is None:
+        if self._check_owner is not None and surface.container is None:
             try:
-                await self._check_owner(record.owner)
-            except FullError as error:
-                raise _LaterError(f"disk space of its owner: {error}") from None
+                await self._check_owner(surface.manifest.owner)
+            except FullError as error:  # which names the owner, and readers see the reason
+                _log.info("the build of %s waits: %s", surface.id, error)
+                raise _LaterError("disk space of its owner, who has as much as allowed (owner_bytes)") from None
 
-    async def _attempt(self, record: Record) -> State | None:
+    async def _attempt(self, surface: Surface, files: Sequence[Path]) -> State | None:
         """Build a surface once, and return its new state; None if the build must start again from nothing."""
-        folder = self._storage.work_folder(record.id)
-        job = self._job(record, folder)
+        it = surface.manifest
+        folder = self._work.new_attempt(it.id)
+        job = self._job(surface, files, folder)
         begun = await asyncio.to_thread(_identities, job.files)
-        allowed = await asyncio.to_thread(_allowed, job, record.upload_bytes, self._memory, self._threads)
-        continued = held = ended = False
+        allowed = await asyncio.to_thread(_allowed, job, it.upload_bytes, self._memory, self._threads)
+        continued = held = ended = counted = False
 
         def begin() -> None:
-            # The folder is there from the moment a process begins: what is left of it tells the next server of a crash.
-            nonlocal continued
+            nonlocal continued, counted
             confinement = self.confinement
             if confinement is None:  # the process that others are forked from has died, and is started again
                 raise BlockingIOError(errno.EAGAIN, "it is not known yet how builds are confined")
             # Who builds by Dask is not confined, and a confined process may have been taken over.
             may_continue = confinement == _CONFINED and not job.shared
-            continued = self._storage.begin_work(record.id, folder, may_continue)
+            continued = self._work.begin(it.id, folder, may_continue)
+            # From the moment a process begins: if the server dies during it, the next one knows.
+            if self._surfaces.begin(it.id) is None:
+                raise _OverError
+            counted = True
 
         call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
-        self._running[record.id] = _Running(folder, call)
+        self._running[it.id] = _Running(folder, call)
         try:
             result: worker.Built | worker.Parsed | worker.Refused | None = await self._run(self._pool.run(call))
             if isinstance(result, worker.Parsed):
-                result = await self._run_by_cluster(record, job)
+                result = await self._run_by_cluster(it.id, job)
             if isinstance(result, worker.Built):
                 self.ready = True  # as a build shows, whatever was wrong before
-                result = await self._keep(record, job, result)
+                result = await self._keep(it.id, job, result)
             if result is None:
                 return "ready"
             ended = True
-            await asyncio.to_thread(
-                self._storage.end_work, record.id, folder
-            )  # whoever sees that it has failed sees nothing of it
+            # Whoever sees that it has failed sees nothing of it.
+            await asyncio.to_thread(self._work.end, it.id, folder)
             # A build may read the files that were there when it began: not those of the same bytes that somebody has
             # uploaded after the last owner of the first had deleted them.
             if await asyncio.to_thread(_identities, job.files) != begun:
+                await self._try(partial(self._surfaces.later, it.id))
                 return None
             if continued:
                 # What it continued from may have been at fault, and is gone now.
-                _log.warning(_STARTED_AGAIN, record.id, result.reason)
+                _log.warning(_STARTED_AGAIN, it.id, result.reason)
+                await self._try(partial(self._surfaces.later, it.id))
                 return None
-            return await (self._refuse if result.final else self._postpone)(record, result.reason)
+            if result.final:
+                return await self._refuse(surface, files, result.reason)
+            return await self._postpone(it.id, result.reason)
         except _LaterError as error:
-            held = error.held and self._is_held_shortly(record.id)
+            held = error.held and self._is_held_shortly(it.id)
             raise
         except (MemoryError, ProcessDiedError) as error:
             if not continued or self._closing:
                 raise
-            _log.warning(_STARTED_AGAIN, record.id, error)
+            _log.warning(_STARTED_AGAIN, it.id, error)
+            await self._try(partial(self._surfaces.later, it.id, str(error), counts=True))
             return None
+        except asyncio.CancelledError:
+            if counted:  # the server ends, or the surface is deleted: that is no fault of the build
+                await _carried_out(partial(self._end_early, it.id))
+            raise
         finally:
-            self._running.pop(record.id, None)
+            self._running.pop(it.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
             keeps = held or (self._closing and not ended)
-            await _carried_out(partial(self._storage.end_work, record.id, folder, keeps))
+            await _carried_out(partial(self._work.end, it.id, folder, keeps))
+
+    def _end_early(self, surface: str) -> None:
+        with suppress(StoreError, IndexLostError):
+            self._surfaces.later(surface)
 
     def _is_held_shortly(self, surface: str) -> bool:
         """Return whether the folder of a build is locked by a process that is about to end."""
@@ -499,11 +561,11 @@ class Builder:
             return worker.Refused(reason_of(result.reason), result.final)
         return result
 
-    async def _run_by_cluster(self, record: Record, job: worker.Job) -> worker.Built | worker.Refused:
+    async def _run_by_cluster(self, surface: str, job: worker.Job) -> worker.Built | worker.Refused:
         if not job.shared:
             raise WrongAnswerError("expected a container, got a surface that is only parsed")
         address, started = self._settings.dask, time.monotonic()
-        _log.info("the build of %s goes to the workers of the Dask scheduler %s", record.id, address)
+        _log.info("the build of %s goes to the workers of the Dask scheduler %s", surface, address)
         how = "cut short"
         try:
             task = ClusterJob(job, address, self._memory // 2)
@@ -512,68 +574,79 @@ class Builder:
             return result
         finally:
             seconds = time.monotonic() - started
-            _log.info("the build of %s came back from Dask after %.1f s: %s", record.id, seconds, how)
+            _log.info("the build of %s came back from Dask after %.1f s: %s", surface, seconds, how)
 
     def _too_slow(self, error: TimeoutError) -> worker.Refused:
         longer = f"more {error} than" if error.args else "longer than"
         return worker.Refused(f"the build took {longer} {self._settings.build_seconds:g} s", final=False)
 
-    async def _keep(self, record: Record, job: worker.Job, built: worker.Built) -> worker.Refused | None:
+    async def _keep(self, surface: str, job: worker.Job, built: worker.Built) -> worker.Refused | None:
         try:
             info = await asyncio.to_thread(results.check, job.container, built, job.files)
-            await asyncio.to_thread(self._storage.ready, record.id, job.container, built.sha256, info)
+            await asyncio.to_thread(self._surfaces.built, surface, job.container, built.sha256, info)
         except OSError as error:
             return _not_now(error)
-        except (MissingError, TooLargeError) as error:
+        except TooLargeError as error:
             return worker.Refused(str(error), final=False)
         return None
 
-    async def _refuse(self, record: Record, reason: str) -> State:
+    async def _refuse(self, surface: Surface, files: Sequence[Path], reason: str) -> State:
         # Only the bytes that were acknowledged can be refused for good: not what a bad disk makes of them.
-        problem = await self._damage(record)
+        problem = await self._damage(surface, files)
         if problem is not None:
-            return await self._postpone(record, problem)
-        if record.info is not None:
-            return await self._postpone(record, f"it was ready before, and cannot be built again: {reason}")
+            return await self._postpone(surface.id, problem)
+        if surface.container is not None:
+            return await self._postpone(surface.id, f"it was ready before, and cannot be built again: {reason}")
         try:
-            await asyncio.to_thread(self._storage.failed, record.id, reason)
-        except OSError as error:
-            return await self._postpone(record, f"{reason}; that could not be recorded: {_not_now(error).reason}")
-        _log.info("%s failed: %s", record.id, reason)
+            await asyncio.to_thread(self._surfaces.refused, surface.id, reason)
+        except stores.FullError:
+            raise
+        except StoreError as error:
+            _log.error("the failure of %s could not be stored: %s", surface.id, error)
+            return await self._postpone(surface.id, f"{reason}; that could not be stored")
+        _log.info("%s failed: %s", surface.id, reason)
         return "failed"
 
-    async def _damage(self, record: Record) -> str | None:
+    async def _damage(self, surface: Surface, files: Sequence[Path]) -> str | None:
         """Return how the upload differs from the acknowledged one; None if it does not."""
         try:
-            problem = await asyncio.to_thread(check_upload, self._storage.upload_files(record), record)
+            problem = await asyncio.to_thread(check_upload, files, surface.manifest)
         except OSError as error:
             problem = error.strerror
         return None if problem is None else f"the upload is damaged or cannot be read: {problem}"
 
-    async def _postpone(self, record: Record, reason: str) -> State:
-        _log.warning("%s waits for a retry: %s", record.id, reason)
-        await asyncio.to_thread(self._storage.postpone, record.id, reason)
-        await asyncio.to_thread(self._storage.forget_work, record.id)  # a retry begins with the upload
+    async def _postpone(self, surface: str, reason: str) -> State:
+        _log.warning("%s waits for a retry: %s", surface, reason)
+        await asyncio.to_thread(self._surfaces.stuck, surface, reason)
+        await asyncio.to_thread(self._work.forget, surface)  # a retry begins with the upload
         return "waiting"
 
     def _out_of_memory(self) -> str:
         return f"the build needed more memory than its share, {self._memory >> 20} MiB (LODESTREAM_MEMORY)"
 
-    def _job(self, record: Record, folder: Path) -> worker.Job:
-        options = dict(record.options)
+    def _job(self, surface: Surface, files: Sequence[Path], folder: Path) -> worker.Job:
+        it = surface.manifest
+        options = dict(it.options)
         return worker.Job(
-            files=tuple(self._storage.upload_files(record)),
-            filename=record.filenames[0] or None,
-            name=record.name,
+            files=tuple(files),
+            filename=it.filenames[0] or None,
+            name=it.name,
             closed=options.pop("closed", "auto"),
             options=options,
             max_vertices=self._settings.max_vertices,
             folder=folder,
-            bands=None if self._settings.dask else self._storage.bands_folder(record.id),
+            bands=None if self._settings.dask else self._work.bands(it.id),
             allowed=self._settings.formats,
             shared=bool(self._settings.dask),
             memory=self._memory,
         )
+
+
+def _lacking(error: Exception) -> str:
+    """Return what a build waits for, in words for users: errors of a store say where the data of the server are."""
+    if isinstance(error, _LaterError):
+        return str(error)
+    return f"waits for {_ROOM if isinstance(error, stores.FullError) else 'the data of the server'}"
 
 
 async def _carried_out(remove: Callable[[], None]) -> None:

@@ -25,7 +25,7 @@ import logging
 import os
 from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Coroutine
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,7 @@ from lodestream.errors import InputError, LodestreamError, OptionError, StreamEr
 from ..access.access import Caller
 from ..operation.settings import Settings
 from ..problems import BusyError, FullError, LargeLevelError, RestartingError, TooManyError, UnfitLevelError
-from ..storage import damage
-from ..storage.folders import is_file
-from ..storage.storage import Storage
+from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
 from .fork_server import Allowed
@@ -119,7 +117,10 @@ class LevelQueue:
 
     Parameters
     ----------
-    settings : Settings storage : Storage files : LevelFiles fork_server : ForkServer
+    settings : Settings
+    containers : Containers
+    files : LevelFiles
+    fork_server : ForkServer
     check_share : callable
         See `Limits.check_share`.
     """
@@ -127,13 +128,13 @@ class LevelQueue:
     def __init__(
         self,
         settings: Settings,
-        storage: Storage,
+        containers: Containers,
         files: LevelFiles,
         fork_server: ForkServer,
         check_share: Callable[[str, int, tuple[int, int], Caller], None],
     ) -> None:
         self._settings = settings
-        self._storage = storage
+        self._containers = containers
         self._files = files
         self._check_share = check_share
         self._pool = Pool(1, fork_server)
@@ -332,10 +333,15 @@ class LevelQueue:
             job.done.set_result(None)
 
     async def _make(self, job: _Job) -> Lease:
-        container = await asyncio.to_thread(self._storage.container, job.key.container)
         most = await self._files.make_room()
         if most < _LEAST_ROOM:
             raise self._no_room(most)
+        with ExitStack() as stack:  # a file of this machine, which a thread may have to fetch
+            local = self._containers.local(job.key.container)
+            container = await asyncio.to_thread(stack.enter_context, local)
+            return await self._make_from(container, job, most)
+
+    async def _make_from(self, container: Path, job: _Job, most: int) -> Lease:
         folder = self._files.new_folder(job.key)
         memory = self._settings.memory_of_levels
         wanted = LevelJob(container, job.key.level, job.key.format_name, folder, most, memory)
@@ -372,9 +378,7 @@ class LevelQueue:
                 raise self._no_room(0) from None
             # It may read the file that was there when it began, and no other in its place.
             if error.kind == "FileNotFoundError" or error.errno == errno.EACCES:
-                gone = self._storage.gone(key.container)
-                if not isinstance(gone, BusyError):
-                    raise gone from None
+                (await asyncio.to_thread(self._containers.blob, key.container)).close()  # or it says that it is gone
                 if os.access(wanted.container, os.R_OK):
                     raise _ReplacedError("its container was deleted and built again meanwhile") from None
             _log.error("making a level failed unexpectedly: %s", error.traceback)
@@ -398,7 +402,7 @@ class LevelQueue:
         if isinstance(refused, InputError) and not isinstance(refused, OptionError):
             raise UnfitLevelError(str(refused))
         if isinstance(refused, StreamError):
-            damage.tell(self._storage, key.container, refused)
+            self._containers.tell_damage(key.container, refused)
         raise refused
 
     @property
@@ -431,7 +435,7 @@ def _allowed(wanted: LevelJob, settings: Settings) -> Allowed:
 
 def _checked_size(wanted: LevelJob, level: MadeLevel) -> int:
     """Return the bytes of a new level file, which must exist and not be a link to another file."""
-    if not is_file(wanted.path):
+    if not wanted.path.is_file():
         raise WrongAnswerError("expected a level in a file of its own")
     status = wanted.path.lstat()
     if status.st_nlink != 1 or status.st_size != level.size or level.size > wanted.most_bytes:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lodestream.errors import CorruptStreamError, InputError, StreamError, TooLargeError
 from lodestream.operating_system import read_at
 
-from ..storage import containers
+from ..store import containers
 from . import finished
 from .answers import WrongAnswerError, reason_of
 
@@ -70,17 +70,16 @@ def check(path: Path, built: Built, files: Sequence[Path]) -> dict[str, Any]:
         if sha256 != built.sha256:
             raise WrongAnswerError(f"expected a container with the SHA-256 {built.sha256}, got {sha256}")
 
-        needed, most = sum(containers.index_memory(file)), containers.most_for_indexes() // 2
-        if needed > most:
-            raise TooLargeError(
-                f"expected a container whose index takes at most {most >> 20} MiB of memory, got {needed >> 20} MiB"
-            )
-
         def read(offset: int, length: int) -> bytes:
             if length > _MOST_AT_ONCE:
                 raise CorruptStreamError(f"expected at most {_MOST_AT_ONCE} bytes at once, got {length}", offset)
             return read_at(handle, length, offset)
 
+        needed, most = sum(containers.index_memory(read, status.st_size)), containers.most_for_indexes() // 2
+        if needed > most:
+            raise TooLargeError(
+                f"expected a container whose index takes at most {most >> 20} MiB of memory, got {needed >> 20} MiB"
+            )
         try:
             index = read_index(read, status.st_size)
             errors = built.errors if finished.is_container(files[0]) else None

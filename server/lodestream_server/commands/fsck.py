@@ -6,20 +6,20 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lodestream.errors import LodestreamError, OptionError
-from lodestream.library import require
+from lodestream.errors import LodestreamError
 from lodestream.text import printable
 
 from ..linux import require_linux
 
 if TYPE_CHECKING:
-    from ..maintenance.fsck import Report
-    from ..storage.records import Record
+    from lodestream.stores import Entry
+
+    from ..maintenance.findings import Report
 
 __all__ = ["fsck", "register"]
 
@@ -29,111 +29,108 @@ def register(subparsers: Any, _: Sequence[str] = ()) -> None:
     parser = subparsers.add_parser(
         "fsck",
         help="check and repair the data folder of a server",
-        description="Check all records, uploads and containers in the data folder of a server, by their hashes and "
-        "checksums. No server may be running in the folder. Exit code 0: nothing is damaged, or all damage was "
-        "repaired without loss; 1: something is damaged, or (with --retry) a surface still waits.",
+        description="Check all that is in the data folder of a server, by hashes and checksums. No server may be "
+        "running in the folder. Without an option nothing is changed. Nothing is built here: what is to be built again "
+        "is built by the next start of the server. Exit code 0: nothing is damaged, or all damage was repaired without "
+        "loss; 1: something is damaged.",
         allow_abbrev=False,
     )
     parser.add_argument("data", metavar="DIR", type=Path, help="data folder of a server")
     parser.add_argument(
-        "--repair",
-        action="store_true",
-        help="move damaged files to DIR/damaged, and build their containers again from the uploads",
+        "--scratch",
+        metavar="DIR",
+        type=Path,
+        help="folder of the server's index, if the server has this setting too (default: LODESTREAM_SCRATCH, or "
+        "scratch in the data folder)",
     )
     parser.add_argument(
-        "--adopt",
+        "--repair",
         action="store_true",
-        help="declare that records, uploads and containers in DIR belong together, after you moved them there: rewrite "
-        "their identity files, and add uploads that have only their own copy of a record",
+        help="remove damaged containers whose uploads are whole, so that the next start builds them again",
+    )
+    parser.add_argument(
+        "--collect",
+        action="store_true",
+        help="remove strays: files that no surface has referred to for a day, as killed processes leave them",
     )
     parser.add_argument(
         "--retry",
         action="store_true",
-        help="also build the surfaces that wait because an earlier build failed for a temporary reason",
+        help="queue the surfaces that wait because an earlier build failed for a temporary reason. The index says "
+        "which do: give --scratch if the server has that setting",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=fsck)
 
 
 def fsck(args: argparse.Namespace) -> int:
-    """Check a folder, repair it if requested, and print the findings; return the exit code.
+    """Check a folder, change what is asked for, and print the findings; return the exit code.
 
     Raises
     ------
-    OptionError
-        If ``--adopt`` and ``--repair`` are both asked for.
     LodestreamError
-        If it is not the data folder of a server, or another process uses it; or if the folder is to be changed and the
-        compiled kernels are missing.
+        If it is not the data folder of a server, or another process uses it.
+    OptionError
+        If an environment variable has an invalid value.
     UnavailableError
         If this is not Linux.
     """
-    from ..storage.folders import Folders
-
     require_linux()
-    folder: Path = args.data
-    if args.repair or args.adopt or args.retry:
-        require("building surfaces again")
-    if args.adopt and args.repair:
-        raise OptionError("expected --adopt or --repair, got both: adopt first, and see that all is there")
-    if not any(place.is_dir() for place in Folders(folder).kept):
-        raise LodestreamError(
-            f"expected the data folder of a server, with records, uploads and containers, got {folder}"
-        )
-    report, records = _looked_through(folder, args)
-    waiting = [record for record in records.values() if record.state == "waiting"]
-    if args.json:
-        print(json.dumps({**report.to_json(), "waiting": [record.id for record in waiting]}))
-    else:
-        _print(report, waiting)
-    return 0 if report.clean and not (args.retry and waiting) else 1
+    from lodestream.stores import Folder
 
-
-def _looked_through(folder: Path, args: argparse.Namespace) -> tuple[Report, Mapping[str, Record]]:
-    from ..maintenance.fsck import check
-
-    # Whoever only looks makes no lock where there is none: nobody has worked there.
-    changes = args.repair or args.adopt or args.retry
-    with _alone(folder) if changes or (folder / "lock").is_file() else nullcontext():
-        report = _first(folder, args)
-    if not changes:
-        return report, report.records
-    import asyncio
-
-    from ..maintenance.repair import compare, rebuild
+    from ..maintenance.check import check, require_data
+    from ..maintenance.strays import collect
+    from ..maintenance.waiting import retry, waiting
+    from ..store.claim import LOCK
+    from ..store.data_folder import INDEX, check_version, scratch_of
     from .serve import chosen_settings
 
-    if report.findings or args.adopt or args.retry:
-        records = asyncio.run(rebuild(folder, chosen_settings(args), retry=args.retry))
-        with _alone(folder):
-            again = check(folder)
-        if args.repair:
-            compare(report, again, records)
-        else:
-            report = again
-        return report, records
-    return report, report.records
-
-
-def _first(folder: Path, args: argparse.Namespace) -> Report:
-    from ..maintenance.fsck import check
-    from ..maintenance.repair import set_aside
-    from ..storage import markers
-    from ..storage.folders import Folders
-
-    if args.adopt:
-        markers.adopt(Folders(folder))
-    elif args.repair or args.retry:
-        markers.establish(Folders(folder))  # or it says why nothing may be changed here
-    report = check(folder)
-    if args.repair:
-        set_aside(report)
-    return report
+    folder: Path = args.data
+    store = Folder(folder, private=True)
+    check_version(folder)
+    require_data(store)
+    index = scratch_of(folder, chosen_settings(args).scratch) / INDEX
+    # Whoever only looks makes no lock where there is none: nobody has worked there.
+    changes = args.repair or args.collect or args.retry
+    with _alone(folder) if changes or (folder / LOCK).is_file() else nullcontext():
+        known, waits = index.is_file(), waiting(store, index)
+        with _progress() as progress:
+            report = check(store, repair=args.repair, waiting=() if args.retry else waits, progress=progress)
+        if args.retry:
+            retry(store, index)
+        removed: list[Entry] = []
+        refusal = None
+        if args.collect:
+            try:
+                removed = collect(store)
+            except LodestreamError as error:
+                refusal = str(error)
+    if args.json:
+        collected = {"bytes": sum(entry.size for entry in removed), "keys": [entry.key for entry in removed]}
+        told = {"waiting": list(waits), "retried": args.retry, "index": known}
+        told |= {"collected": collected, "refused": refusal}
+        print(json.dumps(report.to_json() | told))
+    else:
+        _print(report, waits, args.retry)
+        if args.retry and not known:
+            print(
+                printable(
+                    f"no index at {index}: nobody knows what waits. The next start of the server without one builds "
+                    "all that is not built; --scratch says where another index is"
+                )
+            )
+        for entry in removed:
+            print(printable(f"removed {entry.key}, {entry.size} bytes"))
+        if args.collect and refusal is None:
+            print(f"{len(removed)} strays removed, {sum(entry.size for entry in removed) / 1e6:.1f} MB")
+        if refusal is not None:
+            print(printable(f"no stray removed: {refusal}"))
+    return 0 if report.clean and refusal is None else 1
 
 
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
-    from ..storage.storage import claim
+    from ..store.claim import claim
 
     guard = claim(folder)
     try:
@@ -142,27 +139,40 @@ def _alone(folder: Path) -> Iterator[None]:
         os.close(guard)
 
 
-def _print(report: Report, waiting: Sequence[Record]) -> None:
-    for record in waiting:
-        print(printable(f"surface {record.id} waits: {record.reason}"))
+@contextmanager
+def _progress() -> Iterator[Callable[[int, int], None]]:
+    """Show on standard error how much of the bytes was read, if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich import progress
+    from rich.console import Console
+
+    columns = (progress.BarColumn(), progress.DownloadColumn(), progress.TimeRemainingColumn())
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _print(report: Report, waits: Mapping[str, str], retried: bool) -> None:
+    for surface, reason in waits.items():
+        print(printable(f"surface {surface} {'is queued again; it waited' if retried else 'waits'}: {reason}"))
     for finding in report.findings:
-        place = finding.path.relative_to(report.folder)
-        of = f" of surface {finding.surface}" if finding.surface and finding.what != "record" else ""
+        of = f" of surface {finding.surface}" if finding.surface and finding.what != "manifest" else ""
         repair = f" - {finding.repair}" if finding.repair else ""
-        print(printable(f"{finding.what}{of}, {place}: {finding.problem}{repair}"))
-    n_damaged = len(report.damage)
+        print(printable(f"{finding.what}{of}, {finding.key}: {finding.problem}{repair}"))
+    damaged = len(report.damage)
     repaired = sum(finding.repaired for finding in report.damage)
-    lost = sum(finding.lost for finding in report.damage)
-    problems = "nothing is damaged" if not n_damaged else f"{n_damaged} damaged"
+    problems = f"{damaged} damaged" if damaged else "nothing is damaged"
     problems += f", {repaired} of these repaired" if repaired else ""
-    problems += f", {lost} lost" if lost else ""
-    problems += f", {len(waiting)} surfaces wait for a retry" if waiting else ""
-    others = sum(finding.what == "version" and finding.repair is None for finding in report.findings)
-    problems += f", {others} of another version, which the next start builds again" if others else ""
-    leftovers = sum(finding.what == "leftover" for finding in report.findings)
+    problems += f", {report.lost} lost" if report.lost else ""
+    problems += f", {len(waits)} surfaces wait for a retry" if waits and not retried else ""
+    others = sum(finding.what == "version" for finding in report.findings)
+    problems += f", {others} of another version" if others else ""
+    problems += f", {report.strays} strays of {report.stray_bytes / 1e6:.1f} MB" if report.strays else ""
     print(
         f"{report.surfaces} surfaces, {report.uploads} uploads, {report.containers} containers, "
         f"{report.bytes / 1e6:.1f} MB in {report.seconds:.1f} s: {problems}"
-        + (f", {leftovers} left over from a process that was killed" if leftovers else ""),
-        file=sys.stdout,
     )
+    if report.queued:
+        print(f"the next start of the server builds {report.queued} surface{'s' if report.queued > 1 else ''}")

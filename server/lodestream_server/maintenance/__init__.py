@@ -1,1 +1,1 @@
-"""Checking and repairing a data folder. Above `builds`, since a repair builds."""
+"""Checking and repairing the data of a server that does not run. Above `builds`, which describes containers."""

@@ -7,14 +7,11 @@ manifests are never touched.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Collection
-from contextlib import suppress
 from dataclasses import replace
 
 from lodestream.container import read_index
-from lodestream.container.sections import SIGNATURE, is_container
 from lodestream.errors import LodestreamError
 from lodestream.stores import AbsentError, Store, StoreError
 
@@ -22,10 +19,29 @@ from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
 from ..store import layout
 from ..store.layout import BUILT, IDENTITY, SURFACES, Built, DamagedObjectError, Identity
 from ..store.surfaces import establish, read_identity
-from .facts import Facts, Found
+from .facts import CONTAINER, Facts, Found
 from .findings import Finding, Report
 
-__all__ = ["check"]
+__all__ = ["check", "require_data"]
+
+
+def require_data(store: Store) -> None:
+    """Check that a store holds the data of a server, damaged or not.
+
+    Raises
+    ------
+    LodestreamError
+        If it does not.
+    StoreError
+        If it cannot be read.
+    """
+    for prefix in (SURFACES, BUILT):
+        if next(iter(store.entries(prefix)), None) is not None:
+            return
+    try:
+        store.get(IDENTITY)
+    except AbsentError:
+        raise LodestreamError(f"expected the data of a server, with {IDENTITY}, got {store.describe()}") from None
 
 
 def check(
@@ -54,6 +70,7 @@ def check(
     StoreError
         If it cannot be listed. What cannot be read is a finding.
     """
+    require_data(store)
     started = time.monotonic()
     report = Report(store.describe())
     judge = _Judge(store, report, repair, waiting)
@@ -77,10 +94,6 @@ class _Judge:
             read_identity(self._store)
             return
         except AbsentError:
-            if all(next(iter(self._store.entries(prefix)), None) is None for prefix in (SURFACES, BUILT)):
-                raise LodestreamError(
-                    f"expected the data of a server, with {IDENTITY}, got {self._store.describe()}"
-                ) from None
             found = Finding("identity", IDENTITY, None, "expected the identity of the data, got none")
         except DamagedObjectError as error:
             found = Finding("identity", IDENTITY, None, str(error))
@@ -115,7 +128,7 @@ class _Judge:
             problem, lost = it.container_problem or "expected a container, got none", lacks and what != "unreadable"
             found = Finding("version" if what == "version" else "container", place, it.id, problem, lost=lost)
             again = self._again(found, what, whole)
-        elif it.built == "ready" and it.figures != it.container_figures:
+        elif it.built == "ready" and (it.figures != it.container_figures or it.errors not in _vouchers(it)):
             problem = "expected the description that the container gives, got another"
             self._found(Finding("figures", key, it.id, problem), lambda: self._describe(it), "taken from the container")
         self._report.queued += again and whole and it.id not in self._waiting
@@ -128,10 +141,10 @@ class _Judge:
             return False
         keys = [layout.built_key(found.surface)]
         if found.what == "container":
-            keys.append(found.key)  # or the same one is not put again
+            keys.insert(0, found.key)  # first: where one is that has the right size, a server puts none
 
         def remove() -> None:
-            for key in keys:  # the small object first
+            for key in keys:
                 self._store.delete([key])
 
         return self._found(found, remove, "removed; the next start of the server builds it again")
@@ -142,10 +155,7 @@ class _Judge:
         key = layout.built_key(it.id)
         data, tag = self._store.get(key)
         built = layout.parse(Built, key, data)
-        errors = json.loads(built.info or b"{}").get(ERRORS)
-        with suppress(StoreError), self._store.open(layout.upload_key(it.upload, 0)) as blob:
-            if errors not in (CHECKED, TOLD) and is_container(blob.read(0, len(SIGNATURE))):
-                errors = TOLD
+        errors = it.errors if it.errors in _vouchers(it) else TOLD if it.upload_kind == CONTAINER else None
         with self._store.open(layout.container_key(it.container)) as blob:
             figures, size = figures_of(read_index(blob.read, blob.size), {ERRORS: errors}, ()), blob.size
         info, summary = layout.describe(figures)
@@ -162,3 +172,8 @@ class _Judge:
                 found = replace(found, repair=f"not repaired: {error}")
         self._report.findings.append(found)
         return found.repaired
+
+
+def _vouchers(it: Found) -> tuple[str | None, ...]:
+    """Return who may vouch for the errors of a surface: somebody must for an uploaded container."""
+    return (CHECKED, TOLD) if it.upload_kind == CONTAINER else (CHECKED, TOLD, None)

@@ -7,19 +7,15 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import sqlite3
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self
 
-from lodestream.container import FrameReader, read_index
-from lodestream.errors import LodestreamError, UnsupportedVersionError
+from lodestream.container.sections import SIGNATURE, is_container
 from lodestream.stores import Store, StoreError
 
-from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
 from ..store import layout
 from ..store.layout import (
     BUILT,
@@ -31,13 +27,14 @@ from ..store.layout import (
     DamagedObjectError,
     Manifest,
     Name,
-    Summary,
 )
+from .containers import check_container, chunks_of, digest_of, errors_of
 from .findings import Finding, Report
 
-__all__ = ["Facts", "Found"]
+__all__ = ["CONTAINER", "Facts", "Found"]
 
-_CHUNK = 1 << 20
+#: What an uploaded container is said to be.
+CONTAINER = "container"
 
 # `built`: none, failed, ready, bad, unreadable. `state` of an upload or a container: whole, bad, unreadable, version
 # (another one than this server reads); what has no row is missing. A manifest that is damaged has no upload.
@@ -46,7 +43,7 @@ PRAGMA journal_mode = OFF;
 PRAGMA synchronous = OFF;
 CREATE TABLE surface (
     id TEXT PRIMARY KEY, write TEXT, upload TEXT, upload_bytes INTEGER, files INTEGER, built TEXT DEFAULT 'none',
-    problem TEXT, container TEXT, container_bytes INTEGER, figures TEXT
+    problem TEXT, container TEXT, container_bytes INTEGER, figures TEXT, errors TEXT
 );
 CREATE INDEX by_upload ON surface (upload);
 CREATE INDEX by_container ON surface (container);
@@ -60,7 +57,8 @@ SELECT (SELECT coalesce(sum(upload_bytes), 0) FROM (SELECT DISTINCT upload, uplo
 """
 _SURFACES = """
 SELECT surface.id, surface.upload, surface.files, surface.built, surface.problem, surface.container, surface.figures,
-    coalesce(it.state, 'missing'), it.problem, coalesce(made.state, 'missing'), made.problem, made.figures
+    surface.errors, coalesce(it.state, 'missing'), it.problem, it.figures, coalesce(made.state, 'missing'),
+    made.problem, made.figures
 FROM surface LEFT JOIN part AS it ON it.kind = 'upload' AND it.sha256 = surface.upload
 LEFT JOIN part AS made ON made.kind = 'container' AND made.sha256 = surface.container
 WHERE surface.upload IS NOT NULL ORDER BY surface.id
@@ -77,8 +75,10 @@ class Found(NamedTuple):
     built_problem: str | None
     container: str | None
     figures: str | None
+    errors: str | None
     upload_state: str
     upload_problem: str | None
+    upload_kind: str | None
     container_state: str
     container_problem: str | None
     container_figures: str | None
@@ -164,24 +164,19 @@ class Facts:
             if known is None:
                 self._stray(entry.size)
                 continue
-            state, problem, container, size, figures = "ready", None, None, None, None
             try:
                 built = layout.parse(Built, entry.key, self._store.get(entry.key)[0])
             except (DamagedObjectError, StoreError) as error:
-                state, problem = "bad" if isinstance(error, DamagedObjectError) else "unreadable", str(error)
-            else:
-                if known[0] not in (None, built.manifest):
-                    continue  # of another manifest: it counts as absent
-                container, size, figures = (
-                    built.container,
-                    built.container_bytes,
-                    _digest(built.container_bytes, built.info, built.summary),
-                )
-                state = "failed" if container is None else "ready"
+                state = "bad" if isinstance(error, DamagedObjectError) else "unreadable"
+                self._facts.execute("UPDATE surface SET built = ?, problem = ? WHERE id = ?", (state, str(error), id_))
+                continue
+            if known[0] not in (None, built.manifest):
+                continue  # of another manifest: it counts as absent
+            state, size = "failed" if built.container is None else "ready", built.container_bytes
             self._facts.execute(
-                "UPDATE surface SET built = ?, problem = ?, container = ?, container_bytes = ?, figures = ? "
+                "UPDATE surface SET built = ?, container = ?, container_bytes = ?, figures = ?, errors = ? "
                 "WHERE id = ?",
-                (state, problem, container, size, figures, id_),
+                (state, built.container, size, digest_of(size, built.info, built.summary), errors_of(built.info), id_),
             )
 
     def _uploads(self) -> None:
@@ -201,22 +196,24 @@ class Facts:
                 self._report.bytes += sum(sizes.values())
                 self._put("upload", sha256, *self._upload(sha256, files, size, sizes))
 
-    def _upload(self, sha256: str, files: int, size: int, sizes: dict[int, int]) -> tuple[str, str | None]:
+    def _upload(self, sha256: str, files: int, size: int, sizes: dict[int, int]) -> tuple[str, str | None, str | None]:
+        """Return the state of an upload, what is wrong with it, and `CONTAINER` if it is one."""
         if len(sizes) < files:
-            return "bad", f"expected {files} files, got {len(sizes)}"
+            return "bad", f"expected {files} files, got {len(sizes)}", None
         if sum(sizes.values()) != size:
-            return "bad", f"expected {size} bytes, got {sum(sizes.values())}"
-        digest = hashlib.sha256()
+            return "bad", f"expected {size} bytes, got {sum(sizes.values())}", None
+        digest, kind, head = hashlib.sha256(), None, len(SIGNATURE)
         try:
             for number in range(files):
-                for chunk in self._chunks(layout.upload_key(sha256, number)):
+                for place, chunk in enumerate(self._told(chunks_of(self._store, layout.upload_key(sha256, number)))):
                     digest.update(chunk)
+                    kind = CONTAINER if place == 0 and is_container(chunk[:head]) else kind
                 digest.update(sizes[number].to_bytes(8, "big"))  # see `Upload.end`
         except StoreError as error:
-            return "unreadable", str(error)
+            return "unreadable", str(error), None
         if digest.hexdigest() != sha256:
-            return "bad", f"expected files with the SHA-256 of their name, got {digest.hexdigest()}"
-        return "whole", None
+            return "bad", f"expected files with the SHA-256 of their name, got {digest.hexdigest()}", None
+        return "whole", None, kind
 
     def _containers(self) -> None:
         for entry in self._store.entries(CONTAINERS):
@@ -227,45 +224,13 @@ class Facts:
                 continue
             self._report.containers += 1
             self._report.bytes += entry.size
-            self._put("container", sha256, *self._container(sha256))
+            self._put("container", sha256, *check_container(self._store, sha256, self._told))
 
-    def _container(self, sha256: str) -> tuple[str, str | None, str | None]:
-        """Return the state of a container, what is wrong with it, and the digest of its figures."""
-        key = layout.container_key(sha256)
-        frames, digest = FrameReader(keeps=()), hashlib.sha256()
-        place: LodestreamError | None = None
-        try:
-            for chunk in self._chunks(key):
-                digest.update(chunk)
-                if place is None:
-                    try:
-                        for _ in frames.feed(chunk):
-                            pass
-                    except LodestreamError as error:
-                        place = error
-            if digest.hexdigest() != sha256:
-                where = f"; {place}" if place else ""
-                return "bad", f"expected bytes with the SHA-256 of the name, got {digest.hexdigest()}{where}", None
-            if place is not None:
-                raise place
-            with self._store.open(key) as blob:
-                index = read_index(blob.read, blob.size)
-                return "whole", None, _digest(blob.size, *layout.describe(figures_of(index, None, ())))
-        except StoreError as error:
-            return "unreadable", str(error), None
-        except UnsupportedVersionError as error:
-            return "version", str(error), None
-        except LodestreamError as error:
-            return "bad", str(error), None
-
-    def _chunks(self, key: str) -> Iterator[bytes]:
-        with self._store.open(key) as blob:
-            offset = 0
-            while chunk := blob.read(offset, _CHUNK):
-                yield chunk
-                offset += len(chunk)
-                self._done += len(chunk)
-                self._progress(self._done, self._total)
+    def _told(self, chunks: Iterable[bytes]) -> Iterator[bytes]:
+        for chunk in chunks:
+            yield chunk
+            self._done += len(chunk)
+            self._progress(self._done, self._total)
 
     def _put(self, kind: str, sha256: str, state: str, problem: str | None, figures: str | None = None) -> None:
         self._facts.execute("INSERT INTO part VALUES (?, ?, ?, ?, ?)", (kind, sha256, state, problem, figures))
@@ -273,11 +238,3 @@ class Facts:
     def _stray(self, size: int) -> None:
         self._report.strays += 1
         self._report.stray_bytes += size
-
-
-def _digest(size: int, info: bytes, summary: Summary) -> str | None:
-    """Return a hash of a description, but for who vouches for the errors; None if nobody may say that of them."""
-    figures = json.loads(info or b"{}")
-    if figures.pop(ERRORS, None) not in (None, CHECKED, TOLD):
-        return None
-    return hashlib.sha256(json.dumps([size, figures, asdict(summary)], sort_keys=True).encode()).hexdigest()

@@ -61,6 +61,7 @@ GROUPS: Mapping[str, str] = {
     "network": "address, data folder, proxies",
     "access": "who may read and write",
     "limits": "formats, sizes, memory",
+    "names": "names that stay",
     "operation": "log",
 }
 
@@ -154,7 +155,7 @@ def _choice(default: Any, group: str, meaning: str, *, metavar: str = "", usual:
         Placeholder for the value in the help of the command line.
     usual : str
         The default in words, if it depends on the machine.
-    limits : ge, le
+    limits : ge, le, allow_inf_nan
     """
     given = {"default_factory": default} if callable(default) else {"default": default}
     shown: dict[str, JsonValue] = {"group": group, "metavar": metavar, "usual": usual}
@@ -179,6 +180,14 @@ class Settings(BaseSettings, Bounds):
     port: int = _choice(8000, "network", "port to listen on; 0 takes a free one", metavar="P", ge=0, le=65535)
     data: _Path = _choice(
         Path("lodestream-data"), "network", "data folder, which holds uploads and containers", metavar="DIR"
+    )
+    scratch: _Path | None = _choice(
+        None,
+        "network",
+        "folder on a local disk, in which the server makes its folder lodestream for what it can make again: the index "
+        "of the surfaces, uploads and builds in progress, levels as files",
+        metavar="DIR",
+        usual="scratch in the data folder",
     )
     root_path: Annotated[str, AfterValidator(_rooted)] = _choice(
         "",
@@ -273,6 +282,15 @@ class Settings(BaseSettings, Bounds):
         "memory of one build; they must see the data folder under the same path",
         metavar="ADDRESS",
         usual="none",
+    )
+    keep_replaced_days: float = _choice(
+        1.0,
+        "names",
+        "days for which a surface stays that another one has replaced under its name; then the server deletes it",
+        metavar="DAYS",
+        ge=0,
+        le=36500,
+        allow_inf_nan=False,
     )
     log_format: Literal["text", "json"] = _choice("text", "operation", "format of the log on standard error")
     log_level: Literal["debug", "info", "warning", "error"] = _choice(
@@ -417,6 +435,8 @@ class Choice:
         expected = {
             "bool_parsing": "yes or no",
             "int_parsing": "a whole number",
+            "float_parsing": "a number",
+            "finite_number": "a number",
             "greater_than_equal": self.limits or "0 or more",
             "less_than_equal": self.limits,
             "literal_error": self.limits,
@@ -432,7 +452,7 @@ class Choice:
             return "yes" if value else "no"
         if self.metavar == _SIZE and value > 1:
             return ByteSize(value).human_readable().replace(".0", "")
-        return str(value)
+        return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def choices() -> dict[str, Choice]:

@@ -6,7 +6,18 @@ from typing import Any
 
 from lodestream.quality import EFFORTS
 
-__all__ = ["CONTAINER_TYPE", "LEVEL", "PAGE", "PROBLEM_SCHEMA", "QUEUED", "READY", "UPLOAD", "answer"]
+__all__ = [
+    "CONTAINER_TYPE",
+    "LEVEL",
+    "NAMES",
+    "PAGE",
+    "POINTING",
+    "PROBLEM_SCHEMA",
+    "QUEUED",
+    "READY",
+    "UPLOAD",
+    "answer",
+]
 
 CONTAINER_TYPE = "application/vnd.lodestream.container"
 
@@ -47,9 +58,46 @@ READY: dict[str, Any] = {
 
 PAGE: dict[str, Any] = {
     "surfaces": [
-        {**QUEUED, "state": "ready", "progress": 1.0, "container": READY["container"], **_FIGURES},
+        {key: READY[key] for key in READY if key in (*QUEUED, *_FIGURES) and key not in ("filenames", "options")},
     ],
     "next": None,
+}
+
+NAMES: dict[str, Any] = {
+    "names": [
+        {
+            "name": "jacksboro",
+            "url": "/v1/names/jacksboro",
+            "surface": READY["url"],
+            "owner": "ci",
+            "changed": "2026-01-31T12:00:00.000+00:00",
+        },
+    ],
+    "next": None,
+}
+
+#: The body of a request that makes a name lead to a surface.
+POINTING: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {
+                "schema": {
+                    "type": "object",
+                    "required": ["surface"],
+                    "properties": {
+                        "surface": {
+                            "type": ["string", "null"],
+                            "pattern": "^(/v1/surfaces/)?[0-9a-f]{20}$",
+                            "description": "id or `url` of the surface; null: only say whether the caller may",
+                        }
+                    },
+                    "additionalProperties": False,
+                },
+                "example": {"surface": READY["id"]},
+            }
+        },
+    },
 }
 
 LEVEL: dict[str, Any] = {

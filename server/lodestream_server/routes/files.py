@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 
@@ -9,12 +10,9 @@ from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from lodestream.errors import StreamError
-
 from ..access.scopes import needs
-from ..problems import responses
-from ..storage import damage
-from ..storage.storage import Storage
+from ..problems import BusyError, responses
+from ..store.containers import Containers
 from . import examples
 from .byte_ranges import sort_out
 from .routing import Parts, matches, readable
@@ -36,8 +34,8 @@ router = APIRouter(prefix="/v1", tags=["files"])
 @needs("read")
 async def find(request: Request, parts: Parts, surface: str) -> Response:
     """Redirect to the container; 409 with Retry-After while it is being built."""
-    record = ready(parts, surface)
-    address = f"{request.scope.get('root_path', '')}{router.prefix}/containers/{record.container}.lode"
+    found = ready(parts, surface)
+    address = f"{request.scope.get('root_path', '')}{router.prefix}/containers/{found.container}.lode"
     return RedirectResponse(address, headers={"cache-control": "no-cache"})
 
 
@@ -56,7 +54,7 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
 @needs("read")
 async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     """Return a container. It never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
-    path = parts.storage.container(sha256)
+    path, status = await asyncio.to_thread(_file, parts.containers, sha256)
     etag = f'"{sha256}"'
     # What needs a token must not come out of a shared cache for those who have none.
     shared = "public" if parts.settings.public_reads else "private"
@@ -65,31 +63,33 @@ async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     if unchanged is not None:
         unchanged.headers.update(headers)
         return unchanged
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        raise parts.storage.gone(sha256) from None
-    kept = parts.storage.container_bytes(sha256)
-    if kept not in (None, status.st_size):
-        error = StreamError(f"expected {kept} bytes of the container {sha256}, got {status.st_size}")
-        damage.tell(parts.storage, sha256, error)
-        raise error
     sort_out(request, status.st_size, etag)
-    return _Container(parts.storage, sha256, path, headers, status)
+    return _Container(parts.containers, sha256, path, headers, status)
+
+
+def _file(containers: Containers, sha256: str) -> tuple[Path, os.stat_result]:
+    """Return the file of a container, which may be deleted at any moment, and its status."""
+    with containers.blob(sha256) as blob:
+        assert blob.path is not None, "the store is a folder"
+        try:
+            return blob.path, blob.path.stat()
+        except FileNotFoundError:
+            raise BusyError(f"the container {sha256} was deleted and stored again meanwhile; try again") from None
 
 
 class _Container(SentFile):
     """A stored container, which may be deleted before it is opened."""
 
     def __init__(
-        self, storage: Storage, sha256: str, path: Path, headers: dict[str, str], status: os.stat_result
+        self, containers: Containers, sha256: str, path: Path, headers: dict[str, str], status: os.stat_result
     ) -> None:
         super().__init__(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
-        self._storage = storage
+        self._containers = containers
         self._sha256 = sha256
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         except FileNotFoundError:
-            raise self._storage.gone(self._sha256) from None
+            await asyncio.to_thread(_file, self._containers, self._sha256)  # which says why
+            raise BusyError(f"the container {self._sha256} was deleted and stored again; try again") from None

@@ -18,7 +18,7 @@ from ..builds.level_files import Key
 from ..builds.level_queue import Loan
 from ..builds.levels import MEDIA_TYPES, written_by
 from ..problems import responses
-from ..storage.records import Record
+from ..store.index import Surface
 from . import examples
 from .byte_ranges import sort_out
 from .routing import Parts, matches, readable
@@ -55,20 +55,20 @@ async def level(
 
     Ranges of it are answered, so that a program such as GDAL (``/vsicurl/``) can read what it shows of a ``cog``.
     """
-    record = ready(parts, surface)
-    _check(record, level)
+    found = ready(parts, surface)
+    _check(found, level)
     format_ = written(wanted)
-    etag = f'"{record.container}-{level}-{format_.name}-{written_by()}"'
+    etag = f'"{found.container}-{level}-{format_.name}-{written_by()}"'
     headers = {"etag": etag, "cache-control": "no-cache"}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         return unchanged
-    key = Key(record.container or "", level, format_.name)
+    key = Key(found.container or "", level, format_.name)
     with still_there(parts, surface):
         loan = await parts.levels.borrow(request, key, caller_of(request) or anybody(request))
     try:
         sort_out(request, loan.size, etag)
-        headers["content-disposition"] = f'attachment; filename="{record.id}-{level}{format_.stream_suffix}"'
+        headers["content-disposition"] = f'attachment; filename="{found.id}-{level}{format_.stream_suffix}"'
         return _Borrowed(loan, headers, format_.media_type)
     except BaseException:
         loan.release()
@@ -89,7 +89,7 @@ class _Borrowed(SentFile):
             self._loan.release()
 
 
-def _check(record: Record, level: int) -> None:
-    finest = len((record.info or {})["levels"]) - 1
+def _check(surface: Surface, level: int) -> None:
+    finest = surface.summary.levels - 1
     if not 0 <= level <= finest:
         raise OptionError(f"expected a level of 0 to {finest}, got {level}")

@@ -89,21 +89,33 @@ async def healthz() -> Response:
     "/readyz",
     summary="Ready",
     responses={
-        200: examples.answer("Builds can begin", {"status": "ready", "confinement": "landlock+seccomp", "missing": []}),
-        503: examples.answer("Not yet", {"status": "starting", "confinement": None, "missing": []}),
+        200: examples.answer(
+            "Builds can begin",
+            {"status": "ready", "index": "current", "confinement": "landlock+seccomp", "missing": []},
+        ),
+        503: examples.answer(
+            "Not yet",
+            {"status": "starting", "index": "being brought up to date", "confinement": None, "missing": []},
+        ),
     },
 )
 @needs(None)
 async def readyz(parts: Parts) -> Response:
-    """Return whether builds can start. Before that uploads wait, and all else works.
+    """Return whether builds can start and all surfaces are known. Before that uploads wait, and all else works.
+
+    ``index`` is ``current``; ``being brought up to date`` with the data folder, so that what was stored or deleted
+    there while no server ran is not told right yet; or ``being made again`` because it was lost, while whatever is
+    about surfaces is answered 503.
 
     ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``; ``missing``
     says for each mechanism that this machine lacks what a build may do.
     """
-    confinement = {"confinement": parts.builder.confinement, "missing": parts.builder.missing}
-    if parts.builder.ready:
-        return JSONResponse({"status": "ready", **confinement})
-    return JSONResponse({"status": "starting", **confinement}, 503, {"retry-after": "1"})
+    surfaces = parts.surfaces
+    index = "being made again" if surfaces.is_lost else "current" if surfaces.is_synced else "being brought up to date"
+    told = {"index": index, "confinement": parts.builder.confinement, "missing": parts.builder.missing}
+    if parts.builder.ready and index == "current":
+        return JSONResponse({"status": "ready", **told})
+    return JSONResponse({"status": "starting", **told}, 503, {"retry-after": "1"})
 
 
 @readable(

@@ -18,8 +18,10 @@ from ..builds.shares import Turns
 from ..operation.metrics import Metrics
 from ..operation.pace import Pace
 from ..operation.settings import Settings
-from ..storage.containers import Containers
-from ..storage.storage import Storage
+from ..store.containers import Containers
+from ..store.data_folder import DataFolder
+from ..store.surfaces import Surfaces
+from ..upkeep import Upkeep
 
 __all__ = ["Parts", "State", "matches", "readable"]
 
@@ -37,7 +39,9 @@ class State:
     """
 
     settings: Settings
-    storage: Storage
+    folder: DataFolder
+    surfaces: Surfaces
+    upkeep: Upkeep
     builder: Builder
     containers: Containers
     access: Access

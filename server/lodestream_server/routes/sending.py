@@ -11,8 +11,8 @@ from starlette.types import Message, Receive, Scope, Send
 
 from lodestream.errors import NotFoundError
 
-from ..problems import BuildFailedError, MissingError, NotReadyError, PostponedError
-from ..storage.records import Record
+from ..problems import BuildFailedError, BusyError, NotReadyError, PostponedError
+from ..store.index import Surface
 from .routing import State
 
 __all__ = ["SentFile", "ready", "still_there"]
@@ -51,8 +51,8 @@ class SentFile(FileResponse):
             _log.warning("%s was sent completely, but could not be closed: %s", self.path, error.strerror or error)
 
 
-def ready(parts: State, surface: str) -> Record:
-    """Return the record of a surface that has a container.
+def ready(parts: State, surface: str) -> Surface:
+    """Return a surface that has a container.
 
     Raises
     ------
@@ -60,36 +60,35 @@ def ready(parts: State, surface: str) -> Record:
         If there is no such surface.
     NotReadyError, PostponedError, BuildFailedError
         If it is still being built, waits for a retry, or has failed.
-    MissingError
-        If it is not on disk now.
     """
-    record = parts.storage.get(surface)
-    if record.state == "failed":
-        raise BuildFailedError(f"{surface} could not be built: {record.reason}")
-    if record.state == "waiting":
-        raise PostponedError(f"{surface} could not be built and waits for a retry: {record.reason}")
-    if record.state == "missing":
-        raise MissingError(f"{surface} is not on the server's disk now: {record.reason}")
-    if record.state != "ready":
-        state, progress = parts.builder.state(record)
-        raise NotReadyError(f"{surface} is {state} ({progress:.0%} done); try again soon")
-    return record
+    found = parts.surfaces.get(surface)
+    if found.state == "failed":
+        raise BuildFailedError(f"{surface} could not be built: {found.reason}")
+    if found.state == "waiting":
+        raise PostponedError(f"{surface} could not be built and waits for a retry: {found.reason}")
+    if found.state != "ready":
+        raise NotReadyError(f"{surface} is {found.state} ({parts.builder.progress(found):.0%} done); try again soon")
+    return found
 
 
 @contextmanager
 def still_there(parts: State, surface: str) -> Iterator[None]:
-    """Guard the reading of a surface's container: if it is missing, raise the error of the surface's current state.
+    """Guard the reading of a surface's container: if it is gone, raise the error of the surface's current state.
 
-    It may have been deleted meanwhile, although another surface has the same container, or been made again.
+    It may have been deleted meanwhile, although another surface has the same container, or is built again.
 
     Raises
     ------
-    NotFoundError, NotReadyError, PostponedError, BuildFailedError, MissingError
+    NotFoundError, NotReadyError, PostponedError, BuildFailedError
         See `ready`.
     BusyError
         If its container can be read again.
     """
     try:
         yield
-    except (NotFoundError, MissingError):
-        raise parts.storage.gone(ready(parts, surface).container or "") from None
+    except NotFoundError:
+        ready(parts, surface)
+        raise BusyError(f"the container of {surface} was deleted and stored again meanwhile; try again") from None
+    except BusyError:
+        ready(parts, surface)
+        raise

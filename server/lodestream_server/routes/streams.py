@@ -24,6 +24,7 @@ from lodestream.protocol.connection import State
 from lodestream.protocol.handshake import PARAMETER, from_address
 from lodestream.protocol.messages import CODES, SUBPROTOCOL, Error, MessageError, Open
 from lodestream.protocol.wire import parse, serialize
+from lodestream.stores import StoreError
 from lodestream.transfer.sender import Sender
 
 from ..access.access import Caller, anybody
@@ -34,15 +35,13 @@ from ..problems import (
     BadTokenError,
     BuildFailedError,
     BusyError,
-    MissingError,
     NoTokenError,
     NotReadyError,
     PostponedError,
     SmallScopeError,
     TooManyError,
 )
-from ..storage import damage
-from ..storage.containers import OpenContainer
+from ..store.containers import OpenContainer
 from .routing import Parts
 from .sending import ready, still_there
 
@@ -98,9 +97,9 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
                     first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.reader_with(_token(first))
         with parts.limits.stream(caller) as credit:
-            record = ready(parts, surface)
+            found = ready(parts, surface)
             with still_there(parts, surface):
-                sha256 = record.container or ""
+                sha256 = found.container or ""
                 container = parts.containers.open_known(sha256, caller.key)
                 if container is None:
                     share = partial(parts.limits.check_indexes, caller)
@@ -111,7 +110,9 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         return
     except LodestreamError as error:
         parts.metrics.failed(_code(error))
-        await _refuse(socket, _code(error), str(error))
+        if isinstance(error, StoreError):
+            _log.error("%s: %s", surface, error)
+        await _refuse(socket, _code(error), "see the server's log" if isinstance(error, StoreError) else str(error))
 
 
 async def _stream(session: _Session, surface: str, caller: Caller) -> None:
@@ -196,7 +197,7 @@ class _Session:
         self._socket = socket
         self._container = container
         self._settings = parts.settings
-        self._storage = parts.storage
+        self._containers = parts.containers
         self._sender = sender
         self._heard = asyncio.Event()
         self._planning = parts.planning
@@ -231,9 +232,10 @@ class _Session:
                 self.result = "restarting"
             return
         except (LodestreamError, OSError) as error:
-            await self._fail(_code(error), str(error) if isinstance(error, LodestreamError) else "see the server's log")
+            told = isinstance(error, LodestreamError) and not isinstance(error, StoreError)
+            await self._fail(_code(error), str(error) if told else "see the server's log")
             if isinstance(error, StreamError) and not isinstance(error, UnsupportedVersionError):
-                damage.tell(self._storage, self._container.sha256, error)
+                self._containers.tell_damage(self._container.sha256, error)
             elif not isinstance(error, MessageError | UnsupportedVersionError | BadTokenError | _SilentError):
                 _log.error("a stream failed", exc_info=error)
         else:
@@ -377,12 +379,12 @@ def _code(error: Exception) -> str:
         (NotReadyError, "not-ready"),
         (BuildFailedError, "failed"),
         (PostponedError, "waiting"),
-        (MissingError, "missing"),
         (NoTokenError, "no-token"),
         (BadTokenError, "bad-token"),
         (SmallScopeError, "bad-token"),
         (TooManyError, "too-many"),
         (BusyError, "busy"),
+        (StoreError, "busy"),
         (StreamError, "damaged"),
     )
     return next((code for kind, code in known if isinstance(error, kind)), "internal")

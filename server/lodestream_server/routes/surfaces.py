@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import time
 from contextlib import AsyncExitStack
 from datetime import UTC, datetime
@@ -10,25 +11,30 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import Response
 
-from lodestream.container.series import SERIES, place_of
+from lodestream.stores import AbsentError
 
 from ..access.access import Caller, anybody
 from ..access.gate import caller_of
 from ..access.scopes import needs
 from ..builds import options
 from ..problems import BusyError, FullError, NotOwnerError, TooManyError, responses
-from ..storage import uploads
-from ..storage.records import Record
+from ..store import layout, uploads
 from ..store.durable import discard
+from ..store.index import Position, Surface
+from ..store.layout import Manifest
 from . import examples
 from .routing import Parts, State, readable
-from .sending import ready
 
-__all__ = ["router"]
+__all__ = ["answer", "base", "calling", "owned", "router"]
 
 router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
+
+_JSON = "application/json"
+
+# Bytes after which a page ends.
+_MOST_PAGE = 1 << 20
 
 # Where a page begins: when a surface was made, and which.
 _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
@@ -57,7 +63,7 @@ async def upload(request: Request, parts: Parts) -> Response:
     A container (.lode) is checked and decoded once, and kept unchanged. It takes no options but name and filename.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
-    caller = _caller(request)
+    caller = calling(request)
     async with AsyncExitStack() as held:
         try:
             watched = await held.enter_async_context(parts.limits.upload(request, caller))
@@ -69,14 +75,12 @@ async def upload(request: Request, parts: Parts) -> Response:
             known = await asyncio.to_thread(_known, received, chosen, caller.owner, parts)
             if known is None:
                 raise refusal from None
-            record = known
+            surface = known
         else:
-            received, record = await _keep(watched, chosen, caller, parts)
+            received, surface = await _keep(watched, chosen, caller, parts)
     parts.metrics.uploaded(received.size)
-    content = _present(record, parts, request, full=True)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
-    status = 200 if content["state"] == "ready" else 202
-    return JSONResponse(content, status, {"location": content["url"]})
+    return await answer(surface, parts, request, located=True)
 
 
 @readable(
@@ -92,15 +96,11 @@ async def page(
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
     after: Annotated[str | None, Query(pattern=_PLACE, description="from `next` of the previous page")] = None,
 ) -> Response:
-    """Return surfaces without their layers and levels; `next` is the address of the next page, or null."""
-    start = _position(after)
-    following = parts.storage.records_after(start, limit + 1)
-    shown = following[:limit]
-    address = None
-    if len(following) > limit:
-        address = f"{_base(request)}?limit={limit}&after={shown[-1].created!r}_{shown[-1].id}"
-    content = {"surfaces": [_present(record, parts, request, full=False) for record in shown], "next": address}
-    return JSONResponse(content)
+    """Return surfaces without their files, options, layers and levels; `next` is the address of the next page, or null.
+
+    A page may have fewer surfaces than its limit although more follow.
+    """
+    return Response(await asyncio.to_thread(_page, _position(after), limit, parts, request), media_type=_JSON)
 
 
 @readable(
@@ -116,13 +116,16 @@ async def page(
 async def look(request: Request, parts: Parts, surface: str) -> Response:
     """Return the state of a surface and, once it is ready, what ``lodestream info --json`` prints.
 
-    The state is queued, building or ready; or, with a reason, failed (the file is not a surface), waiting (it could not
-    be built and needs a retry) or missing (its files are not on the server's disk now).
+    The state is queued, building or ready; or, with a reason, failed (the file is not a surface) or waiting (it could
+    not be built and needs a retry). A surface that is queued with a reason is tried again by itself.
 
     A surface that was uploaded as a container also has `errors`: `checked` if the server has measured the errors of its
     layers and levels again, which is possible if it is exact; otherwise `told`, by whoever uploaded it.
+
+    A surface that a name has replaced has `replaced_until`: then the server deletes it, unless a name leads to it again
+    or it is uploaded again.
     """
-    return JSONResponse(_present(parts.storage.get(surface), parts, request, full=True))
+    return await answer(parts.surfaces.get(surface), parts, request)
 
 
 @router.post(
@@ -133,23 +136,19 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
     responses={
         202: examples.answer("The surface will be built", examples.QUEUED, location=True),
         200: examples.answer("The surface is ready", examples.READY, location=True),
-        **responses(403, 404, 424, 429, 503),
+        **responses(403, 404, 429, 503, 507),
     },
 )
 @needs("write")
 async def retry(request: Request, parts: Parts, surface: str) -> Response:
-    """Build a surface again that waits, failed or is missing; does nothing if it is ready or queued.
+    """Build a surface again that waits or failed; does nothing if it is ready or queued.
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.
     """
-    record, caller = _changeable(request, parts, surface)
-    if record.state not in ("queued", "ready"):
+    known, caller = _changeable(request, parts, surface)
+    if known.state in ("failed", "waiting"):
         parts.limits.check_builds(caller)
-    record = await parts.builder.retry(surface, caller.key)
-    if record.state in ("missing", "failed"):
-        ready(parts, surface)  # says that there is nothing to build it from
-    content = _present(record, parts, request, full=True)
-    return JSONResponse(content, 200 if content["state"] == "ready" else 202, {"location": content["url"]})
+    return await answer(await parts.builder.retry(surface, caller.key), parts, request, located=True)
 
 
 @router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(403, 404))
@@ -159,15 +158,14 @@ async def delete(request: Request, parts: Parts, surface: str) -> Response:
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.
     """
-    record, _ = _changeable(request, parts, surface)
+    known, _ = _changeable(request, parts, surface)
     await parts.builder.delete(surface)
-    if record.container is not None and not parts.storage.has_container(record.container):
-        parts.levels.forget(record.container)
+    parts.upkeep.forget_levels(known)
     return Response(status_code=204)
 
 
-def _changeable(request: Request, parts: State, surface: str) -> tuple[Record, Caller]:
-    """Return the record of a surface and the caller, who must be allowed to change it.
+def _changeable(request: Request, parts: State, surface: str) -> tuple[Surface, Caller]:
+    """Return a surface and the caller, who must be allowed to change it.
 
     Raises
     ------
@@ -176,29 +174,33 @@ def _changeable(request: Request, parts: State, surface: str) -> tuple[Record, C
     NotOwnerError
         If the caller is neither its owner nor an admin.
     """
-    record, caller = parts.storage.get(surface), _caller(request)
-    if not caller.may_change(record.owner):
-        whose = "nobody" if record.owner is None else "another owner"
+    found, caller = parts.surfaces.get(surface), calling(request)
+    owner = found.manifest.owner
+    if not caller.may_change(owner):
+        whose = "nobody" if owner is None else "another owner"
         raise NotOwnerError(f"expected the owner of {surface} or an admin, got {caller.name}: it belongs to {whose}")
-    return record, caller
+    return found, caller
 
 
-def _caller(request: Request) -> Caller:
+def calling(request: Request) -> Caller:
+    """Return who makes a request."""
     return caller_of(request) or anybody(request)
 
 
 async def _keep(
     request: Request, chosen: options.SurfaceOptions, caller: Caller, parts: State
-) -> tuple[uploads.Upload, Record]:
-    folder = await asyncio.to_thread(parts.storage.new_upload)
+) -> tuple[uploads.Upload, Surface]:
     try:
-        received = await uploads.receive(request, folder, parts.settings, chosen.filename)
-        record = await asyncio.to_thread(_record, received, chosen, caller.owner, parts)
-    except BaseException:
-        await asyncio.to_thread(discard, folder)
-        raise
-    record, _ = await parts.builder.accept(record, folder, caller.key)
-    return received, record
+        folder = await asyncio.to_thread(parts.folder.new_upload)
+        try:
+            received = await uploads.receive(request, folder, parts.settings, chosen.filename)
+            manifest = await asyncio.to_thread(_manifest, received, chosen, caller.owner, parts)
+        except BaseException:
+            await asyncio.to_thread(discard, folder)
+            raise
+        return received, await parts.builder.accept(manifest, received.paths, folder, caller.key)
+    except FileNotFoundError as error:
+        raise BusyError("the server's scratch folder was removed meanwhile; send the upload again") from error
 
 
 def _perhaps_known(request: Request, parts: State) -> bool:
@@ -206,20 +208,23 @@ def _perhaps_known(request: Request, parts: State) -> bool:
     length = request.headers.get("content-length", "")
     size = int(length) if length.isascii() and length.isdecimal() and len(length) < 19 else None
     form = request.headers.get("content-type", "").startswith("multipart/")
-    return parts.storage.may_have_upload(size, form=form)
+    return parts.surfaces.index.has_size(None if form else size)
 
 
-def _known(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Record | None:
+def _known(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Surface | None:
     """Return the existing surface of this upload, of which only the hash was kept; else None."""
-    for record in parts.storage.records_of(received.digest.hexdigest()):
-        try:
+    other = parts.surfaces.index.one_of_upload(received.digest.hexdigest())
+    if other is None:
+        return None
+    try:
+        with parts.surfaces.upload(other) as files:
             # The same bytes, so they say the same of their format.
-            surface, _ = _identify(received, parts.storage.upload_files(record), chosen, owner, parts)
-        except FileNotFoundError:  # deleted since, or not there now
-            continue
-        surface_record = parts.storage.find(surface)
-        return surface_record if surface_record is not None and surface_record.state in ("queued", "ready") else None
-    return None
+            id_, _ = _identify(received, files, chosen, owner, parts)
+    except AbsentError:  # deleted since, or lost
+        return None
+    parts.surfaces.names.keep(id_)
+    found = parts.surfaces.index.find(id_)
+    return found if found is not None and found.state in ("queued", "building", "ready") else None
 
 
 def _identify(
@@ -230,58 +235,106 @@ def _identify(
     return options.identify(received.digest, format_, names[0], chosen, owner), names
 
 
-def _record(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Record:
+def _manifest(received: uploads.Upload, chosen: options.SurfaceOptions, owner: str | None, parts: State) -> Manifest:
     surface, names = _identify(received, received.paths, chosen, owner, parts)
-    return Record(
+    return Manifest(
         id=surface,
         name=chosen.name,
+        owner=owner,
         created=time.time(),
         filenames=tuple(name or "" for name in names),
-        upload_bytes=received.size,
         options=chosen.chosen,
-        upload_sha256=received.digest.hexdigest(),
-        owner=owner,
+        upload=received.digest.hexdigest(),
+        upload_bytes=received.size,
+        write=layout.new_write(),
     )
 
 
-def _present(record: Record, parts: State, request: Request, *, full: bool) -> dict[str, Any]:
-    state, progress = parts.builder.state(record)
-    # What is built again has the figures of the container that was lost.
-    info = dict(record.info or {}) if state == "ready" else {}
-    place = place_of(info.get("metadata") or {})
-    if not full:
-        info = {key: info[key] for key in ("shape", "closed", "bytes") if key in info}
-    if place is not None:
-        info[SERIES] = place.told()
+async def answer(surface: Surface, parts: State, request: Request, *, located: bool = False) -> Response:
+    """Return the answer that describes a surface.
+
+    Parameters
+    ----------
+    surface : Surface
+    parts : State
+    request : Request
+    located : bool
+        Whether somebody asked for its build: 202 unless it is ready, with its address in a header.
+    """
+    head = _told(surface, parts, request)
+    head["filenames"] = list(surface.manifest.filenames)
+    head["options"] = surface.manifest.options
+    until = parts.surfaces.index.replaced_until(surface.id)
+    if until is not None:
+        head["replaced_until"] = datetime.fromtimestamp(until, UTC).isoformat(timespec="milliseconds")
+    status, headers = 200, {}
+    if located:
+        status, headers = 200 if surface.state == "ready" else 202, {"location": head["url"]}
+    # What was built is described by bytes of the store, which may be many.
+    content = await asyncio.to_thread(_joined, parts, surface, head)
+    return Response(content, status, headers, media_type=_JSON)
+
+
+def _joined(parts: State, surface: Surface, head: dict[str, Any]) -> bytes:
+    """Return a JSON object with what is told of a surface, and the description of its container as it was stored."""
+    start = _json({key: value for key, value in head.items() if key not in surface.summary.shown})
+    info = parts.surfaces.info(surface) if surface.state == "ready" else b"{}"
+    return start if info == b"{}" else start[:-1] + b", " + info[1:]
+
+
+def _page(start: Position, limit: int, parts: State, request: Request) -> bytes:
+    """Return a page of surfaces that come after a position, as JSON of at most about `_MOST_PAGE` bytes."""
+    following = parts.surfaces.index.page(start, limit + 1)
+    shown, size = list[bytes](), 0
+    for surface in following[:limit]:
+        shown.append(_json(_told(surface, parts, request)))
+        size += len(shown[-1])
+        if size > _MOST_PAGE:
+            break
+    address = None
+    if len(shown) < len(following):
+        created, id_ = following[len(shown) - 1].position
+        address = f"{base(request)}?limit={limit}&after={created!r}_{id_}"
+    return b'{"surfaces": [' + b", ".join(shown) + b'], "next": ' + _json(address) + b"}"
+
+
+def _told(surface: Surface, parts: State, request: Request) -> dict[str, Any]:
+    """Return what a list tells of a surface."""
+    it, ready = surface.manifest, surface.state == "ready"
+    name = it.name or options.printable(surface.summary.name or "") or next(filter(None, it.filenames), None)
     return {
-        "id": record.id,
-        "url": f"{_base(request)}/{record.id}",
-        "name": record.name or options.printable((record.info or {}).get("metadata", {}).get("name") or ""),
-        **_owned(record, request),
-        "state": state,
-        "progress": progress,
-        "reason": record.reason,
-        "created": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
-        "filenames": list(record.filenames),
-        "upload_bytes": record.upload_bytes,
-        "options": record.options,
-        "container": record.container if state == "ready" else None,
-        **info,
+        "id": surface.id,
+        "url": f"{base(request)}/{surface.id}",
+        "name": name,
+        **owned(it.owner, request),
+        "state": surface.state,
+        "progress": parts.builder.progress(surface),
+        "reason": surface.reason,
+        "created": datetime.fromtimestamp(it.created, UTC).isoformat(timespec="milliseconds"),
+        "upload_bytes": it.upload_bytes,
+        "container": surface.container if ready else None,
+        # What is built again has the figures of the container that was lost.
+        **(surface.summary.shown if ready else {}),
     }
 
 
-def _owned(record: Record, request: Request) -> dict[str, Any]:
-    # The names of tokens are told to those who have one.
+def _json(value: Any) -> bytes:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
+
+
+def owned(owner: str | None, request: Request) -> dict[str, Any]:
+    """Return what is told of an owner: the names of tokens are told to those who have one."""
     caller = caller_of(request)
-    return {"owner": record.owner} if caller is not None and (caller.admin or caller.owner is not None) else {}
+    return {"owner": owner} if caller is not None and (caller.admin or caller.owner is not None) else {}
 
 
-def _base(request: Request) -> str:
+def base(request: Request) -> str:
+    """Return the path of the collection of surfaces."""
     # A path, not an address: behind a proxy only the client knows the host's name.
     return f"{request.scope.get('root_path', '')}{router.prefix}"
 
 
-def _position(after: str | None) -> tuple[float, str]:
+def _position(after: str | None) -> Position:
     if after is None:
         return (float("-inf"), "")
     created, _, surface = after.partition("_")

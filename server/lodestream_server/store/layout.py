@@ -41,6 +41,7 @@ __all__ = [
     "LONGEST_NAME",
     "MOST_REASON",
     "MOST_TEXT",
+    "NAME",
     "NAMES",
     "SURFACES",
     "UPLOADS",
@@ -72,6 +73,9 @@ MOST_TEXT, MOST_REASON = 3072, 1024
 
 VERSION = 1
 
+#: A name that stays; and none that Windows keeps for itself.
+NAME = r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}"
+
 #: Characters of the name of a surface; every page of a list has it.
 LONGEST_NAME = 255
 
@@ -79,7 +83,6 @@ LONGEST_NAME = 255
 _SHOWN = ("shape", "closed", "bytes")
 _INFO = b', "info":\n'
 _ID = re.compile(r"(?:surfaces|built)/([0-9a-f]{20})\.json")
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _BYTES = re.compile(r"uploads/([0-9a-f]{64})/(?:0|[1-9][0-9]*)|containers/([0-9a-f]{64})\.lode")
 _CHECK = re.compile(rb', "check": "([0-9a-f]{8})"\}\Z')
 T = TypeVar("T")
@@ -261,7 +264,7 @@ def name_key(name: str) -> str:
         If it cannot be a name.
     """
     key = f"{NAMES}{name}.json"
-    if not _NAME.fullmatch(name) or not is_key(key):
+    if not re.fullmatch(NAME, name) or not is_key(key):
         raise InputError(
             "expected a name of at most 100 letters, digits and ._- that begins with a letter or a digit, and none "
             f"that Windows keeps for itself, such as con, got {name[:100]!a}"
@@ -272,7 +275,7 @@ def name_key(name: str) -> str:
 def name_of(key: str) -> str | None:
     """Return the name that has a key; None of another key."""
     name = key.removeprefix(NAMES).removesuffix(".json")
-    return name if f"{NAMES}{name}.json" == key and _NAME.fullmatch(name) else None
+    return name if f"{NAMES}{name}.json" == key and re.fullmatch(NAME, name) else None
 
 
 def id_of(key: str) -> str | None:

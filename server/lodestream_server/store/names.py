@@ -1,7 +1,9 @@
 """Names that stay: each leads to one surface, and what it led to before stays for a time and is then deleted.
 
 A change is one write: the object of the name is created or replaced. Only after it are surfaces deleted that the name
-has replaced. A surface is not deleted while any name leads to it, or has replaced it a shorter time ago.
+has replaced. A surface is not deleted while any name leads to it, or has replaced it a shorter time ago. What is found
+in the store may be of a writer that was killed before it was on disk, so whatever is acknowledged, or relied on by a
+delete, is written again.
 """
 
 from __future__ import annotations
@@ -9,30 +11,33 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
-import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING
 
-from lodestream.errors import InputError, NotFoundError
-from lodestream.stores import AbsentError, Tag
+from lodestream.errors import InputError, LodestreamError, NotFoundError
+from lodestream.stores import AbsentError, StoreError, Tag, UnacknowledgedError
 
-from ..problems import NotOwnerError
+from ..problems import DamagedNameError, NotOwnerError
 from . import layout
-from .index import Named, Surface
+from .index import IndexLostError, Named, Surface
 from .layout import NAMES, DamagedObjectError, Name
 
 if TYPE_CHECKING:
     from .surfaces import Surfaces
 
-__all__ = ["MOST_REPLACED", "Names"]
+__all__ = ["MOST_NAMES", "MOST_REPLACED", "Names"]
 
 _log = logging.getLogger(__name__)
 
 #: Replaced surfaces that a name keeps; the time of older ones has come.
 MOST_REPLACED = 100
+
+#: Names that may lead to one surface, or have replaced it: all of them are written when it is uploaded again.
+MOST_NAMES = 16
 
 
 class Names:
@@ -41,14 +46,15 @@ class Names:
     Parameters
     ----------
     surfaces : Surfaces
-    lock : RLock
+    lock : context manager
         Held for each change of surfaces and names.
     """
 
-    def __init__(self, surfaces: Surfaces, lock: threading.RLock) -> None:
+    def __init__(self, surfaces: Surfaces, lock: AbstractContextManager[None]) -> None:
         self._surfaces = surfaces
         self._store = surfaces.store
         self._lock = lock
+        self._kept = set[str]()  # surfaces that are to be kept once the names that have replaced them are known
 
     def get(self, name: str) -> Named:
         """Return a name whose object can be read.
@@ -57,7 +63,7 @@ class Names:
         ------
         NotFoundError
             If there is none.
-        DamagedObjectError
+        DamagedNameError
             If it cannot be read.
         InputError
             If it cannot be a name.
@@ -66,13 +72,17 @@ class Names:
         if found is None:
             raise _absent(name)
         if found.surface is None:
-            raise DamagedObjectError(
-                f"the name {name} cannot be read on this server: an admin can make it lead to a surface again"
-            )
+            raise _damaged(name)
         return found
 
     def point(
-        self, name: str, surface: str, owner: str | None, may_change: Callable[[str | None], bool], keep: float
+        self,
+        name: str,
+        surface: str,
+        owner: str | None,
+        may_change: Callable[[str | None], bool],
+        keep: float,
+        fits: Callable[[], object] = lambda: None,
     ) -> Named:
         """Make a name lead to a surface; return it. To do so again is harmless.
 
@@ -85,9 +95,11 @@ class Names:
         owner : str or None
         may_change : callable (owner) -> bool
             Whether the caller may change what belongs to an owner: the name, and the surface. What the name led to
-            before is deleted later if the caller may change that.
+            before is deleted later if it belongs to the owner of the name.
         keep : float
             Seconds for which the surface that the name led to before stays.
+        fits : callable
+            Raises an error if there is no room for one more name. It is called before one is made, while no other is.
 
         Raises
         ------
@@ -96,40 +108,64 @@ class Names:
         NotOwnerError
             If the caller may not.
         InputError
-            If it cannot be a name, or differs from another one in case alone.
-        DamagedObjectError
-            If the name cannot be read and the caller does not own everything.
+            If it cannot be a name, or differs from another one in case alone; or if `MOST_NAMES` others lead to the
+            surface, or have replaced it.
+        DamagedNameError
+            If the name cannot be read and the caller may not change what belongs to nobody.
         StoreError
             If it could not be stored, or it is not known whether it was.
         """
         key, now = layout.name_key(name), time.time()
         with self._lock:
             _check_owner(f"the surface {surface}", self._surfaces.get(surface).manifest.owner, may_change)
-            other = self._surfaces.index.name_like(name)
-            if other is not None:
-                raise InputError(f"expected a name that differs from {other} in more than case, got {name}")
-            before, tag = self._before(key, may_change)
+            before, tag = self._changeable(name, may_change, fits)
+            if len(self._surfaces.index.names_of(surface) - {key}) >= MOST_NAMES:
+                raise InputError(
+                    f"expected at most {MOST_NAMES} names that lead to {surface}, or have replaced it of late, got one "
+                    "more: delete one of them"
+                )
+            new = Name(name, owner, surface, now, (), layout.new_write())
             if before is not None and before.surface == surface:
-                new = before
-            else:
-                replaced = () if before is None else self._replaced(before, surface, may_change, now, keep)
-                owner = owner if before is None else before.owner
-                new = Name(name, owner, surface, now, replaced, layout.new_write())
-                data = layout.dump(new)
+                new = replace(before, write=new.write)
+            elif before is not None:
+                replaced = self._replaced(before, surface, now, keep)
+                self._kept.discard(before.surface)
+                new = replace(new, owner=before.owner, replaced=replaced)
+            try:
                 if tag is None:
-                    self._store.create(key, data)
+                    self._store.create(key, layout.dump(new))
                 else:
-                    self._store.replace(key, data, tag)
-            self._surfaces.index.put_name(key, new)
+                    self._store.replace(key, layout.dump(new), tag)
+            except UnacknowledgedError:
+                with suppress(StoreError):
+                    self._current(key)  # it may lead there now, so that surface is not to be deleted
+                raise
+            self._surfaces.note(lambda: self._surfaces.index.put_name(key, new))
             return Named(name, new.owner, new.surface, new.changed)
 
-    def _replaced(
-        self, before: Name, surface: str, may_change: Callable[[str | None], bool], now: float, keep: float
-    ) -> tuple[tuple[str, float], ...]:
-        """Return the surfaces that a name has replaced when it leads to another one."""
+    def check(self, name: str, may_change: Callable[[str | None], bool], fits: Callable[[], object]) -> None:
+        """Check that a caller may change a name, or make it, before there is a surface; see `point` for the errors."""
+        with self._lock:
+            self._changeable(name, may_change, fits)
+
+    def _changeable(
+        self, name: str, may_change: Callable[[str | None], bool], fits: Callable[[], object]
+    ) -> tuple[Name | None, Tag | None]:
+        """Return a name that the caller may change, and its tag; without a tag there is none, and room for it."""
+        key = layout.name_key(name)
+        other = self._surfaces.index.name_like(name)
+        if other is not None:
+            raise InputError(f"expected a name that differs from {other} in more than case, got {name}")
+        before, tag = self._before(key, may_change)
+        if tag is None:
+            fits()
+        return before, tag
+
+    def _replaced(self, before: Name, surface: str, now: float, keep: float) -> tuple[tuple[str, float], ...]:
+        """Return the surfaces that a name has replaced when it leads to another one: those of its owner alone."""
         left = [it for it in before.replaced if it[0] not in (before.surface, surface)]
         old = self._surfaces.index.find(before.surface)
-        if old is not None and may_change(old.manifest.owner):
+        if old is not None and old.manifest.owner == before.owner:
             left.append((before.surface, now + keep))
         more = len(left) - MOST_REPLACED
         return tuple((id_, min(due, now) if place < more else due) for place, (id_, due) in enumerate(left))
@@ -143,17 +179,16 @@ class Names:
             If there is none.
         NotOwnerError
             If the caller may not.
-        DamagedObjectError
-            If the name cannot be read and the caller does not own everything.
+        DamagedNameError
+            If the name cannot be read and the caller may not change what belongs to nobody.
         StoreError
             If it is not known whether it is gone; to delete it again is harmless.
         """
         key = layout.name_key(name)
         with self._lock:
             _, tag = self._before(key, may_change)
-            if tag is not None:
-                self._store.delete([key])
-            self._surfaces.index.drop_name(key)
+            self._store.delete([key])  # also of what is gone already: perhaps not from the disk
+            self._surfaces.index.gone(key)
             if tag is None:
                 raise _absent(name)
 
@@ -165,16 +200,20 @@ class Names:
         StoreError
             If that could not be stored.
         """
+        if not self._surfaces.is_synced:  # the index may not know yet who has replaced it
+            self._kept.add(surface)
+        if not self._surfaces.index.replaced_by(surface):  # as of most: nobody need wait for others
+            return
         with self._lock:
             for key in self._surfaces.index.replaced_by(surface):
                 if (found := self._current(key)) is not None:
                     name, tag = found
-                    self._forget(name, tag, lambda id_, _: id_ == surface)
+                    self._rewrite(name, tag, tuple(it for it in name.replaced if it[0] != surface))
 
     def expire(self, now: float | None = None) -> list[Surface]:
         """Delete the replaced surfaces whose time has come; return them.
 
-        The index must be up to date with the store.
+        The index must be up to date with the store. What cannot be deleted now is told, and goes at another time.
 
         Parameters
         ----------
@@ -183,14 +222,19 @@ class Names:
 
         Raises
         ------
-        StoreError
-            If the store does not answer; the others go at another time.
+        IndexLostError
+            If the index cannot be used.
         """
         now = time.time() if now is None else now
         gone: list[Surface] = []
         for key in self._surfaces.index.due(now):
-            with self._lock:
-                gone += self._expire(key, now)
+            try:
+                with self._lock:
+                    gone += self._expire(key, now)
+            except IndexLostError:
+                raise
+            except (LodestreamError, OSError) as error:
+                _log.error("%s: what it has replaced cannot be deleted now, which is tried again: %s", key, error)
         return gone
 
     def _expire(self, key: str, now: float) -> list[Surface]:
@@ -201,17 +245,19 @@ class Names:
         index = self._surfaces.index
         due = (index.find(id_) for id_, when in name.replaced if when <= now and not index.is_kept(id_, now))
         gone = [surface for surface in due if surface is not None]
+        if gone:
+            tag = self._rewrite(name, tag, name.replaced)
         for surface in gone:
             self._surfaces.delete(surface.id)
-        self._forget(name, tag, lambda _, when: when <= now)
+        self._rewrite(name, tag, tuple(it for it in name.replaced if it[1] > now))
         return gone
 
-    def _forget(self, name: Name, tag: Tag, gone: Callable[[str, float], bool]) -> None:
-        """Write a name without some of the surfaces that it has replaced."""
-        left = tuple(it for it in name.replaced if not gone(*it))
-        name, key = replace(name, replaced=left, write=layout.new_write()), layout.name_key(name.name)
-        self._store.replace(key, layout.dump(name), tag)
+    def _rewrite(self, name: Name, tag: Tag, replaced: tuple[tuple[str, float], ...]) -> Tag:
+        """Write a name with these surfaces as those that it has replaced; return its tag."""
+        name, key = replace(name, replaced=replaced, write=layout.new_write()), layout.name_key(name.name)
+        tag = self._store.replace(key, layout.dump(name), tag)
         self._surfaces.index.put_name(key, name)
+        return tag
 
     def sync(self) -> None:
         """Bring the index of the names up to date with the store; what cannot be read is told, and left alone.
@@ -229,6 +275,9 @@ class Names:
             if 0 not in tags or tags[0] != tags.get(1):
                 with self._lock:
                     self._current(key, tags.get(0))
+        kept, self._kept = self._kept, set()
+        for surface in kept:
+            self.keep(surface)
 
     def _current(self, key: str, seen: str | None = None) -> tuple[Name, Tag] | None:
         """Return a name and its tag, and tell the index; None if there is none, or it cannot be read."""
@@ -251,7 +300,7 @@ class Names:
 
         Raises
         ------
-        DamagedObjectError
+        DamagedNameError
             If it cannot be read, and the caller may not change what belongs to nobody; others may write it anew.
         NotOwnerError
             If it belongs to another owner.
@@ -264,10 +313,16 @@ class Names:
             name = layout.parse(Name, key, data)
         except DamagedObjectError:
             if not may_change(None):
-                raise
+                raise _damaged(layout.name_of(key) or key) from None
             return None, tag
         _check_owner(f"the name {name.name}", name.owner, may_change)
         return name, tag
+
+
+def _damaged(name: str) -> DamagedNameError:
+    return DamagedNameError(
+        f"the name {name} cannot be read on this server: an admin can make it lead to a surface again, or delete it"
+    )
 
 
 def _absent(name: str) -> NotFoundError:

@@ -18,7 +18,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from lodestream.errors import InputError, NotFoundError
+from lodestream.errors import InputError, LodestreamError, NotFoundError
 from lodestream.stores import AbsentError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
 
 from . import layout
@@ -35,6 +35,7 @@ from .layout import (
     Manifest,
 )
 from .names import Names
+from .private import make_private
 from .states import Event, after
 
 __all__ = ["STRAY", "Surfaces", "establish", "read_identity"]
@@ -68,6 +69,10 @@ class Surfaces:
     store : Store
     is_synced : bool
         Whether `sync` has come to its end: before that the index may lack what was changed while no server ran.
+    is_lost : bool
+        Whether the index cannot be used, and is to be made again.
+    tell_lost : callable
+        See ``lost``.
     names : Names
         The names that lead to surfaces.
 
@@ -82,13 +87,14 @@ class Surfaces:
         self.is_synced = False
         self._identity = establish(store)
         self._path = index
-        self._tell_lost = lost
-        self._mending = False
+        self.tell_lost = lost
+        self.is_lost = False
         self._mender: int | None = None  # the thread that makes the index again
         #: Held for each change, so that what was looked at is still so when it is written.
-        self._lock = threading.RLock()
+        self._lock = _Changes(self)
         #: Prefixes and keys of large objects that are being put and that no small object refers to yet.
         self._coming: Counter[str] = Counter()
+        self._counting = threading.Lock()
         #: What is wrong with a small object that cannot be read: nobody knows which large ones it refers to.
         self._damaged: DamagedObjectError | None = None
         try:
@@ -96,20 +102,36 @@ class Surfaces:
         except IndexLostError as error:
             _log.warning("%s", error)
             self._open_new()
-            self._mending = False
+            self.is_lost = False
         self.names = Names(self, self._lock)
 
     def _open_new(self) -> None:
         Index.remove(self._path)
         self._index = Index(self._path, self._identity, self._lost)
 
+    def note(self, change: Callable[[], object]) -> None:
+        """Tell the index of a change that is in the store.
+
+        Raises
+        ------
+        UnacknowledgedError
+            If it cannot be told now: it is behind the store then, until the next `sync`.
+        """
+        try:
+            change()
+        except StoreError as error:
+            self.is_synced = False
+            self.tell_lost()
+            raise UnacknowledgedError(f"it was stored, but the index could not be told: {error}") from error
+
     def _lost(self) -> None:
-        self._mending = True
-        self._tell_lost()
+        self.is_lost, self.is_synced = True, False
+        self.tell_lost()
 
     def close(self) -> None:
-        """Close the index."""
-        self._index.close()
+        """Close the index, once the change that is under way is made."""
+        with self._lock.lock:
+            self._index.close()
 
     @property
     def index(self) -> Index:
@@ -120,9 +142,19 @@ class Surfaces:
         IndexLostError
             While it is made again.
         """
-        if self._mending and threading.get_ident() != self._mender:
-            raise IndexLostError("the index of the surfaces is made again; try again soon")
+        self.check_index()
         return self._index
+
+    def check_index(self) -> None:
+        """Check that the index can be used.
+
+        Raises
+        ------
+        IndexLostError
+            While it is made again.
+        """
+        if self.is_lost and threading.get_ident() != self._mender:
+            raise IndexLostError("the index of the surfaces is made again; try again soon")
 
     def get(self, surface: str) -> Surface:
         """Return a surface.
@@ -179,29 +211,55 @@ class Surfaces:
             If it could not be stored, or it is not known whether it was: the same upload again is harmless.
         """
         self.names.keep(manifest.id)
-        known = self.index.find(manifest.id)
-        if known is not None and known.state not in _STOPPED:
-            _check_same(known.manifest, manifest)
-            return known, False
+        with self._lock:
+            known = self._known(manifest)
+            if known is not None and known.state not in _STOPPED and self._is_whole(known):
+                self._created(known.manifest)  # what a killed server left is not on disk before it is written again
+                return known, False
         keys = [layout.upload_key(manifest.upload, number) for number in range(len(files))]
         with self._arriving(keys):
-            self._put_upload(manifest, keys, files)
+            self._put_upload(manifest, keys, files, known is None)
             with self._lock:
-                known = self.index.find(manifest.id)
+                known = self._known(manifest)
                 if known is not None:
-                    _check_same(known.manifest, manifest)
-                    again = self.retry(known.id)
-                    return again, known.state in _STOPPED
-                found = self._adopted(self._created(manifest))
-                self._noted_or_taken_back(found)
+                    gone = known.state == "ready" and not self._is_whole(known)
+                    again = self._unbuilt(known) if gone else self.retry(known.id)
+                    return again, again.state != known.state
+                there = self._created(manifest)
+                found = self._adopted(there)
+                self._noted_or_taken_back(found, ours=there.write == manifest.write)
                 return found, found.state == "queued"
 
-    def _put_upload(self, manifest: Manifest, keys: Sequence[str], files: Sequence[Path]) -> None:
-        """Put the files of an upload, but those that are there and that another surface refers to.
+    def _known(self, manifest: Manifest) -> Surface | None:
+        """Return the surface of an upload that came before; whoever relies on it is told that it is stored.
 
-        What nobody refers to may be collected as a stray at any time, unless it is put again.
+        Raises
+        ------
+        InputError
+            If it is of another upload.
         """
-        shared = any(other.id != manifest.id for other in self.index.of_upload(manifest.upload))
+        known = self.index.find(manifest.id)
+        # The store may be older than the index: somebody has restored a backup, or a delete came to no answer.
+        if known is None or self._size(layout.manifest_key(manifest.id)) is None:
+            return None
+        _check_same(known.manifest, manifest)
+        return known
+
+    def _is_whole(self, known: Surface) -> bool:
+        """Return whether the store has the container of a surface that is ready, or the upload of another."""
+        it = known.manifest
+        if known.state == "ready" and known.container is not None:
+            return self._size(layout.container_key(known.container)) is not None
+        keys = (layout.upload_key(it.upload, number) for number in range(len(it.filenames)))
+        return all(self._size(key) is not None for key in keys)
+
+    def _put_upload(self, manifest: Manifest, keys: Sequence[str], files: Sequence[Path], new: bool) -> None:
+        """Put the files of an upload, but those of a new surface that are there and that another one refers to.
+
+        What nobody refers to may be collected as a stray at any time, unless it is put again. A surface that was not
+        built may be waiting for files that are whole.
+        """
+        shared = new and self.is_synced and self.index.uses_upload(manifest.upload)
         for key, file in zip(keys, files, strict=True):
             if not shared or self._size(key) != file.stat().st_size:
                 self.store.put_file(key, file, given=True)
@@ -223,11 +281,13 @@ class Surfaces:
             return known
         return manifest
 
-    def _noted_or_taken_back(self, new: Surface) -> None:
-        """Tell the index of a new surface; if it cannot be told, there is no such surface."""
+    def _noted_or_taken_back(self, new: Surface, *, ours: bool) -> None:
+        """Tell the index of a surface; if it cannot be told, and the manifest is ours, there is no such surface."""
         try:
             self.index.put(new)
         except StoreError as error:
+            if not ours:  # somebody was told that it is stored
+                raise UnacknowledgedError(f"{new.id} is stored, and cannot be told now: {error}") from error
             try:
                 self.store.delete([layout.manifest_key(new.id)])
             except StoreError:
@@ -240,24 +300,24 @@ class Surfaces:
 
         What nothing refers to when the block ends is removed: as a stray it would take room for a day.
         """
-        with self._lock:
+        with self._lock, self._counting:  # not between a look at them and a removal
             self._coming.update(keys)
         settled = False
         try:
             yield
             settled = True
-        except UnacknowledgedError:
+        except (UnacknowledgedError, IndexLostError):
             raise  # there may be a small object that refers to them
-        except StoreError:
+        except LodestreamError:
             settled = True
             raise
         finally:
-            with self._lock:
+            with self._counting:
                 self._coming.subtract(keys)
                 self._coming += Counter()
-                if settled:
-                    with suppress(StoreError, IndexLostError):
-                        self._remove_unused(keys)
+            if settled:
+                with suppress(StoreError, IndexLostError), self._lock:
+                    self._remove_unused(keys)
 
     def _remove_unused(self, keys: Iterable[str], deleted: str | None = None) -> None:
         """Remove large objects to which nothing refers, as far as that is known; `deleted` is about to leave the index.
@@ -268,19 +328,21 @@ class Surfaces:
             If the store cannot remove them; they are strays then.
         """
         # Before the end of the first `sync` the index may not know who refers to them.
-        if not self.is_synced or self._damaged is not None or self._mending:
+        if not self.is_synced or self._damaged is not None or self.is_lost:
             return
-        unused = [key for key in keys if not self._coming[key] and self._users(key) <= {deleted}]
+        unused = [key for key in keys if not self._coming[key] and not self._is_used(key, but=deleted)]
         if unused:
             self.store.delete(unused)
 
-    def _users(self, key: str) -> set[str | None]:
-        """Return the surfaces that refer to a large object."""
-        sha256 = layout.sha256_of(key) or ""
+    def _is_used(self, key: str, but: str | None = None) -> bool:
+        """Return whether a surface, other than one, refers to an object."""
+        sha256 = layout.sha256_of(key)
+        if sha256 is None:
+            id_ = layout.id_of(key)  # of what is none of ours nobody knows who uses it
+            return id_ is None or self._index.find(id_) is not None
         if key.startswith(CONTAINERS):
-            return {it.id for it in self._index.of_container(sha256)}
-        number = int(key.rpartition("/")[2])
-        return {it.id for it in self._index.of_upload(sha256) if number < len(it.manifest.filenames)}
+            return self._index.uses_container(sha256, but)
+        return self._index.uses_upload(sha256, int(key.rpartition("/")[2]), but)
 
     def _size(self, key: str) -> int | None:
         """Return the bytes of an object; None if it is not there."""
@@ -315,7 +377,7 @@ class Surfaces:
     # What becomes of builds. A surface that was deleted meanwhile is left alone.
 
     def begin(self, surface: str) -> Surface | None:
-        """Note that a build begins: it counts as an attempt until it ends. None: it was deleted."""
+        """Note that a build begins: it counts as an attempt until it ends. None: there is nothing to be built."""
         return self._noted(surface, "begun", attempt=1)
 
     def later(self, surface: str, reason: str | None = None, *, counts: bool = False) -> Surface | None:
@@ -338,8 +400,10 @@ class Surfaces:
     def _noted(self, surface: str, event: Event, reason: str | None = None, attempt: int = 0) -> Surface | None:
         with self._lock:
             known = self.index.find(surface)
-            if known is None:
+            if known is None or known.state in ("ready", "failed"):  # as the store says, which may be known only now
                 return None
+            if event == "later" and known.state != "building":  # it has not begun
+                attempt = 0
             attempts = max(known.attempts + attempt, 0)
             noted = replace(known, state=after(known.state, event), reason=_bounded(reason), attempts=attempts)
             self.index.put(noted)
@@ -371,12 +435,13 @@ class Surfaces:
         described, summary = layout.describe(info)
         key, size = layout.container_key(sha256), container.stat().st_size
         with self._arriving([key]):
-            if not self.index.of_container(sha256) or self._size(key) != size:
+            shared = self.is_synced and self.index.uses_container(sha256, surface)
+            if not shared or self._size(key) != size:
                 self.store.put_file(key, container, given=True)
             with self._lock:
                 known = self.index.find(surface)
-                if known is None:
-                    return None
+                if known is None or (known.state == "ready" and known.container == sha256):
+                    return known
                 after(known.state, "built")
                 built = Built(known.manifest.write, sha256, size, None, layout.new_write(), summary, info=described)
                 return self._told(known, built)
@@ -410,7 +475,7 @@ class Surfaces:
                 container = layout.parse(Built, key, there).container
                 before += [layout.container_key(container)] if container not in (None, built.container) else []
         told = _surface(known.manifest, built, tag)
-        self.index.put(told)
+        self.note(lambda: self.index.put(told))
         with suppress(StoreError):
             self._remove_unused(before)
         return told
@@ -435,7 +500,10 @@ class Surfaces:
                 self.store.delete([layout.built_key(surface)])  # or a lost index would make it fail again
                 tag = None
             again = replace(known, state=state, reason=None, attempts=0, built_tag=tag)
-            self.index.put(again)
+            if known.state == "failed":
+                self.note(lambda: self.index.put(again))
+            else:
+                self.index.put(again)
             return again
 
     def lose(self, container: str, *, unreadable: bool = False) -> list[Surface]:
@@ -451,13 +519,27 @@ class Surfaces:
         with self._lock:
             if not unreadable and self._size(layout.container_key(container)) is not None:
                 return []
-            lost = []
-            for known in self.index.of_container(container):
-                if known.state == "ready":
-                    again = replace(known, state=after(known.state, "lost"))
-                    self.index.put(again)
-                    lost.append(again)
-            return lost
+            with self.index.together():
+                users = map(self.index.find, self.index.with_container(container))
+                return [self._unbuilt(known) for known in users if known is not None and known.state == "ready"]
+
+    def _unbuilt(self, known: Surface) -> Surface:
+        """Queue a surface again whose container is not there; what tells of it stays, since it may come back."""
+        again = replace(known, state=after(known.state, "lost"))
+        self.index.put(again)
+        return again
+
+    def found(self, surface: str) -> Surface | None:
+        """Take back that the container of a surface is lost, if it is there again; None if it is not."""
+        with self._lock:
+            known = self.index.find(surface)
+            if known is None or known.container is None or known.built_tag is None:
+                return None
+            if self._size(layout.container_key(known.container)) != known.container_bytes:
+                return None
+            again = replace(known, state=after(known.state, "built"), reason=None, attempts=0)
+            self.index.put(again)
+            return again
 
     def delete(self, surface: str) -> None:
         """Delete a surface, with its upload and its container unless another surface has them.
@@ -470,6 +552,8 @@ class Surfaces:
             If it is not known whether the manifest is gone; to delete it again is harmless.
         """
         with self._lock:
+            if self.index.find(surface) is None and layout.id_of(layout.manifest_key(surface)) is not None:
+                self.store.delete([layout.manifest_key(surface)])  # of a killed server, whose delete is not on disk yet
             known = self.get(surface)
             it = known.manifest
             self.store.delete([layout.manifest_key(surface)])  # it is deleted from here on
@@ -480,7 +564,7 @@ class Surfaces:
                 self._remove_unused(keys, deleted=surface)
             except StoreError as error:
                 _log.warning("%s was deleted, but some of its files are left as strays: %s", surface, error)
-            self.index.drop(surface)
+            self.index.gone(surface)
 
     # The index and the store.
 
@@ -506,6 +590,7 @@ class Surfaces:
         taken = looked = 0
         changed: list[_Found] = []
         damaged = None
+        self._index.check()
         for found in self._found():
             looked += 1
             if found.changed:
@@ -559,7 +644,11 @@ class Surfaces:
                     if before.built_tag == surface.built_tag:
                         surface = before  # with what only the index knows: whether it waits, is built, and how often
                     elif surface.state == "queued":
-                        surface = replace(surface, attempts=before.attempts)
+                        # What was ready once is not refused for good: `builds.jobs` has to know.
+                        once = before.container, before.container_bytes
+                        surface = replace(surface, attempts=before.attempts, container=once[0], container_bytes=once[1])
+                if surface is not before and surface.state == "ready" and not self._is_whole(surface):
+                    surface = replace(surface, state=after("ready", "lost"))
                 self._index.put(surface, *tags)
         return damaged
 
@@ -571,16 +660,16 @@ class Surfaces:
         StoreError
             If the store cannot be read, or the disk of the index is full; to be repeated then.
         """
-        with self._lock:
-            self._mending, self._mender = True, threading.get_ident()
-            try:
+        self.is_lost, self._mender = True, threading.get_ident()
+        try:
+            with self._lock:
                 self._index.close()
-                self._path.parent.mkdir(parents=True, exist_ok=True)
+                make_private(self._path.parent)
                 self._open_new()
                 self.sync()
-                self._mending = False
-            finally:
-                self._mender = None
+                self.is_lost = False
+        finally:
+            self._mender = None
 
     def strays(self, older: float = STRAY) -> list[Entry]:
         """Return the objects that no small object refers to, and that are older than so many seconds.
@@ -597,12 +686,6 @@ class Surfaces:
             for entry in self.store.entries(prefix)
             if entry.modified < before and not self._coming[entry.key] and not self._is_used(entry.key)
         ]
-
-    def _is_used(self, key: str) -> bool:
-        if layout.sha256_of(key) is not None:
-            return bool(self._users(key))
-        id_ = layout.id_of(key)  # of what is none of ours nobody knows who uses it
-        return id_ is None or self._index.find(id_) is not None
 
     def collect(self, older: float = STRAY) -> list[Entry]:
         """Remove strays; return what they were.
@@ -622,6 +705,21 @@ class Surfaces:
             found = self.strays(older)
             self.store.delete([entry.key for entry in found])
         return found
+
+
+class _Changes:
+    """The lock of all changes. While the index is made again nobody waits for it."""
+
+    def __init__(self, surfaces: Surfaces) -> None:
+        self._surfaces = surfaces
+        self.lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        self._surfaces.check_index()
+        self.lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self.lock.release()
 
 
 @dataclass(frozen=True)
@@ -717,4 +815,8 @@ def _bounded(reason: str | None) -> str | None:
     """Return a reason that is no longer than the texts of a surface may be."""
     if reason is None:
         return None
-    return reason.encode("utf-8", "replace")[: layout.MOST_REASON].decode("utf-8", "ignore")
+    data = reason.encode("utf-8", "replace")
+    if len(data) > layout.MOST_REASON:
+        data = data[: layout.MOST_REASON - 3]
+        return data.decode("utf-8", "ignore") + "..."
+    return data.decode("utf-8")

@@ -105,11 +105,11 @@ def test_a_state_that_there_is_not_is_refused_with_those_that_are(run: Run) -> N
     assert (code, stdout) == (2, "")
     words = stderr.replace("'", "")
     assert "argument --state: invalid choice: nonsense (choose from" in words
-    assert "queued, building, ready, failed, waiting, missing" in words
+    assert "queued, building, ready, failed, waiting" in words
 
 
-@pytest.mark.parametrize("state", ["queued", "building", "ready", "failed", "waiting", "missing"])
+@pytest.mark.parametrize("state", ["queued", "building", "ready", "failed", "waiting"])
 def test_each_state_can_be_asked_for(run: Run, state: str) -> None:
-    states = ["queued", "building", "ready", "failed", "waiting", "missing"]
+    states = ["queued", "building", "ready", "failed", "waiting"]
     _, stdout = listed(run, [{"state": it, "name": it} for it in states], "--state", state, "--json")
     assert [it["name"] for it in json.loads(stdout)["surfaces"]] == [state]

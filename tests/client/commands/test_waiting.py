@@ -39,7 +39,7 @@ class Fake:
         if path.startswith(("/v1/surfaces/none", "/v1/formats")):  # it does not say what it reads, as an older server
             return 404, {"code": "not-found", "detail": "no such surface", "status": 404}
         state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
-        reason = REASON if state in ("waiting", "missing", "failed") else None
+        reason = REASON if state in ("waiting", "failed") else None
         surface = {"id": "ab", "url": "/v1/surfaces/ab", "state": state, "reason": reason, "progress": 0.5}
         return 202 if method == "POST" and state != "ready" else 200, surface
 
@@ -81,7 +81,7 @@ def ask(what: str, server: Fake, asynchronous: bool) -> Description:
     return asyncio.run(client.retry(server.surface)) if asynchronous else sync.retry(server.surface)
 
 
-@pytest.mark.parametrize("state", ["waiting", "missing", "failed"])
+@pytest.mark.parametrize("state", ["waiting", "failed"])
 @pytest.mark.parametrize("states", [(), ("queued", "building")], ids=["at once", "later"])
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
 @pytest.mark.parametrize("what", ["upload", "retry"])
@@ -122,11 +122,10 @@ def test_retry_waits_until_the_surface_is_ready(asynchronous: bool) -> None:
 
 
 def test_states_are_told_to_those_who_only_look() -> None:
-    for state in ("waiting", "missing"):
-        with fake(state) as server:
-            found = sync.describe(server.surface)
-            assert (found.state, found.ready, found.details["reason"]) == (state, False, REASON)
-            assert sync.upload(server.url, np.eye(4), wait=False).state == state
+    with fake("waiting") as server:
+        found = sync.describe(server.surface)
+        assert (found.state, found.ready, found.details["reason"]) == ("waiting", False, REASON)
+        assert sync.upload(server.url, np.eye(4), wait=False).state == "waiting"
 
 
 def test_the_command_retry(run: Run) -> None:
@@ -135,22 +134,20 @@ def test_the_command_retry(run: Run) -> None:
     with fake("queued") as server:
         code, out, _ = run("retry", server.surface, "--no-wait", "--json")
         assert (code, json.loads(out)["state"], json.loads(out)["url"]) == (0, "queued", server.surface)
-    for state in ("waiting", "missing"):
-        with fake("queued", state) as server:
-            code, out, err = run("retry", server.surface)
-            assert (code, out) == (1, "")
-            assert err == f"lodestream: {server.surface} is {state}: {REASON}\n"
+    with fake("queued", "waiting") as server:
+        code, out, err = run("retry", server.surface)
+        assert (code, out) == (1, "")
+        assert err == f"lodestream: {server.surface} is waiting: {REASON}\n"
     assert run("retry", "http://host")[0] == 2
 
 
 def test_push_says_that_a_surface_waits(run: Run, tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.eye(5))
-    for state in ("waiting", "missing"):
-        with fake("queued", state) as server:
-            code, out, err = run("push", tmp_path / "a.npy", server.url)
-            assert (code, out) == (1, "")
-            assert err == f"lodestream: {server.surface} is {state}: {REASON}\n"
-            assert f"{state} {REASON}" in run("info", server.surface)[1]
+    with fake("queued", "waiting") as server:
+        code, out, err = run("push", tmp_path / "a.npy", server.url)
+        assert (code, out) == (1, "")
+        assert err == f"lodestream: {server.surface} is waiting: {REASON}\n"
+        assert f"waiting {REASON}" in run("info", server.surface)[1]
 
 
 def test_a_server_whose_limit_was_raised(run: Run, tmp_path: Path) -> None:

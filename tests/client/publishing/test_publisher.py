@@ -351,7 +351,7 @@ def test_a_store_that_cannot_be_listed_is_published_in_all_the_same(
         ("index.html", "holds index.html"),
         ("view.json", "another file"),
         ("containers/identity", "holds containers/identity"),
-        ("records/0.json", "holds records/0.json"),
+        ("built/0.json", "holds built/0.json"),
         (f"containers/{'a' * 64}.lode", "holds containers/a"),
         (f"levels/{'a' * 64}/mine.tif", "holds levels/a"),
     ],

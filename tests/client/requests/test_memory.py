@@ -95,7 +95,7 @@ def test_a_surface_in_memory_goes_whole(server: str, kind: str, asynchronous: bo
     assert values(back) == values(given)
     assert back.metadata == given.metadata == metadata
     assert made.details["errors"] == "checked"
-    assert made.details["name"] == given.metadata.get("name")
+    assert made.details["name"] == given.metadata.get("name", "surface.lode")
     assert made.details["filenames"] == ["surface.lode"]
     stages = [stage for stage, _ in told]
     if not asynchronous or kind == "raster":  # the second time it is there already

@@ -15,7 +15,8 @@ from lodestream.container import FrameReader, sections
 from lodestream.container.writer import CodedLayer, CodedSegment, ContainerWriter
 from lodestream.decoding.inspection import inspect
 from lodestream.errors import CorruptStreamError, LodestreamError, UnsupportedVersionError
-from lodestream_server.maintenance.fsck import check_container
+from lodestream.stores import Folder
+from lodestream_server.maintenance.containers import check_container
 
 from ..surfaces import index_of, terrain
 
@@ -104,12 +105,13 @@ def test_an_inspection_lets_it_pass(long: Path, memory: int | None) -> None:
     assert len(found.index.optional) == 2
 
 
-def test_fsck_lets_it_pass(long: Path) -> None:
+def test_fsck_lets_it_pass(long: Path, tmp_path: Path) -> None:
     with long.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    (tmp_path / "containers").mkdir()
+    (tmp_path / "containers" / f"{sha256}.lode").symlink_to(long)
     with little_memory():
-        found = check_container(long, sha256)
-    assert not isinstance(found, str)
+        assert check_container(Folder(tmp_path), sha256)[0] == "whole"
 
 
 def test_fsck_holds_no_other_section_whole(tmp_path: Path) -> None:
@@ -119,14 +121,15 @@ def test_fsck_holds_no_other_section_whole(tmp_path: Path) -> None:
     for damaged in (0, 1):
         data = bytearray(start + sections.section(sections.RESIDUAL, bytes(LONG)))
         data[-10] ^= damaged
-        path = tmp_path / f"{damaged}.lode"
-        path.write_bytes(data)
         sha256 = hashlib.sha256(data).hexdigest()
+        path = tmp_path / "containers" / f"{sha256}.lode"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(data)
         del data
         with little_memory():
-            found = check_container(path, sha256)
-        assert isinstance(found, str)
-        assert ("kind 3 to match its CRC" in found) == bool(damaged)
+            state, problem, _ = check_container(Folder(tmp_path), sha256)
+        assert state == "bad"
+        assert ("kind 3 to match its CRC" in str(problem)) == bool(damaged)
 
 
 def inspect_path(path: Path) -> None:

@@ -29,7 +29,7 @@ from lodestream_server.access.tokens import SCOPES, TokenFile
 from lodestream_server.routes import streams
 from lodestream_server.store.durable import write_file
 from tests.patience import PATIENCE
-from tests.server.helpers import Keys, Raw, closed, eventually, hills, npy, problem, push, raw_stream
+from tests.server.helpers import Keys, Raw, closed, eventually, hills, kept, npy, problem, push, raw_stream
 
 
 @dataclass
@@ -292,10 +292,10 @@ def test_the_client_sends_its_token_everywhere(served: Served, tmp_path: Path) -
 
 
 def test_a_body_that_may_not_come_is_not_stored(served: Served, http: httpx.Client) -> None:
-    before = sorted((served.keys.folder / "incoming").iterdir())
+    before = kept(served.keys.folder, "scratch/incoming")
     answer = http.post("/v1/surfaces", content=b"x" * 3_000_000, headers=served.keys.header("read"))
     assert problem(answer) == (403, "small-scope")
-    assert sorted((served.keys.folder / "incoming").iterdir()) == before
+    assert kept(served.keys.folder, "scratch/incoming") == before
     # The connection is good for the next request.
     assert http.get("/v1/surfaces", headers=served.keys.header("read")).status_code == 200
 

@@ -38,6 +38,11 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/v1/surfaces/{surface}/container"): "read",
     ("GET", "/v1/surfaces/{surface}/levels/{level}"): "read",
     ("GET", "/v1/containers/{sha256}.lode"): "read",
+    ("GET", "/v1/names"): "read",
+    ("PUT", "/v1/names/{name}"): "write",
+    ("GET", "/v1/names/{name}"): "read",
+    ("GET", "/v1/names/{name}/container"): "read",
+    ("DELETE", "/v1/names/{name}"): "write",
 }
 GUARDED = [(method, path) for (method, path), scope in ROUTES.items() if scope is not None]
 WRITING = [(method, path) for method, path in GUARDED if method != "GET"]

@@ -25,8 +25,8 @@ from lodestream_server.access.tokens import TokenFile
 from lodestream_server.operation import least_rate
 from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
 from lodestream_server.store import durable
-from tests.server.helpers import PATIENCE, Raw, eventually, hills, npy, push, raw_stream
-from tests.server.storage.disks import FullDisk
+from tests.server.helpers import PATIENCE, Raw, eventually, hills, kept, npy, push, raw_stream
+from tests.server.store.disks import FullDisk
 
 
 class Disk(NamedTuple):
@@ -51,7 +51,7 @@ def limits(
     """Of which ``of_anna`` surfaces, ``own`` builds and ``kept`` bytes on the disk are Anna's."""
     return Limits(
         Settings(data=folder, **settings),
-        folder,
+        (folder,),
         lambda owner: (surfaces, of_anna if owner == ANNA.owner else 0),
         lambda caller: (builds, own if caller == ANNA.key else 0),
         lambda owner: kept if owner == ANNA.owner else 0,
@@ -406,7 +406,7 @@ def test_uploads_too_many_are_told_to_come_back(folder: Path, small: tuple[str, 
             "Content-Length: 100000\r\n\r\nxxx".encode()
         )
         # Seen in the folder: whoever asked by another upload might be the one that is taken.
-        eventually(lambda: list((folder / "incoming").glob("*/0")), "the slow upload to begin")
+        eventually(lambda: list((folder / "scratch" / "incoming").glob("*/0")), "the slow upload to begin")
         answer = http.post("/v1/surfaces", content=npy(hills(6, 5)))
         assert answer.status_code == 503
         assert answer.headers["retry-after"].isdecimal()
@@ -435,7 +435,7 @@ def test_uploads_too_many_are_told_to_come_back(folder: Path, small: tuple[str, 
         assert (bad.status_code, bad.json()["code"]) == (422, "bad-option")
         # Of what cannot be there, by its size, nothing is awaited.
         assert refused_at_once(url, tokens["one"], len(body) + 1).startswith(b"HTTP/1.1 507 ")
-        assert list((folder / "incoming").iterdir()) == []
+        assert kept(folder, "scratch/incoming") == []
 
 
 def settled_upload(http: httpx.Client, body: bytes) -> httpx.Response | None:
@@ -451,7 +451,7 @@ def test_a_server_without_room_says_so(tmp_path: Path) -> None:
     ):
         answer = http.post("/v1/surfaces", content=npy(hills()))
         assert (answer.status_code, answer.json()["code"]) == (507, "full")
-        assert list((tmp_path / "incoming").iterdir()) == []
+        assert kept(tmp_path, "scratch/incoming") == []
 
 
 def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -460,7 +460,7 @@ def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: py
         httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = push(http, npy(hills()))
-        eventually(lambda: not list((tmp_path / "work").iterdir()), "the build's folder to be removed")
+        eventually(lambda: not kept(tmp_path, "scratch/work"), "the build's folder to be removed")
         before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
         monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(1 << 40, 1 << 40, 0))
         monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 
+from lodestream.stores import Folder, StoreError
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import worker
+from lodestream_server.store.data_folder import DataFolder
+from lodestream_server.store.layout import CONTAINERS
 from tests.patience import PATIENCE
 from tests.server.builds import slow
 from tests.server.helpers import eventually, hills, kept, npy, problem, settled
@@ -67,6 +69,8 @@ def test_each_name_and_each_owner_has_a_surface_and_the_bytes_are_there_once(off
         assert problem(bert.delete(mine[1])) == (403, "not-owner")
         assert bert.delete(theirs[1]).status_code == 204
         assert anna.get(f"{mine[1]}/container", follow_redirects=True).status_code == 200
+        # The name is in the container.
+        assert len(kept(office.data, "containers")) == 3
         for where in mine[:2]:
             assert anna.delete(where).status_code == 204
             assert anna.get(where).status_code == 404
@@ -74,16 +78,17 @@ def test_each_name_and_each_owner_has_a_surface_and_the_bytes_are_there_once(off
         assert root.delete(theirs[0]).status_code == 204
         assert len(kept(office.data, "uploads")) == 1
         assert root.delete(mine[2]).status_code == 204
-        for folder in ("records", "uploads", "containers"):
-            assert kept(office.data, folder) == []
+        assert_empty(office.data)
 
 
-def test_the_second_owner_of_the_same_bytes_need_not_wait(office: Office, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_owner_of_the_same_bytes_has_a_build_of_its_own(office: Office) -> None:
     with office.client("anna") as anna, office.client("bert") as bert:
-        push(anna, name="hills")
-        monkeypatch.setattr(worker, "build", slow.wait)
+        mine = push(anna, name="hills")
         answer = bert.post("/v1/surfaces", content=BODY, params={"name": "hills"})
-        assert (answer.status_code, answer.json()["state"], answer.json()["owner"]) == (200, "ready", "bert")
+        assert (answer.status_code, answer.json()["owner"]) == (202, "bert")
+        theirs = settled(bert, answer.headers["location"])
+        assert (theirs["state"], theirs["container"]) == ("ready", anna.get(mine).json()["container"])
+        assert len(kept(office.data, "containers")) == 1
 
 
 def test_a_renewed_token_keeps_its_surfaces(office: Office) -> None:
@@ -153,54 +158,64 @@ def test_deletes_and_uploads_of_the_same_bytes_at_once(office: Office) -> None:
     with ThreadPoolExecutor(4) as threads:
         left = list(threads.map(work, ["anna", "bert", "carl", "dora"]))
     assert left == [2, 2, 2, 2]
-    eventually(lambda: len(kept(office.data, "records")) == sum(left), "no other records")
+    eventually(lambda: len(kept(office.data, "surfaces")) == sum(left), "no other surfaces")
+    assert len(kept(office.data, "built")) == sum(left)
     assert len(kept(office.data, "uploads")) == 1
 
 
+@pytest.fixture
+def stubborn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Containers cannot be removed from the store."""
+    remove = Folder.delete
+
+    def delete(store: Folder, keys: Iterable[str]) -> None:
+        wanted = list(keys)
+        if any(key.startswith(CONTAINERS) for key in wanted):
+            raise StoreError("Input/output error")
+        remove(store, wanted)
+
+    monkeypatch.setattr(Folder, "delete", delete)
+
+
+@pytest.mark.usefixtures("stubborn")
 def test_what_a_delete_could_not_remove_does_not_take_what_was_uploaded_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from lodestream_server.store import durable
-
-    class Stubborn(durable.Disk):
-        def unlink(self, path: Path) -> None:
-            if path.suffix == ".lode":
-                raise OSError(errno.EIO, "Input/output error")
-            super().unlink(path)
-
     data = tmp_path / "data"
     with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         where = push(http)
-        monkeypatch.setattr(durable, "disk", Stubborn())
         assert http.delete(where).status_code == 204
         assert http.get(where).status_code == 404
-        assert [name.partition(".")[2] for name in kept(data, "records")] == ["deleted"]
+        assert (kept(data, "surfaces"), len(kept(data, "containers"))) == ([], 1)
         monkeypatch.undo()
         assert push(http) == where
     with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         assert http.get(where).json()["state"] == "ready"
         assert http.delete(where).status_code == 204
-        for folder in ("records", "uploads", "containers"):
-            assert kept(data, folder) == []
+        eventually(lambda: kept(data, "containers") == [], "nothing to be left")
+        assert_empty(data)
 
 
-def test_what_a_delete_could_not_remove_is_removed_by_the_next_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from lodestream_server.store import durable
-
-    class Stubborn(durable.Disk):
-        def remove_folder(self, path: Path) -> None:
-            """It stays."""
-
+@pytest.mark.usefixtures("stubborn")
+def test_what_a_delete_could_not_remove_is_a_stray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
     with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         where = push(http)
-        monkeypatch.setattr(durable, "disk", Stubborn())
         assert http.delete(where).status_code == 204
-        monkeypatch.undo()
-        assert len(kept(data, "uploads")) == 1
+    monkeypatch.undo()
+    (left,) = kept(data, "containers")
     with running_server(data, workers=1) as url:
         assert httpx.get(f"{url}{where}", trust_env=False).status_code == 404
-        for folder in ("records", "uploads", "containers"):
-            assert kept(data, folder) == []
+        assert kept(data, "containers") == [left], "a start removes nothing"
+    folder = DataFolder(data)
+    try:
+        folder.surfaces.collect(older=-60.0)  # whatever its age
+    finally:
+        folder.close()
+    assert_empty(data)
+
+
+def assert_empty(data: Path) -> None:
+    """Nothing of any surface is in a data folder."""
+    for folder in ("surfaces", "built", "uploads", "containers"):
+        assert kept(data, folder) == []

@@ -16,6 +16,7 @@ import pytest
 
 from lodestream import encode
 from lodestream.protocol.messages import BASE_CREDIT
+from lodestream.stores import Folder
 from lodestream_server import Settings
 from lodestream_server.access.access import Caller
 from lodestream_server.access.limits import Limits
@@ -24,12 +25,13 @@ from lodestream_server.builds.level_queue import LevelQueue
 from lodestream_server.builds.shares import Turns
 from lodestream_server.connections.places import Places
 from lodestream_server.problems import FullError, TooManyError
-from lodestream_server.storage.containers import Containers, OpenContainer, index_memory
-from lodestream_server.storage.storage import Storage
+from lodestream_server.store.containers import Containers, OpenContainer, index_memory
+from lodestream_server.store.surfaces import Surfaces
 from tests.server.access.test_limits import ANNA, BERT, CARL, Disk, request
 from tests.server.helpers import PATIENCE, hills
+from tests.server.store.world import upload
 
-# Storage and processes of levels that are not made.
+# Containers and processes of levels that are not made.
 nothing: Any = None
 
 #: Settings that are not shared, and why.
@@ -37,6 +39,7 @@ NOT_SHARED = {
     "host": "an address",
     "port": "an address",
     "data": "a path",
+    "scratch": "a path",
     "root_path": "a path",
     "trusted_proxies": "addresses",
     "insecure": "a switch",
@@ -45,6 +48,7 @@ NOT_SHARED = {
     "public_reads": "a switch",
     "origins": "addresses",
     "formats": "a list of words",
+    "keep_replaced_days": "a time; what it keeps counts as its owner's (max_surfaces, owner_bytes)",
     "log_format": "a word",
     "log_level": "a word",
     "dask": "an address; builds go there in their turns (workers)",
@@ -76,7 +80,7 @@ class Town:
         self.bytes: Counter[str | None] = Counter()
         self.limits = Limits(
             self.settings,
-            folder,
+            (folder,),
             lambda owner: (self.surfaces.total(), self.surfaces[owner]),
             lambda caller: (self.builds.total(), self.builds[caller]),
             lambda owner: self.bytes[owner],
@@ -298,17 +302,17 @@ def turns_of_builds(folder: Path) -> None:
 
 
 #: Settings that callers share, and what shows that one of them cannot take everything.
-def test_memory_of_indexes_is_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_of_indexes_is_shared(tmp_path: Path) -> None:
     """An eighth of the machine's memory, which no setting says."""
     data = encode(hills(9, 8))
-    names = [f"{number:064x}" for number in range(40)]
-    for name in names:
+    names = [f"{number:064x}" for number in range(16)]
+    surfaces = Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+    for number, name in enumerate(names):
+        surfaces.accept(*upload(tmp_path, number))
         (tmp_path / name).write_bytes(data)
-    monkeypatch.setattr(Storage, "__init__", lambda self: None)
-    monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
-    with (tmp_path / names[0]).open("rb") as file:
-        each = sum(index_memory(file))
-    containers, town = Containers(Storage.__new__(Storage), 8 * each), Town(tmp_path)
+        surfaces.built(f"{number:020x}", tmp_path / name, name, {"levels": []})
+    each = sum(index_memory(lambda offset, length: data[offset : offset + length], len(data)))
+    containers, town = Containers(surfaces, 8 * each), Town(tmp_path)
     left, held = iter(names), dict[Caller, list[OpenContainer]]()
 
     def open_one(caller: Caller, name: str) -> None:
@@ -327,11 +331,12 @@ def test_memory_of_indexes_is_shared(tmp_path: Path, monkeypatch: pytest.MonkeyP
         opened.close()
     held.clear()
     assert containers._open == {}
-    alone = Containers(Storage.__new__(Storage), 8 * each)
+    alone = Containers(surfaces, 8 * each)
     town.limits._alone = lambda: True
     several = [alone.open(name, ANNA.key, partial(town.limits.check_indexes, ANNA)) for name in names[:8]]
     for opened in several:
         opened.close()
+    surfaces.close()
 
 
 SHARED: dict[str, Callable[[Path], None]] = {

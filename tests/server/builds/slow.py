@@ -23,7 +23,7 @@ from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, m
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 from lodestream_server.store import durable
 from tests.patience import PATIENCE as _PATIENCE
-from tests.server.storage.disks import FullDisk
+from tests.server.store.disks import FullDisk
 
 __all__ = [
     "allow_levels_more",
@@ -78,12 +78,12 @@ __all__ = [
 
 def allow_more(job: Job, *args: object) -> Allowed:
     """What `jobs` allows a build, and the data folder, where those below leave a mark for the next attempt."""
-    return replace(_allowed(job, *args), write=job.folder.parents[2])
+    return replace(_allowed(job, *args), write=job.folder.parents[3])
 
 
 def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
     """The same of those who make levels."""
-    return replace(_allowed_level(job, *args), write=job.folder.parent.parent, file_bytes=None)
+    return replace(_allowed_level(job, *args), write=job.folder.parents[2], file_bytes=None)
 
 
 # The server's limits are longer, and no test leaves it at that.
@@ -248,7 +248,7 @@ def out_of_processor_time(job: Job) -> Built | Parsed | Refused:
 def wait(job: Job) -> Built | Parsed | Refused:
     """Report half, then go on when a file called ``go`` appears beside the surfaces' folders."""
     (job.folder / "progress").write_text("0.5")
-    go = job.folder.parents[2] / "go"
+    go = job.folder.parents[3] / "go"
     until = time.monotonic() + _PATIENCE
     while not go.exists():
         if time.monotonic() > until:
@@ -259,7 +259,7 @@ def wait(job: Job) -> Built | Parsed | Refused:
 
 def listed(job: Job) -> Built | Parsed | Refused:
     """Write down in which order surfaces are built."""
-    with (job.folder.parents[2] / "order").open("a") as file:
+    with (job.folder.parents[3] / "order").open("a") as file:
         file.write(job.folder.parent.name + "\n")
     return wait(job)
 
@@ -272,7 +272,7 @@ def kill(job: Job) -> Built | Parsed | Refused:
 
 def end_once(job: Job) -> Built | Parsed | Refused:
     """Be told to end the first time, as all processes of a service are that is stopped."""
-    marker = job.folder.parents[2] / "told"
+    marker = job.folder.parents[3] / "told"
     if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGTERM)
@@ -298,7 +298,7 @@ def refuse(job: Job) -> Built | Parsed | Refused:
 
 def kill_once(job: Job) -> Built | Parsed | Refused:
     """Be killed the first time."""
-    marker = job.folder.parents[2] / "killed"
+    marker = job.folder.parents[3] / "killed"
     if not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -317,7 +317,7 @@ def take(count: int) -> int:
 
 def full_at_each_step(job: Job) -> Built | Parsed | Refused:
     """Find the disk full at the first step of writing the container, the next time at the second, and so on."""
-    marker = job.folder.parents[2] / "fuller"
+    marker = job.folder.parents[3] / "fuller"
     done = int(marker.read_text()) if marker.exists() else 0
     marker.write_text(str(done + 1))
     durable.disk = FullDisk(done)
@@ -326,7 +326,7 @@ def full_at_each_step(job: Job) -> Built | Parsed | Refused:
 
 def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
     """Say who makes a level, then make the coarsest at once and the others when ``go`` appears beside the folders."""
-    begun = job.folder.parent.parent / "begun"
+    begun = job.folder.parents[2] / "begun"
     with begun.open("a") as file:
         file.write(f"{os.getpid()} {job.level}\n")
     until = time.monotonic() + _PATIENCE
@@ -351,7 +351,7 @@ def make_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
 
 def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
     """Miss the container of the first level once it was deleted, and say so when ``go`` appears beside the folders."""
-    data, until = job.folder.parent.parent, time.monotonic() + _PATIENCE
+    data, until = job.folder.parents[2], time.monotonic() + _PATIENCE
     first = not (data / "missed").exists()
     while first and job.container.exists() and time.monotonic() < until:
         (data / "begun").touch()
@@ -388,7 +388,7 @@ def hoard_level(job: LevelJob) -> MadeLevel | RefusedLevel:
 
 def kill_level_once(job: LevelJob) -> MadeLevel | RefusedLevel:
     """Be killed the first time, with half a file written."""
-    marker = job.folder.parent.parent / "killed"
+    marker = job.folder.parents[2] / "killed"
     if not marker.exists():
         marker.touch()
         (job.folder / "level").write_bytes(b"half")

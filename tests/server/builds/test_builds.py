@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
+import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -21,11 +22,11 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.builds import jobs, worker
-from lodestream_server.storage.markers import MARKER
-from lodestream_server.storage.storage import Storage
+from lodestream_server.builds.work import Work
+from lodestream_server.store.data_folder import DataFolder
 from lodestream_server.store.durable import discard
 from tests.server.builds import slow
-from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, push, settled, upload_of
+from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, problem, push, settled, upload_of
 
 
 @contextmanager
@@ -82,7 +83,7 @@ def test_deleting_stops_the_build_and_frees_its_process(tmp_path: Path, monkeypa
         assert push(http, npy(hills(seed=2)))["state"] == "ready"
         assert len(kept(data, "uploads")) == 1
         # A surface is ready a moment before the folder of its build is gone.
-        eventually(lambda: not list((data / "work").iterdir()) or None, "the work folder empty")
+        eventually(lambda: not list((data / "scratch" / "work").iterdir()) or None, "the work folder empty")
 
 
 def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +123,7 @@ def test_a_build_that_needs_too_much_memory_waits(tmp_path: Path, monkeypatch: p
     with running(tmp_path / "data", build_memory=1 << 30) as http:
         surface = settled(http, post(http, 1))
         assert surface["state"] == "waiting"
-        assert "more memory than its share, 1024 MiB (LODESTREAM_MEMORY), 2 times" in surface["reason"]
+        assert "more memory than its share, 1024 MiB (LODESTREAM_MEMORY): 3 builds began" in surface["reason"]
         monkeypatch.undo()
         assert settled(http, post(http, 1))["state"] == "ready"
 
@@ -169,8 +170,8 @@ def test_identical_uploads_at_once_are_one_surface(tmp_path: Path, monkeypatch: 
         assert {answer.status_code for answer in answers} == {202}
         (location,) = {answer.headers["location"] for answer in answers}
         building(http, location)
-        assert len(list((data / "work").iterdir())) == 1
-        assert [len(kept(data, name)) for name in ("records", "uploads", "incoming")] == [1, 1, 0]
+        assert len(list((data / "scratch" / "work").iterdir())) == 1
+        assert [len(kept(data, name)) for name in ("surfaces", "uploads", "scratch/incoming")] == [1, 1, 0]
         (data / "go").touch()
         assert settled(http, location)["state"] == "ready"
         assert http.post("/v1/surfaces", content=bytes_).status_code == 200
@@ -187,7 +188,7 @@ def test_a_restart_keeps_surfaces_and_takes_up_builds(tmp_path: Path, monkeypatc
         building(http, half)
         queued = post(http, 4)
     monkeypatch.undo()
-    assert list((data / "work").iterdir()) == []
+    assert list((data / "scratch" / "work").iterdir()) == []
     with running(data) as http:
         assert http.get(ready["url"]).json() == ready
         assert http.get(failed["url"]).json() == failed
@@ -195,12 +196,29 @@ def test_a_restart_keeps_surfaces_and_takes_up_builds(tmp_path: Path, monkeypatc
         assert len(http.get("/v1/surfaces").json()["surfaces"]) == 4
 
 
+@contextmanager
+def stopped(data: Path) -> Iterator[DataFolder]:
+    """The data folder of a server that does not run."""
+    folder = DataFolder(data)
+    try:
+        yield folder
+    finally:
+        folder.close()
+
+
 def crash(data: Path) -> None:
     """Leave the folder as a server leaves it that dies in the middle of the one build that is queued."""
-    storage = Storage(data)
-    (record,) = storage.records()
-    storage.begin_work(record.id, storage.work_folder(record.id), may_continue=True)
-    storage.close()
+    with stopped(data) as folder:
+        (surface,) = folder.surfaces.index.queued()
+        work = Work(folder.work)
+        work.begin(surface, work.new_attempt(surface), may_continue=True)
+        folder.surfaces.begin(surface)
+
+
+def attempts(data: Path) -> list[int]:
+    """How often builds of the surfaces have begun and come to no end."""
+    with stopped(data) as folder:
+        return [surface.attempts for surface in folder.surfaces.index.page((0.0, ""), 10)]
 
 
 def test_a_build_under_which_server_after_server_dies_is_given_up(
@@ -213,11 +231,10 @@ def test_a_build_under_which_server_after_server_dies_is_given_up(
         building(http, location)
     # To be stopped properly does not count, whatever was under way.
     for _ in range(3):
-        storage = Storage(data)
-        assert [record.attempts for record in storage.records()] == [0]
-        storage.close()
+        assert attempts(data) == [0]
     for _ in range(2):
         crash(data)
+    assert attempts(data) == [2]
     with running(data) as http:
         later = post(http, 2)
         building(http, location)
@@ -231,98 +248,200 @@ def test_a_build_under_which_server_after_server_dies_is_given_up(
     with running(data) as http:
         surface = settled(http, location)
         assert surface["state"] == "waiting"
-        assert surface["reason"] == "the server ended 3 times while this was being built"
+        assert surface["reason"] == "the server ended: 3 builds began and did not end"
+        # Whoever asks for it begins to count anew.
+        assert http.post(f"{location}/retry").status_code == 202
+        building(http, location)
+    assert attempts(data) == [0]
 
 
-def test_what_a_dead_server_left_half_done_is_swept_away(tmp_path: Path) -> None:
+def test_servers_and_processes_that_die_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        location = post(http, 1)
+    for _ in range(2):
+        crash(data)
+    monkeypatch.setattr(worker, "build", slow.kill)
+    with running(data) as http:
+        surface = settled(http, location)
+    assert surface["state"] == "waiting"
+    assert surface["reason"].startswith("the build failed: the process ended")
+    assert surface["reason"].endswith("SIGKILL): 3 builds began and did not end")
+
+
+def test_a_start_removes_what_a_dead_server_left_in_its_scratch_and_nothing_else(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, npy(hills()))
-    for leftover in (
-        "incoming/ab/0",
-        "work/cd/container",
-        "uploads/0123456789abcdef0123/0",
-        f"containers/{'0' * 64}.lode",
-    ):
+    (upload,) = kept(data, "uploads")
+    stray = f"containers/{'0' * 64}.lode", f"uploads/{'0' * 64}/0", ".lodestream/0123456789abcdef.new"
+    scratch = "scratch/incoming/ab/0", "scratch/work/cd/container", "scratch/levels/ef/level"
+    for leftover in (*stray, *scratch):
         path = data / leftover
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"half")
-    (data / "records" / "x.json.0123.new").write_bytes(b"{")
     with running(data) as http:
         assert [entry["id"] for entry in http.get("/v1/surfaces").json()["surfaces"]] == [surface["id"]]
-    (upload,) = kept(data, "uploads")
-    files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file() and path.name != MARKER)
-    # What was whole, and nobody speaks of, is not removed.
-    assert files == [
-        f"containers/{surface['container']}.lode",
-        f"damaged/containers/{'0' * 64}.lode",
-        "damaged/uploads/0123456789abcdef0123/0",
-        "lock",
-        f"records/{surface['id']}.json",
-        f"uploads/{upload}/0",
-        f"uploads/{upload}/{surface['id']}.json",
-    ]
+    files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file())
+    # What was whole, and nobody speaks of, is removed by `lodestream fsck --collect` alone.
+    assert files == sorted(
+        [
+            *stray,
+            ".lodestream/lock",
+            f"built/{surface['id']}.json",
+            f"containers/{surface['container']}.lode",
+            "lock",
+            "lodestream.json",
+            "scratch/index.sqlite",
+            f"surfaces/{surface['id']}.json",
+            f"uploads/{upload}/0",
+        ]
+    )
 
 
-def test_a_lost_container_is_built_again_and_without_its_upload_it_is_missing(tmp_path: Path) -> None:
-    data = tmp_path / "data"
-    with running(data) as http:
-        one, two = push(http, npy(hills(seed=1))), push(http, npy(hills(seed=2)))
-    for surface in (one, two):
-        (data / "containers" / f"{surface['container']}.lode").unlink()
-    upload = upload_of(data, two)
-    upload.rename(data / "away")
-    before = (data / "records" / f"{two['id']}.json").read_bytes()
-    with running(data) as http:
-        assert settled(http, one["url"])["container"] == one["container"]
-        lost = http.get(two["url"]).json()
-        assert lost["state"] == "missing"
-        assert lost["reason"] == "neither its upload nor its container is on the server's disk"
-        for path in (f"{two['url']}/container", f"{two['url']}/levels/0", f"/v1/containers/{two['container']}.lode"):
-            answer = http.get(path)
-            assert (answer.status_code, answer.json()["code"]) in ((503, "missing"), (404, "not-found"))
-        assert http.get(f"{two['url']}/container").status_code == 503
-        # Once it is there again it is enough to ask.
-        (data / "away").rename(upload)
-        assert (data / "records" / f"{two['id']}.json").read_bytes() == before
-        assert http.post(f"{two['url']}/retry").status_code == 202
-        assert settled(http, two["url"])["container"] == two["container"]
+def busy(answer: httpx.Response) -> bool:
+    """Whether a server tells to come back, since it has noticed that something is not there."""
+    return problem(answer) == (503, "busy") and int(answer.headers["retry-after"]) >= 1
 
 
-def test_a_record_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("path", ["{url}/container", "{url}/levels/0", "/v1/containers/{container}.lode"])
+def test_a_lost_container_is_built_again_when_somebody_opens_it(tmp_path: Path, path: str) -> None:
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, npy(hills()))
-    path = data / "records" / f"{surface['id']}.json"
-    copy = upload_of(data, surface) / path.name
+        container = data / "containers" / f"{surface['container']}.lode"
+        whole = container.read_bytes()
+        container.unlink()
+        lost = http.get(path.format(**surface), follow_redirects=True)
+        # Levels are asked for by surface, which is not ready now.
+        assert problem(lost) == (409, "not-ready") if "levels" in path else busy(lost)
+        again = eventually(lambda: (it := settled(http, surface["url"]))["container"] and it, "another build")
+        assert again == surface
+        assert container.read_bytes() == whole
+        assert http.get(path.format(**surface), follow_redirects=True).status_code == 200
+
+
+def test_without_its_upload_a_lost_container_is_waited_for(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        surface = push(http, npy(hills()))
+    container = data / "containers" / f"{surface['container']}.lode"
+    upload = upload_of(data, surface)
+    upload.rename(data / "away")
+    before = {path: path.read_bytes() for name in ("surfaces", "built") for path in (data / name).iterdir()}
+    with running(data) as http:
+        assert http.get(surface["url"]).json() == surface, "its container is there"
+        assert http.get(f"{surface['url']}/container", follow_redirects=True).status_code == 200
+        container.rename(data / "lost")
+        assert busy(http.get(f"{surface['url']}/container", follow_redirects=True))
+        waiting = settled(http, surface["url"])
+        assert (waiting["state"], waiting["container"]) == ("waiting", None)
+        assert waiting["reason"] == "its upload is not in the server's store"
+        assert http.get(f"{surface['url']}/container").status_code == 424
+        assert busy(http.get(f"/v1/containers/{surface['container']}.lode"))
+        assert {path: path.read_bytes() for path in before} == before
+        # Once either is there again it is enough to ask.
+        (data / "lost").rename(container)
+        assert http.post(f"{surface['url']}/retry").status_code == 202
+        assert settled(http, surface["url"]) == surface
+        assert http.get(f"{surface['url']}/container", follow_redirects=True).status_code == 200
+        container.unlink()
+        assert busy(http.get(f"{surface['url']}/container", follow_redirects=True))
+        assert settled(http, surface["url"])["state"] == "waiting"
+        (data / "away").rename(upload)
+        assert http.post(f"{surface['url']}/retry").status_code == 202
+        assert settled(http, surface["url"]) == surface
+
+
+def test_a_manifest_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        surface, other = push(http, npy(hills())), push(http, npy(hills()), name="of the same bytes")
+    path = data / "surfaces" / f"{surface['id']}.json"
+    files = (upload_of(data, surface) / "0", data / "containers" / f"{surface['container']}.lode")
     path.write_text("{not json")
-    copy.write_text("{not json")
-    storage = Storage(data)
-    (record,) = storage.records()
-    assert (record.id, record.state) == (surface["id"], "missing")
-    storage.close()
-    assert path.read_text() == copy.read_text() == "{not json"
-    assert (copy.parent / "0").is_file()
-    assert (data / "containers" / f"{surface['container']}.lode").is_file()
+    (data / "scratch" / "index.sqlite").unlink()
+    with running(data) as http:
+        assert http.get(surface["url"]).status_code == 404
+        # Nobody knows what the other one refers to.
+        assert http.delete(other["url"]).status_code == 204
+        assert path.read_text() == "{not json"
+        assert all(file.is_file() for file in files)
+        # The same upload again takes its place, and is built again.
+        again = push(http, npy(hills()))
+        assert (again["id"], again["state"], again["container"]) == (surface["id"], "ready", surface["container"])
+    with running(data) as http:
+        assert http.get(surface["url"]).json() == again
 
 
 def test_two_servers_never_share_a_folder(tmp_path: Path) -> None:
-    storage = Storage(tmp_path)
-    with pytest.raises(LodestreamError, match="which another one uses"):
-        Storage(tmp_path)
-    storage.close()
-    Storage(tmp_path).close()
+    with stopped(tmp_path), pytest.raises(LodestreamError, match="which another one uses"):
+        DataFolder(tmp_path)
+    DataFolder(tmp_path).close()
 
 
-def test_a_record_written_by_a_later_version_is_read(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["surfaces", "built"])
+def test_what_a_later_version_writes_is_read(tmp_path: Path, name: str) -> None:
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, npy(hills()))
-    path = data / "records" / f"{surface['id']}.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "later": "something"}))
-    storage = Storage(data)
-    assert storage.get(surface["id"]).state == "ready"
-    storage.close()
+    path = data / name / f"{surface['id']}.json"
+    body, _, _ = path.read_bytes().rpartition(b', "check": ')
+    body = body.replace(b"{", b'{"later": {"something": [1]}, ', 1)
+    path.write_bytes(body + b', "check": "%08x"}' % zlib.crc32(body))
+    with running(data) as http:
+        assert http.get(surface["url"]).json() == surface
+
+
+def test_the_same_bytes_of_two_names_are_built_twice_and_stored_once(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running(data) as http:
+        one, two = push(http, npy(hills()), name="one"), push(http, npy(hills()), name="two")
+        assert (one["state"], two["state"]) == ("ready", "ready")
+        assert [len(kept(data, name)) for name in ("surfaces", "uploads", "containers")] == [2, 1, 2]
+        three = push(http, npy(hills()), name="one", precision="0.5")
+        assert (three["state"], len(kept(data, "uploads"))) == ("ready", 1)
+
+
+def test_builds_go_on_while_the_index_is_lost_and_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        location = post(http, 1)
+        building(http, location)
+        behind = post(http, 2)
+        for path in (data / "scratch").glob("index.sqlite*"):
+            path.unlink()
+        for where in (location, behind):
+
+            def there(where: str = where) -> dict[str, Any] | None:
+                answer = http.get(where)
+                if answer.status_code == 503:
+                    assert busy(answer)
+                    return None
+                return dict(answer.raise_for_status().json())
+
+            assert eventually(there, "the index")["state"] in ("queued", "building")
+        (data / "go").touch()
+        assert [settled(http, where)["state"] for where in (location, behind)] == ["ready", "ready"]
+    assert any("is made again" in record.getMessage() for record in caplog.records)
+    assert kept(data, "scratch/work") == []
+
+
+def test_scratch_may_be_elsewhere_and_go(tmp_path: Path) -> None:
+    data, scratch = tmp_path / "data", tmp_path / "fast" / "disk"
+    with running(data, scratch=scratch) as http:
+        surface = push(http, npy(hills()))
+        assert http.get(f"{surface['url']}/levels/0").status_code == 200
+    assert not (data / "scratch").exists()
+    assert kept(scratch, "work") == []
+    shutil.rmtree(scratch)
+    with running(data, scratch=scratch) as http:
+        assert http.get(surface["url"]).json() == surface
+        assert http.get(f"{surface['url']}/levels/0").status_code == 200
 
 
 def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -> None:

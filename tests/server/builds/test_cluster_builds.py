@@ -246,8 +246,8 @@ def test_an_option_that_does_not_fit_is_not_laid_on_the_cluster(
     [
         (worker.Refused("LODESTREAM_DASK: no workers", final=False), "waiting", "LODESTREAM_DASK: no workers"),
         (TimeoutError(), "waiting", "the build took longer than 3600 s"),
-        (MemoryError(), "waiting", "(LODESTREAM_MEMORY), 2 times"),
-        (ProcessDiedError(-9), "waiting", "the process ended before it was done (exit code -9, SIGKILL), 2 times"),
+        (MemoryError(), "waiting", "(LODESTREAM_MEMORY): 3 builds began and did not end"),
+        (ProcessDiedError(-9), "waiting", "the process ended before it was done (exit code -9, SIGKILL): 3 builds"),
         (UnforeseenError("KeyError", None, "| secret"), "waiting", "the build failed with an internal error: KeyError"),
         (UnforeseenError("OSError", errno.ENOSPC, "| secret"), "queued", "waits for space on the server's disk"),
     ],
@@ -276,11 +276,10 @@ def test_how_a_build_by_a_cluster_ends_is_told_and_logged(
 
         def ended() -> dict[str, Any] | None:
             surface: dict[str, Any] = http.get(location).json()
-            return surface if surface.get("reason") else None
+            return surface if surface["state"] == state and surface["reason"] else None
 
-        surface = eventually(ended, "a reason")
+        surface = eventually(ended, f"it to be {state}, and a reason")
         assert reason in surface["reason"]
-        assert eventually(lambda: http.get(location).json()["state"] == state, state)
         assert "secret" not in str(surface)
     logged = [record.getMessage() for record in caplog.records]
     assert f"the build of {surface['id']} goes to the workers of the Dask scheduler {address}" in logged
@@ -298,7 +297,7 @@ def test_a_server_starts_where_no_scheduler_is_and_says_so_of_what_it_cannot_bui
         assert surface["reason"].startswith(
             "LODESTREAM_DASK: expected the address of a Dask scheduler, got 'tcp://127.0.0.1:1': "
         )
-        assert not any((tmp_path / "work").iterdir())
+        assert not any((tmp_path / "scratch" / "work").iterdir())
 
 
 # What is cut.
@@ -324,7 +323,7 @@ def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_
             eventually(handing_out, "a build at the cluster")
             assert http.get(deleted).json()["state"] == "building"
             http.delete(deleted).raise_for_status()
-            assert not any((tmp_path / "data" / "work").iterdir())
+            assert not any((tmp_path / "data" / "scratch" / "work").iterdir())
             eventually(lambda: not handing_out(), "the scheduler to drop its tasks")
             kept = http.post("/v1/surfaces?filename=b.npy", content=data).headers["location"]
             eventually(handing_out, "another build at the cluster")
@@ -337,7 +336,7 @@ def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_
         ):
             eventually(lambda: http.get(kept).json()["state"] == "ready", "the build to be done again")
             container = http.get(f"{kept}/container", follow_redirects=True).content
-            assert not any((tmp_path / "data" / "work").iterdir())
+            assert not any((tmp_path / "data" / "scratch" / "work").iterdir())
     assert np.array_equal(ls.decode(container).points, np.load(io.BytesIO(data)), equal_nan=True)
 
 

@@ -18,14 +18,16 @@ import lodestream as ls
 from lodestream.container import describe, sections
 from lodestream.container.model import Errors
 from lodestream.container.writer import CodedLayer, write_container
+from lodestream.stores import Folder
 from lodestream.transform.predictors import default_predictors
 from lodestream_server import running_server
 from lodestream_server.builds import worker
-from lodestream_server.maintenance import fsck, repair
-from lodestream_server.storage.records import plain
+from lodestream_server.builds.finished import plain
+from lodestream_server.maintenance.check import check
+from lodestream_server.store import layout
 from tests.core.container.forgery import index_of, rewritten, unchanged, with_layer_errors, with_metadata
 from tests.patience import PATIENCE
-from tests.server.helpers import eventually, hills, npy, problem, push, settled
+from tests.server.helpers import eventually, hills, kept, npy, problem, push, settled
 from tests.server.routes.test_bad_uploads import stored
 
 #: What a container does not keep is another matter, see test_losses.
@@ -75,7 +77,7 @@ def test_a_container_is_kept_as_it_is(http: httpx.Client, data: Path) -> None:
     assert {key: made[key] for key in told} == told
     assert made["metadata"]["crs"] == "LOCAL_CS[]"
     assert made["name"] == "whole/1[31m"
-    eventually(lambda: not list((data / "work").iterdir()), "the build's folder to be removed")
+    eventually(lambda: not list((data / "scratch" / "work").iterdir()), "the build's folder to be removed")
     for level in (0, len(made["levels"]) - 1):
         answer = http.get(f"{made['url']}/levels/{level}", params={"format": "ply"})
         assert (answer.status_code, answer.content[:3]) == (200, b"ply")
@@ -184,9 +186,9 @@ def test_nothing_of_a_wrong_container_is_kept(http: httpx.Client, data: Path, ex
     assert re.search(words, made["reason"]), made["reason"]
     assert "\n" not in made["reason"]
     new = [path for path in stored(data) if path not in before]
-    assert {path.partition("/")[0] for path in new} == {"records", "uploads"}  # which stay until somebody deletes it
+    assert {path.partition("/")[0] for path in new} == {"built", "surfaces", "uploads"}  # until somebody deletes it
     assert http.get(f"{made['url']}/container").status_code == 424
-    assert list((data / "work").iterdir()) == []
+    assert kept(data, "scratch/work") == []
     http.delete(made["url"]).raise_for_status()
     assert stored(data) == before
 
@@ -253,22 +255,26 @@ def test_whose_word_the_errors_are_outlives_a_repair(tmp_path: Path, exact: byte
         httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         made = {name: push(http, body) for name, body in (("checked", exact), ("told", near))}
-    assert fsck.check(data).findings == []
+    store = Folder(data)
+    assert check(store).findings == []
     for name, surface in made.items():
-        path = data / "records" / f"{surface['id']}.json"
-        record = json.loads(path.read_bytes())
-        assert record["info"]["errors"] == name
+        key = layout.built_key(surface["id"])
+        built = layout.parse(layout.Built, key, (data / key).read_bytes())
+        info = json.loads(built.info)
+        assert info["errors"] == name
         for errors, repaired in ((name, name), (None, "told"), ("measured", "told")):
             # With other figures than the container has, or without a word of whose they are.
-            record["info"] |= {"bytes": 5, "errors": errors}
-            path.write_text(json.dumps(record))
-            found = fsck.check(data)
-            assert [finding.what for finding in found.findings] == ["figures"]
-            repair.set_aside(found)
-            assert fsck.check(data).findings == []
-            record = json.loads(path.read_bytes())
-            assert record["info"]["errors"] == repaired
-            assert record["info"]["bytes"] == surface["bytes"]
+            wrong = json.dumps(info | {"bytes": 5, "errors": errors}).encode()
+            (data / key).write_bytes(layout.dump(replace(built, info=wrong)))
+            assert [finding.what for finding in check(store).findings] == ["figures"]
+            assert check(store, repair=True).clean
+            assert check(store).findings == []
+            with (
+                running_server(data, workers=1) as url,
+                httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+            ):
+                told = http.get(surface["url"]).json()
+            assert told == surface | {"errors": repaired}
 
 
 def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Path, exact: bytes) -> None:
@@ -285,6 +291,7 @@ def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Pa
         running_server(data, workers=1) as url,
         httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
+        assert problem(http.get(f"{made['url']}/container", follow_redirects=True)) == (503, "busy")
         again = push(http, exact)
         assert (again["state"], again["container"], again["errors"]) == ("ready", made["container"], "checked")
     assert lost.read_bytes() == exact

@@ -16,8 +16,7 @@ import pytest
 import lodestream as ls
 from lodestream.encoding import tasks
 from lodestream_server.builds import worker
-from lodestream_server.storage import work
-from lodestream_server.storage.folders import Folders
+from lodestream_server.builds.work import Work
 from tests.core.surfaces import terrain
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.helpers import eventually, settled
@@ -72,7 +71,7 @@ def _made(folder: Path) -> Inodes:
 
 
 def _is_measured(data: Path) -> Callable[[], object]:
-    return lambda: "exact/counts/0/0.npy" in _made(data / "work")
+    return lambda: "exact/counts/0/0.npy" in _made(data / "scratch" / "work")
 
 
 def _begin(data: Path, name: str, content: bytes) -> tuple[Server, str]:
@@ -102,7 +101,7 @@ def test_a_build_continues_after_its_server_has_ended(
     end(first)
     with server(data, preload="preload_continuing", build_memory=MEMORY) as second, second.client() as http:
         assert _container(http, location) == container
-        assert list((data / "work").iterdir()) == []
+        assert list((data / "scratch" / "work").iterdir()) == []
         assert "continues from what an interrupted attempt had made" in second.log.read_text()
 
 
@@ -115,13 +114,14 @@ def test_what_is_kept_of_a_surface_that_waits_for_no_build_is_removed(
     first, location = _begin(data, name, content)
     first.stop()
     surface = location.rpartition("/")[2]
-    assert [path.relative_to(data).as_posix() for path in data.glob("work/*/*")] == [f"work/{surface}/bands"]
+    work = data / "scratch" / "work"
+    assert [path.relative_to(work).as_posix() for path in work.glob("*/*")] == [f"{surface}/bands"]
     for kept in ("0123456789abcdef0123", "other"):
-        (data / "work" / kept / "bands" / "deep").mkdir(parents=True)
+        (work / kept / "bands" / "deep").mkdir(parents=True)
     with server(data, preload="preload_large", build_memory=MEMORY) as second, second.client() as http:
-        assert [path.name for path in (data / "work").iterdir()] == [surface]
+        assert [path.name for path in work.iterdir()] == [surface]
         http.delete(location).raise_for_status()
-        eventually(lambda: not list((data / "work").iterdir()), "an empty folder")
+        eventually(lambda: not list((data / "scratch" / "work").iterdir()), "an empty folder")
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
@@ -140,14 +140,14 @@ def test_a_process_of_the_server_before_is_waited_for(tmp_path: Path, upload: tu
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.stop()
-    (mark,) = (data / "work").glob("*/bands/*/lock")
+    (mark,) = (data / "scratch" / "work").glob("*/bands/*/lock")
     left = _made(data)
     with mark.open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)
         with server(data, preload="preload_large", build_memory=MEMORY) as second, second.client() as http:
             eventually(lambda: "waits for the server's system" in second.log.read_text(), "a build that waits")
             assert http.get(location).json()["state"] in ("queued", "building")
-            assert _made(data / "work") == left, "what was made, still there"
+            assert _made(data / "scratch" / "work") == left, "what was made, still there"
             held.close()
             assert _container(http, location) == container
 
@@ -158,7 +158,7 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.kill()
-    for number, path in enumerate(sorted((data / "work").glob("*/bands/*/exact/**/*.npy"))):
+    for number, path in enumerate(sorted((data / "scratch" / "work").glob("*/bands/*/exact/**/*.npy"))):
         if number % 5 == 0:
             os.truncate(path, path.stat().st_size // 2)
     assert "starts again from the beginning" not in _end(data, location, container)
@@ -173,7 +173,7 @@ def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
     data = tmp_path / "data"
     first, location = _begin(data, name, content)
     first.kill()
-    (exact,) = (data / "work").glob("*/bands/*/exact")
+    (exact,) = (data / "scratch" / "work").glob("*/bands/*/exact")
     shutil.rmtree(exact)
     exact.touch()
     text = _end(data, location, container)
@@ -207,53 +207,72 @@ def test_another_attempt_goes_on_in_the_same_folder(tmp_path: Path, monkeypatch:
 
 
 @pytest.fixture
-def at(tmp_path: Path) -> Folders:
-    at = Folders(tmp_path / "data")
-    at.work.mkdir(parents=True)
-    return at
+def folder(tmp_path: Path) -> Path:
+    return tmp_path / "scratch" / "work"
 
 
-def test_what_an_attempt_has_made_is_there_for_the_next(at: Folders) -> None:
-    first, bands = work.new_attempt(at, "ab"), work.bands_of(at, "ab")
-    assert not work.begin(at, "ab", first, may_continue=True)
+def test_what_an_attempt_has_made_is_there_for_the_next(folder: Path) -> None:
+    work = Work(folder)
+    folder.parent.mkdir()
+    first, bands = work.new_attempt("ab"), work.bands("ab")
+    assert not work.begin("ab", first, may_continue=True)
     (bands / "some").touch()
-    assert work.begun(at) == {"ab"}
-    work.end(at, "ab", first, keep=True)
-    assert work.begun(at) == set()
-    second = work.new_attempt(at, "ab")
+    work.forget("ab")
+    assert first.is_dir(), "an attempt goes on"
+    work.end("ab", first, keep=True)
+    second = Work(folder).new_attempt("ab")
     assert second != first
-    assert work.begin(at, "ab", second, may_continue=True)
+    assert Work(folder).begin("ab", second, may_continue=True)
     assert [path.name for path in bands.iterdir()] == ["some"]
     assert list(second.iterdir()) == []
-    work.end(at, "ab", second, keep=False)
-    assert list(at.work.iterdir()) == []
+    work.end("ab", second)
+    assert list(folder.iterdir()) == []
 
 
-def test_where_a_build_may_not_continue_what_was_kept_is_removed(at: Folders) -> None:
-    attempt = work.new_attempt(at, "ab")
-    work.begin(at, "ab", attempt, may_continue=True)
-    (work.bands_of(at, "ab") / "some").touch()
-    work.end(at, "ab", attempt, keep=True)
-    assert not work.begin(at, "ab", attempt, may_continue=False)
-    assert list(work.bands_of(at, "ab").iterdir()) == []
+def test_the_end_of_an_attempt_leaves_another_one_of_the_same_surface(folder: Path) -> None:
+    """One that was deleted and came again at once."""
+    work = Work(folder)
+    folder.parent.mkdir()
+    first, second = work.new_attempt("ab"), work.new_attempt("ab")
+    work.begin("ab", first, may_continue=True)
+    work.begin("ab", second, may_continue=True)
+    (work.bands("ab") / "some").touch()
+    work.end("ab", first)
+    assert second.is_dir()
+    assert (work.bands("ab") / "some").exists()
+    work.end("ab", second)
+    assert list(folder.iterdir()) == []
 
 
-def test_a_start_keeps_only_what_queued_builds_continue_from(at: Folders, tmp_path: Path) -> None:
+def test_where_a_build_may_not_continue_what_was_kept_is_removed(folder: Path) -> None:
+    work = Work(folder)
+    folder.parent.mkdir()
+    attempt = work.new_attempt("ab")
+    work.begin("ab", attempt, may_continue=True)
+    (work.bands("ab") / "some").touch()
+    work.end("ab", attempt, keep=True)
+    assert not work.begin("ab", attempt, may_continue=False)
+    assert list(work.bands("ab").iterdir()) == []
+
+
+def test_a_start_keeps_only_what_queued_builds_continue_from(folder: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside"
     (outside / "bands").mkdir(parents=True)
     (outside / "bands" / "precious").touch()
+    folder.parent.mkdir()
+    work = Work(folder)
+    work.clean({"queued"})
     for surface in ("queued", "ready"):
-        work.begin(at, surface, work.new_attempt(at, surface), may_continue=True)
-        (work.bands_of(at, surface) / "some").symlink_to(outside)
-    (at.work / "link").symlink_to(outside)
-    (at.work / "file").touch()
-    assert work.begun(at) == {"queued", "ready"}
-    work.clean(at, {"queued", "link", "file"})
-    assert [path.relative_to(at.work).as_posix() for path in at.work.glob("*/*")] == ["queued/bands"]
-    assert (work.bands_of(at, "queued") / "some").is_symlink()
+        work.begin(surface, work.new_attempt(surface), may_continue=True)
+        (work.bands(surface) / "some").symlink_to(outside)
+    (folder / "link").symlink_to(outside)
+    (folder / "file").touch()
+    work.clean({"queued", "link", "file"})
+    assert [path.relative_to(folder).as_posix() for path in folder.glob("*/*")] == ["queued/bands"]
+    assert (work.bands("queued") / "some").is_symlink()
     assert (outside / "bands" / "precious").exists()
-    work.forget(at, "queued")
-    assert list(at.work.iterdir()) == []
+    work.forget("queued")
+    assert list(folder.iterdir()) == []
     assert (outside / "bands" / "precious").exists()
 
 
@@ -270,4 +289,4 @@ def test_nothing_is_kept_for_a_surface_whose_upload_is_damaged(
         damaged.write(b"\0")
     with server(data, preload="preload_large", build_memory=MEMORY) as second, second.client() as http:
         assert settled(http, location)["state"] == "waiting"
-        eventually(lambda: not list((data / "work").iterdir()), "an empty folder")
+        eventually(lambda: not list((data / "scratch" / "work").iterdir()), "an empty folder")

@@ -130,7 +130,7 @@ def test_a_cluster_builds_what_is_large(cluster: Any, tmp_path: Path) -> None:
     assert any("measure" in name for name in tasks)
     points = np.load(io.BytesIO(data))
     assert np.array_equal(ls.decode(container).points, points, equal_nan=True)
-    assert not any((tmp_path / "data" / "work").iterdir())
+    assert not any((tmp_path / "data" / "scratch" / "work").iterdir())
 
 
 @pytest.mark.parametrize("name", ["heights.npy", "blocks.p3d"])

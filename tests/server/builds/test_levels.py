@@ -78,7 +78,7 @@ def begun(data: Path) -> list[tuple[int, int]]:
 def on_disk(data: Path) -> int:
     """Bytes of the levels on the disk."""
     total = 0
-    for path in (data / "levels").rglob("*"):
+    for path in (data / "scratch" / "levels").rglob("*"):
         try:
             total += path.stat().st_size if path.is_file() else 0
         except FileNotFoundError:
@@ -149,7 +149,7 @@ def test_slow_readers_hold_no_more_of_the_disk_than_there_is_for_levels(tmp_path
 
 
 def so_many_files(data: Path, count: int) -> bool:
-    return len(list((data / "levels").glob("*.level"))) >= count
+    return len(list((data / "scratch" / "levels").glob("*.level"))) >= count
 
 
 def _refused(http: httpx.Client, path: str) -> httpx.Response | None:
@@ -167,7 +167,7 @@ def test_nothing_is_left_of_levels(tmp_path: Path) -> None:
     with running_server(tmp_path / "data", workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
         assert http.get(finest(surface)).status_code == 200
-        (path,) = (tmp_path / "data" / "levels").iterdir()
+        (path,) = (tmp_path / "data" / "scratch" / "levels").iterdir()
         assert path.name.startswith(f"{surface['container']}-{len(surface['levels']) - 1}-npy")
         twin = push(http, npy(hills()), name="twin")
         assert twin["container"] != surface["container"] or twin["id"] != surface["id"]
@@ -179,7 +179,7 @@ def test_nothing_is_left_of_levels(tmp_path: Path) -> None:
         eventually(lambda: not path.exists(), "the file to be removed")
         assert http.get(finest(surface)).status_code == 404
         http.get(finest(push(http, npy(hills(seed=3))))).raise_for_status()
-    assert not (tmp_path / "data" / "levels").exists()
+    assert not (tmp_path / "data" / "scratch" / "levels").exists()
 
 
 # The queue.
@@ -196,7 +196,7 @@ def test_whoever_goes_leaves_the_queue_and_the_process(tmp_path: Path, slowly: N
         assert http.get(f"{other['url']}/levels/0").status_code == 200
         assert [level for _, level in begun(tmp_path)][1:] == [0]  # the other two were never begun
         assert not alive(process)
-        assert len(list((tmp_path / "levels").iterdir())) == 1
+        assert len(list((tmp_path / "scratch" / "levels").iterdir())) == 1
 
 
 def test_whoever_waits_when_the_server_ends_is_told_to_ask_again(
@@ -376,7 +376,7 @@ def test_a_container_may_be_built_again_while_a_level_is_made(tmp_path: Path, mo
     monkeypatch.setattr(level_queue, "make_level", slow.make_when_told)
 
     def begin() -> Path:
-        return eventually(lambda: next((tmp_path / "levels").glob("*/begun"), None), "a process to begin")
+        return eventually(lambda: next((tmp_path / "scratch" / "levels").glob("*/begun"), None), "a process to begin")
 
     with running_server(tmp_path, workers=1) as url, client(url) as http, ThreadPoolExecutor(1) as other:
         surface = push(http, npy(hills()))
@@ -554,7 +554,7 @@ def test_a_level_larger_than_memory_is_made_by_bands_to_the_same_file(
             banded = http.get(str(httpx.URL(address).path), params={"format": format_name}).raise_for_status()
             assert banded.content == before.content
             assert banded.headers["ETag"] == before.headers["ETag"]
-        assert [path.name for path in (tmp_path / "levels").rglob("values")] == []
+        assert [path.name for path in (tmp_path / "scratch" / "levels").rglob("values")] == []
 
 
 @pytest.mark.parametrize("format_name", ["plot3d", "vtm"])

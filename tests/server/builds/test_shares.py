@@ -25,6 +25,7 @@ from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import jobs, worker
 from lodestream_server.builds.shares import Turns
 from lodestream_server.routes import streams
+from lodestream_server.store.index import LEAST
 from tests.server.access.test_limits import ANNA
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, problem, push, raw_stream, settled
@@ -56,7 +57,9 @@ class Town:
         return made
 
     def begun(self, count: int) -> None:
-        eventually(lambda: len(list((self.data / "incoming").glob("*/0"))) == count or None, "the uploads to begin")
+        eventually(
+            lambda: len(list((self.data / "scratch" / "incoming").glob("*/0"))) == count or None, "the uploads to begin"
+        )
 
 
 @pytest.fixture
@@ -110,13 +113,13 @@ def test_promises_do_not_take_the_room_of_others(town: Town) -> None:
         assert refusal(impossible).startswith(b"HTTP/1.1 507 ")
 
 
-@pytest.mark.parametrize("town", [{"owner_bytes": 4000}], indirect=True)
+@pytest.mark.parametrize("town", [{"owner_bytes": LEAST + 4000}], indirect=True)
 def test_what_one_keeps_on_the_disk_leaves_room_for_others(town: Town) -> None:
     with town.client("bad") as bad, town.client("good") as good:
         made = push(bad, npy(hills(20, 20)))
         answer = bad.post("/v1/surfaces", content=npy(hills(20, 20, seed=2)))
         assert problem(answer) == (507, "full")
-        assert "4000 bytes of bad" in answer.json()["detail"]
+        assert f"{LEAST + 4000} bytes of bad" in answer.json()["detail"]
         assert answer.headers["retry-after"].isdecimal()
         assert push(bad, npy(hills(20, 20))) == made, "what is there already takes no room"
         assert push(good, npy(hills(20, 20)))["state"] == "ready"
@@ -124,7 +127,7 @@ def test_what_one_keeps_on_the_disk_leaves_room_for_others(town: Town) -> None:
         assert push(bad, npy(hills(20, 20, seed=2)))["state"] == "ready"
 
 
-@pytest.mark.parametrize("town", [{"owner_bytes": 8000}], indirect=True)
+@pytest.mark.parametrize("town", [{"owner_bytes": 4 * LEAST + 8000}], indirect=True)
 def test_containers_count_too_and_builds_wait_for_their_owners_room(
     town: Town, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,7 +142,7 @@ def test_containers_count_too_and_builds_wait_for_their_owners_room(
 
         def waits() -> list[str]:
             found = [bad.get(where).json() for where in theirs]
-            return [entry["url"] for entry in found if "8000 bytes of bad" in (entry["reason"] or "")]
+            return [entry["url"] for entry in found if "disk space of its owner" in (entry["reason"] or "")]
 
         left = eventually(waits, "builds that wait for room")
         assert push(good, npy(hills(18, 18, seed=9)))["state"] == "ready"

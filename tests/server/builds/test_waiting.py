@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import argparse
 import errno
-import json
 import logging
-import os
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lodestream.errors import FormatError, TooLargeError, UnavailableError
+from lodestream.stores import Folder, FullError, StoreError, Tag
 from lodestream_server.builds import jobs, worker
-from lodestream_server.commands.fsck import register
-from lodestream_server.storage.records import Record
-from lodestream_server.storage.storage import Storage
+from lodestream_server.maintenance.check import check
+from lodestream_server.maintenance.waiting import retry, waiting
 from tests.server.builds import slow
 from tests.server.builds.test_builds import building, running
-from tests.server.helpers import eventually, hills, npy, problem, push, settled, upload_of
+from tests.server.helpers import eventually, hills, kept, npy, problem, push, settled, upload_of
 
 BODY = npy(hills(seed=5))
 
 
-def fsck(data: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any]]:
-    parser = argparse.ArgumentParser()
-    register(parser.add_subparsers())
-    args = parser.parse_args(["fsck", str(data), "--json", *options])
-    code = args.run(args)
-    return code, json.loads(capsys.readouterr().out)
+def index_of(data: Path) -> Path:
+    return data / "scratch" / "index.sqlite"
 
 
 @pytest.mark.parametrize(
@@ -64,27 +57,27 @@ def test_bytes_that_are_no_surface_are_refused_for_good(tmp_path: Path) -> None:
         assert surface["state"] == "failed"
         assert (upload_of(data, surface) / "0").read_bytes() == BODY[:-1]
         assert http.delete(surface["url"]).status_code == 204
-        assert not (data / "uploads" / surface["id"]).exists()
+        assert kept(data, "uploads") == kept(data, "built") == kept(data, "surfaces") == []
 
 
-@pytest.mark.parametrize(("number", "state"), [(errno.ENOSPC, "queued"), (errno.EIO, "waiting")])
+@pytest.mark.parametrize(("kind", "state"), [(FullError, "queued"), (StoreError, "waiting")])
 def test_nobody_is_told_of_a_failure_that_a_restart_could_take_back(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
-    number: int,
+    kind: type[StoreError],
     state: str,
 ) -> None:
-    """A record that cannot be written says after a restart that the surface is queued."""
+    """Where the failure is not in the store, the surface is queued after a restart."""
     caplog.set_level(logging.INFO, "lodestream_server")
-    write = Storage._write
+    create = Folder.create
 
-    def broken(storage: Storage, record: Record) -> None:
-        if record.state == "failed":
-            raise OSError(number, os.strerror(number))
-        write(storage, record)
+    def broken(store: Folder, key: str, data: bytes) -> Tag:
+        if key.startswith("built/"):
+            raise kind(f"{store.root}: it does not work")
+        return create(store, key, data)
 
-    monkeypatch.setattr(Storage, "_write", broken)
+    monkeypatch.setattr(Folder, "create", broken)
     monkeypatch.setattr(jobs, "_FIRST_DELAY", 0.01)
     with running(tmp_path / "data") as http:
         location = http.post("/v1/surfaces", content=BODY[:-1]).headers["location"]
@@ -101,9 +94,12 @@ def test_nobody_is_told_of_a_failure_that_a_restart_could_take_back(
         if state == "queued":
             assert told == "waits for space on the server's disk"
         else:
-            assert "that could not be recorded: the server's disk: Input/output error" in told
+            assert told.endswith("; that could not be stored")
             assert http.post(f"{location}/retry").status_code == 202
-        assert settled(http, location)["state"] == "failed"
+        # Where the data are is for the log.
+        assert str(tmp_path) not in told
+        assert f"{tmp_path / 'data'}: it does not work" in caplog.text
+        assert eventually(lambda: settled(http, location)["state"] == "failed", "the failure")
     with running(tmp_path / "data") as http:
         assert http.get(location).json()["state"] == "failed"
 
@@ -139,124 +135,65 @@ def test_asking_at_once_is_not_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPa
             assert settled(http, surface["url"])["state"] == "waiting"
 
 
-def test_fsck_builds_what_waits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_what_waits_is_built_by_the_next_start_when_asked_without_a_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = tmp_path / "data"
     monkeypatch.setattr(worker, "build", slow.explode)
     with running(data) as http:
         surface = push(http, BODY)
-    assert fsck(data, capsys)[0] == 0
-    assert fsck(data, capsys, "--retry")[1]["waiting"] == [surface["id"]]
+    store = Folder(data)
+    assert waiting(store, index_of(data)) == {surface["id"]: surface["reason"]}
+    report = check(store, repair=True, waiting=[surface["id"]])
+    assert (report.findings, report.queued) == ([], 0)
     monkeypatch.undo()
-    code, report = fsck(data, capsys, "--retry")
-    assert (code, report["waiting"]) == (0, [])
     with running(data) as http:
-        assert http.get(surface["url"]).json()["state"] == "ready"
+        assert http.get(surface["url"]).json()["state"] == "waiting"
+    assert retry(store, index_of(data)) == {surface["id"]: surface["reason"]}
+    with running(data) as http:
+        assert settled(http, surface["url"])["state"] == "ready"
 
 
 @pytest.mark.parametrize("build", [slow.kill, slow.explode, slow.refuse])
-def test_a_rebuild_that_fails_costs_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], build: Any
-) -> None:
+def test_a_rebuild_that_fails_costs_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, build: Any) -> None:
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, BODY)
-    upload = upload_of(data, surface) / "0"
     container = data / "containers" / f"{surface['container']}.lode"
     whole = container.read_bytes()
     container.write_bytes(whole[:-1])
+    report = check(Folder(data), repair=True)
+    assert [(found.what, found.repaired, found.lost) for found in report.findings] == [("container", True, False)]
     monkeypatch.setattr(worker, "build", build)
-    code, report = fsck(data, capsys, "--repair")
-    (finding,) = report["findings"]
-    assert (code, finding["repaired"], finding["lost"]) == (1, False, False)
-    assert "waiting: " in finding["repair"]
-    assert upload.read_bytes() == BODY
-    monkeypatch.undo()
-    code, _ = fsck(data, capsys, "--retry")
-    assert code == 0
-    assert container.read_bytes() == whole
     with running(data) as http:
-        assert http.get(surface["url"]).json() == surface
+        left = settled(http, surface["url"])
+        assert left["state"] == "waiting", left
+        assert (upload_of(data, surface) / "0").read_bytes() == BODY
+    monkeypatch.undo()
+    assert list(retry(Folder(data), index_of(data))) == [surface["id"]]
+    with running(data) as http:
+        assert settled(http, surface["url"]) == surface
+    assert container.read_bytes() == whole
+    assert check(Folder(data)).findings == []
 
 
-def test_an_upload_that_cannot_be_read_is_not_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("read", [BODY[:-1], b"x" + BODY[1:]], ids=["shorter", "other"])
+def test_an_upload_that_cannot_be_read_is_not_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: bytes
+) -> None:
     data = tmp_path / "data"
+    with running(data) as http:
+        other = push(http, BODY, name="of the same bytes")
     monkeypatch.setattr(worker, "build", slow.wait)
     with running(data) as http:
         where = http.post("/v1/surfaces", content=BODY).headers["location"]
         building(http, where)  # which has been found as it was acknowledged
-        (upload_of(data, http.get(where).json()) / "0").write_bytes(BODY[:-1])  # as a bad disk gives it back
+        (upload_of(data, other) / "0").write_bytes(read)  # as a bad disk gives it back
         (data / "go").touch()
         surface = settled(http, where)
         assert surface["state"] == "waiting"
-        assert f"expected {len(BODY)} bytes, got {len(BODY) - 1}" in surface["reason"]
-        # The same file again makes it whole.
+        assert "the upload is damaged or cannot be read: expected " in surface["reason"]
+        monkeypatch.undo()
+        # The same file again makes it whole, also for the other surface.
         assert push(http, BODY)["state"] == "ready"
-
-
-def test_fsck_without_a_lock_repairs_what_it_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    data = tmp_path / "data"
-    with running(data) as http:
-        surface = push(http, BODY)
-    (data / "lock").unlink()
-    container = data / "containers" / f"{surface['container']}.lode"
-    whole = container.read_bytes()
-    container.write_bytes(whole[::-1])
-    code, report = fsck(data, capsys, "--repair")
-    assert (code, [finding["repaired"] for finding in report["findings"]]) == (0, [True])
-    assert container.read_bytes() == whole
-    assert (data / "damaged" / "containers" / container.name).read_bytes() == whole[::-1]
-
-
-@pytest.mark.parametrize("kind", ["container", "upload"])
-def test_setting_aside_on_another_disk(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
-    from lodestream_server.store import durable
-
-    class OtherDisk(durable.Disk):
-        def rename(self, source: Path, target: Path) -> None:
-            if "damaged" in target.parts and "damaged" not in source.parts:
-                raise OSError(errno.EXDEV, "Invalid cross-device link")
-            super().rename(source, target)
-
-    data = tmp_path / "data"
-    with running(data) as http:
-        surface = push(http, BODY)
-    container = data / "containers" / f"{surface['container']}.lode"
-    upload = upload_of(data, surface)
-    damaged = container if kind == "container" else upload / "0"
-    damaged.write_bytes(damaged.read_bytes()[:-1])
-    bytes_ = damaged.read_bytes()
-    monkeypatch.setattr(durable, "disk", OtherDisk())
-    assert fsck(data, capsys, "--repair")[0] == 0
-    aside = data / "damaged" / damaged.relative_to(data / f"{kind}s").parent
-    aside = data / "damaged" / f"{kind}s" / (damaged.name if kind == "container" else f"{upload.name}/0")
-    assert aside.read_bytes() == bytes_
-    storage = Storage(data)
-    assert storage.get(surface["id"]).state == "ready"
-    storage.close()
-
-
-def test_nothing_is_lost_where_it_cannot_be_set_aside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from lodestream_server.store import durable
-
-    class NoRename(durable.Disk):
-        def rename(self, source: Path, target: Path) -> None:
-            raise OSError(errno.EROFS, "Read-only file system")
-
-    data = tmp_path / "data"
-    with running(data) as http:
-        surface = push(http, BODY)
-    container = data / "containers" / f"{surface['container']}.lode"
-    container.write_bytes(container.read_bytes()[:-1])
-    before = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
-    monkeypatch.setattr(durable, "disk", NoRename())
-    with pytest.raises(OSError, match="Read-only"):
-        fsck(data, capsys, "--repair")
-    assert {path: path.read_bytes() for path in data.rglob("*") if path.is_file()} == before
+        assert (upload_of(data, other) / "0").read_bytes() == BODY

@@ -60,7 +60,7 @@ __all__ = [
 
 def escape(job: Job) -> Built | Parsed | Refused:
     """Try every way out that a build should not have, and a few that it has; what came of each stands in the reason."""
-    data, work = job.folder.parents[2], job.folder.parents[1]
+    data, work = job.folder.parents[3], job.folder.parents[1]
     victim = data / "victim"
     trials: dict[str, Callable[[], object]] = {
         "read the upload": lambda: job.files[0].read_bytes(),
@@ -181,7 +181,7 @@ def trick_progress(job: Job) -> Built | Parsed | Refused:
     """Make the file that the server looks at a link, and then something huge."""
     progress = job.folder / "progress"
     progress.symlink_to("/dev/zero")
-    go = job.folder.parents[2] / "go"
+    go = job.folder.parents[3] / "go"
     until = time.monotonic() + PATIENCE
     while not go.exists() and time.monotonic() < until:
         time.sleep(0.01)

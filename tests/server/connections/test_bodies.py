@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from tests.server.connections.sockets import CHUNKS, Place, chunked
-from tests.server.helpers import PATIENCE, eventually, hills, listed, npy
+from tests.server.helpers import PATIENCE, eventually, hills, kept, listed, npy
 
 
 def asked(url: str, data: bytes) -> socket.socket:
@@ -89,7 +89,7 @@ def test_chunks_that_are_no_use_are_refused(http: httpx.Client, server: str, dat
     assert document["status"] == 400
     assert document["code"] in ("bad-request", "small-chunks")
     assert listed(http) == before
-    eventually(lambda: not list((data / "incoming").iterdir()), "the upload's folder to be removed")
+    eventually(lambda: not kept(data, "scratch/incoming"), "the upload's folder to be removed")
 
 
 def test_a_head_is_answered_without_a_body_when_its_chunks_are_refused(http: httpx.Client, server: str) -> None:

@@ -32,7 +32,7 @@ from lodestream_server.operation.least_rate import LeastRate
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.pace import Pace
 from lodestream_server.operation.settings import Settings
-from tests.server.helpers import PATIENCE, closed, eventually, hills, listed, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, closed, eventually, hills, kept, listed, npy, push, raw_stream
 
 SECONDS = 1.5
 
@@ -368,7 +368,7 @@ def test_a_body_shorter_than_it_says_is_nothing(http: httpx.Client, server: str,
         connection.sendall(b"POST /v1/surfaces HTTP/1.1\r\nHost: localhost\r\nContent-Length: 1000\r\n\r\nshort")
         connection.shutdown(socket.SHUT_WR)
         all_of(connection)
-    eventually(lambda: not list((data / "incoming").iterdir()), "the upload's folder to be removed")
+    eventually(lambda: not kept(data, "scratch/incoming"), "the upload's folder to be removed")
     assert listed(http) == before
 
 

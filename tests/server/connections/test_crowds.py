@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from tests.server.helpers import hills, npy, push
+from tests.server.helpers import hills, kept, npy, push
 from tests.server.programs import server
 from tests.torture import crowd
 from tests.torture.parts import sent
@@ -25,6 +25,6 @@ def test_honest_clients_are_served_and_nothing_remains_of_the_others(tmp_path: P
         assert outcome.hostile == len(crowd.BEHAVIOURS) * COUNT
         assert outcome.health.own < 1
         assert outcome.grown < 128 * 1024
-        assert list((data / "incoming").iterdir()) == []
+        assert kept(data, "scratch/incoming") == []
     log = running.log.read_text()
     assert "Traceback" not in log, log[-3000:]

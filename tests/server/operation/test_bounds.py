@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -11,8 +13,8 @@ from typing import Any
 import pytest
 
 from lodestream_server.problems import BusyError, FullError, TooManyError
-from lodestream_server.storage.catalog import Catalog
-from lodestream_server.storage.records import Record
+from lodestream_server.store.index import LEAST, Index, Surface
+from lodestream_server.store.layout import Manifest
 from tests.server.access.test_limits import ANNA, BERT, CARL, Disk, limits, read, request
 from tests.server.helpers import PATIENCE
 
@@ -150,47 +152,55 @@ def test_an_upload_that_does_not_say_its_size_stops_at_its_owners_share(tmp_path
     assert len(asyncio.run(read(made, request(bytes(1 << 24), b"x", length=(1 << 24) + 1), BERT))) == (1 << 24) + 1
 
 
-def record(surface: str, **values: Any) -> Record:
-    fixed: dict[str, Any] = {"name": None, "created": 1.0, "filenames": ("a",), "upload_bytes": 100, "options": {}}
-    return Record(id=surface, **{**fixed, **values})
+@pytest.fixture
+def index(tmp_path: Path) -> Iterator[Index]:
+    index = Index(tmp_path / "index.sqlite", "tests")
+    yield index
+    index.close()
 
 
-def test_what_is_kept_is_counted_once_for_each_owner() -> None:
-    ready = {"upload": "up", "container": "c", "info": {"bytes": 30}, "state": "ready"}
-    catalog = Catalog([record("1", owner="anna", upload="up"), record("2", owner="anna", **ready)])
-    assert (catalog.kept("anna"), catalog.kept("bert"), catalog.kept(None)) == (130, 0, 0)
-    catalog.put(record("3", owner="bert", **ready))
-    catalog.put(record("4", owner=None))
-    assert (catalog.kept("anna"), catalog.kept("bert"), catalog.kept(None)) == (130, 130, 100)
-    catalog.put(record("1", owner="anna", **ready))
-    catalog.drop("2")
-    assert catalog.kept("anna") == 130
-    catalog.put(record("1", owner="anna", **{**ready, "upload_lost": True}))
-    assert catalog.kept("anna") == 30
-    for surface in "1234":
-        catalog.drop(surface)
-    assert [catalog.kept(owner) for owner in ("anna", "bert", None)] == [0, 0, 0]
-    assert not catalog._things
+def surface(id_: str, owner: str | None, upload: str, container: str | None = None, size: int = 30) -> Surface:
+    """A surface of an upload of 100 bytes."""
+    it = Manifest(id_, None, owner, 1.0, ("a",), {}, upload, 100, "w")
+    return Surface(it, "queued" if container is None else "ready", None, 0, container, size if container else None)
 
 
-def test_what_is_kept_is_what_a_new_catalog_would_count() -> None:
-    random = Random(7)
-    catalog = Catalog()
-    for _ in range(2000):
-        surface = str(random.randrange(12))
+def test_what_is_kept_is_counted_once_for_each_owner(index: Index) -> None:
+    def kept(*owners: str | None) -> list[int]:
+        return [index.kept(owner) for owner in owners]
+
+    index.put(surface("1", "anna", "up"))
+    index.put(surface("2", "anna", "up", "c"))
+    assert kept("anna", "bert", None) == [130 + 2 * LEAST, 0, 0]
+    index.put(surface("3", "bert", "up", "c"))
+    index.put(surface("4", None, "up"))
+    assert kept("anna", "bert", None) == [130 + 2 * LEAST, 130 + LEAST, 100 + LEAST]
+    index.put(surface("1", "anna", "up", "c"))
+    index.drop("2")
+    assert kept("anna") == [130 + LEAST]
+    # A container that is lost, and built again, goes on to count: its place is taken again.
+    index.put(replace(surface("1", "anna", "up", "c"), state="queued"))
+    assert kept("anna") == [130 + LEAST]
+    for id_ in "1234":
+        index.drop(id_)
+    assert kept("anna", "bert", None) == [0, 0, 0]
+
+
+def test_what_is_kept_is_what_a_count_of_all_surfaces_gives(index: Index) -> None:
+    random, known = Random(7), dict[str, Surface]()
+    for _ in range(500):
+        id_ = str(random.randrange(12))
         if random.random() < 0.3:
-            catalog.drop(surface)
-            continue
-        number = random.randrange(4)
-        made = record(
-            surface,
-            owner=random.choice(["anna", "bert", None]),
-            upload=random.choice([None, "x", "y"]),
-            upload_lost=random.random() < 0.2,
-            container=random.choice([None, f"c{number}"]),
-            info=random.choice([None, {"bytes": 10 + number}]),
-        )
-        catalog.put(made)
-        fresh = Catalog(catalog.all())
+            index.drop(id_)
+            known.pop(id_, None)
+        else:
+            number = random.randrange(4)
+            container = random.choice([None, f"c{number}"])
+            owner = random.choice(["anna", "bert", None])
+            known[id_] = surface(id_, owner, random.choice("xy"), container, 10 + number)
+            index.put(known[id_])
         for owner in ("anna", "bert", None):
-            assert catalog.kept(owner) == fresh.kept(owner)
+            own = [each for each in known.values() if each.manifest.owner == owner]
+            things = {each.manifest.upload: 100 for each in own}
+            things |= {each.container: each.container_bytes or 0 for each in own if each.container is not None}
+            assert index.kept(owner) == sum(things.values()) + LEAST * len(own)

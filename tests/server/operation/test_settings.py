@@ -44,7 +44,7 @@ def example(choice: Choice) -> str:
         return known[choice.name]
     if choice.metavar == "SIZE":
         return "3GiB"
-    return "7" if "int" in str(choice.field.annotation) else "/x"
+    return "7" if choice.field.annotation in (int, int | None, float) else "/x"
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,7 @@ import socket
 import stat
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -23,8 +24,8 @@ from lodestream.errors import LodestreamError
 from lodestream_client.__main__ import main
 from lodestream_server import Settings, create_app, running_server
 from lodestream_server.access.tokens import TokenFile
-from lodestream_server.storage.storage import Storage
 from lodestream_server.store import durable
+from lodestream_server.store.data_folder import DataFolder
 from lodestream_server.store.durable import Disk
 from tests.server.helpers import PATIENCE, Keys, hills, npy, problem, push
 
@@ -96,13 +97,14 @@ def test_a_folder_that_cannot_be_written(closed: Path, refused: Refused) -> None
     assert f"{closed}/data: " in refused("token", "create", "--data", closed / "data")
 
 
-@pytest.mark.parametrize("name", ["", "records", "uploads", "containers", "incoming", "work"])
+@pytest.mark.parametrize("name", ["", ".lodestream", "surfaces", "built", "uploads", "containers", "names", "scratch"])
 def test_a_folder_that_can_be_read_but_not_written_any_more(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = tmp_path / "data"
-    Storage(data).close()
+    DataFolder(data).close()
     folder = data / name
+    folder.mkdir(exist_ok=True)
     folder.chmod(0o500)
     if os.access(folder, os.W_OK):  # root: what the system says of a disk that is mounted for reading
         ask = os.access
@@ -111,7 +113,44 @@ def test_a_folder_that_can_be_read_but_not_written_any_more(
         pass
     folder.chmod(0o700)
     monkeypatch.undo()
-    Storage(data).close()
+    DataFolder(data).close()
+
+
+def test_a_data_folder_of_an_earlier_version_is_refused_and_left_alone(tmp_path: Path, refused: Refused) -> None:
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "0.json").write_text("{}")
+    (tmp_path / "work" / "0").mkdir(parents=True)
+    line = refused("serve", "--port", "0", "--data", tmp_path)
+    assert "an earlier one: start with a new folder, and push the containers" in line
+    assert f"{tmp_path}/containers/*.lode" in line
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["0", "0.json", "lock", "records", "work"]
+
+
+@pytest.mark.parametrize("other_disk", [False, True])
+def test_what_can_be_made_again_may_be_elsewhere(tmp_path: Path, other_disk: bool) -> None:
+    data, shm = tmp_path / "data", Path("/dev/shm")
+    if other_disk and (not shm.is_dir() or shm.stat().st_dev == tmp_path.stat().st_dev):
+        pytest.skip("there is no other disk")
+    with tempfile.TemporaryDirectory(dir=shm if other_disk else tmp_path) as folder:
+        scratch = Path(folder) / "above" / "scratch"
+
+        def client(url: str) -> httpx.Client:
+            return httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE)
+
+        with running_server(data, scratch=scratch, workers=1) as url, client(url) as http:
+            made = push(http, npy(hills(12, 9)))
+            level = http.get(f"{made['url']}/levels/0", params={"format": "npy"})
+            assert (made["state"], level.status_code) == ("ready", 200)
+            assert mode(scratch / "lodestream") == 0o700
+            assert {path.name for path in (scratch / "lodestream").iterdir()} >= {"index.sqlite", "work", "levels"}
+        places = {".lodestream", "built", "containers", "lock", "lodestream.json", "probe", "surfaces", "uploads"}
+        assert {path.name for path in data.iterdir()} == places
+        # Nothing of it is needed by the next server.
+        shutil.rmtree(scratch)
+        with running_server(data, scratch=scratch, workers=1) as url, client(url) as http:
+            assert http.get(made["url"]).json() == made
+        with running_server(data, workers=1) as url, client(url) as http:
+            assert http.get(made["url"]).json() == made
 
 
 def test_a_file_in_the_place_of_a_folder(tmp_path: Path, refused: Refused) -> None:
@@ -205,8 +244,10 @@ def test_what_a_server_makes_is_its_owners_alone(tmp_path: Path) -> None:
     assert surface["state"] == "ready"
     assert mode(data) == 0o700
     assert mode(data / "lock") == 0o600
-    files = [path for folder in ("records", "uploads", "containers") for path in (data / folder).rglob("*")]
-    assert len(files) >= 5
+    places = [data / folder for folder in ("surfaces", "built", "uploads", "containers")]
+    files = [data / "lodestream.json", *places, *(path for place in places for path in place.rglob("*"))]
+    assert len(files) == 10
+    assert (mode(data / ".lodestream"), mode(data / "scratch")) == (0o700, 0o700)
     for path in files:
         assert mode(path) == (0o700 if path.is_dir() else 0o600), path
 
@@ -217,13 +258,13 @@ def test_a_data_folder_that_is_open_to_others_is_closed(tmp_path: Path, caplog: 
     for setup in (0o755, 0o777, 0o2750):
         data.mkdir(exist_ok=True)
         data.chmod(setup)
-        Storage(data).close()
+        DataFolder(data).close()
         assert mode(data) == setup & ~0o077
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     # With something else in it, it may be somebody's home.
     (data / "thesis.tex").write_text("")
     data.chmod(0o755)
-    Storage(data).close()
+    DataFolder(data).close()
     assert mode(data) == 0o755
     (warning,) = [record for record in caplog.records if record.levelname == "WARNING"]
     assert "thesis.tex" in warning.getMessage()
@@ -238,7 +279,7 @@ def test_a_data_folder_that_cannot_be_closed_is_warned_of(
 
     tmp_path.chmod(0o755)
     monkeypatch.setattr(Path, "chmod", chmod)
-    Storage(tmp_path).close()
+    DataFolder(tmp_path).close()
     assert "Operation not permitted" in caplog.text
     assert str(tmp_path) in caplog.text
 

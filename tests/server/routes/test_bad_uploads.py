@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.server.helpers import PATIENCE, eventually, hills, npy, push
+from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, push
 
 VRT = b"""<VRTDataset rasterXSize="5" rasterYSize="5"><VRTRasterBand dataType="Byte" band="1">
 <SimpleSource><SourceFilename>/etc/passwd</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"""
@@ -23,8 +23,9 @@ VRT = b"""<VRTDataset rasterXSize="5" rasterYSize="5"><VRTRasterBand dataType="B
 
 def stored(data: Path) -> list[str]:
     """What lies in the server's folder, once it has cleared away what it built."""
-    eventually(lambda: not list((data / "work").iterdir()), "the builds' folders to be removed")
-    return sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file())
+    eventually(lambda: not kept(data, "scratch/work"), "the builds' folders to be removed")
+    files = sorted(str(path.relative_to(data)) for path in data.rglob("*") if path.is_file())
+    return [path for path in files if not path.startswith(("scratch/index", ".lodestream/lock"))]
 
 
 @pytest.mark.parametrize(
@@ -46,7 +47,7 @@ def test_a_look_at_the_first_bytes_refuses_at_once(
     assert words in answer.json()["detail"]
     assert "\n" not in answer.json()["detail"]
     assert stored(data) == before
-    assert list((data / "incoming").iterdir()) == []
+    assert kept(data, "scratch/incoming") == []
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,7 @@ def test_what_only_a_reader_sees_ends_as_failed_without_its_bytes(
     assert "Traceback" not in surface["reason"]
     assert str(data) not in surface["reason"]
     assert not (data / "uploads" / surface["id"]).exists()
-    eventually(lambda: not list((data / "work").iterdir()), "the build's folder to be removed")
+    eventually(lambda: not list((data / "scratch" / "work").iterdir()), "the build's folder to be removed")
 
 
 def test_what_says_that_it_is_too_large_is_refused_before_it_is_read(server: str, data: Path) -> None:
@@ -143,7 +144,7 @@ def test_what_does_not_say_its_size_is_counted(http: httpx.Client, data: Path) -
     form = http.post("/v1/surfaces", files=[("file", ("a", bytes(1 << 20)))])
     assert form.status_code == 413
     assert stored(data) == before
-    assert list((data / "incoming").iterdir()) == []
+    assert kept(data, "scratch/incoming") == []
 
 
 def test_the_limit_itself_is_allowed(http: httpx.Client) -> None:
@@ -191,7 +192,7 @@ def test_a_form_that_cannot_be_read_is_refused(
     assert answer.status_code == 422, answer.text
     assert words in answer.json()["detail"]
     assert stored(data) == before
-    assert list((data / "incoming").iterdir()) == []
+    assert kept(data, "scratch/incoming") == []
 
 
 def test_too_many_files_are_refused(http: httpx.Client, data: Path) -> None:
@@ -228,5 +229,5 @@ def test_a_client_that_vanishes_leaves_nothing(server: str, data: Path, http: ht
             )
         # The next request is answered after the first one's end has been seen.
         assert http.get("/healthz").status_code == 200
-    eventually(lambda: not list((data / "incoming").iterdir()), "the half upload to be removed")
+    eventually(lambda: not kept(data, "scratch/incoming"), "the half upload to be removed")
     assert stored(data) == before

@@ -24,7 +24,7 @@ from lodestream.formats import write_stream
 from lodestream_server import running_server
 from lodestream_server.builds import levels
 from tests.patience import PATIENCE
-from tests.server.helpers import eventually, hills, npy, push
+from tests.server.helpers import eventually, hills, kept, npy, push
 
 
 @pytest.fixture(scope="module")
@@ -290,5 +290,5 @@ def test_a_file_that_was_sent_and_cannot_be_closed_cuts_no_connection(
 
 def test_nothing_is_left_behind(http: httpx.Client, surface: dict[str, Any], data: Path) -> None:
     http.get(surface["url"] + "/levels/2")
-    for name in ("work", "incoming"):
-        eventually(lambda name=name: not list((data / name).iterdir()), "nothing to be left")  # type: ignore[misc]
+    for name in ("scratch/work", "scratch/incoming"):
+        eventually(lambda name=name: not kept(data, name), "nothing to be left")  # type: ignore[misc]

@@ -35,14 +35,14 @@ POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.Generati
 INDESCRIBABLE = {"POST /v1/surfaces", "GET /v1/surfaces/{surface}/levels/{level}"}
 
 #: Where something can be wrong that a schema does say; any text may be the name of a surface.
-FALLIBLE = {"GET /v1/surfaces", *INDESCRIBABLE}
+FALLIBLE = {"GET /v1/surfaces", "GET /v1/names", "GET /v1/names/{name}", "PUT /v1/names/{name}", *INDESCRIBABLE}
 
 CASES = [(name, POSITIVE) for name in OPERATIONS] + [(name, NEGATIVE) for name in sorted(FALLIBLE)]
 
 
 @dataclass
 class Server:
-    """A server with one surface that stays, and others to be had."""
+    """A server with one surface and one name that stay, and others to be had."""
 
     url: str
     http: httpx.Client
@@ -50,6 +50,7 @@ class Server:
 
     def __post_init__(self) -> None:
         self._seeds = itertools.count(100)
+        self._name("stays")
 
     def real(self, method: str) -> dict[str, str]:
         """Path parameters of something that there is."""
@@ -57,7 +58,12 @@ class Server:
         if method == "delete":
             answer = self.http.post("/v1/surfaces", content=npy(hills(3, 4, seed=next(self._seeds))))
             surface = {**answer.json(), "container": ""}
-        return {"surface": surface["id"], "sha256": surface["container"]}
+        name = self._name(f"name-{next(self._seeds)}") if method == "delete" else "stays"
+        return {"surface": surface["id"], "sha256": surface["container"], "name": name}
+
+    def _name(self, name: str) -> str:
+        assert self.http.put(f"/v1/names/{name}", json={"surface": self.stays["id"]}).status_code == 201
+        return name
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +99,8 @@ def test_what_the_document_says_is_what_happens(
                 case.path_parameters = {key: known.get(key, value) for key, value in case.path_parameters.items()}
                 if case.media_type == "application/octet-stream":
                     case.body = npy(hills(4, 5))
+                if case.media_type == "application/json":
+                    case.body = {"surface": server.stays["id"]}
             answer = case.call(base_url=server.url, session=session, allow_redirects=False)
             statuses[answer.status_code] += 1
             case.validate_response(answer, excluded_checks=excluded)

@@ -42,7 +42,7 @@ def test_curl_uploads_and_fetches_what_the_page_says(server: str, http: httpx.Cl
     heights = hills(60, 50)
     ls.write(ls.Surface(heights), tmp_path / "mountain.tif")
     upload, *others = [command for command in commands() if command.startswith("curl")]
-    assert len(others) == 4
+    assert len(others) == 6
 
     def curl(command: str) -> str:
         line = command.replace("http://127.0.0.1:8000", server).replace(
@@ -56,8 +56,9 @@ def test_curl_uploads_and_fetches_what_the_page_says(server: str, http: httpx.Cl
 
     surface = json.loads(curl(upload))["id"]
     settled(http, f"/v1/surfaces/{surface}")
-    answers = [curl(command.replace("surfaces/ID", f"surfaces/{surface}")) for command in others]
+    answers = [curl(re.sub(r"\bID\b", surface, command)) for command in others]
     assert json.loads(answers[0])["state"] == "ready"
+    assert json.loads(answers[-1])["id"] == surface
     points = ls.decode((tmp_path / "mountain.lode").read_bytes()).points
     assert np.array_equal(points, heights)
     coarse = ls.read(tmp_path / "coarse.ply").points

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from tests.server.helpers import eventually, hills, npy, push, settled
+from lodestream_server.routes import surfaces as routes
+from lodestream_server.store import layout
+from tests.server.helpers import eventually, hills, kept, npy, push, settled, upload_of
 
 
 def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
@@ -42,7 +44,14 @@ def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
     assert len(container) == surface["bytes"]
     assert hashlib.sha256(container).hexdigest() == surface["container"]
     assert np.array_equal(ls.decode(container).points, hills())
-    assert json.loads((data / "records" / f"{surface['id']}.json").read_text())["state"] == "ready"
+    small = (data / "built" / f"{surface['id']}.json").read_bytes()
+    built = layout.parse(layout.Built, layout.built_key(surface["id"]), small)
+    assert (built.container, built.container_bytes) == (surface["container"], surface["bytes"])
+    # The description is sent as it is stored, behind what the server says of the surface, and nothing is said twice.
+    answer = http.get(location)
+    assert answer.content.endswith(b", " + built.info[1:])
+    keys = [key for key, _ in json.loads(answer.content, object_pairs_hook=list)]
+    assert len(keys) == len(set(keys))
 
 
 def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> None:
@@ -124,12 +133,12 @@ def test_several_files_of_one_surface_are_taken_and_told_apart(http: httpx.Clien
     assert all(surface["state"] == "failed" and "one file" in surface["reason"] for surface in surfaces)
 
 
-def test_a_bad_file_fails_with_its_reason_and_leaves_no_bytes(http: httpx.Client, data: Path) -> None:
+def test_a_bad_file_fails_with_its_reason_and_keeps_its_upload(http: httpx.Client, data: Path) -> None:
     surface = push(http, npy(hills(seed=8))[:-100], filename="cut.npy")
     assert surface["state"] == "failed"
     assert "cut short" in surface["reason"]
     assert "\n" not in surface["reason"]
-    assert not (data / "uploads" / surface["id"]).exists()
+    assert kept(data, f"uploads/{upload_of(data, surface).name}") == ["0"], "a retry needs it"
     for path in ("/container", "/levels/0"):
         answer = http.get(surface["url"] + path)
         assert (answer.status_code, answer.json()["code"]) == (424, "failed")
@@ -147,12 +156,15 @@ def test_nothing_but_holes_fails_with_its_reason(http: httpx.Client) -> None:
 
 def test_a_deleted_surface_is_gone_with_all_its_bytes(http: httpx.Client, data: Path) -> None:
     surface = push(http, npy(hills(seed=10)))
+    upload = upload_of(data, surface)
+    assert upload.is_dir()
     assert http.delete(surface["url"]).status_code == 204
     assert http.get(surface["url"]).status_code == 404
     assert http.delete(surface["url"]).status_code == 404
     for path in (
-        f"records/{surface['id']}.json",
-        f"uploads/{surface['id']}",
+        f"surfaces/{surface['id']}.json",
+        f"built/{surface['id']}.json",
+        f"uploads/{upload.name}",
         f"containers/{surface['container']}.lode",
     ):
         assert not (data / path).exists()
@@ -178,12 +190,46 @@ def test_the_list_comes_in_pages_without_gaps(http: httpx.Client) -> None:
     while address:
         document = http.get(address).raise_for_status().json()
         assert len(document["surfaces"]) <= 2
-        assert all("layers" not in surface for surface in document["surfaces"])
+        unlisted = {"filenames", "options", "layers", "levels", "metadata"}
+        assert not any(unlisted & surface.keys() for surface in document["surfaces"])
         seen += [surface["id"] for surface in document["surfaces"]]
         address = document["next"]
     assert len(seen) == len(set(seen))
     assert [name for name in seen if name in made] == made
     assert [entry["id"] for entry in http.get("/v1/surfaces?limit=1000").json()["surfaces"]] == seen
+
+
+def test_a_page_ends_after_so_many_bytes(http: httpx.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = [push(http, npy(hills(5, 5, seed=30 + number)), name="ä" * 255)["id"] for number in range(5)]
+    monkeypatch.setattr(routes, "_MOST_PAGE", 3000)
+    seen: list[str] = []
+    sizes: list[int] = []
+    address: str | None = "/v1/surfaces?limit=1000"
+    while address:
+        answer = http.get(address).raise_for_status()
+        seen += [surface["id"] for surface in answer.json()["surfaces"]]
+        sizes.append(len(answer.content))
+        address = answer.json()["next"]
+    # What goes beyond is one surface.
+    assert len(sizes) > 2
+    assert max(sizes) < 3000 + 2000
+    assert len(seen) == len(set(seen))
+    assert [name for name in seen if name in made] == made
+
+
+def test_a_surface_without_a_name_has_that_of_its_file(http: httpx.Client) -> None:
+    body, named = npy(hills(seed=14)), ls.encode(ls.Surface(hills(seed=14), metadata={"name": "Told"}))
+    surfaces = [
+        push(http, body, filename="ridge.npy", precision="0.5"),
+        push(http, body, filename="ridge.npy", name="Ridge"),
+        push(http, body, closed="none"),
+        push(http, named, filename="a.lode"),
+        push(http, body[:-1], filename="cut.npy"),
+    ]
+    names = {surface["id"]: surface["name"] for surface in surfaces}
+    assert list(names.values()) == ["ridge", "Ridge", None, "Told", "cut.npy"]
+    listed = http.get("/v1/surfaces?limit=1000").json()["surfaces"]
+    assert {entry["id"]: entry["name"] for entry in listed if entry["id"] in names} == names
 
 
 @pytest.mark.parametrize("query", ["limit=0", "limit=x", "limit=1001", "after=yesterday"])
@@ -226,7 +272,7 @@ def test_problems_have_one_shape(http: httpx.Client) -> None:
         (http.get("/v1/surfaces/" + "x" * 500), 404, "id"),
         (http.get("/v1/surfaces/..%2f..%2fetc"), 404, "expected"),
         (http.get(f"/v1/containers/{'0' * 64}.lode"), 404, "SHA-256"),
-        (http.get("/v1/containers/..%2f..%2frecords.lode"), 404, "expected"),
+        (http.get("/v1/containers/..%2f..%2fsurfaces.lode"), 404, "expected"),
         (http.put("/v1/surfaces"), 405, "GET, HEAD, POST"),
         (http.post("/healthz"), 405, "GET, HEAD"),
         (http.get("/v1/surfaces/"), 404, "expected"),
@@ -254,6 +300,9 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/v1/surfaces/{surface}/container",
         "/v1/surfaces/{surface}/levels/{level}",
         "/v1/containers/{sha256}.lode",
+        "/v1/names",
+        "/v1/names/{name}",
+        "/v1/names/{name}/container",
     }
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])

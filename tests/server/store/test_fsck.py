@@ -26,11 +26,12 @@ from lodestream.stores import Folder, Store, StoreError
 from lodestream_server.builds.finished import CHECKED, ERRORS, figures_of
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.findings import Finding, Report
-from lodestream_server.maintenance.upkeep import collect, retry, waiting
+from lodestream_server.maintenance.strays import collect
+from lodestream_server.maintenance.waiting import retry, waiting
 from lodestream_server.store import layout
 from lodestream_server.store.index import Index
 from lodestream_server.store.layout import Built, Identity, Manifest
-from lodestream_server.store.surfaces import Surfaces, read_identity
+from lodestream_server.store.surfaces import Surfaces
 
 from .conftest import PLACES, Place
 from .world import CutError, Failing
@@ -100,11 +101,11 @@ class Made:
         }
         return keys[kind]
 
-    def start(self, data: Path) -> dict[str, str]:
+    def start(self, data: Path, index: Path | None = None) -> dict[str, str]:
         """Build what is queued, as a server would; return the states of all surfaces."""
         with (
             tempfile.TemporaryDirectory() as folder,
-            closing(Surfaces(Folder(data), Path(folder) / "index.sqlite")) as surfaces,
+            closing(Surfaces(Folder(data), index or Path(folder) / "index.sqlite")) as surfaces,
         ):
             surfaces.sync()
             for queued in set(surfaces.index.queued()) - {QUEUED}:
@@ -443,7 +444,7 @@ def test_a_container_that_only_some_can_build(data: Path, made: Made, tmp_path: 
 
 
 @pytest.mark.parametrize("id_", [ONE, LODE])
-@pytest.mark.parametrize("change", ["figures", "summary", "errors", "bytes"])
+@pytest.mark.parametrize("change", ["figures", "summary", "errors", "nobody", "bytes"])
 @pytest.mark.parametrize("upload", [True, False])
 def test_a_description_that_is_not_that_of_the_container(
     data: Path, made: Made, id_: str, change: str, upload: bool
@@ -455,18 +456,22 @@ def test_a_description_that_is_not_that_of_the_container(
         "figures": replace(built, info=layout.describe(info | {"layers": []})[0]),
         "summary": replace(built, summary=replace(built.summary, levels=9)),
         "errors": replace(built, info=layout.describe(info | {ERRORS: "believed"})[0]),
+        "nobody": replace(built, info=layout.describe({k: v for k, v in info.items() if k != ERRORS})[0]),
         "bytes": replace(built, container_bytes=1),
     }[change]
     path.write_bytes(layout.dump(wrong))
     if not upload:
         (data / made.key("upload", id_)).unlink()
+    if change == "nobody" and not (id_ == LODE and upload):
+        assert ("figures", id_) not in told(looked(data)), "only for an uploaded container somebody vouches"
+        return
     assert ("figures", id_) in told(looked(data))
     report = check(Folder(data), repair=True)
     assert {found.what: found.repaired for found in report.findings} == {"figures": True} | (
         {} if upload else {"upload": False}
     )
     mended = layout.parse(Built, made.key("built", id_), path.read_bytes())
-    if change == "errors":
+    if change in ("errors", "nobody"):
         info.pop(ERRORS, None)
         info |= {ERRORS: "told"} if id_ == LODE and upload else {}
     assert (json.loads(mended.info), mended.summary) == (info, built.summary)
@@ -546,9 +551,11 @@ def _unreadable(read: Callable[..., Any], key: str) -> Callable[..., Any]:
 
 
 def test_a_repair_that_is_cut_at_any_step_is_done_by_the_next_one(data: Path, made: Made, tmp_path: Path) -> None:
-    at = 0
+    at, index = 0, tmp_path / "index.sqlite"
     while True:
         damaged = shutil.copytree(data, tmp_path / str(at))
+        Index.remove(index)
+        made.start(damaged, index)
         flip(damaged / made.key("container", ONE), 77)
         flip(damaged / made.key("container", LODE), 77)
         flip(damaged / made.key("built", TWO_FILES), 77)
@@ -557,11 +564,25 @@ def test_a_repair_that_is_cut_at_any_step_is_done_by_the_next_one(data: Path, ma
             break
         except CutError:
             pass
-        assert check(Folder(damaged), repair=True).clean
-        assert made.start(damaged) == STATES
+        if at % 2:  # or a server starts in between, and whoever asks for a container finds that it is gone
+            assert check(Folder(damaged), repair=True).clean
+        made.start(damaged, index)
+        check(Folder(damaged), repair=True)
+        assert made.start(damaged, index) == STATES
         assert looked(damaged).findings == []
         at += 1
     assert at == 2 * 7  # three objects of surfaces and the container of two of them, that of another, and one alone
+
+
+def test_a_container_that_nothing_tells_any_more_is_put_again(data: Path, made: Made, tmp_path: Path) -> None:
+    """What was built is damaged too, so nobody looks at the container, of which the index knows."""
+    index = tmp_path / "index.sqlite"
+    made.start(data, index)
+    for kind in ("built", "container"):
+        flip(data / made.key(kind, TWO_FILES), 99)
+    assert told(check(Folder(data), repair=True)) == {("built", TWO_FILES)}
+    assert made.start(data, index) == STATES
+    assert looked(data).findings == []
 
 
 def test_a_repair_that_the_store_refuses(data: Path, made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -601,8 +622,7 @@ def test_what_waits_is_queued_again(data: Path, made: Made, tmp_path: Path) -> N
         assert waiting(store, index) == {}
         assert index.read_bytes() == body
         assert retry(store, index) == {}
-        with closing(Index(index, read_identity(store).identity)) as left:
-            assert left.is_new, "a server does not believe it"
+        assert index.read_bytes() == body
 
 
 def test_what_is_no_data_of_a_server(data: Path, tmp_path: Path) -> None:

@@ -6,20 +6,25 @@ import json
 import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from lodestream import stores
 from lodestream.errors import InputError, NotFoundError
-from lodestream.stores import Folder, Store, Tag
-from lodestream_server.problems import NotOwnerError
+from lodestream.stores import Folder, Store, StoreError, Tag, UnacknowledgedError
+from lodestream_server.problems import DamagedNameError, FullError, NotOwnerError
 from lodestream_server.store import layout
-from lodestream_server.store.layout import DamagedObjectError, Name
-from lodestream_server.store.names import MOST_REPLACED
+from lodestream_server.store.index import LEAST
+from lodestream_server.store.layout import Name
+from lodestream_server.store.names import MOST_NAMES, MOST_REPLACED
 from lodestream_server.store.surfaces import Surfaces, establish
+from tests.patience import PATIENCE
 
 from .conftest import PLACES, Place
 from .world import CutError, Failing, upload
@@ -133,12 +138,97 @@ def test_what_was_replaced_stays_for_its_time(surfaces: Surfaces, tmp_path: Path
     assert not surfaces.names.expire(LATER)
 
 
-def test_to_point_again_to_the_same_surface_writes_nothing(surfaces: Surfaces, tmp_path: Path) -> None:
-    id_ = accept(surfaces, tmp_path, 1)
-    point(surfaces, "dem", id_)
+def test_what_cannot_be_deleted_is_told_and_keeps_nothing_else(
+    surfaces: Surfaces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = ("a", "b", "c")
+    for number in range(6):
+        point(surfaces, names[number // 2], accept(surfaces, tmp_path, number))
+    replaced = surfaces.store.replace
+
+    def failing(key: str, data: bytes, tag: Tag) -> Tag:
+        if key == layout.name_key("b"):
+            raise StoreError("a disk failed")
+        return replaced(key, data, tag)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(surfaces.store, "replace", failing)
+        assert {int(it.id, 16) for it in surfaces.names.expire(LATER)} == {0, 4}
+    assert (
+        "names/b.json: what it has replaced cannot be deleted now, which is tried again: a disk failed" in caplog.text
+    )
+    assert [int(it.id, 16) for it in surfaces.names.expire(LATER)] == [2]
+
+
+def test_until_when_a_replaced_surface_stays(surfaces: Surfaces, tmp_path: Path) -> None:
+    first, second, third = (accept(surfaces, tmp_path, number) for number in range(3))
+    until = surfaces.index.replaced_until
+    for name, id_, days in (("a", first, 1), ("a", second, 1), ("b", first, 2), ("b", third, 2)):
+        begun = time.time()
+        surfaces.names.point(name, id_, "ann", anybody, days * DAY)
+        if (name, id_) == ("b", first):
+            assert until(first) is None, "a name leads to it"
+    assert (until(second), until(third)) == (None, None)
+    assert begun + 2 * DAY <= (until(first) or 0) <= time.time() + 2 * DAY
+    accept(surfaces, tmp_path, 0)
+    assert until(first) is None
+
+
+def test_to_point_again_to_the_same_surface_changes_nothing(surfaces: Surfaces, tmp_path: Path) -> None:
+    first, second = (accept(surfaces, tmp_path, number) for number in range(2))
+    for id_ in (first, second):
+        point(surfaces, "dem", id_)
     before = record(surfaces.store, "dem")
-    point(surfaces, "dem", id_)
-    assert record(surfaces.store, "dem") == before
+    point(surfaces, "dem", second)
+    after = record(surfaces.store, "dem")
+    assert replace(after, write=before.write) == before
+    assert after.write != before.write, "what was found may not be on disk"
+
+
+def test_where_a_name_may_lead_is_not_deleted(
+    surfaces: Surfaces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, third = (accept(surfaces, tmp_path, number) for number in range(3))
+    point(surfaces, "dem", first)
+    for id_ in (second, third):
+        point(surfaces, "other", id_)
+    replaced = surfaces.store.replace
+
+    def unsure(key: str, data: bytes, tag: Tag) -> Tag:
+        replaced(key, data, tag)
+        raise UnacknowledgedError("a disk failed")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(surfaces.store, "replace", unsure)
+        with pytest.raises(UnacknowledgedError):
+            point(surfaces, "dem", second)
+    assert [it.id for it in surfaces.names.expire(LATER)] == [first]
+    surfaces.restore()
+    assert surfaces.names.get("dem").surface == second
+
+
+def test_what_is_relied_on_is_written_before(
+    surfaces: Surfaces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ids = [accept(surfaces, tmp_path, number) for number in range(2)]
+    for id_ in ids:
+        point(surfaces, "dem", id_)
+    done = list[str]()
+
+    def noted(what: str, method: Callable[..., Any], keys: Any, *more: Any) -> Any:
+        done.extend(f"{what} {key}" for key in ([keys] if isinstance(keys, str) else keys))
+        return method(keys, *more)
+
+    for what in ("create", "replace", "delete"):
+        monkeypatch.setattr(surfaces.store, what, partial(noted, what, getattr(surfaces.store, what)))
+    surfaces.names.expire(LATER)
+    assert done[:2] == ["replace names/dem.json", f"delete surfaces/{ids[0]}.json"]
+    assert done[-1] == "replace names/dem.json"
+    done.clear()
+    surfaces.store.delete(["names/dem.json"])  # by somebody whose delete may not be on disk
+    with pytest.raises(NotFoundError):
+        surfaces.names.delete("dem", anybody)
+    assert done == ["delete names/dem.json"] * 2
 
 
 def test_what_a_name_leads_to_again_or_another_one_leads_to_is_not_deleted(surfaces: Surfaces, tmp_path: Path) -> None:
@@ -177,6 +267,35 @@ def test_who_uploads_a_replaced_surface_again_keeps_it(surfaces: Surfaces, tmp_p
     assert there(surfaces) == {0, 1, 2}
 
 
+def test_who_does_so_before_the_names_are_known_keeps_it_too(surfaces: Surfaces, tmp_path: Path) -> None:
+    first, second = (accept(surfaces, tmp_path, number) for number in (1, 2))
+    point(surfaces, "dem", first)
+    point(surfaces, "dem", second)
+    surfaces.index.drop_name(layout.name_key("dem"))  # the power failed, and the end of the index was lost
+    surfaces.is_synced = False
+    accept(surfaces, tmp_path, 1)
+    surfaces.sync()
+    surfaces.names.expire(LATER)
+    assert there(surfaces) == {1, 2}
+
+
+def test_a_name_of_which_the_index_cannot_be_told(surfaces: Surfaces, tmp_path: Path) -> None:
+    first, second = (accept(surfaces, tmp_path, number) for number in (1, 2))
+    surfaces.sync()
+    point(surfaces, "dem", first)
+    with pytest.MonkeyPatch.context() as patch:
+
+        def full(*_: Any) -> None:
+            raise stores.FullError("full")
+
+        patch.setattr(surfaces.index, "put_name", full)
+        with pytest.raises(UnacknowledgedError, match="the index could not be told"):
+            point(surfaces, "dem", second)
+    assert not surfaces.is_synced, "nothing is removed before it knows again"
+    surfaces.sync()
+    assert surfaces.names.get("dem").surface == second
+
+
 def test_owners(surfaces: Surfaces, tmp_path: Path) -> None:
     anns, bens = accept(surfaces, tmp_path, 0, "ann"), accept(surfaces, tmp_path, 1, "ben")
     point(surfaces, "dem", anns, "ann")
@@ -201,6 +320,84 @@ def test_owners(surfaces: Surfaces, tmp_path: Path) -> None:
     with pytest.raises(NotFoundError, match="a name on this server"):
         surfaces.names.get("dem")
     assert there(surfaces) == {1, 2}, "a name takes no surface with it"
+
+
+def test_a_name_of_an_admin_deletes_no_surface_of_another_owner(surfaces: Surfaces, tmp_path: Path) -> None:
+    anns, roots, last = (
+        accept(surfaces, tmp_path, number, owner) for number, owner in enumerate(("ann", "root", "root"))
+    )
+    for id_ in (anns, roots, last):
+        surfaces.names.point("dem", id_, "root", anybody, DAY)
+    assert [it[0] for it in record(surfaces.store, "dem").replaced] == [roots]
+    assert [it.id for it in surfaces.names.expire(LATER)] == [roots]
+    assert there(surfaces) == {0, 2}
+
+
+def test_an_upload_writes_few_names_and_waits_for_none_without(
+    surfaces: Surfaces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of them is on disk before the upload is acknowledged, and nobody else can change anything meanwhile."""
+    first, second, third = (accept(surfaces, tmp_path, number) for number in range(3))
+    for number in range(MOST_NAMES):
+        point(surfaces, f"n{number}", first)
+        point(surfaces, f"n{number}", second)
+    for id_ in (first, second):
+        with pytest.raises(InputError, match=f"at most {MOST_NAMES} names that lead to {id_}, or have replaced it"):
+            point(surfaces, "more", id_)
+    point(surfaces, "n0", first)  # as one of those that there are
+    point(surfaces, "more", third)
+    written = list[str]()
+    replaced = surfaces.store.replace
+
+    def noted(key: str, data: bytes, tag: Tag) -> Tag:
+        written.append(key)
+        return replaced(key, data, tag)
+
+    monkeypatch.setattr(surfaces.store, "replace", noted)
+    accept(surfaces, tmp_path, 0)
+    assert len(written) == MOST_NAMES - 1
+    surfaces.names.delete("n1", only("ann"))
+    point(surfaces, "more", second)
+    assert surfaces.names.get("more").surface == second
+    with ThreadPoolExecutor(1) as thread, surfaces._lock:  # somebody else is at work
+        thread.submit(surfaces.names.keep, first).result(PATIENCE)
+
+
+def test_names_count_in_the_bytes_of_their_owner(surfaces: Surfaces, tmp_path: Path) -> None:
+    id_ = accept(surfaces, tmp_path, 0)
+    before = surfaces.index.kept("ann"), surfaces.index.kept("ben")
+    for name in ("a", "b"):
+        point(surfaces, name, id_)
+    assert (surfaces.index.kept("ann"), surfaces.index.kept("ben")) == (before[0] + 2 * LEAST, before[1])
+
+
+def test_whether_there_is_room_is_asked_under_the_lock_before_a_name_is_made(
+    surfaces: Surfaces, tmp_path: Path
+) -> None:
+    """Of names that are made at once, only so many as there is room for."""
+    ids = [accept(surfaces, tmp_path, number) for number in range(2)]
+
+    def fits() -> None:
+        if surfaces.index.count_names("ann")[1] >= 2:
+            raise FullError("expected at most 2 names")
+
+    def made(number: int) -> bool:
+        try:
+            surfaces.names.point(f"n{number}", ids[0], "ann", only("ann"), DAY, fits)
+        except FullError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as threads:
+        assert sum(threads.map(made, range(8))) == 2
+    with pytest.raises(FullError):
+        surfaces.names.check("more", only("ann"), fits)
+    there = surfaces.index.names("", 9)
+    assert len(there) == 2
+    surfaces.names.check(there[0].name, only("ann"), fits)
+    surfaces.names.point(there[0].name, ids[1], "ann", only("ann"), DAY, fits)
+    with pytest.raises(NotOwnerError):
+        surfaces.names.check(there[0].name, only("ben"), fits)
 
 
 @pytest.mark.parametrize("name", ["", ".a", "-a", "a/b", "a b", "ä", "x" * 101, "con", "NUL.tif", "a\n"])
@@ -296,9 +493,9 @@ def test_a_name_that_is_damaged_is_told_and_left(
     caplog.clear()
     surfaces.sync()
     assert "names/dem.json " in caplog.text, "it is told each time"
-    with pytest.raises(DamagedObjectError, match="dem cannot be read"):
+    with pytest.raises(DamagedNameError, match="dem cannot be read"):
         surfaces.names.get("dem")
-    with pytest.raises(DamagedObjectError, match=r"names/dem\.json"):
+    with pytest.raises(DamagedNameError, match="dem cannot be read"):
         point(surfaces, "dem", ids[1])
     assert surfaces.names.get("good").surface == ids[2]
     assert not surfaces.names.expire(LATER), "it may lead to any surface"
@@ -316,7 +513,7 @@ def test_a_name_that_is_damaged_while_the_server_runs(surfaces: Surfaces, tmp_pa
     path.write_bytes(b"")
     accept(surfaces, tmp_path, 0)  # which it has replaced
     assert not surfaces.names.expire(LATER)
-    with pytest.raises(DamagedObjectError):
+    with pytest.raises(DamagedNameError):
         surfaces.names.get("dem")
     surfaces.names.delete("dem", anybody)
     assert not path.exists()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import sqlite3
 import tempfile
 import threading
@@ -12,7 +13,8 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, cast, get_args
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
@@ -140,7 +142,7 @@ def test_what_failed_for_good_stays_so_without_an_index(surfaces: Surfaces, tmp_
     surfaces.begin(manifest.id)
     surfaces.refused(manifest.id, "x" * 5000)
     found = surfaces.get(manifest.id)
-    assert (found.state, found.reason) == ("failed", "x" * 1024)
+    assert (found.state, found.reason) == ("failed", "x" * 1021 + "...")
     surfaces.restore()
     assert surfaces.get(manifest.id) == found
     assert surfaces.retry(manifest.id).state == "queued"
@@ -178,6 +180,8 @@ def test_the_same_upload_again(surfaces: Surfaces, tmp_path: Path) -> None:
     (lost,) = surfaces.lose(sha256)
     assert lost == surfaces.get(manifest.id)
     assert (lost.state, lost.container) == ("queued", sha256)
+    surfaces.restore()
+    assert surfaces.get(manifest.id).state == "queued", "without the index too"
     surfaces.stuck(manifest.id, "its upload is damaged")
     surfaces.store.delete([layout.upload_key(manifest.upload, 0)])
     _, files = upload(tmp_path, 1)
@@ -185,6 +189,80 @@ def test_the_same_upload_again(surfaces: Surfaces, tmp_path: Path) -> None:
     assert surfaces.accept(manifest, files)[1], "it is built again, from the bytes that came"
     with surfaces.store.open(layout.upload_key(manifest.upload, 0)) as blob:
         assert blob.read(0, blob.size) == body
+
+
+class Unanswered:
+    """A store whose deletes happen, and are not acknowledged."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._store, name)
+
+    def delete(self, keys: Any) -> None:
+        self._store.delete(keys)
+        raise UnacknowledgedError("the power may fail")
+
+
+@pytest.mark.parametrize("died", [False, True])
+def test_the_same_upload_after_a_delete_that_came_to_no_answer(surfaces: Surfaces, tmp_path: Path, died: bool) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    build(surfaces, manifest, tmp_path)
+    store = surfaces.store
+    surfaces.store = cast(Store, Unanswered(store))
+    with pytest.raises(UnacknowledgedError):
+        surfaces.delete(manifest.id)
+    surfaces.store = store
+    if died:  # and the next server answers before it knows what became of it
+        surfaces.close()
+        surfaces = Surfaces(store, tmp_path / "index.sqlite")
+    again, _ = surfaces.accept(*upload(tmp_path, 1))
+    assert again.state in ("queued", "ready")
+    surfaces.restore()
+    assert surfaces.get(manifest.id).manifest == again.manifest
+
+
+@pytest.mark.parametrize("state", ["queued", "building", "ready"])
+def test_the_same_upload_of_a_surface_of_which_files_are_gone(surfaces: Surfaces, tmp_path: Path, state: str) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    if state == "building":
+        surfaces.begin(manifest.id)
+    elif state == "ready":
+        build(surfaces, manifest, tmp_path)
+        surfaces.store.delete([layout.container_key(surfaces.get(manifest.id).container or "")])
+    surfaces.store.delete([layout.upload_key(manifest.upload, 0)])
+    again, new = surfaces.accept(*upload(tmp_path, 1))
+    assert (again.state, new) == (("queued", True) if state == "ready" else (state, False))
+    with surfaces.upload(again) as (path,):
+        assert path.read_bytes() == upload(tmp_path, 1)[1][0].read_bytes()
+
+
+def died(folder: Path) -> Surfaces:
+    """Return what the next server finds after a kill."""
+    return Surfaces(Folder(folder / "data"), folder / "index.sqlite")
+
+
+def test_a_delete_while_the_disk_of_the_index_is_full(
+    surfaces: Surfaces, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept, other, again = (upload(tmp_path, number) for number in range(3))
+    for manifest, files in (kept, other, again):
+        surfaces.accept(manifest, files)
+    full = sqlite3.OperationalError("database or disk is full")
+    full.sqlite_errorcode = sqlite3.SQLITE_FULL
+    with monkeypatch.context() as patched:
+        patched.setattr("lodestream_server.store.index._forget", Mock(side_effect=full))
+        surfaces.delete(other[0].id)
+        with pytest.raises(IndexLostError):
+            surfaces.get(other[0].id)
+    assert died(tmp_path).index.is_new, "it is made anew before anybody is answered"
+    surfaces.restore()
+    with pytest.raises(NotFoundError):
+        surfaces.get(other[0].id)
+    assert [it.id for it in surfaces.index.page((0.0, ""), 10)] == [kept[0].id, again[0].id]
 
 
 def test_an_id_of_other_bytes_is_refused(surfaces: Surfaces, tmp_path: Path) -> None:
@@ -242,6 +320,92 @@ def test_shared_files_stay_until_the_last_surface_is_deleted(surfaces: Surfaces,
     assert not surfaces.collect(older=-3600)
     surfaces.delete(ids[1])
     assert keys(surfaces.store) == ["lodestream.json"]
+
+
+def test_a_full_index_takes_nothing_back_that_was_acknowledged(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    surfaces.index.drop(manifest.id)  # it is of another time than the store
+
+    def full(*_: Any) -> Any:
+        raise FullError("full")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces.index, "put", full)
+        with pytest.raises(UnacknowledgedError, match="is stored"):
+            surfaces.accept(*upload(tmp_path, 1))
+    surfaces.restore()
+    assert surfaces.get(manifest.id).manifest == manifest
+    with surfaces.upload(surfaces.get(manifest.id)) as stored:
+        assert stored[0].stat().st_size == manifest.upload_bytes
+
+
+def test_another_file_in_the_place_of_the_index(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    Index(tmp_path / "other.sqlite", "of another server").close()
+    (tmp_path / "other.sqlite").replace(tmp_path / "index.sqlite")
+    with pytest.raises(IndexLostError):
+        surfaces.get(manifest.id)
+    surfaces.restore()
+    assert surfaces.get(manifest.id).state == "queued"
+
+
+def test_a_damaged_cell_of_the_index(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    with sqlite3.connect(tmp_path / "index.sqlite") as other:
+        other.execute("UPDATE surface SET filenames = '[\"a'")
+    other.close()
+    with pytest.raises(IndexLostError):
+        surfaces.index.page((0.0, ""), 10)
+    surfaces.restore()
+    assert surfaces.get(manifest.id).manifest == manifest
+
+
+def test_a_closed_index_is_opened_by_nobody(surfaces: Surfaces, tmp_path: Path) -> None:
+    surfaces.close()
+    with ThreadPoolExecutor(1) as threads, pytest.raises(IndexLostError):
+        threads.submit(surfaces.accept, *upload(tmp_path, 1)).result()
+    assert keys(surfaces.store) == ["lodestream.json"]
+
+
+def test_what_was_built_and_could_not_be_told_stays(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    surfaces.begin(manifest.id)
+
+    def full(*_: Any) -> Any:
+        raise FullError("full")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces.index, "put", full)
+        with pytest.raises(UnacknowledgedError):
+            surfaces.built(manifest.id, *container(tmp_path, manifest))
+    assert not surfaces.is_synced
+    surfaces.sync()
+    found = surfaces.get(manifest.id)
+    assert found.state == "ready"
+    with surfaces.store.open(layout.container_key(found.container or "")):
+        pass
+
+
+def test_an_index_that_is_newer_than_the_store_acknowledges_nothing(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    body = files[0].read_bytes()
+    surfaces.accept(manifest, files)
+    build(surfaces, manifest, tmp_path)
+    surfaces.close()
+    for path in [*(tmp_path / "data").glob("surfaces/*"), *(tmp_path / "data").glob("uploads/*/*")]:
+        path.unlink()  # a backup from before it was restored
+    again = Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
+    assert again.get(manifest.id).state == "ready", "it is told so until the first sync has ended"
+    found, new = again.accept(*upload(tmp_path, 1))
+    assert (found.state, new) == ("queued", True)
+    again.sync()
+    assert again.get(manifest.id).state == "queued"
+    with again.store.open(layout.upload_key(manifest.upload, 0)) as blob:
+        assert blob.read(0, blob.size) == body
 
 
 @pytest.mark.parametrize("kind", ["surfaces", "built"])
@@ -411,7 +575,7 @@ def test_pages_and_the_queue(surfaces: Surfaces, tmp_path: Path) -> None:
     (oldest, *_), numbers = surfaces.index.queued(), [int(id_, 16) for id_ in surfaces.index.queued()]
     assert numbers == [2, 4, 9]
     surfaces.begin(oldest)
-    assert oldest not in surfaces.index.queued()
+    assert surfaces.index.queued()[-1] == oldest, "it may have ended without a word"
     queued = surfaces.later(oldest, "waits for space")
     assert queued is not None
     assert surfaces.get(oldest).reason == "waits for space"
@@ -504,6 +668,21 @@ def test_an_index_of_other_data_is_not_used(surfaces: Surfaces, tmp_path: Path) 
     assert len(other.index) == 0
 
 
+def test_a_copy_of_an_index_is_not_used(surfaces: Surfaces, tmp_path: Path) -> None:
+    manifest, files = upload(tmp_path, 1)
+    surfaces.accept(manifest, files)
+    surfaces.close()
+    again = Surfaces(surfaces.store, tmp_path / "index.sqlite")
+    assert not again.index.is_new
+    again.close()
+    copy = tmp_path / "copy.sqlite"
+    shutil.copy2(tmp_path / "index.sqlite", copy)
+    again = Surfaces(surfaces.store, copy)
+    assert again.index.is_new
+    again.sync()
+    assert again.get(manifest.id).manifest == manifest
+
+
 @pytest.mark.parametrize("data", [b"no index at all", b""])
 def test_a_start_with_a_file_that_is_no_index(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "index.sqlite").write_bytes(data)
@@ -570,9 +749,10 @@ def test_a_turn_that_cannot_be_changes_nothing(surfaces: Surfaces, tmp_path: Pat
     build(surfaces, manifest, tmp_path)
     before = keys(surfaces.store), surfaces.get(manifest.id)
     with pytest.raises(WrongTurnError):
-        surfaces.begin(manifest.id)
-    with pytest.raises(WrongTurnError):
         surfaces.refused(manifest.id, "x")
+    # What a build has to say that began before its end was known.
+    assert surfaces.begin(manifest.id) is surfaces.later(manifest.id) is surfaces.stuck(manifest.id, "x") is None
+    assert surfaces.built(manifest.id, *container(tmp_path, manifest)) == before[1]
     assert (keys(surfaces.store), surfaces.get(manifest.id)) == before
 
 

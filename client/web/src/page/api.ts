@@ -5,13 +5,13 @@ export interface ListedSurface {
   readonly id: string;
   /** A path on the server. */
   readonly url: string;
-  readonly name: string;
-  readonly state: "queued" | "building" | "ready" | "failed" | "waiting" | "missing";
+  /** Of the surface, or of its first file; null: neither has one. */
+  readonly name: string | null;
+  readonly state: "queued" | "building" | "ready" | "failed" | "waiting";
   /** 0 to 1. */
   readonly progress: number;
   readonly reason: string | null;
   readonly created: string;
-  readonly filenames: readonly string[];
   readonly upload_bytes: number;
   readonly bytes?: number;
   readonly shape?: readonly [number, number] | null;

@@ -140,13 +140,12 @@ export class Listing {
     const name = nameOf(surface);
     const ready = surface.state === "ready";
     const title = ready ? html("a", { href: `#s=${encodeURIComponent(surface.id)}` }, name) : html("span", {}, name);
-    const files = surface.filenames.filter((file) => file !== "" && file !== name).join(", ");
-    const state = ready ? files : stateText(surface);
+    const state = ready ? "" : stateText(surface);
     const remove = html("button", { type: "button", class: "plain", "aria-label": `Delete ${name}` }, "Delete");
     remove.addEventListener("click", () => void this.remove(surface, name));
     const actions = html("td", { class: "actions" });
     const mayWrite = !this.server.readsOnly;
-    if (mayWrite && (surface.state === "waiting" || surface.state === "missing")) {
+    if (mayWrite && surface.state === "waiting") {
       const retry = html(
         "button",
         { type: "button", class: "plain", "aria-label": `Retry the build of ${name}` },
@@ -156,7 +155,7 @@ export class Listing {
       actions.append(retry);
     }
     if (mayWrite) actions.append(remove);
-    const reason = surface.state === "failed" || surface.state === "waiting" || surface.state === "missing";
+    const reason = surface.state === "failed" || surface.state === "waiting";
     return html(
       "tr",
       {},

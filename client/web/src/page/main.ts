@@ -90,26 +90,29 @@ function closeAll(): void {
   view = null;
 }
 
-/** The id of a surface in the part of the address after #; null: the list. */
+/** The path of the surface, or of the name, in the part of the address after #; null: the list. */
 function asked(): string | null {
-  const found = /(?:^#|&)s=([^&]+)/.exec(location.hash)?.[1];
+  const [, kind, found] = /(?:^#|&)([sn])=([^&]+)/.exec(location.hash) ?? [];
   if (found === undefined) return null;
+  return `v1/${kind === "s" ? "surfaces" : "names"}/${encodeURIComponent(unescaped(found))}`;
+}
+
+function unescaped(text: string): string {
   try {
-    return decodeURIComponent(found);
+    return decodeURIComponent(text);
   } catch {
-    return found; // anybody can write an address
+    return text; // anybody can write an address
   }
 }
 
 async function route(): Promise<void> {
-  const id = asked();
-  if (id === shown && (view !== null || listing !== null)) return;
-  shown = id;
-  if (id === null) return showList();
-  const path = `v1/surfaces/${encodeURIComponent(id)}`;
+  const path = asked();
+  if (path === shown && (view !== null || listing !== null)) return;
+  shown = path;
+  if (path === null) return showList();
   try {
     const surface = await server.look(path);
-    if (asked() !== id) return;
+    if (asked() !== path) return;
     open(server.address(surface.url), nameOf(surface), true);
     await showSeries(surface);
   } catch (error) {
@@ -124,8 +127,9 @@ async function showSeries(surface: ListedSurface): Promise<void> {
   if (!series?.show(surface.id)) {
     series = null;
     if (surface.series === undefined) return;
+    const path = shown;
     const surfaces = seriesOf(surface, await server.all());
-    if (shown !== surface.id || surfaces.length < 2) return;
+    if (shown !== path || surfaces.length < 2) return;
     series = new SeriesSlider(surfaces, ({ id }) => {
       moved = true;
       location.hash = `s=${encodeURIComponent(id)}`;
@@ -151,11 +155,7 @@ function fail(error: unknown): void {
 function askedName(): string | null {
   const [name] = location.hash.slice(1).split("&", 1);
   if (!name || name.includes("=")) return null; // what has a value tells how a surface is looked at
-  try {
-    return decodeURIComponent(name);
-  } catch {
-    return name;
-  }
+  return unescaped(name);
 }
 
 /** Shows the surfaces of a published page: the one whose name is asked for, the only one, or a list. */

@@ -52,7 +52,6 @@ export const CODES: Readonly<Record<string, { readonly close: number; readonly t
   "message-too-large": { close: 1009, title: "The message is too large" },
   damaged: { close: 4500, title: "The stored container is damaged" },
   busy: { close: 4503, title: "The server is busy; try again later" },
-  missing: { close: 4503, title: "The surface is not on the server's disk now" },
   internal: { close: 1011, title: "The server failed" },
   restarting: { close: 1012, title: "The server is restarting; try again" },
 };

@@ -1,19 +1,19 @@
-/** URLs of surfaces on a server and of container files. */
+/** URLs of surfaces on a server, of names that lead to them, and of container files. */
 
 import { OptionError } from "../errors";
 
-const SURFACES = "/v1/surfaces";
+const COLLECTIONS = /\/v1\/(?:surfaces|names)$/;
 
 /**
- * The URL of something that can be received: a surface on a server, a container file on any web server, or a name on a
- * published page, `PAGE#NAME`.
+ * The URL of something that can be received: a surface on a server, a name there that leads to one, a container file on
+ * any web server, or a name on a published page, `PAGE#NAME`.
  *
  * @param base What a relative URL refers to; in a page the page's own address.
  * @throws OptionError if this is none of them.
  */
 export function sourceUrl(given: string | URL, base?: string): string {
   const url = parsed(given, base);
-  if (isSurface(url.href)) {
+  if (isSurface(url.href) || isName(url.href)) {
     url.hash = url.search = "";
     url.pathname = url.pathname.replace(/\/+$/, "");
     return url.href;
@@ -21,7 +21,7 @@ export function sourceUrl(given: string | URL, base?: string): string {
   // The query may be what allows reading a file.
   if (url.hash.length > 1 && !/^#[^&]*=/.test(url.hash)) return url.href;
   url.hash = "";
-  if (url.pathname === "/" || url.pathname.replace(/\/+$/, "").endsWith(SURFACES)) {
+  if (url.pathname === "/" || COLLECTIONS.test(url.pathname.replace(/\/+$/, ""))) {
     throw new OptionError(
       "expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as " +
         `http://HOST/NAME.lode, or a published name's such as http://HOST/#NAME, got ${url.href}`,
@@ -33,6 +33,11 @@ export function sourceUrl(given: string | URL, base?: string): string {
 /** Whether this is the URL of a surface, not of a file. */
 export function isSurface(url: string): boolean {
   return /\/v1\/surfaces\/[^/]+\/*$/.test(new URL(url).pathname);
+}
+
+/** Whether this is the URL of a name on a server, which leads to one surface now and perhaps to another one later. */
+export function isName(url: string): boolean {
+  return /\/v1\/names\/[^/]+\/*$/.test(new URL(url).pathname);
 }
 
 /** The WebSocket URL of a surface's stream, perhaps with a query. */

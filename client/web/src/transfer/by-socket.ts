@@ -6,6 +6,7 @@ import type { Region, Target, ViewInfo } from "../types";
 import { streamUrl } from "./addresses";
 import { Download, type DownloadOptions } from "./download";
 import type { Journey } from "./journey";
+import type { Place } from "./locating";
 import { fromCode } from "./problems";
 import { isClosing, Socket, type SocketClass } from "./socket";
 import { seconds } from "./waiting";
@@ -14,10 +15,11 @@ import { seconds } from "./waiting";
 export class SocketTransport<View extends ViewInfo> {
   private download: Download<View> | undefined;
   private socket: Socket | undefined;
+  private finding: AbortController | undefined;
 
   constructor(
     private readonly journey: Journey<View>,
-    private readonly url: string,
+    private readonly place: Place,
     private readonly options: DownloadOptions,
     private readonly make: SocketClass | undefined,
   ) {}
@@ -33,8 +35,10 @@ export class SocketTransport<View extends ViewInfo> {
     const download = new Download(reception, options);
     // A token has no place in an address.
     const opening = options.token === undefined ? toAddress(download.opening) : undefined;
+    this.finding = new AbortController();
+    const url = await this.place.find(() => journey.patience(), this.finding.signal);
     const began = seconds();
-    const socket = await Socket.open(streamUrl(this.url, opening), journey.patience(), this.make);
+    const socket = await Socket.open(streamUrl(url, opening), journey.patience(), this.make);
     this.socket = socket;
     journey.met();
     if (opening !== undefined) download.opened(began);
@@ -50,7 +54,7 @@ export class SocketTransport<View extends ViewInfo> {
         // Interrupted, or the time of the target is over.
         if (seconds() - asked < journey.patience() - 0.005) continue;
         throw new SilenceError(
-          `expected more of the stream, but ${this.url} has sent nothing for ${journey.patience()} seconds`,
+          `expected more of the stream, but ${url} has sent nothing for ${journey.patience()} seconds`,
         );
       }
       if (isClosing(heard)) return lost(download, heard.code, heard.reason);
@@ -75,7 +79,7 @@ export class SocketTransport<View extends ViewInfo> {
   stop(): void {
     this.download?.stop();
     this.flush();
-    this.socket?.interrupt();
+    this.interrupt();
   }
 
   /** Change the region that comes first, if there is a connection to do so; false: there is none. */
@@ -96,6 +100,7 @@ export class SocketTransport<View extends ViewInfo> {
 
   /** Let whatever is waited for be looked at again. */
   interrupt(): void {
+    this.finding?.abort();
     this.socket?.interrupt();
   }
 

@@ -1,9 +1,10 @@
 /** Parts of a file: over HTTP with `fetch`, or of a `File` or `Blob`. */
 
-import { LodestreamError, SilenceError, TruncatedStreamError, UnreachableError } from "../errors";
-import { sameOrigin } from "./addresses";
+import { UnreachableError } from "../errors";
+import { containerUrl } from "./addresses";
+import type { Place } from "./locating";
+import { Patience } from "./patience";
 import { fromResponse } from "./problems";
-import { locate, publishedName } from "./published";
 import type { AnswerHeaders, RangeRequest } from "./range-download";
 
 /** The answer to a request for a range. */
@@ -32,33 +33,19 @@ const LONGEST_PROBLEM = 64 * 1024;
 
 /** A container on a server of Lodestream or on any web server that knows Range. */
 export class HttpRanges implements RangeSource {
-  /** Where the container is; until it is known, the name on a published page that leads to it. */
-  located: string;
-  private address: string;
+  private address: string | undefined;
 
-  /**
-   * @param url Where the container is, or a name on a published page that leads to it; a redirect is followed, and its target is asked from then on.
-   * @param home The address that the token is for: it goes to no other origin.
-   */
+  /** @param place Of the container. A redirect is followed, and its target is asked from then on. */
   constructor(
-    url: string,
-    private readonly home: string,
-    private readonly token: string | undefined,
+    private readonly place: Place,
     private readonly fetch: typeof globalThis.fetch,
-  ) {
-    this.located = this.address = url;
-  }
+  ) {}
 
   async ask(request: RangeRequest, patience: () => number, signal: AbortSignal): Promise<RangeAnswer> {
+    const { place } = this;
+    this.address ??= containerUrl(await place.find(patience, signal));
     const timer = new Patience(patience, signal);
-    const own: Record<string, string> = {};
-    if (this.token !== undefined && sameOrigin(this.address, this.home)) own.Authorization = `Bearer ${this.token}`;
-    if (publishedName(this.located) !== undefined) {
-      // Once: the stream ends on the container that it begins, whatever the name leads to by then.
-      const found = await timer.wait(this.located, () => locate(this.located, own, this.fetch, timer.signal));
-      this.located = this.address = found;
-    }
-    const headers = { ...request.headers, ...own };
+    const headers = { ...request.headers, ...place.authorization(this.address) };
     const asked = this.address;
     // No cache comes between: browsers lock an address in theirs while one part of it is under way.
     const options: RequestInit = { headers, cache: "no-store", credentials: "same-origin", signal: timer.signal };
@@ -76,51 +63,6 @@ export class HttpRanges implements RangeSource {
     }
     if (response.url !== "") this.address = response.url;
     return { status: response.status, headers: response.headers, read };
-  }
-}
-
-/** Ends a request after a silence. */
-class Patience {
-  private readonly controller = new AbortController();
-  private readonly abort = (): void => this.controller.abort();
-  private silent = false;
-
-  constructor(
-    private readonly seconds: () => number,
-    private readonly outer: AbortSignal,
-  ) {
-    if (outer.aborted) this.abort();
-    outer.addEventListener("abort", this.abort);
-  }
-
-  get signal(): AbortSignal {
-    return this.controller.signal;
-  }
-
-  /** The request has ended. */
-  end(): void {
-    this.outer.removeEventListener("abort", this.abort);
-  }
-
-  async wait<T>(url: string, step: () => Promise<T>): Promise<T> {
-    const seconds = this.seconds();
-    const timer = setTimeout(() => {
-      this.silent = true;
-      this.abort();
-    }, 1000 * seconds);
-    try {
-      return await step();
-    } catch (error) {
-      this.end();
-      if (error instanceof LodestreamError) throw error;
-      if (this.silent) {
-        throw new SilenceError(`expected more of the stream, but ${url} has sent nothing for ${seconds} seconds`);
-      }
-      if (this.outer.aborted) throw new TruncatedStreamError(`an answer of ${url} was left`);
-      throw new UnreachableError(`no connection to ${url}, or it broke: ${(error as Error).message}`);
-    } finally {
-      clearTimeout(timer);
-    }
   }
 }
 

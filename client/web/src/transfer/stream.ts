@@ -8,11 +8,11 @@ import { LodestreamError, OptionError, RemoteError } from "../errors";
 import type { Ended } from "../planning/plan";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { Region, Target, ViewInfo } from "../types";
-import { containerUrl, isSurface } from "./addresses";
 import { RangeTransport } from "./by-ranges";
 import { SocketTransport } from "./by-socket";
 import type { StreamDecoder } from "./decoding";
 import type { Journey } from "./journey";
+import { Place } from "./locating";
 import type { Progress, StreamOptions, StreamState } from "./options";
 import { Link, windowFor } from "./pacing";
 import { fromCode } from "./problems";
@@ -38,7 +38,7 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   private readonly socket: SocketTransport<View> | undefined;
   private readonly makeRanges: () => RangeTransport<View>;
   private made: RangeTransport<View> | undefined;
-  private readonly address: () => string | undefined;
+  private readonly place: Place | undefined;
   private link: Link | undefined;
   private readonly silence: number;
   private readonly closeTimeout: number;
@@ -72,14 +72,14 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       const own = sockets === undefined && transport === "auto" ? "http" : transport;
       const transports = new Transports(source, own, options.deadline ?? 60, options.pauses);
       const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
-      const http = new HttpRanges(containerUrl(transports.url), transports.url, token, fetch);
+      const place = new Place(transports.url, token, fetch);
+      const http = new HttpRanges(place, fetch);
       this.makeRanges = () => new RangeTransport(this, http, options.version);
-      this.address = () => (isSurface(transports.url) ? transports.url : http.located);
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
-      this.socket = new SocketTransport(this, transports.url, { token, window }, sockets);
+      this.socket = new SocketTransport(this, place, { token, window }, sockets);
+      this.place = place;
       this.transports = transports;
     } else {
-      this.address = () => undefined;
       const ranges = source instanceof Blob ? new BlobRanges(source) : source;
       this.makeRanges = () => new RangeTransport(this, ranges);
     }
@@ -93,11 +93,11 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
   }
 
   /**
-   * The URL of the surface or file; undefined for a file of this machine. Of a name on a published page it is that of
-   * the container, once it is known.
+   * The URL of the surface or file; undefined for a file of this machine. Of a name it is that of the surface or
+   * container to which it leads, once it is known.
    */
   get url(): string | undefined {
-    return this.address();
+    return this.place?.url;
   }
 
   /** What tells this version of a file from others, as far as its server says: its entity tag, or else its date. */

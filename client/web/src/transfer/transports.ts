@@ -5,7 +5,7 @@
  */
 
 import { type LodestreamError, NotFoundError, OptionError } from "../errors";
-import { isSurface, sourceUrl } from "./addresses";
+import { isName, isSurface, sourceUrl } from "./addresses";
 import { NoStreamError, passes } from "./problems";
 
 /** Transports that may be used: `auto` tries a WebSocket first. */
@@ -54,7 +54,7 @@ export class Transports {
     }
     if (!(deadline >= 0)) throw new OptionError(`expected 0 or more seconds until the deadline, got ${deadline}`);
     this.url = sourceUrl(url);
-    if (!isSurface(this.url)) {
+    if (!isSurface(this.url) && !isName(this.url)) {
       if (transport === "ws") {
         throw new OptionError(`expected a surface's address for a WebSocket, got that of a file: ${url}`);
       }

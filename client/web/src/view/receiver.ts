@@ -7,9 +7,9 @@ import { CorruptStreamError, RemoteError, UnsupportedVersionError } from "../err
 import { loadKernels } from "../kernels/instance";
 import { makeTarget, type TargetOptions } from "../planning/target";
 import type { WindowErrors } from "../planning/window-errors";
+import { isNamed } from "../transfer/locating";
 import { PartRanges, type PartReader } from "../transfer/parts";
 import { CutShortError } from "../transfer/problems";
-import { publishedName } from "../transfer/published";
 import { Stream } from "../transfer/stream";
 import type { Surface } from "../types";
 import { composed, thinned } from "./compose";
@@ -55,8 +55,8 @@ export class Receiver {
       this.description ??= description;
       this.tell();
     };
-    // Of a name on a published page the stream learns which container it leads to.
-    const named = typeof url === "string" && publishedName(url) !== undefined;
+    // Of a name the stream learns which surface or container it leads to.
+    const named = typeof url === "string" && isNamed(url);
     const place = named ? header.then(() => this.stream?.url ?? url) : Promise.resolve(url);
     place.then((known) => describe(known, token, header)).then(described, () => described(NO_DESCRIPTION));
     void header.then(() => setTimeout(() => described(NO_DESCRIPTION), PATIENCE));

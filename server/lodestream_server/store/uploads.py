@@ -21,7 +21,7 @@ from lodestream.errors import FormatError, OptionError, TooLargeError
 from ..operation.settings import Settings
 from ..problems import SlowUploadError
 from ..store.durable import NewFile
-from .records import Record
+from .layout import Manifest
 
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
@@ -134,7 +134,7 @@ def digest_of(files: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
-def check_upload(files: Sequence[Path], record: Record) -> str | None:
+def check_upload(files: Sequence[Path], manifest: Manifest) -> str | None:
     """Return the problem of the files of an upload; None if they are intact.
 
     Raises
@@ -144,13 +144,13 @@ def check_upload(files: Sequence[Path], record: Record) -> str | None:
     """
     try:
         size = sum(path.stat().st_size for path in files)
-        if size != record.upload_bytes:
-            return f"expected {record.upload_bytes} bytes, got {size}"
-        digest = digest_of(files) if record.upload_sha256 else None
+        if size != manifest.upload_bytes:
+            return f"expected {manifest.upload_bytes} bytes, got {size}"
+        digest = digest_of(files)
     except (FileNotFoundError, NotADirectoryError) as error:
         return f"expected {len(files)} files: {error.strerror}"
-    if digest != record.upload_sha256:
-        return f"expected files with the SHA-256 {record.upload_sha256}, got {digest}"
+    if digest != manifest.upload:
+        return f"expected files with the SHA-256 {manifest.upload}, got {digest}"
     return None
 
 

@@ -7,7 +7,8 @@ import logging
 from lodestream.errors import StreamError
 
 from ..operation.logs import event
-from .storage import Storage
+from . import layout
+from .surfaces import Surfaces
 
 __all__ = ["tell"]
 
@@ -16,27 +17,27 @@ _log = logging.getLogger(__name__)
 _MOST_NAMES = 5
 
 
-def tell(storage: Storage, sha256: str, error: StreamError) -> None:
+def tell(surfaces: Surfaces, sha256: str, error: StreamError) -> None:
     """Log that a container is damaged, which surfaces have it, and what to do; repetitions are counted (`repeats`).
 
     ``lodestream_errors_total`` counts each of them as ``damaged`` when the request is answered.
 
     Parameters
     ----------
-    storage : Storage
+    surfaces : Surfaces
     sha256 : str
         Name of the container.
     error : StreamError
         What is wrong. It is a field of the log record and not part of the line, because it may differ from time to
         time.
     """
-    surfaces = storage.surfaces_of(sha256)
-    named = ", ".join(surfaces[:_MOST_NAMES]) or "none"
-    more = f" and {len(surfaces) - _MOST_NAMES} more" if len(surfaces) > _MOST_NAMES else ""
+    count = surfaces.index.count_container(sha256)
+    named = ", ".join(surfaces.index.with_container(sha256, _MOST_NAMES)) or "none"
+    more = f" and {count - _MOST_NAMES} more" if count > _MOST_NAMES else ""
     event(
         _log,
-        f"{storage.place_of(sha256)}, the container of surface {named}{more}, is damaged: stop the server and run "
-        f"lodestream fsck --repair {storage.root}, which builds it again from its upload",
+        f"{layout.container_key(sha256)}, the container of surface {named}{more}, is damaged: stop the server and run "
+        f"lodestream fsck --repair {surfaces.store.describe()}; the next start builds it again from its upload",
         logging.ERROR,
         problem=str(error),
     )

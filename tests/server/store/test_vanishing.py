@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,72 +13,22 @@ import anyio
 import httpx
 import pytest
 
-from lodestream.errors import NotFoundError
 from lodestream.protocol.messages import CODES, Error
 from lodestream_server import running_server
 from lodestream_server.access.access import Caller
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_queue
 from lodestream_server.builds.level_files import Key, Lease
-from lodestream_server.problems import BusyError, MissingError
-from lodestream_server.storage import storage as storages
-from lodestream_server.storage.containers import Containers, OpenContainer
-from lodestream_server.storage.storage import Storage
+from lodestream_server.problems import BusyError
+from lodestream_server.store.containers import Containers, OpenContainer
 from tests.server.builds import slow
-from tests.server.helpers import PATIENCE, closed, eventually, hills, npy, problem, push, raw_stream
+from tests.server.helpers import PATIENCE, closed, eventually, hills, npy, problem, push, raw_stream, settled
 
 BODY = npy(hills(seed=8))
 
 
 def finest(surface: dict[str, Any]) -> str:
     return f"{surface['url']}/levels/{len(surface['levels']) - 1}"
-
-
-@pytest.fixture
-def stored(tmp_path: Path) -> Iterator[tuple[Storage, dict[str, Any]]]:
-    """A storage, and what the server said of the one surface in it."""
-    with running_server(tmp_path, workers=1) as url, _client(url) as http:
-        surface = push(http, BODY)
-    storage = Storage(tmp_path)
-    yield storage, surface
-    storage.close()
-
-
-def before(function: Callable[..., Any], work: Callable[[], object]) -> Callable[..., Any]:
-    """A function before which something happens, once."""
-    left = [work]
-
-    def then(*args: Any) -> Any:
-        if left:
-            left.pop()()
-        return function(*args)
-
-    return then
-
-
-@pytest.mark.parametrize("look", ["is_file", "other_version"])
-def test_what_is_deleted_during_the_look_at_the_disk_is_not_missing(
-    stored: tuple[Storage, dict[str, Any]], monkeypatch: pytest.MonkeyPatch, look: str
-) -> None:
-    storage, surface = stored
-    monkeypatch.setattr(storages, look, before(getattr(storages, look), lambda: storage.delete(surface["id"])))
-    assert isinstance(storage.gone(surface["container"]), NotFoundError)
-
-
-def test_what_is_not_there_is_missing_and_what_is_there_again_can_be_read(
-    stored: tuple[Storage, dict[str, Any]],
-) -> None:
-    storage, surface = stored
-    path = storage.container(surface["container"])
-    assert isinstance(storage.gone(surface["container"]), BusyError)
-    path.rename(path.with_name("away"))
-    assert isinstance(storage.gone(surface["container"]), MissingError)
-    with pytest.raises(MissingError):
-        storage.container(surface["container"])
-    path.with_name("away").rename(path)
-    # Another surface of the same bytes made it, and was deleted; this one is still being built.
-    storage._catalog.put(replace(storage.get(surface["id"]), state="queued"))
-    assert storage.container(surface["container"]) == path
 
 
 @pytest.mark.parametrize("header", [{}, {"range": "bytes=5-9"}, {"range": "bytes=5-9,20-29"}])
@@ -105,7 +54,7 @@ def test_a_container_may_go_before_it_is_opened(
 
 def test_a_stream_says_of_its_surface_what_is_true_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Another surface has the same container and lacks it: only this one was deleted.
-    missing = MissingError("the container is not on the server's disk now")
+    missing = BusyError("the container was not there a moment ago")
     with running_server(tmp_path, workers=1) as url, _client(url) as http:
         surface = push(http, BODY)
 
@@ -172,3 +121,34 @@ def _client(url: str, token: str | None = None) -> Iterator[httpx.Client]:
     headers = {} if token is None else {"authorization": f"Bearer {token}"}
     with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE, headers=headers) as http:
         yield http
+
+
+def test_a_container_that_is_gone_is_built_again(tmp_path: Path) -> None:
+    with running_server(tmp_path, workers=1) as url, _client(url) as http:
+        surface = push(http, BODY)
+        path = tmp_path / "containers" / f"{surface['container']}.lode"
+        for look in (f"/v1/containers/{path.name}", finest(surface)):
+            path.unlink()
+            assert problem(http.get(look))[1] in ("busy", "not-ready")
+            again = settled(http, surface["url"])
+            assert (again["state"], again["container"]) == ("ready", surface["container"])
+            assert http.get(look).status_code == 200
+        path.unlink()
+        with raw_stream(url + surface["url"]) as stream:
+            event = stream.receive()
+            assert isinstance(event, Error)
+            assert event.code in ("busy", "not-ready")
+        settled(http, surface["url"])
+        assert path.exists()
+
+
+def test_a_container_and_an_upload_that_are_gone(tmp_path: Path) -> None:
+    with running_server(tmp_path, workers=1) as url, _client(url) as http:
+        surface = push(http, BODY)
+        for path in (*(tmp_path / "containers").iterdir(), *(tmp_path / "uploads").glob("*/0")):
+            path.unlink()
+        assert http.get(f"/v1/containers/{surface['container']}.lode").status_code == 503
+        waiting = settled(http, surface["url"])
+        assert (waiting["state"], waiting["reason"]) == ("waiting", "its upload is not in the server's store")
+        again = push(http, BODY)  # which brings it back
+        assert (again["id"], again["state"], again["container"]) == (surface["id"], "ready", surface["container"])

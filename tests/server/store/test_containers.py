@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import threading
 import tracemalloc
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import BinaryIO
 
 import httpx
 import numpy as np
@@ -16,95 +16,119 @@ import pytest
 from lodestream import Block, Surface, Target, encode
 from lodestream.container import Index
 from lodestream.container.metadata import MAX_BYTES
+from lodestream.errors import NotFoundError
 from lodestream.grid.layout import Layout
 from lodestream.planning.planner import plan
+from lodestream.stores import Blob, Folder
 from lodestream_server import running_server
 from lodestream_server.problems import BusyError
-from lodestream_server.storage import containers
-from lodestream_server.storage.containers import Containers
-from lodestream_server.storage.storage import Storage
+from lodestream_server.store import containers
+from lodestream_server.store.containers import Containers
+from lodestream_server.store.index import Surface as Known
+from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
 from tests.server.helpers import hills, kept, push
 
+from .world import upload
+
+
+def stocked(folder: Path, containers_: dict[str, bytes]) -> Surfaces:
+    """Surfaces with these containers, by their names."""
+    surfaces = Surfaces(Folder(folder / "data"), folder / "index.sqlite")
+    surfaces.sync()
+    for number, (name, data) in enumerate(containers_.items()):
+        manifest, files = upload(folder, number)
+        surfaces.accept(manifest, files)
+        path = folder / "built"
+        path.write_bytes(data)
+        surfaces.built(manifest.id, path, name, {"levels": []})
+    return surfaces
+
+
+NAMES = [f"{number:064x}" for number in range(3 * containers._INDEXES_KEPT)]
+
 
 @pytest.fixture
-def names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Of more containers than indexes are kept of, in a folder."""
+def surfaces(tmp_path: Path) -> Iterator[Surfaces]:
+    """Of more containers than indexes are kept of."""
     data = encode(hills(9, 8))
-    found = [f"{number:064x}" for number in range(3 * containers._INDEXES_KEPT)]
-    for name in found:
-        (tmp_path / name).write_bytes(data)
-    monkeypatch.setattr(Storage, "__init__", lambda self: None)
-    monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
-    monkeypatch.setattr(Storage, "gone", lambda self, sha256: BusyError(sha256))
-    return found
+    found = stocked(tmp_path, dict.fromkeys(NAMES, data))
+    yield found
+    found.close()
 
 
-def test_an_index_is_shared_while_a_container_is_open(names: list[str]) -> None:
-    made = Containers(Storage.__new__(Storage))
-    first = [made.open(name) for name in names]
-    again = [made.open(name) for name in names]
-    assert [one.index is other.index for one, other in zip(first, again, strict=True)] == [True] * len(names)
+def test_an_index_is_shared_while_a_container_is_open(surfaces: Surfaces) -> None:
+    made = Containers(surfaces)
+    first = [made.open(name) for name in NAMES]
+    again = [made.open(name) for name in NAMES]
+    assert [one.index is other.index for one, other in zip(first, again, strict=True)] == [True] * len(NAMES)
     for opened in first:
         opened.close()
     del first, opened
     gc.collect()
-    third = [made.open(name) for name in names]
+    third = [made.open(name) for name in NAMES]
     assert all(one.index is other.index for one, other in zip(again, third, strict=True))
     for opened in (*again, *third):
         opened.close()
 
 
-def test_only_a_container_whose_index_is_in_memory_opens_at_once(names: list[str]) -> None:
-    made = Containers(Storage.__new__(Storage))
-    assert made.open_known(names[0], "me") is None
-    first = made.open(names[0], "me")
-    again = made.open_known(names[0], "me")
+def test_only_a_container_whose_index_is_in_memory_opens_at_once(surfaces: Surfaces) -> None:
+    made = Containers(surfaces)
+    assert made.open_known(NAMES[0], "me") is None
+    first = made.open(NAMES[0], "me")
+    again = made.open_known(NAMES[0], "me")
     assert again is not None
     assert again.index is first.index
     for opened in (first, again):
         opened.close()
     assert made._open == {}
-    (Path(first.file.name)).unlink()
-    with pytest.raises(BusyError):
-        made.open_known(names[0])
+    surfaces.store.delete([f"containers/{NAMES[0]}.lode"])
+    lost: list[Known] = []
+    made = Containers(surfaces, lost=lost.extend)
+    with pytest.raises(BusyError, match="a moment ago"):
+        made.open(NAMES[0])
+    assert [surface.id for surface in lost] == [f"{0:020x}"], "it is built again"
+    with pytest.raises(BusyError, match="is built again"):
+        made.open(NAMES[0])
+    with pytest.raises(NotFoundError):
+        made.open("f" * 64)
 
 
-def test_no_more_indexes_are_kept_than_are_worth_it(names: list[str]) -> None:
-    made = Containers(Storage.__new__(Storage))
+def test_no_more_indexes_are_kept_than_are_worth_it(surfaces: Surfaces) -> None:
+    made = Containers(surfaces)
     before = _indexes()
-    for name in names:
+    for name in NAMES:
         made.open(name).close()
     assert _indexes() - before == containers._INDEXES_KEPT
 
 
-def test_nor_more_than_so_many_bytes_of_them(names: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    made = Containers(Storage.__new__(Storage))
-    with made.open(names[0]).file as file:
-        each = sum(containers.index_memory(file))
+def test_nor_more_than_so_many_bytes_of_them(surfaces: Surfaces, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Containers(surfaces)
+    with made.open(NAMES[0]).blob as blob:
+        each = sum(containers.index_memory(blob.read, blob.size))
     assert each > 1000
     monkeypatch.setattr(containers, "_BYTES_KEPT", 3 * each + 1)
     before = _indexes() - 1
-    for name in names:
+    for name in NAMES:
         made.open(name).close()
     assert _indexes() - before == 3
 
 
-def test_those_that_are_open_have_room_for_so_many_bytes_of_indexes(names: list[str]) -> None:
-    with Containers(Storage.__new__(Storage)).open(names[0]).file as file:
-        each = sum(containers.index_memory(file))
-    made = Containers(Storage.__new__(Storage), 5 * each)
-    for name in names[5:20]:  # what nobody has open any more is in nobody's way
+def test_those_that_are_open_have_room_for_so_many_bytes_of_indexes(surfaces: Surfaces) -> None:
+    with Containers(surfaces).open(NAMES[0]).blob as blob:
+        each = sum(containers.index_memory(blob.read, blob.size))
+    made = Containers(surfaces, 5 * each)
+    for name in NAMES[5:20]:  # what nobody has open any more is in nobody's way
         made.open(name).close()
-    held = [made.open(name) for name in names[:5]]
+    held = [made.open(name) for name in NAMES[:5]]
     with pytest.raises(BusyError, match="indexes of all surfaces that are streamed"):
-        made.open(names[5])
-    again = made.open(names[0])
+        made.open(NAMES[5])
+    again = made.open(NAMES[0])
     assert again.index is held[0].index
     again.close()
     held.pop().close()
     gc.collect()
-    held.append(made.open(names[5]))
+    held.append(made.open(NAMES[5]))
     for opened in held:
         opened.close()
 
@@ -131,7 +155,7 @@ def joined(random: np.random.Generator) -> Surface:
     return Surface(blocks=[Block(low, mask=valid), Block(high, mask=valid)])
 
 
-def surfaces() -> dict[str, bytes]:
+def shapes() -> dict[str, bytes]:
     """Containers whose indexes are large in different ways, by name."""
     random = np.random.default_rng(4)
     heights, mask = hills(250, 240), random.random((250, 240)) > 0.5
@@ -154,18 +178,17 @@ def surfaces() -> dict[str, bytes]:
     }
 
 
-def test_what_is_counted_for_an_index_is_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Storage, "__init__", lambda self: None)
-    monkeypatch.setattr(Storage, "container", lambda self, sha256: tmp_path / sha256)
-    for name, data in surfaces().items():
-        (tmp_path / name).write_bytes(data)
-        made = Containers(Storage.__new__(Storage))
+def test_what_is_counted_for_an_index_is_what_it_takes(tmp_path: Path) -> None:
+    made_of = shapes()
+    surfaces = stocked(tmp_path, {f"{number:064x}": data for number, data in enumerate(made_of.values())})
+    for number, name in enumerate(made_of):
+        made = Containers(surfaces)
         Layout.single.cache_clear()
         Layout.of.cache_clear()
         gc.collect()
         tracemalloc.start()
         try:
-            opened = made.open(name)
+            opened = made.open(f"{number:064x}")
             for target in (Target(), Target(level=0), Target(order="level"), Target(attributes=())):
                 plan(opened.index, target)
             if len(opened.index.header.blocks) == 1:
@@ -174,7 +197,7 @@ def test_what_is_counted_for_an_index_is_what_it_takes(tmp_path: Path, monkeypat
             taken, most = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()
-        kept, masks = containers.index_memory(opened.file)
+        kept, masks = containers.index_memory(opened.blob.read, opened.blob.size)
         opened.close()
         assert taken <= kept, name
         assert most <= kept + masks + 4 * MAX_BYTES, name
@@ -188,20 +211,20 @@ def _indexes() -> int:
 
 
 def test_of_many_who_open_a_container_at_once_one_reads_its_index(
-    names: list[str], monkeypatch: pytest.MonkeyPatch
+    surfaces: Surfaces, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, read = Containers(Storage.__new__(Storage)), list[int]()
+    made, read = Containers(surfaces), list[int]()
     together, right = threading.Barrier(8), containers._read_index
 
-    def counted(file: BinaryIO) -> Index:
+    def counted(blob: Blob) -> Index:
         read.append(1)
-        return right(file)
+        return right(blob)
 
     monkeypatch.setattr(containers, "_read_index", counted)
 
     def open_one(_: int) -> object:
         together.wait()
-        opened = made.open(names[0])
+        opened = made.open(NAMES[0])
         opened.close()
         return opened.index
 

@@ -13,11 +13,14 @@ import pytest
 
 from lodestream.errors import StreamError
 from lodestream.protocol.messages import BASE_CREDIT, CODES, Credit, Error, Event, Open
+from lodestream.stores import Folder
 from lodestream_server.operation.repeats import Repeats
-from lodestream_server.storage import damage
-from lodestream_server.storage.storage import Storage
+from lodestream_server.store import damage
+from lodestream_server.store.surfaces import Surfaces
 from tests.server.builds.test_builds import running
 from tests.server.helpers import closed, hills, npy, push, raw_stream
+
+from .world import upload
 
 
 @pytest.fixture
@@ -76,8 +79,8 @@ def test_a_damaged_container_is_told_once_with_what_to_do(
     lines = [record for record in caplog.records if record.levelno >= logging.ERROR]
     words = {record.getMessage() for record in lines}
     assert words == {
-        f"{path}, the container of surface {made['id']}, is damaged: stop the server and run lodestream fsck --repair "
-        f"{tmp_path / 'data'}, which builds it again from its upload"
+        f"containers/{path.name}, the container of surface {made['id']}, is damaged: stop the server and run "
+        f"lodestream fsck --repair {tmp_path / 'data'}; the next start builds it again from its upload"
     }
     assert len(lines) == 3
     assert all("expected" in vars(record)["lodestream_fields"]["problem"] for record in lines)
@@ -89,15 +92,23 @@ def test_a_damaged_container_is_told_once_with_what_to_do(
 def test_all_surfaces_of_a_container_are_named_or_counted(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    storage = Storage(tmp_path / "data")
+    surfaces = Surfaces(Folder(tmp_path / "data"), tmp_path / "index.sqlite")
     names = [f"{number:020x}" for number in range(7)]
-    for known, words in (
-        (names[:2], ", ".join(names[:2])),
-        (names, f"{', '.join(names[:5])} and 2 more"),
-        ([], "none"),
+    for number, (manifest, files) in enumerate(upload(tmp_path, number) for number in range(7)):
+        surfaces.accept(manifest, files)
+        path = tmp_path / "built"
+        path.write_bytes(b"container")
+        surfaces.built(manifest.id, path, ("a" if number < 2 else "b") * 64, {"levels": []})
+    for sha256, words in (
+        ("a" * 64, ", ".join(names[:2])),
+        ("b" * 64, ", ".join(names[2:])),
+        ("c" * 64, "none"),
     ):
         caplog.clear()
-        monkeypatch.setattr(storage, "surfaces_of", lambda sha256, known=known: known)
-        damage.tell(storage, "0" * 64, StreamError("expected another"))
+        damage.tell(surfaces, sha256, StreamError("expected another"))
         assert f", the container of surface {words}, is damaged: " in caplog.records[0].getMessage()
-    storage.close()
+    monkeypatch.setattr(damage, "_MOST_NAMES", 3)
+    caplog.clear()
+    damage.tell(surfaces, "b" * 64, StreamError("expected another"))
+    assert f"surface {', '.join(names[2:5])} and 2 more, is damaged: " in caplog.records[0].getMessage()
+    surfaces.close()

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import os
+import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import TYPE_CHECKING, BinaryIO
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 from weakref import WeakValueDictionary
 
 from lodestream.container.capacity import memory_limit
-from lodestream.errors import CorruptStreamError, StreamError
-from lodestream.operating_system import read_at, read_cached
+from lodestream.errors import CorruptStreamError, NotFoundError, StreamError, UnsupportedVersionError
+from lodestream.stores import AbsentError, Blob
 
 from ..problems import BusyError
-from . import damage
-from .storage import Storage
+from . import damage, layout
+from .index import Surface
+from .surfaces import Surfaces
 
 if TYPE_CHECKING:
     from lodestream.container import ByteRange, Index
@@ -42,6 +43,11 @@ _PART_BYTES = 4 << 10
 _COPIES_OF_MASKS = 4
 
 
+_log = logging.getLogger(__name__)
+
+#: Reads bytes at an offset, so many of them.
+Read = Callable[[int, int], bytes]
+
 #: Takes the bytes of memory that there are for indexes, and of these all that are taken and those of the caller, with
 #: one more index; raises an error if the caller may not have that.
 Share = Callable[[int, tuple[int, int]], None]
@@ -53,20 +59,20 @@ def _nothing(*_: object) -> None:
 
 @dataclass(frozen=True)
 class OpenContainer:
-    """A container that is open for reading; it stays readable if it is deleted meanwhile."""
+    """A container that is open for reading; in a folder it stays readable if it is deleted meanwhile."""
 
     sha256: str
     index: Index
-    file: BinaryIO
-    let_go: Callable[[], None] = _nothing
+    blob: Blob
+    held: ExitStack = field(default_factory=ExitStack)
 
     def read(self, place: ByteRange) -> bytes:
-        """Read a slice; fewer bytes if the file ends. May be called from any thread."""
-        return _read_from(self.file.fileno(), place.offset, place.length)
+        """Read a slice; fewer bytes if the container ends. May be called from any thread."""
+        return self.blob.read(place.offset, place.length)
 
     def read_at_once(self, place: ByteRange) -> bytes | None:
-        """Read a slice if that needs no disk access; None if it would, or if the system cannot tell."""
-        return read_cached(self.file.fileno(), place.length, place.offset)
+        """Read a slice if that needs no access to a disk; None if it would, or if the system cannot tell."""
+        return self.blob.read_at_once(place.offset, place.length)
 
     def window_errors(self) -> WindowErrors | None:
         """Read the bounds of the errors of windows; None if the container has none. May be called from any thread.
@@ -78,27 +84,31 @@ class OpenContainer:
         """
         from lodestream.planning.window_errors import read_window_errors
 
-        return read_window_errors(self.index, partial(_read_from, self.file.fileno()))
+        return read_window_errors(self.index, self.blob.read)
 
     def close(self) -> None:
-        """Close the file."""
-        if not self.file.closed:
-            self.let_go()
-        self.file.close()
+        """Close it; once more does nothing."""
+        self.held.close()
+        self.blob.close()
 
 
 class Containers:
-    """The containers of a storage, with the indexes of open containers and the most recently used others.
+    """The containers of all surfaces, with the indexes of open containers and the most recently used others.
 
     Parameters
     ----------
-    storage : Storage
+    surfaces : Surfaces
     most : int or None
         Bytes of memory that all indexes may take; None: `most_for_indexes`.
+    lost : callable
+        Called with surfaces that are queued again, because their container is not there or is no longer read.
     """
 
-    def __init__(self, storage: Storage, most: int | None = None) -> None:
-        self._storage = storage
+    def __init__(
+        self, surfaces: Surfaces, most: int | None = None, lost: Callable[[list[Surface]], object] = _nothing
+    ) -> None:
+        self._surfaces = surfaces
+        self._lost = lost
         self._most = most_for_indexes() if most is None else most
         self._coming: Counter[str] = Counter()  # bytes of indexes that are being read, by caller
         self._open: dict[str, Counter[str]] = {}  # what callers have open, and how often
@@ -107,6 +117,74 @@ class Containers:
         self._sizes: dict[str, int] = {}  # bytes of indexes
         self._indexes: WeakValueDictionary[str, Index] = WeakValueDictionary()
         self._readers: WeakValueDictionary[str, _Reader] = WeakValueDictionary()
+
+    def blob(self, sha256: str) -> Blob:
+        """Open the bytes of a container.
+
+        Raises
+        ------
+        NotFoundError
+            If no surface has it.
+        BusyError
+            If it is built again, because it was not there.
+        StreamError
+            If it has not the length that it had when it was stored.
+        StoreError
+            If the store cannot be read.
+        """
+        blob, size = self._bytes(sha256)
+        if blob.size != size:
+            blob.close()
+            error = StreamError(f"expected {size} bytes of the container {sha256}, got {blob.size}")
+            self.tell_damage(sha256, error)
+            raise error
+        return blob
+
+    @contextmanager
+    def local(self, sha256: str) -> Iterator[Path]:
+        """Give a container as a file on this machine for the length of a block; it must not be changed.
+
+        Raises
+        ------
+        NotFoundError, BusyError, StoreError
+            See `blob`.
+        """
+        self._check(sha256)
+        try:
+            with self._surfaces.store.local(layout.container_key(sha256)) as path:
+                yield path
+        except AbsentError:
+            self._gone(sha256)
+
+    def tell_damage(self, sha256: str, error: StreamError) -> None:
+        """Log that a container turned out to be damaged when it was read."""
+        damage.tell(self._surfaces, sha256, error)
+
+    def _bytes(self, sha256: str) -> tuple[Blob, int]:
+        """Open the bytes of a container; return also how many it had when it was stored."""
+        size = self._check(sha256)
+        try:
+            return self._surfaces.store.open(layout.container_key(sha256)), size
+        except AbsentError:
+            self._gone(sha256)
+
+    def _check(self, sha256: str) -> int:
+        """Return the bytes of a container that some surface has; raise an error if none has it."""
+        size = self._surfaces.index.served_bytes(sha256)
+        if size is None and not self._surfaces.index.uses_container(sha256):
+            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+        if size is None:
+            raise BusyError(f"the container {sha256} was not there, and is built again; try again later")
+        return size
+
+    def _gone(self, sha256: str) -> NoReturn:
+        lost = self._surfaces.lose(sha256)
+        if not lost and not self._surfaces.index.uses_container(sha256):
+            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+        if lost:
+            _log.error("the container %s is not in the store, and is built again", sha256)
+            self._lost(lost)
+        raise BusyError(f"the container {sha256} was not there a moment ago; try again soon")
 
     def open(self, sha256: str, caller: str = "", share: Share = _nothing) -> OpenContainer:
         """Open a container.
@@ -121,25 +199,30 @@ class Containers:
 
         Raises
         ------
-        NotFoundError
-            If there is none.
-        MissingError
-            If it is not on disk.
+        NotFoundError, StoreError
+            See `blob`.
         StreamError
             If it is damaged.
         BusyError
-            If the indexes of open containers leave no memory for its index, or it was deleted and stored again at this
-            moment.
+            If the indexes of open containers leave no memory for its index, or the container is built again.
         """
-        file = self._file(sha256)
+        blob, _ = self._bytes(sha256)
         try:
-            return self._opened(sha256, self._index(sha256, file, caller, share), file, caller)
+            return self._opened(sha256, self._index(sha256, blob, caller, share), blob, caller)
+        except UnsupportedVersionError as error:
+            blob.close()
+            if lost := self._surfaces.lose(sha256, unreadable=True):
+                _log.info("the container %s is built again: %s", sha256, error)
+                self._lost(lost)
+            raise BusyError(
+                f"the container {sha256} is of another version and is built again; try again soon"
+            ) from None
         except StreamError as error:
-            file.close()
-            damage.tell(self._storage, sha256, error)
+            blob.close()
+            self.tell_damage(sha256, error)
             raise
         except BaseException:
-            file.close()
+            blob.close()
             raise
 
     def open_known(self, sha256: str, caller: str = "") -> OpenContainer | None:
@@ -147,23 +230,19 @@ class Containers:
 
         Raises
         ------
-        NotFoundError, MissingError, BusyError
-            See `open`.
+        NotFoundError, BusyError, StoreError
+            See `blob`.
         """
         with self._lock:
             index = self._known(sha256)
-        return None if index is None else self._opened(sha256, index, self._file(sha256), caller)
+        return None if index is None else self._opened(sha256, index, self._bytes(sha256)[0], caller)
 
-    def _file(self, sha256: str) -> BinaryIO:
-        try:
-            return self._storage.container(sha256).open("rb")
-        except FileNotFoundError:
-            raise self._storage.gone(sha256) from None
-
-    def _opened(self, sha256: str, index: Index, file: BinaryIO, caller: str) -> OpenContainer:
+    def _opened(self, sha256: str, index: Index, blob: Blob, caller: str) -> OpenContainer:
         with self._lock:
             self._open.setdefault(caller, Counter())[sha256] += 1
-        return OpenContainer(sha256, index, file, partial(self._let_go, caller, sha256))
+        held = ExitStack()
+        held.callback(self._let_go, caller, sha256)
+        return OpenContainer(sha256, index, blob, held)
 
     def _let_go(self, caller: str, sha256: str) -> None:
         with self._lock:
@@ -174,7 +253,7 @@ class Containers:
             if not held:
                 del self._open[caller]
 
-    def _index(self, sha256: str, file: BinaryIO, caller: str, share: Share) -> Index:
+    def _index(self, sha256: str, blob: Blob, caller: str, share: Share) -> Index:
         with self._lock:
             known = self._known(sha256)
             if known is not None:
@@ -187,9 +266,9 @@ class Containers:
             with self._lock:
                 known = self._known(sha256)
             if known is None:
-                kept, masks = index_memory(file)
+                kept, masks = index_memory(blob.read, blob.size)
                 with self._room(kept + masks, caller, share):
-                    known = _read_index(file)
+                    known = _read_index(blob)
                     with self._lock:
                         self._sizes[sha256] = kept
                         self._indexes[sha256] = known
@@ -249,8 +328,15 @@ def most_for_indexes() -> int:
     return memory_limit() // 8
 
 
-def index_memory(file: BinaryIO) -> tuple[int, int]:
+def index_memory(read: Read, size: int) -> tuple[int, int]:
     """Estimate the bytes of memory of a container's index from the lengths of its sections.
+
+    Parameters
+    ----------
+    read : callable (offset, length) -> bytes
+        Gives fewer bytes where the container ends.
+    size : int
+        Bytes of the container.
 
     Returns
     -------
@@ -259,25 +345,25 @@ def index_memory(file: BinaryIO) -> tuple[int, int]:
     int
         Of masks, while the index is read.
     """
-    from lodestream.container.frames import section_lengths
+    from lodestream.container import section_lengths
     from lodestream.container.reader import INDEX_GROWTH
     from lodestream.container.sections import FOOTER_LENGTH, KEPT_MASKS, MASKS, parse_footer
 
-    tail = max(os.fstat(file.fileno()).st_size - FOOTER_LENGTH, 0)
+    tail = max(size - FOOTER_LENGTH, 0)
     try:
-        index = parse_footer(_read_from(file.fileno(), tail, FOOTER_LENGTH), tail)[0].length
+        index = parse_footer(read(tail, FOOTER_LENGTH), tail)[0].length
     except CorruptStreamError:
         index = 0
-    sections = [*islice(section_lengths(file), 2), (0, 0), (0, 0)]
+    sections = [*islice(section_lengths(read, size), 2), (0, 0), (0, 0)]
     header = sections[0][1]
     masks = sections[1][1] if sections[1][0] in (MASKS, KEPT_MASKS) else 0
     # A length that the file does not have is refused when it is read.
     header = min(header, tail)
-    parts = _parts(file.fileno(), header) * _PART_BYTES
+    parts = _parts(read, header) * _PART_BYTES
     return _LEAST_INDEX + INDEX_GROWTH * index + _HEADER_GROWTH * header + parts, _COPIES_OF_MASKS * min(masks, tail)
 
 
-def _parts(handle: int, length: int) -> int:
+def _parts(read: Read, length: int) -> int:
     """Return the number of blocks, patches, interfaces and channels in a header whose payload has ``length`` bytes.
 
     0 if it cannot be read: it is refused then when the index is read.
@@ -288,7 +374,7 @@ def _parts(handle: int, length: int) -> int:
 
     offset = len(SIGNATURE)
     try:
-        data = _read_from(handle, offset, length + 16)  # and what stands before and behind the payload
+        data = read(offset, length + 16)  # and what stands before and behind the payload
         extent = section_extent(data[:10], offset)
         frame = whole_section(data[: extent[1]] if extent else data, offset, HEADER)
         header = parse_header(frame.payload, frame.payload_offset, frame.end)
@@ -298,21 +384,9 @@ def _parts(handle: int, length: int) -> int:
     return len(header.blocks) + grids + header.channels
 
 
-def _read_index(file: BinaryIO) -> Index:
+def _read_index(blob: Blob) -> Index:
     """Read the index without masks and metadata, which no plan needs."""
     from lodestream.container import read_index
 
-    handle = file.fileno()
-    index = read_index(partial(_read_from, handle), os.fstat(handle).st_size)
+    index = read_index(blob.read, blob.size)
     return replace(index, header=replace(index.header, mask_data=(), kept_data=()), metadata_values={})
-
-
-def _read_from(handle: int, offset: int, length: int) -> bytes:
-    """Read bytes of a file, fewer if it ends; repeats reads that the system cuts short."""
-    data = bytearray()
-    while len(data) < length:
-        piece = read_at(handle, length - len(data), offset + len(data))
-        if not piece:
-            break
-        data += piece
-    return bytes(data)

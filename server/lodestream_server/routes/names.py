@@ -1,0 +1,195 @@
+"""The routes of names that stay: each leads to one surface now, and perhaps to another one later."""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel, ValidationError
+
+from lodestream.errors import InputError, NotFoundError, TooLargeError
+
+from ..access.scopes import needs
+from ..problems import SlowUploadError, responses
+from ..store.index import Named, Surface
+from ..store.layout import NAME
+from . import examples, files
+from .routing import Parts, State, readable
+from .sending import ready
+from .surfaces import answer, base, calling, owned
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1/names", tags=["names"])
+
+_Name = Annotated[str, Path(pattern=f"^{NAME}$")]
+_LONGEST_BODY = 1024
+_DAY = 86400.0
+
+
+class _Pointing(BaseModel):
+    """What is asked of a name: to lead to a surface, by its id or address; None: nothing but whether it may."""
+
+    surface: str | None
+
+
+@router.put(
+    "/{name}",
+    summary="Make a name lead to a surface",
+    openapi_extra=examples.POINTING,
+    responses={
+        200: examples.answer("It leads to this surface", examples.READY),
+        201: examples.answer("There was no such name", examples.READY),
+        204: {"description": "`surface` is null, and the caller may change the name"},
+        **responses(403, 404, 408, 409, 413, 422, 424, 503, 507),
+    },
+)
+@needs("write")
+async def point(request: Request, parts: Parts, name: _Name) -> Response:
+    """Make a name lead to a surface that is ready; the name is made if there is none.
+
+    `surface` is its id, or its `url`. With null nothing is changed, and the answer says whether the caller may.
+
+    A name belongs to whoever made it. Only its owner and an admin may change it, and only to a surface that they may
+    delete. What the name led to before is deleted a set time later, if it belongs to the owner of the name and no name
+    leads to it then.
+    """
+    surface, caller, names = await _asked(request, parts), calling(request), parts.surfaces.names
+    new = parts.surfaces.index.find_name(name) is None
+    found = None if surface is None else ready(parts, surface)
+    if new:
+        await parts.limits.check_owner(caller.owner)
+    fits = parts.limits.names(caller)
+    if found is None:
+        await asyncio.to_thread(names.check, name, caller.may_change, fits)
+        return Response(status_code=204)
+    keep = _DAY * parts.settings.keep_replaced_days
+    await asyncio.to_thread(names.point, name, found.id, caller.owner, caller.may_change, keep, fits)
+    described = await answer(found, parts, request)
+    described.status_code = 201 if new else 200
+    return described
+
+
+@readable(
+    router,
+    "",
+    summary="List names",
+    responses={200: examples.answer("A page of names", examples.NAMES), **responses(422)},
+)
+@needs("read")
+async def page(
+    request: Request,
+    parts: Parts,
+    limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of names on the page")] = 100,
+    after: Annotated[str, Query(pattern=f"^({NAME})?$", description="from `next` of the previous page")] = "",
+) -> Response:
+    """Return names and the address of the surface to which each leads (null: it cannot be read).
+
+    `next` is the address of the next page, or null.
+    """
+    return await asyncio.to_thread(_page, after, limit, parts, request)
+
+
+@readable(
+    router,
+    "/{name}",
+    summary="Describe the surface to which a name leads",
+    responses={
+        200: examples.answer("The surface to which it leads now", examples.READY),
+        **responses(404, 422, 503),
+    },
+)
+@needs("read")
+async def look(request: Request, parts: Parts, name: _Name) -> Response:
+    """Return what is told of the surface to which a name leads now; its `url` is that of the surface."""
+    described = await answer(_surface(parts, name), parts, request)
+    described.headers["cache-control"] = "no-cache"
+    return described
+
+
+@readable(
+    router,
+    "/{name}/container",
+    status_code=307,
+    summary="Find the container to which a name leads",
+    response_class=Response,
+    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 422, 424, 503)},
+)
+@needs("read")
+async def find(request: Request, parts: Parts, name: _Name) -> Response:
+    """Redirect to the container of the surface to which a name leads now."""
+    return await files.find(request, parts, _surface(parts, name).id)
+
+
+@router.delete("/{name}", status_code=204, summary="Delete a name", responses=responses(403, 404, 422, 503))
+@needs("write")
+async def delete(request: Request, parts: Parts, name: _Name) -> Response:
+    """Delete a name. The surface to which it leads stays, and so do those that it has replaced.
+
+    Only its owner and an admin may do this.
+    """
+    await asyncio.to_thread(parts.surfaces.names.delete, name, calling(request).may_change)
+    return Response(status_code=204)
+
+
+async def _asked(request: Request, parts: State) -> str | None:
+    """Return the id of the surface in the body of a request; None if it asks of none."""
+    body, seconds = bytearray(), parts.settings.idle_seconds
+    try:
+        async with asyncio.timeout(seconds):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > _LONGEST_BODY:
+                    raise TooLargeError(f"expected at most {_LONGEST_BODY} bytes of JSON, got more")
+    except TimeoutError:
+        raise SlowUploadError(f"expected the whole request within {seconds:g} s") from None
+    try:
+        surface = _Pointing.model_validate_json(bytes(body)).surface
+    except ValidationError:
+        raise InputError(f'expected {{"surface": ID}} in JSON, got {bytes(body[:80])!r}') from None
+    return None if surface is None else surface.removeprefix(f"{base(request)}/")
+
+
+def _surface(parts: State, name: str) -> Surface:
+    """Return the surface to which a name leads.
+
+    Raises
+    ------
+    NotFoundError
+        If there is no such name, or its surface was deleted.
+    DamagedNameError
+        If it cannot be read.
+    """
+    leads = parts.surfaces.names.get(name).surface
+    found = None if leads is None else parts.surfaces.index.find(leads)
+    if found is None:
+        raise NotFoundError(f"the name {name} led to the surface {leads}, which was deleted")
+    return found
+
+
+def _page(after: str, limit: int, parts: State, request: Request) -> Response:
+    following = parts.surfaces.index.names(after, limit + 1)
+    shown = following[:limit]
+    address = None
+    if len(following) > limit:
+        address = f"{_base(request)}?limit={limit}&after={shown[-1].name}"
+    return JSONResponse({"names": [_told(named, request) for named in shown], "next": address})
+
+
+def _told(named: Named, request: Request) -> dict[str, Any]:
+    told = {"name": named.name, "url": f"{_base(request)}/{named.name}"}
+    if named.surface is None:
+        return {**told, "surface": None}
+    return {
+        **told,
+        "surface": f"{base(request)}/{named.surface}",
+        **owned(named.owner, request),
+        "changed": datetime.fromtimestamp(named.changed, UTC).isoformat(timespec="milliseconds"),
+    }
+
+
+def _base(request: Request) -> str:
+    return f"{request.scope.get('root_path', '')}{router.prefix}"

@@ -1,1 +1,0 @@
-"""The data folder: records, uploads and containers that survive a power failure."""

@@ -1,0 +1,94 @@
+"""What a server does beside answering: it keeps its index up to date, makes a lost one again, deletes what is due."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+
+from .builds.jobs import Builder
+from .builds.level_queue import LevelQueue
+from .store.index import IndexLostError, Surface
+from .store.surfaces import Surfaces
+
+__all__ = ["Upkeep"]
+
+_log = logging.getLogger(__name__)
+
+# How often it is looked for surfaces that nobody builds, because an error came between.
+_LOOK_SECONDS = 300.0
+
+# How often replaced surfaces are looked at, and what failed is tried again.
+_EXPIRE_SECONDS = 300.0
+_AGAIN_SECONDS = 2.0
+
+
+class Upkeep:
+    """Work on the surfaces of a server that nobody waits for.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    builder : Builder
+    levels : LevelQueue
+    """
+
+    def __init__(self, surfaces: Surfaces, builder: Builder, levels: LevelQueue) -> None:
+        self._surfaces = surfaces
+        self._builder = builder
+        self._levels = levels
+        self._lost, self._synced = asyncio.Event(), asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+
+    def start(self) -> None:
+        """Begin."""
+        loop = asyncio.get_running_loop()
+        self._surfaces.tell_lost = lambda: loop.call_soon_threadsafe(self._lost.set)
+        self._tasks = [asyncio.create_task(self._keep_index()), asyncio.create_task(self._expire())]
+
+    async def close(self) -> None:
+        """End."""
+        self._surfaces.tell_lost = lambda: None
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _keep_index(self) -> None:
+        while True:
+            try:
+                if self._surfaces.is_lost:
+                    _log.error("the index of the surfaces is lost; requests are answered 503 until it is made again")
+                    await asyncio.to_thread(self._surfaces.restore)
+                    _log.info("the index of the surfaces is made again")
+                elif not self._surfaces.is_synced:
+                    await asyncio.to_thread(self._surfaces.sync)
+                self._synced.set()
+                await self._builder.resume()
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(_LOOK_SECONDS):
+                        await self._lost.wait()
+                self._lost.clear()
+            except Exception as error:  # whatever it is, nobody else would do this work
+                _log.error("the index of the surfaces could not be brought up to date: %s", error)
+                await asyncio.sleep(_AGAIN_SECONDS)
+
+    def forget_levels(self, deleted: Surface) -> None:
+        """Remove the level files of a deleted surface, unless another one has its container."""
+        if deleted.container is None:
+            return
+        with suppress(IndexLostError):  # they go when others need the room
+            if not self._surfaces.index.uses_container(deleted.container):
+                self._levels.forget(deleted.container)
+
+    async def _expire(self) -> None:
+        await self._synced.wait()
+        while True:
+            if self._surfaces.is_synced:
+                try:
+                    for surface in await asyncio.to_thread(self._surfaces.names.expire):
+                        self.forget_levels(surface)
+                except IndexLostError:
+                    pass  # it is told; what is due stays so
+                except Exception:
+                    _log.exception("replaced surfaces cannot be deleted now, which is tried again")
+            await asyncio.sleep(_EXPIRE_SECONDS)
