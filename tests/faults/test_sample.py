@@ -41,6 +41,7 @@ def test_what_was_acknowledged_survives_a_fault_in_operation(session: Session) -
         ("upload", "read", "uploads/*/N", "EIO"),
         ("upload", "write", "scratch/index.sqlite", "EIO"),
         ("delete", "unlink", "surfaces/ID", "EIO"),
+        ("delete", "stat", "surfaces/ID", "ESTALE"),
         ("delete and push", "fsync", "surfaces", "EIO"),
         ("fetch", "stat", "containers/ID", "ESTALE"),
     )

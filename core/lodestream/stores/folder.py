@@ -156,7 +156,11 @@ class Folder:
 
     def _remove(self, key: str, path: Path) -> None:
         """Remove a file, if there is one, and the folders that are then empty."""
-        if not os.path.lexists(path) or path.is_dir():
+        try:
+            path.lstat()  # what says only whether it is there would take an error of the disk for a no
+        except _ABSENT:
+            return
+        if path.is_dir():
             return
         # Or, after a create of another writer, a `replace` that has looked would overwrite what it never read.
         with self._locked(key), suppress(*_ABSENT):

@@ -142,6 +142,19 @@ def test_folders_below_those_of_the_store_are_on_disk_too_and_go_when_they_are_e
     assert steps == [("fsync", "a")]
 
 
+def test_a_delete_that_cannot_look_fails(store: Folder, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.create("a.json", b"1")
+
+    def stale(path: Path) -> os.stat_result:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "lstat", stale)
+        with pytest.raises(StoreError):
+            store.delete(["a.json"])
+    assert store.get("a.json")[0] == b"1"
+
+
 def test_a_delete_where_no_store_is_makes_none(store: Folder) -> None:
     store.delete(["a", "a/b/c"])
     assert not store.root.exists()
