@@ -29,7 +29,7 @@ __all__ = ["PATIENCE", "Program", "Programs", "Server"]
 # A process from which others are forked has one thread.
 _ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("MKL", "OMP", "OPENBLAS")}
 
-_LISTENING = re.compile(r"Lodestream serving (http://\S+)")
+_LISTENING = re.compile(r"Lodestream serving (http://[\d.]+:\d{1,5})")  # what is logged may follow without a space
 
 
 class Programs:
