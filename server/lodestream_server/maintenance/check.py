@@ -17,8 +17,8 @@ from lodestream.stores import AbsentError, Store, StoreError
 
 from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
 from ..store import layout
+from ..store.identity import establish, read_identity
 from ..store.layout import BUILT, IDENTITY, SURFACES, Built, DamagedObjectError, Identity
-from ..store.surfaces import establish, read_identity
 from .facts import CONTAINER, Facts, Found
 from .findings import Finding, Report
 

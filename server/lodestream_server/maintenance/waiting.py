@@ -7,9 +7,10 @@ from pathlib import Path
 
 from lodestream.stores import AbsentError, Store
 
+from ..store.identity import read_identity
 from ..store.index import Index, IndexLostError
 from ..store.layout import DamagedObjectError
-from ..store.surfaces import Surfaces, read_identity
+from ..store.surfaces import Surfaces
 
 __all__ = ["retry", "waiting"]
 

@@ -6,15 +6,12 @@ brings it up to date: at a start, after it was lost, and (later) in readers. Wha
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
-from operator import itemgetter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +19,22 @@ from lodestream.errors import InputError, LodestreamError, NotFoundError
 from lodestream.stores import AbsentError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
 
 from . import layout
-from .index import Index, IndexLostError, Known, Surface, state_of
+from .comparison import Comparison, compare
+from .identity import establish
+from .index import Index, IndexLostError, Surface, state_of
 from .layout import (
     BUILT,
     CONTAINERS,
-    IDENTITY,
-    SURFACES,
     UPLOADS,
     Built,
     DamagedObjectError,
-    Identity,
     Manifest,
 )
 from .names import Names
 from .private import make_private
 from .states import Event, after
 
-__all__ = ["STRAY", "Surfaces", "establish", "read_identity"]
+__all__ = ["STRAY", "Surfaces"]
 
 _log = logging.getLogger(__name__)
 #: Seconds after which what no small object refers to is a stray that may be removed: whoever has put it there has come
@@ -588,10 +584,10 @@ class Surfaces:
     def _synced(self, progress: Callable[[int], None] = lambda _: None) -> tuple[int, DamagedObjectError | None]:
         """Return the number of surfaces that were read, and what is wrong with one that cannot be."""
         taken = looked = 0
-        changed: list[_Found] = []
+        changed: list[Comparison] = []
         damaged = None
         self._index.check()
-        for found in self._found():
+        for found in compare(self.store, self._index):
             looked += 1
             if found.changed:
                 changed.append(found)
@@ -607,16 +603,7 @@ class Surfaces:
         self.is_synced, self._damaged = True, damaged
         return taken, damaged
 
-    def _found(self) -> Iterator[_Found]:
-        """Return what the store lists and the index knows of each surface, in the order of their ids."""
-        listed = (_named(self.store.entries(prefix), kind) for prefix, kind in ((SURFACES, 0), (BUILT, 1)))
-        known = ((it.id, 2, it) for it in self._index.known())
-        merged = heapq.merge(*listed, known, key=itemgetter(0, 1))
-        for id_, group in itertools.groupby(merged, key=itemgetter(0)):
-            parts = {kind: part for _, kind, part in group}
-            yield _Found(id_, parts.get(0), parts.get(1), parts.get(2))
-
-    def _take(self, changed: Sequence[_Found]) -> DamagedObjectError | None:
+    def _take(self, changed: Sequence[Comparison]) -> DamagedObjectError | None:
         """Read surfaces from the store into the index; return what is wrong with one that cannot be read."""
         damaged = None
         with self._lock, self._index.together():
@@ -720,82 +707,6 @@ class _Changes:
 
     def __exit__(self, *_: object) -> None:
         self.lock.release()
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What the store lists and the index knows of a surface."""
-
-    id: str
-    manifest: Entry | None
-    built: Entry | None
-    known: Known | None
-
-    @property
-    def changed(self) -> bool:
-        """Whether the index is to be brought up to date."""
-        if self.known is None:
-            return self.manifest is not None  # what was built belongs to nobody
-        seen = tuple(None if entry is None else entry.tag for entry in (self.manifest, self.built))
-        return self.manifest is None or seen != (self.known.seen, self.known.built_seen)
-
-
-def _named(entries: Iterable[Entry], kind: int) -> Iterator[tuple[str, int, Any]]:
-    """Return the small objects of surfaces with their ids; other objects are left out."""
-    return ((id_, kind, entry) for entry in entries if (id_ := layout.id_of(entry.key)) is not None)
-
-
-def establish(store: Store) -> str:
-    """Return the identity of a server's data in a store; an empty store becomes such data.
-
-    Raises
-    ------
-    InputError
-        If the store holds a published list, or data of another version.
-    StoreError
-        If it cannot be used.
-    """
-    try:
-        return read_identity(store).identity
-    except AbsentError:
-        store.probe()
-        if next(iter(store.entries("")), None) is not None and _published(store):
-            raise InputError(f"{store.describe()} is a published prefix, with view.json: choose another one") from None
-    new = Identity(layout.VERSION, layout.new_write())
-    try:
-        store.create(IDENTITY, layout.dump(new))
-    except ExistsError:
-        return read_identity(store).identity
-    return new.identity
-
-
-def read_identity(store: Store) -> Identity:
-    """Return the identity of a server's data in a store.
-
-    Raises
-    ------
-    AbsentError
-        If there are no such data.
-    InputError
-        If they are of another version.
-    DamagedObjectError
-        If it cannot be read.
-    """
-    identity = layout.parse(Identity, IDENTITY, store.get(IDENTITY)[0])
-    if identity.version != layout.VERSION:
-        raise InputError(
-            f"expected data of version {layout.VERSION} in {store.describe()}, got version {identity.version}: "
-            "another version of Lodestream has made them"
-        )
-    return identity
-
-
-def _published(store: Store) -> bool:
-    try:
-        store.get("view.json")
-    except AbsentError:
-        return False
-    return True
 
 
 def _surface(manifest: Manifest, built: Built | None, tag: Tag | None) -> Surface:

@@ -20,10 +20,11 @@ from lodestream.errors import InputError, NotFoundError
 from lodestream.stores import Folder, Store, StoreError, Tag, UnacknowledgedError
 from lodestream_server.problems import DamagedNameError, FullError, NotOwnerError
 from lodestream_server.store import layout
+from lodestream_server.store.identity import establish
 from lodestream_server.store.index import LEAST
 from lodestream_server.store.layout import Name
 from lodestream_server.store.names import MOST_NAMES, MOST_REPLACED
-from lodestream_server.store.surfaces import Surfaces, establish
+from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
 
 from .conftest import PLACES, Place

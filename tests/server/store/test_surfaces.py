@@ -31,10 +31,11 @@ from hypothesis.stateful import (
 from lodestream.errors import InputError, NotFoundError
 from lodestream.stores import Folder, FullError, Store, StoreError, Tag, UnacknowledgedError
 from lodestream_server.store import layout
+from lodestream_server.store.identity import establish
 from lodestream_server.store.index import LEAST, Index, IndexLostError
 from lodestream_server.store.layout import MOST_TEXT, Built, DamagedObjectError, Identity, Manifest
 from lodestream_server.store.states import EDGES, STATES, Event, WrongTurnError, after
-from lodestream_server.store.surfaces import Surfaces, establish
+from lodestream_server.store.surfaces import Surfaces
 
 from .conftest import PLACES, Place
 from .world import CutError, Failing, container, upload
