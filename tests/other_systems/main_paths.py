@@ -21,7 +21,7 @@ from tests.other_systems.imitation import imitate
 #: Modules that are for Linux alone, or for a process of their own.
 _LEFT_OUT = ("lodestream.confinement.landlock", "lodestream.confinement.seccomp", "lodestream.formats.vtk.process")
 #: Packages of the server that do not build surfaces, which needs Linux.
-_SERVER = ("access", "commands", "connections", "operation", "storage")
+_SERVER = ("access", "commands", "connections", "operation", "store")
 
 
 def main(system: str, folder: Path, url: str) -> None:

@@ -123,6 +123,8 @@ class _Torment:
         assert not self.failures, self.failures
 
     def _kill(self, server: Server) -> None:
+        if not self.kills.uploads:  # however slow the machine is, something is there to be lost
+            eventually(lambda: self.kills.uploads, "an upload that is acknowledged")
         moment = self.random.uniform(0.02, self.random.choice((self.longest / 5, self.longest)))
         if self.random.random() < 0.5:
             # Later: when the processes that build are warm, and builds come to their end.

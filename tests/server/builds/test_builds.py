@@ -294,6 +294,8 @@ def test_a_start_removes_what_a_dead_server_left_in_its_scratch_and_nothing_else
             "lock",
             "lodestream.json",
             "scratch/index.sqlite",
+            "scratch/index.sqlite.room",
+            "scratch/lock",
             f"surfaces/{surface['id']}.json",
             f"uploads/{upload}/0",
         ]
