@@ -72,6 +72,9 @@ _STARTED_AGAIN = "the build of %s starts again from the beginning; continuing it
 # So often a build may begin and come to no end: its process dies, or the server does.
 _ATTEMPTS = 3
 
+# Builds that are taken up at once from a queue that may be long: each is a task.
+_TAKEN_UP = 1000
+
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
 _PASSING = (*worker.NO_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 _ROOM = "space on the server's disk"
@@ -169,6 +172,8 @@ class Builder:
         self._held: dict[str, float] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._preloading: asyncio.Task[None] | None = None
+        self._has_more = False  # whether surfaces are queued that were not taken up
+        self._resuming: asyncio.Task[None] | None = None
         self._room = asyncio.Event()
         self._closing = False
         self._deleting = set[str]()
@@ -193,20 +198,21 @@ class Builder:
         self._check_owner = check_owner
         self._preloading = asyncio.create_task(self._preload())
         try:
-            queued = await asyncio.to_thread(self._surfaces.index.queued)
-        except (StoreError, IndexLostError) as error:  # they are found once it is there again, see `resume`
+            await asyncio.to_thread(lambda: self._work.clean(set(self._surfaces.index.queued())))
+            await self.resume()
+        except (StoreError, IndexLostError) as error:  # they are found once it is there again
             _log.error("%s", error)
-            return
-        await asyncio.to_thread(self._work.clean, set(queued))
-        self._submit_all(queued)
 
     async def resume(self) -> None:
-        """Queue the builds of all surfaces that are queued: more may have been found in the store."""
-        self._submit_all(await asyncio.to_thread(self._surfaces.index.queued))
+        """Take up builds of surfaces that are queued: more may have been found in the store.
 
-    def _submit_all(self, queued: Sequence[str]) -> None:
+        Of a long queue some are taken up now, and others when these end.
+        """
+        queued = await asyncio.to_thread(self._surfaces.index.queued, _TAKEN_UP)
+        self._has_more = len(queued) == _TAKEN_UP
         for surface in queued:
-            self._submit(surface, None)
+            if len(self._tasks) < _TAKEN_UP:
+                self._submit(surface, None)
 
     async def accept(
         self, manifest: Manifest, files: Sequence[Path], folder: Path, caller: str | None = None
@@ -258,9 +264,16 @@ class Builder:
             self._pending[caller] -= 1
             if not self._pending[caller]:
                 del self._pending[caller]
+        if self._has_more and len(self._tasks) < _TAKEN_UP // 2 and not self._closing:
+            self._has_more = False
+            self._resuming = asyncio.create_task(self._resume_later())
         # Whoever saw the build end may have asked for another before its task was over.
         if surface not in self._deleting and (known := self._find(surface)) is not None:
             self._resume(known, caller)
+
+    async def _resume_later(self) -> None:
+        with suppress(StoreError, IndexLostError):  # it is done again after a while anyway
+            await self.resume()
 
     def _find(self, surface: str) -> Surface | None:
         try:

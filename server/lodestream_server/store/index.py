@@ -369,14 +369,14 @@ class Index:
         where, given = ("", ()) if size is None else (" WHERE upload_bytes = ?", (size,))
         return bool(self._rows(f"SELECT 1 FROM surface{where} LIMIT 1", *given))
 
-    def queued(self) -> list[str]:
-        """Return the ids of the surfaces to be built: those with the fewest attempts first, then the oldest.
+    def queued(self, most: int = -1) -> list[str]:
+        """Return ids of surfaces to be built, at most so many: those with the fewest attempts first, then the oldest.
 
         What may have killed a server comes last: everything else is built before it does so again. Those that are being
         built are among them: that an attempt has ended may not have been noted.
         """
         kinds = (f"SELECT id, attempts, created FROM surface WHERE state = '{it}'" for it in ("queued", "building"))
-        rows = self._rows(f"SELECT id FROM ({' UNION ALL '.join(kinds)}) ORDER BY attempts, created")
+        rows = self._rows(f"SELECT id FROM ({' UNION ALL '.join(kinds)}) ORDER BY attempts, created LIMIT ?", most)
         return [row[0] for row in rows]
 
     def waiting(self) -> list[str]:

@@ -27,6 +27,7 @@ from lodestream_server.store.data_folder import DataFolder
 from lodestream_server.store.durable import discard
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, problem, push, settled, upload_of
+from tests.server.store.world import upload
 
 
 @contextmanager
@@ -253,6 +254,26 @@ def test_a_build_under_which_server_after_server_dies_is_given_up(
         assert http.post(f"{location}/retry").status_code == 202
         building(http, location)
     assert attempts(data) == [0]
+
+
+def test_of_a_long_queue_some_builds_are_taken_up_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data, most = tmp_path / "data", list[int]()
+    folder = DataFolder(data)
+    for number in range(11):
+        folder.surfaces.accept(*upload(tmp_path, number))
+    folder.close()
+    monkeypatch.setattr(jobs, "_TAKEN_UP", 4)
+    submit = jobs.Builder._submit
+
+    def counted(self: jobs.Builder, surface: str, caller: str | None) -> None:
+        submit(self, surface, caller)
+        most.append(self.pending)
+
+    monkeypatch.setattr(jobs.Builder, "_submit", counted)
+    with running(data) as http:
+        for entry in http.get("/v1/surfaces").json()["surfaces"]:
+            settled(http, entry["url"])
+    assert max(most) <= 5
 
 
 def test_servers_and_processes_that_die_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
