@@ -211,15 +211,17 @@ def damage_index(data: Path, how: str, random_: random.Random) -> None:
     ----------
     data : Path
     how : "cut", "head" or "pages"
-        Nothing is left of it; its first page is; any of its pages, and of its log, are other bytes.
+        Nothing is left of it; its first page is; any of its pages, and of its log, are other bytes. If it is being made
+        again at this moment, it may not be there.
     random_ : Random
     """
     if how == "cut":
-        os.truncate(data / _INDEX, 0)
+        with contextlib.suppress(FileNotFoundError):
+            os.truncate(data / _INDEX, 0)
         return
     chosen = [data / _INDEX] if how == "head" else [path for path in _index(data) if not path.name.endswith("-shm")]
     for path in chosen:
-        with path.open("r+b") as file:
+        with contextlib.suppress(FileNotFoundError), path.open("r+b") as file:
             pages = -(-path.stat().st_size // _PAGE)
             for page in range(pages):
                 if random_.random() < 0.5 if how == "pages" else page == 0:
