@@ -104,6 +104,10 @@ _NO_ROOM = (sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_WRITE)
 # Bytes of pages that each thread keeps in memory; the system keeps the others.
 _CACHE = 256 << 10
 
+# Pages of the log beside the index before they are written into it: 256 KiB, where SQLite would take 4 MiB, which is
+# what a small disk may not have.
+_LOG_PAGES = 64
+
 _ROOM = ".room"
 
 # Bytes of a file that is removed when there is no other room on its disk to open the index: so much takes what SQLite
@@ -600,6 +604,7 @@ class Index:
             connection.execute("PRAGMA synchronous = NORMAL")
             connection.execute("PRAGMA busy_timeout = 10000")
             connection.execute(f"PRAGMA cache_size = -{_CACHE >> 10}")
+            connection.execute(f"PRAGMA wal_autocheckpoint = {_LOG_PAGES}")
             self._local.connection = connection
             self._opened.append(connection)
         return connection

@@ -479,6 +479,23 @@ def test_every_changed_bit_of_a_small_object_is_seen(data: st.DataObject) -> Non
             layout.parse(Built, "built/x.json", damaged)
 
 
+def test_a_delete_leaves_files_that_are_on_their_way_to_another_surface(surfaces: Surfaces, tmp_path: Path) -> None:
+    one, other = upload(tmp_path, 0), upload(tmp_path, 3)  # of the same bytes
+    surfaces.accept(*one)
+    create = surfaces.store.create
+
+    def late(key: str, data: bytes) -> Tag:
+        with suppress(NotFoundError):
+            surfaces.delete(one[0].id)  # when the files have been looked at, and nothing refers to them yet
+        return create(key, data)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(surfaces.store, "create", late)
+        surfaces.accept(*other)
+    with surfaces.upload(surfaces.get(other[0].id)) as (path,):
+        assert path.stat().st_size == other[0].upload_bytes
+
+
 def test_strays_are_left_for_a_day(surfaces: Surfaces, tmp_path: Path) -> None:
     manifest, files = upload(tmp_path, 0)
     surfaces.accept(manifest, files)
