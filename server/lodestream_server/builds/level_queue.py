@@ -349,6 +349,10 @@ class LevelQueue:
             await asyncio.to_thread(_make_folders, folder)
             size = await self._insist(wanted, job.key)
             return self._files.add(job.key, wanted.path, size, kept=job.kept)
+        except (FileNotFoundError, WrongAnswerError) as error:
+            if folder.exists():
+                raise
+            raise BusyError("the server's scratch folder was removed meanwhile; ask again") from error
         finally:
             await asyncio.to_thread(discard, folder)
 

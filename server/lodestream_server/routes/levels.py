@@ -17,7 +17,7 @@ from ..access.scopes import needs
 from ..builds.level_files import Key
 from ..builds.level_queue import Loan
 from ..builds.levels import MEDIA_TYPES, written_by
-from ..problems import responses
+from ..problems import BusyError, responses
 from ..store.index import Surface
 from . import examples
 from .byte_ranges import sort_out
@@ -70,6 +70,10 @@ async def level(
         sort_out(request, loan.size, etag)
         headers["content-disposition"] = f'attachment; filename="{found.id}-{level}{format_.stream_suffix}"'
         return _Borrowed(loan, headers, format_.media_type)
+    except FileNotFoundError as error:
+        loan.release()
+        parts.levels.forget(key.container)  # or it would be lent again
+        raise BusyError("the server's scratch folder was removed meanwhile; ask again") from error
     except BaseException:
         loan.release()
         raise

@@ -590,3 +590,20 @@ def test_values_in_files_count_for_the_room_of_a_level(tmp_path: Path) -> None:
 def _new(folder: Path) -> Path:
     folder.mkdir()
     return folder
+
+
+def test_levels_of_a_scratch_folder_that_is_removed_are_made_again(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with running_server(data, workers=1) as url, client(url) as http:
+        surface = push(http, npy(hills()))
+        level = f"{surface['url']}/levels/1"
+        made = http.get(level)
+        assert made.status_code == 200
+        shutil.rmtree(data / "scratch")
+
+        def again() -> bool:
+            answer = http.get(level)
+            assert answer.status_code in (200, 503), answer.text
+            return answer.status_code == 200 and answer.content == made.content
+
+        assert eventually(again, "the level to be made again")
