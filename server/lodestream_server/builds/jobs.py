@@ -431,7 +431,8 @@ class Builder:
         """Build a surface until it is ready or refused, or waits; return its state, None if it was deleted."""
         reason = "the server ended"
         while True:
-            known = await asyncio.to_thread(self._surfaces.index.find, surface)
+            # Not in a thread: builds wait for their turns in the order in which they were queued.
+            known = self._surfaces.index.find(surface)
             if known is not None and known.state == "building":  # that the last attempt had ended could not be noted
                 known = await asyncio.to_thread(self._surfaces.later, surface)
             if known is None or known.state != "queued":
