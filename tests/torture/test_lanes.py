@@ -52,7 +52,7 @@ def test_holes_between_blocks_in_use_are_not_in_use() -> None:
     del blocks[1::2], blocks[2::3]
     holes = streams.memory(2)
     assert holes.free - grown.free > 30 * MIB
-    assert holes.used - before.used < 30 * MIB
+    assert holes.used - before.used < 40 * MIB  # of 64, of which 21 are left; what else the process did may add some
     assert len(blocks) > 200
 
 
