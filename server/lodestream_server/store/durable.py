@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
 
-__all__ = ["Disk", "NewFile", "discard", "disk", "make_folder", "remove", "rename", "sync_folder", "write_file"]
+__all__ = ["Disk", "NewFile", "discard", "disk", "make_folder", "remove", "rename", "sync_folder"]
 
 _log = logging.getLogger(__name__)
 
@@ -121,18 +121,6 @@ def make_folder(path: Path) -> Path:
     """Create a folder; its name is on disk once the parent folder is synchronised."""
     disk.make_folder(path)
     return path
-
-
-def write_file(path: Path, data: bytes) -> None:
-    """Write or replace a file atomically: at every moment it has the old or the new contents."""
-    temporary = path.with_name(f"{path.name}.{secrets.token_hex(8)}.new")
-    with NewFile(temporary) as file:
-        file.write(data)
-    try:
-        rename(temporary, path)
-    except OSError:
-        discard(temporary)
-        raise
 
 
 def rename(source: Path, target: Path) -> None:

@@ -27,7 +27,6 @@ from lodestream_client import sync
 from lodestream_server import running_server
 from lodestream_server.access.tokens import SCOPES, TokenFile
 from lodestream_server.routes import streams
-from lodestream_server.store.durable import write_file
 from tests.patience import PATIENCE
 from tests.server.helpers import Keys, Raw, closed, eventually, hills, kept, npy, problem, push, raw_stream
 
@@ -225,7 +224,9 @@ def expire_soon(path: Path, name: str) -> None:
     document = json.loads(path.read_text())
     (token,) = (token for token in document["tokens"] if token["name"] == name)
     token["expires"] = (datetime.now(UTC) + timedelta(seconds=1)).isoformat()
-    write_file(path, json.dumps(document).encode())
+    new = path.with_name("new")
+    new.write_bytes(json.dumps(document).encode())
+    new.replace(path)
 
 
 def last_error(stream: Raw) -> str:

@@ -149,17 +149,6 @@ def test_a_failure_that_cannot_be_stored(tmp_path: Path) -> None:
     folder.close()
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "file"
-    durable.write_file(path, b"old")
-    for step in range(4):
-        monkeypatch.setattr(durable, "disk", FullDisk(step))
-        with pytest.raises(OSError, match="space"):
-            durable.write_file(path, b"new")
-        assert path.read_bytes() == b"old"
-        assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.skipif(not small_disk.can_mount(), reason="no small disk can be mounted on this machine")
 def test_what_nobody_needs_any_more_may_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
