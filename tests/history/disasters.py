@@ -27,6 +27,8 @@ _INDICES = ("removed", "scratch", "cut", "head", "pages")
 #: Seconds after which what nothing refers to may be removed, and more.
 _LONG = 2 * 86400.0
 
+#: Of a surface that waits. One that waits each time lacks something that does not come back by itself.
+_RETRIES = 3
 
 _MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
 
@@ -219,13 +221,9 @@ class Disasters:
         operator.list(None if not subjects else subjects[0].owner)
         operator.names(None if not subjects else subjects[0].owner)
         for subject in subjects:
-            state = operator.settled(subject, until)
-            if state == "waiting":
-                operator.retry(subject)
-                state = self._after_retry(subject, until)
-            if state == "waiting" and self.done["backup"]:  # half of it was restored: somebody has to push it again
-                operator.upload(subject)
-                state = self._after_retry(subject, until)
+            # Half of a surface may have been restored: somebody has to push it again, which is a retry too.
+            again = operator.upload if self.done["backup"] else operator.retry
+            state = self._insists(subject, again, until)
             if state is None or state == "waiting":
                 self._history.found("never built", f"{subject}: expected its build to come to an end, got {state}")
             operator.fetch(subject)
@@ -233,17 +231,22 @@ class Disasters:
             ready += state == "ready"
         return ready
 
-    def _after_retry(self, subject: Subject, until: float) -> str | None:
-        # The answer to the retry may come before the build has begun.
-        while (state := self._operator.settled(subject, until)) == "waiting" and time.monotonic() < until:
-            time.sleep(0.1)
+    def _insists(self, subject: Subject, again: Callable[[Subject], object], until: float) -> str | None:
+        """The state in which a surface stays that is built again a few times if it waits."""
+        state = self._operator.settled(subject, until)
+        for _ in range(_RETRIES):
+            if state != "waiting":
+                break
+            again(subject)
+            state = self._operator.settled(subject, until)
         return state
 
     def _reaches(self, subject: Subject, state: str, words: str) -> None:
         until = time.monotonic() + _PATIENCE
-        found = self._operator.settled(subject, until)
-        if state == "ready" and found == "waiting":
-            found = self._after_retry(subject, until)
+        if state == "ready":
+            found = self._insists(subject, self._operator.retry, until)
+        else:
+            found = self._operator.settled(subject, until)
         if found != state:
             self._history.found("extra", f"{subject} {words}: expected it to be {state}, got {found}")
 
