@@ -27,8 +27,6 @@ _INDICES = ("removed", "scratch", "cut", "head", "pages")
 #: Seconds after which what nothing refers to may be removed, and more.
 _LONG = 2 * 86400.0
 
-#: Of a surface that waits. One that waits each time lacks something that does not come back by itself.
-_RETRIES = 3
 
 _MISSING_EXTRA = '''"""Stands where rasterio would be, and says that it is not installed."""
 
@@ -221,9 +219,12 @@ class Disasters:
         operator.list(None if not subjects else subjects[0].owner)
         operator.names(None if not subjects else subjects[0].owner)
         for subject in subjects:
-            # Half of a surface may have been restored: somebody has to push it again, which is a retry too.
-            again = operator.upload if self.done["backup"] else operator.retry
-            state = self._insists(subject, again, until)
+            state = operator.settled(subject, until)
+            if state == "waiting":
+                # Half of a surface may have been restored: somebody has to push it again, which is a retry too.
+                again = operator.upload if self.done["backup"] else operator.retry
+                again(subject)
+                state = operator.settled(subject, until)
             if state is None or state == "waiting":
                 self._history.found("never built", f"{subject}: expected its build to come to an end, got {state}")
             operator.fetch(subject)
@@ -231,22 +232,9 @@ class Disasters:
             ready += state == "ready"
         return ready
 
-    def _insists(self, subject: Subject, again: Callable[[Subject], object], until: float) -> str | None:
-        """The state in which a surface stays that is built again a few times if it waits."""
-        state = self._operator.settled(subject, until)
-        for _ in range(_RETRIES):
-            if state != "waiting":
-                break
-            again(subject)
-            state = self._operator.settled(subject, until)
-        return state
-
     def _reaches(self, subject: Subject, state: str, words: str) -> None:
         until = time.monotonic() + _PATIENCE
-        if state == "ready":
-            found = self._insists(subject, self._operator.retry, until)
-        else:
-            found = self._operator.settled(subject, until)
+        found = self._operator.settled(subject, until)
         if found != state:
             self._history.found("extra", f"{subject} {words}: expected it to be {state}, got {found}")
 
