@@ -142,7 +142,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             expose_headers=["content-range", "etag", "location", "retry-after", "x-request-id"],
         )
     app.add_middleware(Paced, pace=pace)
-    app.add_middleware(Observation, metrics=metrics)
+    app.add_middleware(Observation, metrics=metrics, log_reads=chosen.log_reads)
     return app
 
 

@@ -48,7 +48,7 @@ class Allowance:
 
 
 class Cuts:
-    """Records connections that were cut: counts them in the metrics and logs a line for each reason (`repeats`).
+    """Records connections that were cut: counts them in the metrics and logs a line for each.
 
     Parameters
     ----------

@@ -6,26 +6,22 @@ import asyncio
 import json
 import logging
 import os
-import queue
 import re
 import secrets
 import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from contextvars import ContextVar
 from datetime import UTC, datetime
+from logging.handlers import QueueHandler, QueueListener
+from queue import SimpleQueue
 from typing import Any
 
-from .repeats import Repeats
-
-__all__ = ["configure", "drain", "event", "new_request", "request_id"]
+__all__ = ["configure", "drain", "event", "new_request"]
 
 _FIELDS = "lodestream_fields"
 _STANDARD_ERROR = 2
 _MOST_LINES = 10_000
 _DRAIN_SECONDS = 1.0
-_LOOK_SECONDS = 1.0
 
 # What uvicorn says of what strangers send, which could fill a disk: refusals are in order, and are told and counted
 # elsewhere.
@@ -35,6 +31,10 @@ _UNWORTHY = {
     "Invalid UTF-8 sequence received from client.",
     "Unsupported upgrade request.",
 }
+
+# asyncio says it for each connection that waits, thousands of times a second while there are no more files.
+_NO_FILES = "socket.accept() out of system resource"
+_NO_FILES_SECONDS = 60.0
 
 _request: ContextVar[str | None] = ContextVar("lodestream_request", default=None)
 _USABLE_ID = re.compile(r"[A-Za-z0-9._-]{1,64}", re.ASCII)
@@ -50,9 +50,9 @@ def configure(style: str, level: str) -> None:
     level : str
         Least severe messages of this server that are logged; libraries are logged from ``warning`` on.
     """
-    handler = _Patient()
+    handler = _Queue()
     handler.setFormatter(_Json() if style == "json" else _Text())
-    handler.addFilter(_is_worth_a_line)
+    handler.addFilter(_Worth())
     root = logging.getLogger()
     root.handlers = [handler]
     root.setLevel(logging.WARNING)
@@ -60,9 +60,11 @@ def configure(style: str, level: str) -> None:
 
 
 def drain() -> None:
-    """Wait up to a second until the log has been written."""
-    for handler in logging.getLogger().handlers:
-        handler.flush()
+    """End the log of `configure`, if there is one: wait up to a second until it has been written."""
+    root = logging.getLogger()
+    for handler in [each for each in root.handlers if isinstance(each, _Queue)]:
+        root.removeHandler(handler)
+        handler.end()
 
 
 def event(log: logging.Logger, words: str, level: int = logging.INFO, **fields: Any) -> None:
@@ -77,96 +79,79 @@ def new_request(offered: str | None) -> str:
     return name
 
 
-def request_id() -> str | None:
-    """Return the id of the current request."""
-    return _request.get()
+class _Worth(logging.Filter):
+    """Passes what is worth a line."""
 
+    _next = 0.0
 
-def _is_worth_a_line(record: logging.LogRecord) -> bool:
-    # A request that the end of the server has cut short is no failure.
-    if record.exc_info and isinstance(record.exc_info[1], asyncio.CancelledError):
-        return False
-    return record.msg not in _UNWORTHY
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a record is logged."""
+        # A request that the end of the server has cut short is no failure.
+        if record.exc_info and isinstance(record.exc_info[1], asyncio.CancelledError):
+            return False
+        if str(record.msg).startswith(_NO_FILES):
+            if record.created < self._next:
+                return False
+            self._next = record.created + _NO_FILES_SECONDS
+        return record.msg not in _UNWORTHY
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
     fields = dict(getattr(record, _FIELDS, {}))
-    if (name := request_id()) is not None:
+    if (name := _request.get()) is not None:
         fields["request"] = name
     return fields
 
 
-class _Patient(logging.Handler):
-    """A handler that writes from a thread: a terminal that is held, or a pipe that nobody reads, stops nobody."""
+class _Queue(QueueHandler):
+    """Format records where they are logged, which knows the request, and leave the writing to a thread.
+
+    A terminal that is held, or a pipe that nobody reads, stops nobody: records that the queue has no room for are
+    dropped and counted, and a later line says how many.
+    """
 
     def __init__(self, descriptor: int = _STANDARD_ERROR) -> None:
-        super().__init__()
-        self._descriptor = descriptor
-        self._lines: queue.Queue[str] = queue.Queue(_MOST_LINES)
+        self._lines: SimpleQueue[logging.LogRecord] = SimpleQueue()
+        super().__init__(self._lines)
         self._lost = 0
-        self._repeats = Repeats()
-        self._idle = threading.Event()
-        threading.Thread(target=self._write, name="lodestream-log", daemon=True).start()
+        self._writer = _Writer(self._lines, descriptor)
+        self._writer.start()
 
-    def emit(self, record: logging.LogRecord) -> None:
-        if self._repeats.admit(record, time.monotonic()):
-            self._put(record)
-
-    def _put(self, record: logging.LogRecord) -> None:
-        self._idle.clear()
-        try:
-            self._lines.put_nowait(self.format(record))
-        except queue.Full:
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Put a formatted record into the queue, if there is room; the handler is locked meanwhile."""
+        if self._lines.qsize() >= _MOST_LINES:
             self._lost += 1
+            return
+        if self._lost:
+            words, self._lost = f"{self._lost} log lines were dropped, because the reader of the log was too slow", 0
+            told = {"name": __name__, "levelno": logging.WARNING, "levelname": "WARNING", "msg": words}
+            self._lines.put(self.prepare(logging.makeLogRecord(told)))
+        self._lines.put(record)
 
-    def flush(self) -> None:
-        with self._exclusive():
-            for record in self._repeats.all():
-                self._put(record)
-        until = time.monotonic() + _DRAIN_SECONDS
-        while not (self._lines.empty() and self._idle.is_set()) and time.monotonic() < until:
-            self._idle.wait(0.01)
+    def end(self) -> None:
+        """Stop the thread once it has written what is in the queue; wait for that only so long."""
+        stopping = threading.Thread(target=self._writer.stop, daemon=True)
+        stopping.start()
+        stopping.join(_DRAIN_SECONDS)
 
-    def _tell_repeats(self) -> None:
-        with self._exclusive():
-            for record in self._repeats.due(time.monotonic()):
-                self._put(record)
 
-    @contextmanager
-    def _exclusive(self) -> Iterator[None]:
-        self.acquire()
-        try:
-            yield
-        finally:
-            self.release()
+class _Writer(QueueListener):
+    """Writes lines to a descriptor.
 
-    def _write(self) -> None:
-        look = time.monotonic()
-        while True:
-            if time.monotonic() >= look:
-                look = time.monotonic() + _LOOK_SECONDS
-                self._tell_repeats()
-            try:
-                line = self._lines.get_nowait()
-            except queue.Empty:
-                self._idle.set()
-                try:
-                    line = self._lines.get(timeout=_LOOK_SECONDS)
-                except queue.Empty:
-                    continue
-                self._idle.clear()
-            if self._lost:
-                line, self._lost = (
-                    f"{self._lost} log lines were dropped, because the reader of the log was too slow\n{line}",
-                    0,
-                )
-            data = f"{line}\n".encode("utf-8", "backslashreplace")
-            try:
-                # Not through Python's own stream, whose lock would be held when the process ends.
-                while data:
-                    data = data[os.write(self._descriptor, data) :]
-            except OSError:
-                continue
+    Not by a handler over Python's own stream: while a write hangs, both would hold locks that the end of the process
+    waits for.
+    """
+
+    def __init__(self, lines: SimpleQueue[logging.LogRecord], descriptor: int) -> None:
+        super().__init__(lines)
+        self._descriptor = descriptor
+
+    def handle(self, record: logging.LogRecord) -> None:
+        """Write a line; where it cannot be written, nobody could be told."""
+        data = f"{record.getMessage()}\n".encode("utf-8", "backslashreplace")
+        with suppress(OSError):
+            while data:
+                data = data[os.write(self._descriptor, data) :]
 
 
 class _Text(logging.Formatter):

@@ -27,12 +27,16 @@ class Observation:
 
     Parameters
     ----------
-    app : ASGI application metrics : Metrics
+    app : ASGI application
+    metrics : Metrics
+    log_reads : bool
+        Whether requests that read are logged at ``info``, like those that write.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, *, log_reads: bool) -> None:
         self._app = app
         self._metrics = metrics
+        self._log_reads = log_reads
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, and record it; when it is cancelled before it is answered, answer 503."""
@@ -74,7 +78,7 @@ class Observation:
             _log,
             "request",
             # Who reads much would otherwise write much.
-            logging.INFO if method not in _READING or status >= 500 else logging.DEBUG,
+            logging.INFO if self._log_reads or method not in _READING or status >= 500 else logging.DEBUG,
             method=method[:20],
             path=scope["path"][:200],
             status=status,

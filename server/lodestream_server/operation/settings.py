@@ -296,6 +296,11 @@ class Settings(BaseSettings, Bounds):
     log_level: Literal["debug", "info", "warning", "error"] = _choice(
         "info", "operation", "least severe messages that are logged"
     )
+    log_reads: bool = _choice(
+        False,
+        "operation",
+        "log requests that read at level info, as those that write; otherwise at debug",
+    )
 
     @classmethod
     def settings_customise_sources(

@@ -18,7 +18,7 @@ _MOST_NAMES = 5
 
 
 def tell(surfaces: Surfaces, sha256: str, error: StreamError) -> None:
-    """Log that a container is damaged, which surfaces have it, and what to do; repetitions are counted (`repeats`).
+    """Log that a container is damaged, which surfaces have it, and what to do.
 
     ``lodestream_errors_total`` counts each of them as ``damaged`` when the request is answered.
 
@@ -28,8 +28,7 @@ def tell(surfaces: Surfaces, sha256: str, error: StreamError) -> None:
     sha256 : str
         Name of the container.
     error : StreamError
-        What is wrong. It is a field of the log record and not part of the line, because it may differ from time to
-        time.
+        What is wrong; a field of the log record.
     """
     count = surfaces.index.count_container(sha256)
     named = ", ".join(surfaces.index.with_container(sha256, _MOST_NAMES)) or "none"

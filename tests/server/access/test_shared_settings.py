@@ -51,6 +51,7 @@ NOT_SHARED = {
     "keep_replaced_days": "a time; what it keeps counts as its owner's (max_surfaces, owner_bytes)",
     "log_format": "a word",
     "log_level": "a word",
+    "log_reads": "a switch",
     "dask": "an address; builds go there in their turns (workers)",
     "upload_bytes": "of one upload",
     "upload_files": "of one upload",

@@ -21,7 +21,6 @@ from lodestream.protocol.messages import Credit, Open
 from lodestream.protocol.wire import serialize
 from lodestream_server.connections.cuts import REASONS, Allowance, Cuts
 from lodestream_server.operation.metrics import Metrics
-from lodestream_server.operation.repeats import Repeats
 from tests.server.connections.sockets import (
     CHUNKS,
     CONTINUATION,
@@ -127,12 +126,11 @@ class Offender(threading.Thread):
 
 @dataclass(frozen=True)
 class Running:
-    """A server in a process of its own with a surface, the hash of what a stream of it carries, and since when."""
+    """A server in a process of its own with a surface, and the hash of what a stream of it carries."""
 
     server: Server
     place: Place
     sha256: str
-    started: float
 
     def kinds(self) -> dict[str, float]:
         """What its metrics say of errors, by kind."""
@@ -149,7 +147,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
         with program.client() as http:
             surface = push(http, npy(hills(420, 400)))
         container = (data / "containers" / f"{surface['container']}.lode").read_bytes()
-        yield Running(program, Place.of(program.url + surface["url"]), hash_of_stream(container), time.monotonic())
+        yield Running(program, Place.of(program.url + surface["url"]), hash_of_stream(container))
 
 
 @pytest.mark.parametrize("name", FLOODS)
@@ -170,7 +168,7 @@ def test_others_are_served_while_a_flood_goes_on(running: Running, name: str) ->
     assert most - before < 16 << 20
     assert running.kinds()[flood.reason] - counted >= offender.cuts
     lines = [line for line in running.server.log.read_text().splitlines() if f"connection cut: {flood.reason} " in line]
-    assert 1 <= len(lines) <= 1 + (time.monotonic() - running.started) / 60
+    assert lines
     assert "Traceback" not in running.server.log.read_text()
 
 
@@ -200,16 +198,13 @@ def test_an_allowance_grows_with_time_and_with_what_is_earned(monkeypatch: pytes
     assert [allowance.take() for _ in range(4)] == [True, True, True, False]
 
 
-def test_very_many_cuts_are_few_lines(caplog: pytest.LogCaptureFixture) -> None:
+def test_each_cut_is_told_and_counted(caplog: pytest.LogCaptureFixture) -> None:
     metrics = Metrics()
     cuts = Cuts(metrics)
     with caplog.at_level(logging.WARNING, "lodestream_server"):
         for number in range(1000):
             cuts.note("frames", (f"192.0.2.{number % 200}", 5))
-    told = Repeats()
-    assert [told.admit(record, 0.0) for record in caplog.records] == [True, *[False] * 999]
-    (line,) = told.due(61.0)
-    assert line.getMessage() == "connection cut: frames (999 times more)"
+    assert [record.getMessage() for record in caplog.records] == ["connection cut: frames"] * 1000
     assert b'lodestream_errors_total{kind="frames"} 1000.0' in metrics.text()
 
 

@@ -20,8 +20,6 @@ import pytest
 
 from lodestream_server import Settings
 from lodestream_server.connections.open_files import most_connections, raise_file_limit
-from lodestream_server.operation import logs
-from lodestream_server.operation.repeats import SECONDS, Repeats
 from tests.patience import PATIENCE
 from tests.server.helpers import eventually, hills, npy, push
 
@@ -120,63 +118,3 @@ def test_the_limit_is_raised_as_far_as_it_is_needed(
         raise_file_limit(Settings(data=tmp_path, workers=1, max_connections=chosen))
     assert changes == ([] if raised is None else [(raised, limits[1])])
     assert bool(caplog.records) == warned
-
-
-# What is said again and again.
-
-
-def line(
-    text: str = "failed %s", *args: object, level: int = logging.ERROR, error: Exception | None = None
-) -> logging.LogRecord:
-    info = None if error is None else (type(error), error, None)
-    return logging.LogRecord("x", level, "", 0, text, args or ("here",), info)
-
-
-def test_one_and_the_same_failure_is_told_once_and_counted() -> None:
-    made = Repeats()
-    assert made.admit(line(), 0)
-    assert not any(made.admit(line(), 1) for _ in range(1000))
-    assert made.admit(line("failed %s", "there"), 1)
-    assert made.admit(line(level=logging.WARNING), 1)
-    assert made.admit(line(error=OSError(24, "files")), 1)
-    assert made.admit(line(error=OSError(28, "room")), 1)
-    assert not made.admit(line(error=OSError(24, "files")), 1)
-    assert all(made.admit(line(level=logging.INFO), 1) for _ in range(3))
-    assert made.due(SECONDS - 1) == []
-    assert [record.getMessage() for record in made.due(SECONDS + 1)] == [
-        "failed here (1000 times more)",
-        "failed here OSError: [Errno 24] files (once more)",
-    ]
-    # Still counted, for another minute; what came once is told again.
-    assert not made.admit(line(), SECONDS + 2)
-    assert made.admit(line("failed %s", "there"), SECONDS + 2)
-    assert [record.getMessage() for record in made.all()] == ["failed here (once more)"]
-    assert made.due(5 * SECONDS) == []
-    assert made.admit(line(), 5 * SECONDS)
-
-
-def test_very_many_different_failures_take_no_memory() -> None:
-    made = Repeats()
-    assert all(made.admit(line("failed %s", number), 0) for number in range(5000))
-    assert len(made._repeated) <= 1000
-
-
-def test_the_log_counts_and_tells_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    read, write = os.pipe()
-    try:
-        handler = logs._Patient(write)
-        handler.setFormatter(logging.Formatter("%(levelname)s %(message)s"))
-        for _ in range(500):
-            handler.handle(line())
-        handler.flush()
-        assert os.read(read, 1 << 16) == b"ERROR failed here\nERROR failed here (499 times more)\n"
-        monkeypatch.setattr("lodestream_server.operation.repeats.SECONDS", 0.1)
-        for _ in range(3):
-            handler.handle(line())
-        taken = b""
-        while taken.count(b"\n") < 2:
-            taken += os.read(read, 1 << 16)
-        assert taken == b"ERROR failed here\nERROR failed here (2 times more)\n"
-    finally:
-        os.close(read)
-        os.close(write)

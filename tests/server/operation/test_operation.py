@@ -23,6 +23,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
@@ -333,7 +334,7 @@ def asked_until_cancelled(app: ASGIApp, kind: str = "http") -> tuple[list[Messag
         sent.append(message)
 
     async def ask() -> bool:
-        task = asyncio.ensure_future(Observation(app, state.metrics)(scope, receive, send))
+        task = asyncio.ensure_future(Observation(app, state.metrics, log_reads=False)(scope, receive, send))
         await asyncio.sleep(0.01)
         task.cancel("the server ends")
         await asyncio.wait((task,))
@@ -394,26 +395,132 @@ def test_the_log_tells_of_requests_that_write_but_not_of_tokens(tmp_path: Path) 
     assert "method=GET" not in text
 
 
-def test_a_log_that_nobody_reads_stops_nobody() -> None:
+@pytest.mark.parametrize(
+    ("method", "status", "log_reads", "level"),
+    [
+        ("GET", 200, False, logging.DEBUG),
+        ("HEAD", 404, False, logging.DEBUG),
+        ("GET", 503, False, logging.INFO),
+        ("POST", 202, False, logging.INFO),
+        ("GET", 200, True, logging.INFO),
+        ("HEAD", 304, True, logging.INFO),
+        ("POST", 202, True, logging.INFO),
+    ],
+)
+def test_reads_are_logged_at_info_when_asked_for(
+    method: str, status: int, log_reads: bool, level: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def answered(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(status_code=status)(scope, receive, send)
+
+    async def ask() -> None:
+        watched = Observation(answered, Metrics(), log_reads=log_reads)
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(watched), base_url="http://x") as client:
+            await client.request(method, "/v1/surfaces")
+
+    with caplog.at_level(logging.DEBUG, "lodestream_server"):
+        asyncio.run(ask())
+    assert [record.levelno for record in caplog.records if record.getMessage() == "request"] == [level]
+
+
+@contextmanager
+def log_to_pipe(style: str = "text") -> Iterator[tuple[logs._Queue, int]]:
+    """The handler of a log that is written to a pipe, and the end of the pipe that is read."""
     read, write = os.pipe()
+    handler = logs._Queue(write)
+    handler.setFormatter(logs._Json() if style == "json" else logs._Text())
+    thread = handler._writer._thread
+    assert thread is not None
     try:
-        handler = logs._Patient(write)
-        handler.setFormatter(logging.Formatter("%(message)s"))
-        record = logging.LogRecord("x", logging.INFO, "", 0, "l" * 100, None, None)
+        yield handler, read
+    finally:
+        # A thread that hangs in a write goes on once there is nobody to write to; it may have been told to end already.
+        os.close(read)
+        handler._writer.enqueue_sentinel()
+        thread.join(PATIENCE)
+        os.close(write)
+
+
+def line(text: str = "here") -> logging.LogRecord:
+    return logging.LogRecord("x", logging.INFO, "", 0, text, None, None)
+
+
+@pytest.mark.parametrize("style", ["text", "json"])
+def test_a_log_that_nobody_reads_stops_nobody(style: str) -> None:
+    with log_to_pipe(style) as (handler, read):
+        started = time.monotonic()
         for _ in range(20_000):
-            handler.emit(record)
+            handler.handle(line("l" * 100))
+        assert time.monotonic() - started < PATIENCE
+        assert handler._lines.qsize() <= 10_000
         # Now somebody does. Some may have been lost already before the pipe was full.
         taken, lost, until = b"", 0, time.monotonic() + PATIENCE
         while lost <= 9000 and time.monotonic() < until:
             taken += os.read(read, 1 << 16)
-            handler.emit(record)
-            lost = sum(map(int, re.findall(rb"\n(\d+) log lines were dropped", taken)))
+            handler.handle(line())
+            lost = sum(map(int, re.findall(rb"(\d+) log lines were dropped, because", taken)))
         assert 9000 < lost < 20_000
+        assert taken.count(b"l" * 100) + lost >= 20_000
+        told = next(each for each in taken.splitlines() if b"were dropped" in each)
+        assert (json.loads(told)["level"] == "warning") if style == "json" else (b" WARNING lodestream_server." in told)
+
+
+def test_the_end_of_the_log_waits_for_its_reader_only_so_long() -> None:
+    with log_to_pipe() as (handler, read):
+        for _ in range(100):
+            handler.handle(line())
+        handler.end()
+        assert os.read(read, 1 << 16).count(b"x: here\n") == 100
+    with log_to_pipe() as (handler, _):
+        for _ in range(5000):
+            handler.handle(line("l" * 100))
+        started = time.monotonic()
+        handler.end()
+        assert time.monotonic() - started < PATIENCE / 2
+
+
+def test_a_log_that_was_ended_is_no_longer_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    before = root.level
+    try:
+        logs.configure("text", "info")
+        (handler,) = root.handlers
+        assert isinstance(handler, logs._Queue)
+        logs.drain()
+        assert root.handlers == []
+        logs.drain()
     finally:
-        # The thread writes on until there is nobody to write to.
-        os.close(read)
-        eventually(lambda: handler._lines.empty() and handler._idle.is_set(), "the thread to have written all")
-        os.close(write)
+        root.setLevel(before)
+
+
+def test_a_lack_of_files_is_told_once_a_minute_and_what_strangers_send_not_at_all() -> None:
+    worth = logs._Worth()
+    lack = [line(f"socket.accept() out of system resource\nsocket: {number}") for number in range(3)]
+    lack[2].created = lack[0].created + 61
+    assert [worth.filter(record) for record in lack] == [True, False, True]
+    assert not worth.filter(line("Invalid HTTP request received."))
+    assert worth.filter(line("anything else"))
+
+
+def test_lines_of_threads_have_the_id_of_their_request() -> None:
+    async def ask(handler: logging.Handler) -> None:
+        async def one(name: str) -> None:
+            logs.new_request(name)
+            await asyncio.to_thread(handler.handle, line(f"of {name}"))
+
+        await asyncio.gather(one("r-1"), one("r-2"))
+
+    with log_to_pipe("json") as (handler, read):
+        asyncio.run(ask(handler))
+        handler.handle(line("of none"))
+        handler.end()
+        said = [json.loads(each) for each in os.read(read, 1 << 16).splitlines()]
+    assert {each["message"]: each.get("request") for each in said} == {
+        "of r-1": "r-1",
+        "of r-2": "r-2",
+        "of none": None,
+    }
 
 
 def test_links_and_clients_behind_a_proxy(tmp_path: Path) -> None:
