@@ -19,6 +19,7 @@ from . import problems
 from .access.access import Access
 from .access.gate import Gate
 from .access.limits import Limits
+from .access.scopes import unrouted
 from .builds.jobs import Builder
 from .builds.level_files import LevelFiles
 from .builds.level_queue import LevelQueue
@@ -125,11 +126,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redirect_slashes=False,
     )
     problems.install(app)
+    for status in (404, 405):  # of the framework; routes raise errors of ours
+        app.add_exception_handler(status, unrouted)
     routers = (pages.router, surfaces.router, names.router, files.router, levels.router, streams.router)
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]
-    app.state.metrics, app.state.pace, app.state.alone = metrics, pace, lambda: access.alone
+    app.state.access, app.state.metrics, app.state.pace = access, metrics, pace
     app.openapi = lambda: interface.describe(app)  # type: ignore[method-assign]
     # The last one is the first that a request meets.
     app.add_middleware(Gate, access=access)

@@ -50,6 +50,7 @@ __all__ = [
     "answer",
     "install",
     "problem",
+    "refused",
     "responses",
 ]
 
@@ -159,7 +160,7 @@ _ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
     (NotFoundError, _Answer(404, "not-found", "There is no such thing")),
     (SlowUploadError, _Answer(408, "idle", "The client was too slow")),
     (NoTokenError, _Answer(401, "no-token", "A token is needed")),
-    (BadTokenError, _Answer(403, "bad-token", "The token is unknown, expired or revoked")),
+    (BadTokenError, _Answer(401, "bad-token", "The token is unknown, expired or revoked")),
     (SmallScopeError, _Answer(403, "small-scope", "The token's scope does not allow this")),
     (NotOwnerError, _Answer(403, "not-owner", "Only its owner and an admin may do this")),
     (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
@@ -195,7 +196,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ClientDisconnect, _gone)
     app.add_exception_handler(OSError, _raised)
     app.add_exception_handler(Exception, _raised)
-    app.add_exception_handler(HTTPException, _refused)
+    app.add_exception_handler(HTTPException, refused)
     app.add_exception_handler(RequestValidationError, _invalid)
 
 
@@ -247,7 +248,8 @@ async def _gone(request: HTTPConnection, error: Exception) -> Response:
     return _document(request, 400, "gone", "The client disconnected", "the body ended before it was complete", {})
 
 
-async def _refused(request: Request, error: Exception) -> Response:
+async def refused(request: Request, error: Exception) -> Response:
+    """Return the problem document for an error of the framework."""
     assert isinstance(error, HTTPException)
     phrase = http.HTTPStatus(error.status_code).phrase
     code = {404: "not-found", 405: "bad-method"}.get(error.status_code, phrase.lower().replace(" ", "-"))

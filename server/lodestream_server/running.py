@@ -125,7 +125,7 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         app,
         host=settings.host,
         port=settings.port,
-        http=connections(settings, cuts, pace, Places(settings, app.state.alone)),
+        http=connections(settings, cuts, pace, Places(settings, lambda: app.state.access.alone)),
         ws=stream_connections(cuts, pace),
         ws_max_size=MAX_MESSAGE,
         # What travels is coded already, and each connection would pay 64 KiB.

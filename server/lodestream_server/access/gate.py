@@ -1,26 +1,22 @@
-"""Access control in front of every route; a request is refused before its body is read."""
+"""What is refused in front of every route, whoever asks: paths that others read differently, pages of other sites."""
 
 from __future__ import annotations
 
 import unicodedata
 
-from fastapi import Request
 from fastapi.requests import HTTPConnection
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from lodestream.errors import LodestreamError, NotFoundError
 
 from ..problems import answer
-from .access import Access, Caller
-from .scopes import needed_scope
+from .access import Access
 
-__all__ = ["Gate", "caller_of"]
-
-_CALLER = "lodestream.caller"
+__all__ = ["Gate"]
 
 
 class Gate:
-    """ASGI middleware that asks `Access` for the scope that the route declares (`scopes`).
+    """ASGI middleware in front of the routes, which ask for their scopes themselves (`scopes`).
 
     Parameters
     ----------
@@ -35,36 +31,15 @@ class Gate:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
         if scope["type"] in ("http", "websocket"):
+            connection = HTTPConnection(scope)
             try:
-                scope[_CALLER] = self._admit(scope)
+                _check_path(scope)
+                if scope["type"] == "websocket" or scope["method"] not in ("GET", "HEAD"):
+                    self._access.check_origin(connection)
             except LodestreamError as error:
-                await answer(HTTPConnection(scope), error)(scope, receive, send)
+                await answer(connection, error)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
-
-    def _admit(self, scope: Scope) -> Caller | None:
-        _check_path(scope)
-        connection = HTTPConnection(scope)
-        needed = needed_scope(scope)
-        if scope["type"] == "websocket":
-            self._access.check_origin(connection)
-            return self._access.reader(connection) if needed == "read" else self._authorize(connection, needed)
-        request = Request(scope)
-        if request.method not in ("GET", "HEAD"):
-            self._access.check_origin(connection)
-        return self._authorize(connection, needed)
-
-    def _authorize(self, connection: HTTPConnection, needed: str | None) -> Caller | None:
-        return None if needed is None else self._access.authorize(connection, needed)
-
-
-def caller_of(connection: HTTPConnection) -> Caller | None:
-    """Return the caller of a request.
-
-    None on an open route, and for a stream whose ``open`` message must have a token.
-    """
-    caller: Caller | None = connection.scope[_CALLER]
-    return caller
 
 
 def _check_path(scope: Scope) -> None:

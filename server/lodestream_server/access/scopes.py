@@ -1,63 +1,68 @@
-"""The scope that a request needs; it is declared at the route that will answer the request."""
+"""The scope that a route needs, as a dependency of FastAPI: it is asked for before any byte of a body is read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Annotated
 
-from fastapi import FastAPI
-from starlette.routing import BaseRoute, Match
-from starlette.types import Scope
+from fastapi import Request, Security
+from fastapi.openapi.models import HTTPBearer
+from fastapi.requests import HTTPConnection
+from fastapi.responses import Response
+from fastapi.security import SecurityScopes
+from fastapi.security.base import SecurityBase
+from fastapi.websockets import WebSocket
 
-__all__ = ["needed_scope", "needs", "routes_of", "scope_of"]
+from lodestream.errors import LodestreamError
 
-_Endpoint = TypeVar("_Endpoint", bound=Callable[..., Any])
+from .. import problems
+from .access import Access, Caller
 
-_DECLARED = "lodestream_scope"
+__all__ = ["ADMIN", "READ", "SCHEME", "WRITE", "Reader", "StreamReader", "Writer", "unrouted"]
+
+#: Name of the tokens in the OpenAPI document.
+SCHEME = "token"
+
 _READING = {"GET", "HEAD", "OPTIONS"}
 
 
-def needs(scope: str | None) -> Callable[[_Endpoint], _Endpoint]:
-    """Decorator that declares the scope of a route; None: open to everybody.
+class _Token(SecurityBase):
+    """The caller of a request, which must be allowed to do what the scope of the route allows."""
 
-    Parameters
-    ----------
-    scope : str or None
-        One of `lodestream_server.access.tokens.SCOPES`.
-    """
+    def __init__(self) -> None:
+        self.model = HTTPBearer(description="as `lodestream token create` prints it")
+        self.scheme_name = SCHEME
 
-    def declare(endpoint: _Endpoint) -> _Endpoint:
-        setattr(endpoint, _DECLARED, scope)
-        return endpoint
-
-    return declare
+    async def __call__(self, connection: HTTPConnection, scopes: SecurityScopes) -> Caller:
+        return _access(connection).authorize(connection, scopes.scope_str)
 
 
-def scope_of(route: BaseRoute) -> str | None:
-    """Return the scope declared at a route; without a declaration ``admin``, so that a forgotten one opens nothing."""
-    declared: str | None = getattr(getattr(route, "endpoint", None), _DECLARED, "admin")
-    return declared
+async def _stream_reader(socket: WebSocket) -> Caller | None:
+    return _access(socket).reader(socket)
 
 
-def routes_of(app: FastAPI) -> list[BaseRoute]:
-    """Return the routes of an application of `create_app`, in the order in which they are matched."""
-    ours = [route for routes in app.state.routes for route in routes]
-    # What was added to the application itself; an included router is none that has a path.
-    return ours + [route for route in app.routes if hasattr(route, "path_regex")]
+def _access(connection: HTTPConnection) -> Access:
+    access: Access = connection.app.state.access
+    return access
 
 
-def needed_scope(scope: Scope) -> str | None:
-    """Return the scope that a request needs; None if it is open to everybody.
+_token = _Token()
 
-    The routes themselves decide which of them answers. If none does, a scope for reading or writing is needed all the
-    same, depending on the method, before the answer 404.
+# For routes that need not know who calls; for the others the caller comes first among the parameters, so that nothing
+# is done for those who are refused.
+READ = Security(_token, scopes=["read"])
+WRITE = Security(_token, scopes=["write"])
+ADMIN = Security(_token, scopes=["admin"])
 
-    Parameters
-    ----------
-    scope : dict
-        The ASGI scope of the request; ``app`` is an application of `create_app`.
-    """
-    for route in routes_of(scope["app"]):
-        if route.matches(scope)[0] is Match.FULL:
-            return scope_of(route)
-    return "read" if scope.get("method", "GET") in _READING else "write"
+Reader = Annotated[Caller, READ]
+Writer = Annotated[Caller, WRITE]
+#: Who opens a stream; None if the ``open`` message must have a token.
+StreamReader = Annotated[Caller | None, Security(_stream_reader, scopes=["read"])]
+
+
+async def unrouted(request: Request, error: Exception) -> Response:
+    """Answer a request that no route takes; what paths there are is told to those who may read or write there."""
+    try:
+        _access(request).authorize(request, "read" if request.method in _READING else "write")
+    except LodestreamError as refusal:
+        return problems.answer(request, refusal)
+    return await problems.refused(request, error)

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, RedirectResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from ..access.scopes import needs
+from ..access.scopes import READ
 from ..problems import BusyError, responses
 from ..store.containers import Containers
 from . import examples
@@ -26,12 +26,12 @@ router = APIRouter(prefix="/v1", tags=["files"])
 @readable(
     router,
     "/surfaces/{surface}/container",
+    dependencies=[READ],
     status_code=307,
     summary="Find a surface's container",
     response_class=Response,
     responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 424, 503)},
 )
-@needs("read")
 async def find(request: Request, parts: Parts, surface: str) -> Response:
     """Redirect to the container; 409 with Retry-After while it is being built."""
     found = ready(parts, surface)
@@ -42,6 +42,7 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
 @readable(
     router,
     "/containers/{sha256}.lode",
+    dependencies=[READ],
     summary="Fetch a container, or ranges of it",
     response_class=FileResponse,
     responses={
@@ -51,7 +52,6 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
         **responses(404, 416, 503),
     },
 )
-@needs("read")
 async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
     """Return a container. It never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
     path, status = await asyncio.to_thread(_file, parts.containers, sha256)

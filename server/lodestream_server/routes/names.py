@@ -12,14 +12,15 @@ from pydantic import BaseModel, ValidationError
 
 from lodestream.errors import InputError, NotFoundError, TooLargeError
 
-from ..access.scopes import needs
+from ..access.access import Caller
+from ..access.scopes import READ, Reader, Writer
 from ..problems import SlowUploadError, responses
 from ..store.index import Named, Surface
 from ..store.layout import NAME
 from . import examples, files
 from .routing import Parts, State, readable
 from .sending import ready
-from .surfaces import answer, base, calling, owned
+from .surfaces import answer, base, owned
 
 __all__ = ["router"]
 
@@ -47,8 +48,7 @@ class _Pointing(BaseModel):
         **responses(403, 404, 408, 409, 413, 422, 424, 503, 507),
     },
 )
-@needs("write")
-async def point(request: Request, parts: Parts, name: _Name) -> Response:
+async def point(caller: Writer, request: Request, parts: Parts, name: _Name) -> Response:
     """Make a name lead to a surface that is ready; the name is made if there is none.
 
     `surface` is its id, or its `url`. With null nothing is changed, and the answer says whether the caller may.
@@ -57,7 +57,7 @@ async def point(request: Request, parts: Parts, name: _Name) -> Response:
     delete. What the name led to before is deleted a set time later, if it belongs to the owner of the name and no name
     leads to it then.
     """
-    surface, caller, names = await _asked(request, parts), calling(request), parts.surfaces.names
+    surface, names = await _asked(request, parts), parts.surfaces.names
     new = parts.surfaces.index.find_name(name) is None
     found = None if surface is None else ready(parts, surface)
     if new:
@@ -68,7 +68,7 @@ async def point(request: Request, parts: Parts, name: _Name) -> Response:
         return Response(status_code=204)
     keep = _DAY * parts.settings.keep_replaced_days
     await asyncio.to_thread(names.point, name, found.id, caller.owner, caller.may_change, keep, fits)
-    described = await answer(found, parts, request)
+    described = await answer(found, caller, parts, request)
     described.status_code = 201 if new else 200
     return described
 
@@ -79,8 +79,8 @@ async def point(request: Request, parts: Parts, name: _Name) -> Response:
     summary="List names",
     responses={200: examples.answer("A page of names", examples.NAMES), **responses(422)},
 )
-@needs("read")
 async def page(
+    caller: Reader,
     request: Request,
     parts: Parts,
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of names on the page")] = 100,
@@ -90,7 +90,7 @@ async def page(
 
     `next` is the address of the next page, or null.
     """
-    return await asyncio.to_thread(_page, after, limit, parts, request)
+    return await asyncio.to_thread(_page, after, limit, caller, parts, request)
 
 
 @readable(
@@ -102,10 +102,9 @@ async def page(
         **responses(404, 422, 503),
     },
 )
-@needs("read")
-async def look(request: Request, parts: Parts, name: _Name) -> Response:
+async def look(caller: Reader, request: Request, parts: Parts, name: _Name) -> Response:
     """Return what is told of the surface to which a name leads now; its `url` is that of the surface."""
-    described = await answer(_surface(parts, name), parts, request)
+    described = await answer(_surface(parts, name), caller, parts, request)
     described.headers["cache-control"] = "no-cache"
     return described
 
@@ -113,25 +112,24 @@ async def look(request: Request, parts: Parts, name: _Name) -> Response:
 @readable(
     router,
     "/{name}/container",
+    dependencies=[READ],
     status_code=307,
     summary="Find the container to which a name leads",
     response_class=Response,
     responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 422, 424, 503)},
 )
-@needs("read")
 async def find(request: Request, parts: Parts, name: _Name) -> Response:
     """Redirect to the container of the surface to which a name leads now."""
     return await files.find(request, parts, _surface(parts, name).id)
 
 
 @router.delete("/{name}", status_code=204, summary="Delete a name", responses=responses(403, 404, 422, 503))
-@needs("write")
-async def delete(request: Request, parts: Parts, name: _Name) -> Response:
+async def delete(caller: Writer, parts: Parts, name: _Name) -> Response:
     """Delete a name. The surface to which it leads stays, and so do those that it has replaced.
 
     Only its owner and an admin may do this.
     """
-    await asyncio.to_thread(parts.surfaces.names.delete, name, calling(request).may_change)
+    await asyncio.to_thread(parts.surfaces.names.delete, name, caller.may_change)
     return Response(status_code=204)
 
 
@@ -170,23 +168,23 @@ def _surface(parts: State, name: str) -> Surface:
     return found
 
 
-def _page(after: str, limit: int, parts: State, request: Request) -> Response:
+def _page(after: str, limit: int, caller: Caller, parts: State, request: Request) -> Response:
     following = parts.surfaces.index.names(after, limit + 1)
     shown = following[:limit]
     address = None
     if len(following) > limit:
         address = f"{_base(request)}?limit={limit}&after={shown[-1].name}"
-    return JSONResponse({"names": [_told(named, request) for named in shown], "next": address})
+    return JSONResponse({"names": [_told(named, caller, request) for named in shown], "next": address})
 
 
-def _told(named: Named, request: Request) -> dict[str, Any]:
+def _told(named: Named, caller: Caller, request: Request) -> dict[str, Any]:
     told = {"name": named.name, "url": f"{_base(request)}/{named.name}"}
     if named.surface is None:
         return {**told, "surface": None}
     return {
         **told,
         "surface": f"{base(request)}/{named.surface}",
-        **owned(named.owner, request),
+        **owned(named.owner, caller),
         "changed": datetime.fromtimestamp(named.changed, UTC).isoformat(timespec="milliseconds"),
     }
 

@@ -9,7 +9,7 @@ import lodestream
 from lodestream import page
 from lodestream.errors import NotFoundError
 
-from ..access.scopes import needs
+from ..access.scopes import ADMIN, WRITE
 from . import examples
 from .documentation import render
 from .html_page import html_page
@@ -36,14 +36,12 @@ lodestream pull URL out.npy --until-rms 1e-3d
 
 
 @readable(router, "/", include_in_schema=False)
-@needs(None)
 async def home(request: Request) -> Response:
     """Return the page that shows the surfaces, or one that says how to build it."""
     return _sent(request, page.INDEX) or html_page("Lodestream", _HOME)
 
 
 @readable(router, "/assets/{name}", include_in_schema=False)
-@needs(None)
 async def asset(request: Request, name: str) -> Response:
     """Return a script, style or kernel of the page."""
     answer = _sent(request, f"assets/{name}")
@@ -53,7 +51,6 @@ async def asset(request: Request, name: str) -> Response:
 
 
 @readable(router, "/view.json", include_in_schema=False)
-@needs(None)
 async def configuration() -> Response:
     """Return the configuration of the page: it shows the surfaces of this server.
 
@@ -63,14 +60,12 @@ async def configuration() -> Response:
 
 
 @readable(router, "/docs", include_in_schema=False)
-@needs(None)
 async def docs(request: Request) -> Response:
     """Return the HTTP interface, for people."""
     return html_page("Lodestream: the HTTP interface", render(request.app.openapi(), f"{_root(request)}/openapi.json"))
 
 
 @readable(router, "/openapi.json", include_in_schema=False)
-@needs(None)
 async def interface(request: Request) -> Response:
     """Return the HTTP interface, for programs."""
     root = _root(request)
@@ -78,7 +73,6 @@ async def interface(request: Request) -> Response:
 
 
 @readable(router, "/healthz", summary="Alive", responses={200: examples.answer("It answers", {"status": "ok"})})
-@needs(None)
 async def healthz() -> Response:
     """Answer at once, while the event loop runs."""
     return JSONResponse({"status": "ok", "version": lodestream.__version__})
@@ -99,7 +93,6 @@ async def healthz() -> Response:
         ),
     },
 )
-@needs(None)
 async def readyz(parts: Parts) -> Response:
     """Return whether builds can start and all surfaces are known. Before that uploads wait, and all else works.
 
@@ -121,10 +114,10 @@ async def readyz(parts: Parts) -> Response:
 @readable(
     router,
     "/v1/formats",
+    dependencies=[WRITE],
     summary="File formats",
     responses={200: examples.answer("Names of formats", {"formats": ["npy", "geotiff", "netcdf", "lode"]})},
 )
-@needs("write")
 async def formats(parts: Parts) -> Response:
     """Return the file formats that this server reads; lode are containers. Clients encode other formats themselves."""
     return JSONResponse({"formats": list(parts.settings.formats)})
@@ -133,11 +126,11 @@ async def formats(parts: Parts) -> Response:
 @readable(
     router,
     "/metrics",
+    dependencies=[ADMIN],
     summary="Figures for Prometheus",
     response_class=Response,
     responses={200: {"description": "The figures", "content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-@needs("admin")
 async def metrics(parts: Parts) -> Response:
     """Return all metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})

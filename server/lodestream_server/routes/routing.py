@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
 
@@ -62,12 +62,14 @@ async def _parts(connection: HTTPConnection) -> State:
 Parts = Annotated[State, Depends(_parts)]
 
 
-def readable(router: APIRouter, path: str, **options: Any) -> Callable[[_Route], _Route]:
+def readable(
+    router: APIRouter, path: str, *, dependencies: Sequence[Any] = (), **options: Any
+) -> Callable[[_Route], _Route]:
     """Decorator for routes that answer GET, and HEAD in the same way; OpenAPI lists GET only."""
 
     def register(route: _Route) -> _Route:
-        router.head(path, include_in_schema=False)(route)
-        return router.get(path, **options)(route)
+        router.head(path, dependencies=dependencies, include_in_schema=False)(route)
+        return router.get(path, dependencies=dependencies, **options)(route)
 
     return register
 

@@ -28,8 +28,7 @@ from lodestream.stores import StoreError
 from lodestream.transfer.sender import Sender
 
 from ..access.access import Caller, anybody
-from ..access.gate import caller_of
-from ..access.scopes import needs
+from ..access.scopes import StreamReader
 from ..operation.logs import event
 from ..problems import (
     BadTokenError,
@@ -72,8 +71,7 @@ _CLOSE_SECONDS = 5.0
 
 
 @router.websocket("/v1/surfaces/{surface}/stream")
-@needs("read")
-async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
+async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface: str) -> None:
     """Send a surface under the client's credit."""
     try:
         offered = socket.scope["subprotocols"]
@@ -84,7 +82,6 @@ async def stream(socket: WebSocket, parts: Parts, surface: str) -> None:
         await socket.accept(subprotocol=SUBPROTOCOL)
     except OSError:  # the client is gone before it was answered
         return
-    caller = caller_of(socket)
     try:
         first = None if opening is None else from_address(opening)
         if first is not None and _token(first) is not None:

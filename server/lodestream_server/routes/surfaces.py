@@ -15,9 +15,8 @@ from fastapi.responses import Response
 
 from lodestream.stores import AbsentError
 
-from ..access.access import Caller, anybody
-from ..access.gate import caller_of
-from ..access.scopes import needs
+from ..access.access import Caller
+from ..access.scopes import Reader, Writer
 from ..builds import options
 from ..problems import BusyError, FullError, NotOwnerError, TooManyError, responses
 from ..store import layout, uploads
@@ -27,7 +26,7 @@ from ..store.layout import Manifest
 from . import examples
 from .routing import Parts, State, readable
 
-__all__ = ["answer", "base", "calling", "owned", "router"]
+__all__ = ["answer", "base", "owned", "router"]
 
 router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
 
@@ -52,8 +51,7 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
         **responses(408, 413, 422, 429, 503, 507),
     },
 )
-@needs("write")
-async def upload(request: Request, parts: Parts) -> Response:
+async def upload(caller: Writer, request: Request, parts: Parts) -> Response:
     """Upload a file, as a raw body or as parts called ``file`` of a form; the surface is built in the background.
 
     Parameters in the query other than precision, rms, effort, closed, nodata, name and filename are options of the
@@ -63,7 +61,6 @@ async def upload(request: Request, parts: Parts) -> Response:
     A container (.lode) is checked and decoded once, and kept unchanged. It takes no options but name and filename.
     """
     chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
-    caller = calling(request)
     async with AsyncExitStack() as held:
         try:
             watched = await held.enter_async_context(parts.limits.upload(request, caller))
@@ -80,7 +77,7 @@ async def upload(request: Request, parts: Parts) -> Response:
             received, surface = await _keep(watched, chosen, caller, parts)
     parts.metrics.uploaded(received.size)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
-    return await answer(surface, parts, request, located=True)
+    return await answer(surface, caller, parts, request, located=True)
 
 
 @readable(
@@ -89,8 +86,8 @@ async def upload(request: Request, parts: Parts) -> Response:
     summary="List surfaces",
     responses={200: examples.answer("A page of surfaces, oldest first", examples.PAGE), **responses(422)},
 )
-@needs("read")
 async def page(
+    caller: Reader,
     request: Request,
     parts: Parts,
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
@@ -100,7 +97,7 @@ async def page(
 
     A page may have fewer surfaces than its limit although more follow.
     """
-    return Response(await asyncio.to_thread(_page, _position(after), limit, parts, request), media_type=_JSON)
+    return Response(await asyncio.to_thread(_page, _position(after), limit, caller, parts, request), media_type=_JSON)
 
 
 @readable(
@@ -112,8 +109,7 @@ async def page(
         **responses(404),
     },
 )
-@needs("read")
-async def look(request: Request, parts: Parts, surface: str) -> Response:
+async def look(caller: Reader, request: Request, parts: Parts, surface: str) -> Response:
     """Return the state of a surface and, once it is ready, what ``lodestream info --json`` prints.
 
     The state is queued, building or ready; or, with a reason, failed (the file is not a surface) or waiting (it could
@@ -125,7 +121,7 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
     A surface that a name has replaced has `replaced_until`: then the server deletes it, unless a name leads to it again
     or it is uploaded again.
     """
-    return await answer(parts.surfaces.get(surface), parts, request)
+    return await answer(parts.surfaces.get(surface), caller, parts, request)
 
 
 @router.post(
@@ -139,33 +135,31 @@ async def look(request: Request, parts: Parts, surface: str) -> Response:
         **responses(403, 404, 429, 503, 507),
     },
 )
-@needs("write")
-async def retry(request: Request, parts: Parts, surface: str) -> Response:
+async def retry(caller: Writer, request: Request, parts: Parts, surface: str) -> Response:
     """Build a surface again that waits or failed; does nothing if it is ready or queued.
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.
     """
-    known, caller = _changeable(request, parts, surface)
+    known = _changeable(caller, parts, surface)
     if known.state in ("failed", "waiting"):
         parts.limits.check_builds(caller)
-    return await answer(await parts.builder.retry(surface, caller.key), parts, request, located=True)
+    return await answer(await parts.builder.retry(surface, caller.key), caller, parts, request, located=True)
 
 
 @router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(403, 404))
-@needs("write")
-async def delete(request: Request, parts: Parts, surface: str) -> Response:
+async def delete(caller: Writer, parts: Parts, surface: str) -> Response:
     """Delete a surface and stop its build. Open streams of it continue to their end.
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.
     """
-    known, _ = _changeable(request, parts, surface)
+    known = _changeable(caller, parts, surface)
     await parts.builder.delete(surface)
     parts.upkeep.forget_levels(known)
     return Response(status_code=204)
 
 
-def _changeable(request: Request, parts: State, surface: str) -> tuple[Surface, Caller]:
-    """Return a surface and the caller, who must be allowed to change it.
+def _changeable(caller: Caller, parts: State, surface: str) -> Surface:
+    """Return a surface that the caller may change.
 
     Raises
     ------
@@ -174,17 +168,12 @@ def _changeable(request: Request, parts: State, surface: str) -> tuple[Surface, 
     NotOwnerError
         If the caller is neither its owner nor an admin.
     """
-    found, caller = parts.surfaces.get(surface), calling(request)
+    found = parts.surfaces.get(surface)
     owner = found.manifest.owner
     if not caller.may_change(owner):
         whose = "nobody" if owner is None else "another owner"
         raise NotOwnerError(f"expected the owner of {surface} or an admin, got {caller.name}: it belongs to {whose}")
-    return found, caller
-
-
-def calling(request: Request) -> Caller:
-    """Return who makes a request."""
-    return caller_of(request) or anybody(request)
+    return found
 
 
 async def _keep(
@@ -250,18 +239,21 @@ def _manifest(received: uploads.Upload, chosen: options.SurfaceOptions, owner: s
     )
 
 
-async def answer(surface: Surface, parts: State, request: Request, *, located: bool = False) -> Response:
+async def answer(
+    surface: Surface, caller: Caller, parts: State, request: Request, *, located: bool = False
+) -> Response:
     """Return the answer that describes a surface.
 
     Parameters
     ----------
     surface : Surface
+    caller : Caller
     parts : State
     request : Request
     located : bool
         Whether somebody asked for its build: 202 unless it is ready, with its address in a header.
     """
-    head = _told(surface, parts, request)
+    head = _told(surface, caller, parts, request)
     head["filenames"] = list(surface.manifest.filenames)
     head["options"] = surface.manifest.options
     until = parts.surfaces.index.replaced_until(surface.id)
@@ -282,12 +274,12 @@ def _joined(parts: State, surface: Surface, head: dict[str, Any]) -> bytes:
     return start if info == b"{}" else start[:-1] + b", " + info[1:]
 
 
-def _page(start: Position, limit: int, parts: State, request: Request) -> bytes:
+def _page(start: Position, limit: int, caller: Caller, parts: State, request: Request) -> bytes:
     """Return a page of surfaces that come after a position, as JSON of at most about `_MOST_PAGE` bytes."""
     following = parts.surfaces.index.page(start, limit + 1)
     shown, size = list[bytes](), 0
     for surface in following[:limit]:
-        shown.append(_json(_told(surface, parts, request)))
+        shown.append(_json(_told(surface, caller, parts, request)))
         size += len(shown[-1])
         if size > _MOST_PAGE:
             break
@@ -298,7 +290,7 @@ def _page(start: Position, limit: int, parts: State, request: Request) -> bytes:
     return b'{"surfaces": [' + b", ".join(shown) + b'], "next": ' + _json(address) + b"}"
 
 
-def _told(surface: Surface, parts: State, request: Request) -> dict[str, Any]:
+def _told(surface: Surface, caller: Caller, parts: State, request: Request) -> dict[str, Any]:
     """Return what a list tells of a surface."""
     it, ready = surface.manifest, surface.state == "ready"
     name = it.name or options.printable(surface.summary.name or "") or next(filter(None, it.filenames), None)
@@ -306,7 +298,7 @@ def _told(surface: Surface, parts: State, request: Request) -> dict[str, Any]:
         "id": surface.id,
         "url": f"{base(request)}/{surface.id}",
         "name": name,
-        **owned(it.owner, request),
+        **owned(it.owner, caller),
         "state": surface.state,
         "progress": parts.builder.progress(surface),
         "reason": surface.reason,
@@ -322,10 +314,9 @@ def _json(value: Any) -> bytes:
     return json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
 
 
-def owned(owner: str | None, request: Request) -> dict[str, Any]:
+def owned(owner: str | None, caller: Caller) -> dict[str, Any]:
     """Return what is told of an owner: the names of tokens are told to those who have one."""
-    caller = caller_of(request)
-    return {"owner": owner} if caller is not None and (caller.admin or caller.owner is not None) else {}
+    return {"owner": owner} if caller.admin or caller.owner is not None else {}
 
 
 def base(request: Request) -> str:

@@ -83,7 +83,7 @@ def test_a_token_that_is_not_good_is_refused_at_the_handshake(served: Served) ->
             raw_stream(served.surface, additional_headers=served.keys.header(name)),
         ):
             pass
-        assert caught.value.response.status_code == 403
+        assert caught.value.response.status_code == 401
         assert json.loads(caught.value.response.body or b"")["code"] == "bad-token"
 
 

@@ -433,7 +433,7 @@ def test_a_client_that_is_gone_before_the_handshakes_end_is_no_error(offered: li
         "subprotocols": offered,
         "extensions": extensions,
     }
-    asyncio.run(streams.stream(WebSocket(scope, receive, send), None, "ab"))  # type: ignore[arg-type]
+    asyncio.run(streams.stream(None, WebSocket(scope, receive, send), None, "ab"))  # type: ignore[arg-type]
     assert len(sent) == 1
 
 
