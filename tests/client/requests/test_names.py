@@ -12,7 +12,8 @@ import lodestream_client
 from lodestream.errors import LodestreamError, NotFoundError, OptionError, RemoteError, RemoteProtocolError
 from lodestream_client import UnreachableError, sync
 from lodestream_client.program import main
-from lodestream_client.requests import addresses
+from lodestream_client.requests import addresses, calls
+from lodestream_client.requests.calls import client_options
 from tests.client.scripted import Answer, Asked, document, problem, redirect, scripted
 
 ID = "0123456789abcdef0123"
@@ -120,7 +121,9 @@ def test_an_upload_that_replaces_what_a_name_leads_to() -> None:
         assert not [asked for asked in server.asked if asked.method != "GET"], "nothing is sent before"
 
 
-def test_a_name_of_another_owner_and_a_redirect_are_told() -> None:
+def test_a_name_of_another_owner_and_a_redirect_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    # For the answer that never comes whole.
+    monkeypatch.setattr(calls, "client_options", lambda url, _, **more: client_options(url, 2.0, **more))
     refusal = problem(403, "not-owner", "expected the owner of the name dem")
     with scripted(Uploads(refusal, refusal)) as server:
         url = f"{server.url}/maps"
