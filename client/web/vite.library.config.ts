@@ -1,7 +1,7 @@
 import { resolve } from "node:path";
 import { defineConfig } from "vite";
 
-/** The npm package: the library and the custom element as ES modules; what the package depends on stays outside. */
+/** The npm package: the library, the custom element and the protocol for maps as ES modules; what the package depends on stays outside. */
 export default defineConfig({
   build: {
     target: "es2022",
@@ -12,6 +12,7 @@ export default defineConfig({
       entry: {
         index: resolve(import.meta.dirname ?? ".", "src/index.ts"),
         view: resolve(import.meta.dirname ?? ".", "src/view/index.ts"),
+        maplibre: resolve(import.meta.dirname ?? ".", "src/maplibre/index.ts"),
       },
       formats: ["es"],
     },
