@@ -1,4 +1,4 @@
-"""Errors as HTTP answers: one table from exception classes to statuses, and problem documents (RFC 9457)."""
+"""What errors are called: from classes to codes, from codes to statuses and titles; problem documents (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import errno
 import http
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -27,9 +26,12 @@ from lodestream.errors import (
     StreamError,
     TooLargeError,
     UnavailableError,
+    UnsupportedVersionError,
 )
+from lodestream.protocol.messages import CODES, MessageError
 
 __all__ = [
+    "MEANINGS",
     "PROBLEM_EXAMPLE",
     "BadTokenError",
     "BuildFailedError",
@@ -43,6 +45,7 @@ __all__ = [
     "NotReadyError",
     "PostponedError",
     "RestartingError",
+    "SilentError",
     "SlowUploadError",
     "SmallScopeError",
     "TooManyError",
@@ -92,6 +95,10 @@ class SlowUploadError(LodestreamError):
     """An upload was too slow, or stopped."""
 
 
+class SilentError(LodestreamError):
+    """The client of a stream sent nothing, or did not read, for too long."""
+
+
 class NoTokenError(LodestreamError):
     """A token is needed, and there is none."""
 
@@ -138,52 +145,84 @@ class FullError(LodestreamError):
     headers: ClassVar = {"retry-after": "60"}
 
 
-@dataclass(frozen=True)
-class _Answer:
+class Meaning(NamedTuple):
+    """What a code says: the status of the answer over HTTP, and the title of the problem."""
+
     status: int
-    code: str
     title: str
 
 
-_FULL = _Answer(507, "disk-full", "The disk is full")
+# Codes of streams whose close code is not 4000 plus the status.
+_STATUSES = {"message-too-large": 413, "internal": 500, "restarting": 503}
 
-#: The first row whose class fits says what is answered. The codes of streams (`lodestream.protocol.messages.CODES`) are
-#: the same words where they mean the same.
-_ANSWERS: tuple[tuple[type[Exception], _Answer], ...] = (
-    (LargeLevelError, _Answer(413, "too-large", "The level is too large to be made as a file")),
-    (TooLargeError, _Answer(413, "too-large", "The request is too large")),
-    (OptionError, _Answer(422, "bad-option", "An option does not exist, or its value is not valid")),
-    (UnfitLevelError, _Answer(422, "bad-file", "The level cannot be written in this format")),
-    (FormatError, _Answer(422, "bad-file", "The file cannot be read as a structured surface")),
-    (InputError, _Answer(422, "bad-input", "The input cannot be used")),
-    (UnavailableError, _Answer(501, "unavailable", "This server lacks a library that this needs")),
-    (NotFoundError, _Answer(404, "not-found", "There is no such thing")),
-    (SlowUploadError, _Answer(408, "idle", "The client was too slow")),
-    (NoTokenError, _Answer(401, "no-token", "A token is needed")),
-    (BadTokenError, _Answer(401, "bad-token", "The token is unknown, expired or revoked")),
-    (SmallScopeError, _Answer(403, "small-scope", "The token's scope does not allow this")),
-    (NotOwnerError, _Answer(403, "not-owner", "Only its owner and an admin may do this")),
-    (ForeignOriginError, _Answer(403, "foreign-origin", "Pages of other sites may not do this")),
-    (TooManyError, _Answer(429, "too-many", "The client has too much in progress")),
-    (BusyError, _Answer(503, "busy", "The server is busy; try again later")),
-    (RestartingError, _Answer(503, "restarting", "The server is restarting; try again")),
-    (FullError, _Answer(507, "full", "There is no space for more")),
-    (NotReadyError, _Answer(409, "not-ready", "The surface is still being built")),
-    (BuildFailedError, _Answer(424, "failed", "The surface could not be built")),
-    (PostponedError, _Answer(424, "waiting", "The surface could not be built yet; it waits for a retry")),
-    (DamagedNameError, _Answer(503, "damaged-name", "It cannot be read where the name leads")),
-    (stores.FullError, _FULL),
-    (stores.UnacknowledgedError, _Answer(503, "busy", "It is not known whether that was done; try again")),
-    (stores.StoreError, _Answer(503, "busy", "The server's store cannot be used now; try again later")),
-    (StreamError, _Answer(500, "damaged", "The stored container is damaged")),
-)
-_INTERNAL = _Answer(500, "internal", "The server failed")
-_NO_ROOM, _SEE_LOG = "nothing was stored; delete surfaces or enlarge the disk", "the server's log says more"
+#: Every code of a problem document or of a stream's ``error``; those of `CODES` have a close code there.
+MEANINGS: Mapping[str, Meaning] = {
+    **{word: Meaning(_STATUSES.get(word, code.close - 4000), code.title) for word, code in CODES.items()},
+    "gone": Meaning(400, "The client disconnected"),
+    "foreign-origin": Meaning(403, "Pages of other sites may not do this"),
+    "not-owner": Meaning(403, "Only its owner and an admin may do this"),
+    "bad-method": Meaning(405, "There is no such method here"),
+    "too-large": Meaning(413, "The request, or what it asks for, is too large"),
+    "requested-range-not-satisfiable": Meaning(416, "The file has no such bytes"),
+    "bad-file": Meaning(422, "The file cannot be read, or the level not be written, in this format"),
+    "bad-input": Meaning(422, "The input cannot be used"),
+    "bad-option": Meaning(422, "An option does not exist, or its value is not valid"),
+    "unavailable": Meaning(501, "This server lacks a library that this needs"),
+    "damaged-name": Meaning(503, "It cannot be read where the name leads"),
+    "disk-full": Meaning(507, "The disk is full"),
+    "full": Meaning(507, "There is no space for more"),
+}
+
+_SEE_LOG = "the server's log says more"
+
+
+class _Kind(NamedTuple):
+    """The code of a class of errors, and what is told in place of their words, which would tell where data are."""
+
+    code: str
+    told: str | None = None
+
+
+# A class that is not here is what its base is.
+_KINDS: Mapping[type[BaseException], _Kind] = {
+    TooLargeError: _Kind("too-large"),
+    OptionError: _Kind("bad-option"),
+    FormatError: _Kind("bad-file"),
+    InputError: _Kind("bad-input"),
+    UnavailableError: _Kind("unavailable"),
+    NotFoundError: _Kind("not-found"),
+    SlowUploadError: _Kind("idle"),
+    SilentError: _Kind("idle"),
+    NoTokenError: _Kind("no-token"),
+    BadTokenError: _Kind("bad-token"),
+    SmallScopeError: _Kind("small-scope"),
+    NotOwnerError: _Kind("not-owner"),
+    ForeignOriginError: _Kind("foreign-origin"),
+    TooManyError: _Kind("too-many"),
+    BusyError: _Kind("busy"),
+    RestartingError: _Kind("restarting"),
+    FullError: _Kind("full"),
+    NotReadyError: _Kind("not-ready"),
+    BuildFailedError: _Kind("failed"),
+    PostponedError: _Kind("waiting"),
+    DamagedNameError: _Kind("damaged-name"),
+    StreamError: _Kind("damaged"),
+    UnsupportedVersionError: _Kind("unsupported-version"),
+    stores.FullError: _Kind("disk-full", "nothing was stored; delete surfaces or enlarge the disk"),
+    stores.UnacknowledgedError: _Kind("busy", f"it is not known whether that was done; {_SEE_LOG}"),
+    stores.StoreError: _Kind("busy", f"the server's store cannot be used now; {_SEE_LOG}"),
+    ClientDisconnect: _Kind("gone", "the body ended before it was complete"),
+    # An unexpected error reveals nothing about the server.
+    Exception: _Kind("internal", _SEE_LOG),
+}
+
+#: Codes of what the framework refuses by itself.
+_OF_THE_FRAMEWORK = {404: "not-found", 405: "bad-method", 416: "requested-range-not-satisfiable"}
 
 PROBLEM_EXAMPLE = {
     "type": "urn:lodestream:not-found",
-    "title": "There is no such thing",
-    "status": 404,
+    "title": MEANINGS["not-found"].title,
+    "status": MEANINGS["not-found"].status,
     "code": "not-found",
     "detail": "expected the id of a surface on this server, got '0123'",
     "instance": "/v1/surfaces/0123",
@@ -193,24 +232,21 @@ PROBLEM_EXAMPLE = {
 def install(app: FastAPI) -> None:
     """Answer every error of an application with a problem document."""
     app.add_exception_handler(LodestreamError, _raised)
-    app.add_exception_handler(ClientDisconnect, _gone)
+    app.add_exception_handler(ClientDisconnect, _raised)
     app.add_exception_handler(OSError, _raised)
     app.add_exception_handler(Exception, _raised)
     app.add_exception_handler(HTTPException, refused)
     app.add_exception_handler(RequestValidationError, _invalid)
 
 
-def problem(error: Exception) -> tuple[int, str, str, str]:
-    """Return status, code, title and detail for an exception; an unexpected one reveals nothing about the server."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        error = stores.FullError()
-    for kind, answer in _ANSWERS:
-        if isinstance(error, kind):
-            detail = str(error)
-            if isinstance(error, stores.StoreError):  # it says where the data of the server are
-                detail = _NO_ROOM if answer is _FULL else _SEE_LOG
-            return answer.status, answer.code, answer.title, detail
-    return _INTERNAL.status, _INTERNAL.code, _INTERNAL.title, _SEE_LOG
+def problem(error: Exception) -> tuple[str, str]:
+    """Return the code of an error, a key of `MEANINGS`, and its detail."""
+    if isinstance(error, MessageError):
+        return error.code, str(error)
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
+    kinds = (stores.FullError if full else type(error)).__mro__
+    code, told = next(_KINDS[kind] for kind in kinds if kind in _KINDS)
+    return code, str(error) if told is None else told
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
@@ -235,33 +271,25 @@ async def _raised(request: HTTPConnection, error: Exception) -> Response:
 
 def answer(request: HTTPConnection, error: Exception) -> Response:
     """Return the problem document for an error."""
-    status, code, title, detail = problem(error)
-    if status >= 500 and not isinstance(error, StreamError):  # whoever found the damage has told of it
+    code, detail = problem(error)
+    status = MEANINGS[code].status
+    if status >= 500 and code != "damaged":  # whoever found the damage has told of it
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
     usual = {503: BusyError.headers, 507: FullError.headers}
-    headers = getattr(error, "headers", usual.get(status, {}))
-    return _document(request, status, code, title, detail, headers)
-
-
-async def _gone(request: HTTPConnection, error: Exception) -> Response:
-    # Nobody is there to read it.
-    return _document(request, 400, "gone", "The client disconnected", "the body ended before it was complete", {})
+    return _document(request, code, detail, getattr(error, "headers", usual.get(status, {})))
 
 
 async def refused(request: Request, error: Exception) -> Response:
     """Return the problem document for an error of the framework."""
     assert isinstance(error, HTTPException)
-    phrase = http.HTTPStatus(error.status_code).phrase
-    code = {404: "not-found", 405: "bad-method"}.get(error.status_code, phrase.lower().replace(" ", "-"))
-    detail = error.detail
-    if error.status_code == 404 and detail == phrase:
+    detail, headers = error.detail, dict(error.headers or {})
+    if error.status_code == 404:
         detail = f"expected a path that /docs lists, got {request.url.path[:100]!r}"
-    headers = dict(error.headers or {})
     if error.status_code == 405:
         # The framework names the methods of the first route of this path only.
         headers = {"allow": ", ".join(_methods(request))}
         detail = f"expected one of {headers['allow']}, got {request.method}"
-    return _document(request, error.status_code, code, phrase, detail, headers)
+    return _document(request, _OF_THE_FRAMEWORK[error.status_code], detail, headers)
 
 
 def _methods(request: Request) -> list[str]:
@@ -277,13 +305,12 @@ async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     places = [(".".join(map(str, item["loc"])), item["msg"]) for item in error.errors()]
     detail = "; ".join(f"{place}: {message}" for place, message in places)
-    return _document(request, 422, "bad-option", "A parameter is not valid", detail, {})
+    return _document(request, "bad-option", detail, {})
 
 
-def _document(
-    request: HTTPConnection, status: int, code: str, title: str, detail: str, headers: Mapping[str, str]
-) -> JSONResponse:
+def _document(request: HTTPConnection, code: str, detail: str, headers: Mapping[str, str]) -> JSONResponse:
     request.app.state.metrics.failed(code)
+    status, title = MEANINGS[code]
     content = {
         "type": f"urn:lodestream:{code}",
         "title": title,

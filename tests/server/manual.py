@@ -1,13 +1,16 @@
-"""Writes docs/settings.md from the model of the settings: ``python -m tests.server.manual``."""
+"""Writes docs/settings.md and docs/errors.md from what they describe: ``python -m tests.server.manual``."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from lodestream.protocol.messages import CODES
 from lodestream_server.operation.bounds import Bounds
 from lodestream_server.operation.settings import GROUPS, Choice, choices
+from lodestream_server.problems import MEANINGS
 
-PATH = Path(__file__).parents[2] / "docs" / "settings.md"
+_DOCS = Path(__file__).parents[2] / "docs"
+PATH, ERRORS_PATH = _DOCS / "settings.md", _DOCS / "errors.md"
 
 _INTRODUCTION = """\
 # Settings of the server
@@ -64,5 +67,31 @@ def render() -> str:
     return "\n".join([*parts, _bounds()])
 
 
+_ERRORS = """\
+# Codes of errors
+
+What the server answers when it refuses or fails. Over HTTP each answer is a problem document (RFC 9457) with the code
+in `code`, and in `detail` what was expected. A stream ends with an `error` message that has the same code, and with a
+close code ([protocol.md](protocol.md#errors-and-close-codes)). In Python the code is `RemoteError.code`, where there is
+no class of its own. `lodestream_errors_total` counts each ([operating.md](operating.md)).
+
+This page is written by `python -m tests.server.manual` from `lodestream_server.problems` and
+`lodestream.protocol.messages`; a test checks it.
+
+| code | status | close code of a stream | title |
+| --- | ---: | ---: | --- |
+"""
+
+
+def render_errors() -> str:
+    """The page of codes, by their statuses."""
+    rows = []
+    for code, (status, title) in sorted(MEANINGS.items(), key=lambda item: (item[1].status, item[0])):
+        close = f"{CODES[code].close} " if code in CODES else ""
+        rows.append(f"| `{code}` | {status} | {close}| {title} |\n")
+    return _ERRORS + "".join(rows)
+
+
 if __name__ == "__main__":
     PATH.write_text(render())
+    ERRORS_PATH.write_text(render_errors())

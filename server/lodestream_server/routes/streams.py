@@ -14,11 +14,10 @@ from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import APIRouter, WebSocket
-from fastapi.responses import JSONResponse
 from starlette.websockets import WebSocketDisconnect
 
 from lodestream.container import ByteRange
-from lodestream.errors import LodestreamError, NotFoundError, StreamError, UnsupportedVersionError
+from lodestream.errors import LodestreamError, StreamError, UnsupportedVersionError
 from lodestream.planning.window_errors import window_section
 from lodestream.protocol.connection import State
 from lodestream.protocol.handshake import PARAMETER, from_address
@@ -30,16 +29,7 @@ from lodestream.transfer.sender import Sender
 from ..access.access import Caller, anybody
 from ..access.scopes import StreamReader
 from ..operation.logs import event
-from ..problems import (
-    BadTokenError,
-    BuildFailedError,
-    BusyError,
-    NoTokenError,
-    NotReadyError,
-    PostponedError,
-    SmallScopeError,
-    TooManyError,
-)
+from ..problems import MEANINGS, SilentError, answer, problem
 from ..store.containers import OpenContainer
 from .routing import Parts
 from .sending import ready, still_there
@@ -106,10 +96,11 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface:
     except WebSocketDisconnect:
         return
     except LodestreamError as error:
-        parts.metrics.failed(_code(error))
-        if isinstance(error, StoreError):
+        code, detail = _problem(error)
+        parts.metrics.failed(code)
+        if isinstance(error, StoreError) or code == "internal":
             _log.error("%s: %s", surface, error)
-        await _refuse(socket, _code(error), "see the server's log" if isinstance(error, StoreError) else str(error))
+        await _refuse(socket, code, detail)
 
 
 async def _stream(session: _Session, surface: str, caller: Caller) -> None:
@@ -139,7 +130,7 @@ async def _first_message(socket: WebSocket, patience: float) -> bytes:
         async with asyncio.timeout(patience):
             return await _message(socket)
     except TimeoutError:
-        raise _SilentError(f"expected open within {patience:g} s") from None
+        raise SilentError(f"expected open within {patience:g} s") from None
 
 
 async def _message(socket: WebSocket) -> bytes:
@@ -157,10 +148,6 @@ def _token(message: bytes) -> str | None:
     if not isinstance(first, Open):
         raise MessageError("out-of-turn", f"expected open, got {first.type}")
     return first.token
-
-
-class _SilentError(LodestreamError):
-    """The client sent nothing, or did not read, for too long."""
 
 
 class _Session:
@@ -229,11 +216,11 @@ class _Session:
                 self.result = "restarting"
             return
         except (LodestreamError, OSError) as error:
-            told = isinstance(error, LodestreamError) and not isinstance(error, StoreError)
-            await self._fail(_code(error), str(error) if told else "see the server's log")
-            if isinstance(error, StreamError) and not isinstance(error, UnsupportedVersionError):
+            code, detail = _problem(error)
+            await self._fail(code, detail)
+            if code == "damaged" and isinstance(error, StreamError):
                 self._containers.tell_damage(self._container.sha256, error)
-            elif not isinstance(error, MessageError | UnsupportedVersionError | BadTokenError | _SilentError):
+            elif MEANINGS[code].status >= 500:
                 _log.error("a stream failed", exc_info=error)
         else:
             self.result = self._sender.why or "closed"
@@ -363,28 +350,13 @@ async def _within(seconds: float, work: Coroutine[Any, Any, object], what: str, 
         async with asyncio.timeout(max(seconds - waited, 0.0)):
             await work
     except TimeoutError:
-        raise _SilentError(f"expected {what} within {seconds:g} s") from None
+        raise SilentError(f"expected {what} within {seconds:g} s") from None
 
 
-def _code(error: Exception) -> str:
-    if isinstance(error, MessageError):
-        return error.code
-    known: tuple[tuple[type[Exception], str], ...] = (
-        (_SilentError, "idle"),
-        (UnsupportedVersionError, "unsupported-version"),
-        (NotFoundError, "not-found"),
-        (NotReadyError, "not-ready"),
-        (BuildFailedError, "failed"),
-        (PostponedError, "waiting"),
-        (NoTokenError, "no-token"),
-        (BadTokenError, "bad-token"),
-        (SmallScopeError, "bad-token"),
-        (TooManyError, "too-many"),
-        (BusyError, "busy"),
-        (StoreError, "busy"),
-        (StreamError, "damaged"),
-    )
-    return next((code for kind, code in known if isinstance(error, kind)), "internal")
+def _problem(error: Exception) -> tuple[str, str]:
+    """Return the code of an error, a key of `CODES`, and its detail."""
+    code, detail = problem(error)
+    return (code, detail) if code in CODES else problem(Exception())
 
 
 async def _refuse(socket: WebSocket, code: str, detail: str) -> None:
@@ -408,12 +380,5 @@ async def _close(socket: WebSocket, code: int, reason: str) -> None:
 
 async def _refuse_handshake(socket: WebSocket) -> None:
     offered = ", ".join(socket.scope["subprotocols"]) or "none"
-    content = {
-        "type": "urn:lodestream:unsupported-version",
-        "title": "Another subprotocol",
-        "status": 426,
-        "code": "unsupported-version",
-        "detail": f"expected the WebSocket subprotocol {SUBPROTOCOL}, got {offered[:80]!a}",
-        "instance": socket.url.path,
-    }
-    await socket.send_denial_response(JSONResponse(content, 426, media_type="application/problem+json"))
+    refusal = UnsupportedVersionError(f"expected the WebSocket subprotocol {SUBPROTOCOL}, got {offered[:80]!a}")
+    await socket.send_denial_response(answer(socket, refusal))

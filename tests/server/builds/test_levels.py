@@ -358,7 +358,7 @@ def test_a_level_that_memory_is_too_little_for_names_the_limit_and_its_setting(
             monkeypatch.setattr(level_queue, "make_level", function)
             answer = http.get(finest(surface))
             assert problem(answer) == (413, "too-large")
-            assert answer.json()["title"] == "The level is too large to be made as a file"
+            assert answer.json()["title"] == "The request, or what it asks for, is too large"
             words = (
                 "256 MiB of memory (level_memory)"
                 if own

@@ -129,7 +129,7 @@ def test_the_finest_level_has_the_columns_of_the_source_and_what_has_no_cog_says
         for other, words in ((curved, "that are not"), (two, "one block")):
             answer = http.get(f"{push(http, ls.encode(other))['url']}/levels/0?format=cog")
             assert answer.status_code == 422
-            assert answer.json()["title"] == "The level cannot be written in this format"
+            assert answer.json()["title"] == "The file cannot be read, or the level not be written, in this format"
             assert words in answer.json()["detail"]
             assert answer.json()["title"] in PAGE
 

@@ -43,6 +43,7 @@ from lodestream.protocol.wire import serialize
 from lodestream.transfer.download import Download, Ended
 from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
+from lodestream_server.operation.metrics import Metrics
 from lodestream_server.routes import streams
 from tests.core.planning.test_cost import crowded
 from tests.server.helpers import PATIENCE, closed, data_of, eventually, hills, npy, push, raw_stream
@@ -432,6 +433,7 @@ def test_a_client_that_is_gone_before_the_handshakes_end_is_no_error(offered: li
         "headers": [],
         "subprotocols": offered,
         "extensions": extensions,
+        "app": SimpleNamespace(state=SimpleNamespace(metrics=Metrics())),
     }
     asyncio.run(streams.stream(None, WebSocket(scope, receive, send), None, "ab"))  # type: ignore[arg-type]
     assert len(sent) == 1
