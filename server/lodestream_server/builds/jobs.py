@@ -61,7 +61,7 @@ from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
 from .fork_server import Allowed
 from .processes import Call, ForkServer, Pool
-from .shares import Turns
+from .turns import Turns
 from .work import Work
 
 __all__ = ["Builder"]

@@ -14,7 +14,7 @@ from ..access.access import Access
 from ..access.limits import Limits
 from ..builds.jobs import Builder
 from ..builds.level_queue import LevelQueue
-from ..builds.shares import Turns
+from ..builds.turns import Turns
 from ..operation.metrics import Metrics
 from ..operation.pace import Pace
 from ..operation.settings import Settings

@@ -22,7 +22,7 @@ from lodestream_server.access.access import Caller
 from lodestream_server.access.limits import Limits
 from lodestream_server.builds.level_files import Key, LevelFiles
 from lodestream_server.builds.level_queue import LevelQueue
-from lodestream_server.builds.shares import Turns
+from lodestream_server.builds.turns import Turns
 from lodestream_server.connections.places import Places
 from lodestream_server.problems import FullError, TooManyError
 from lodestream_server.store.containers import Containers, OpenContainer, index_memory

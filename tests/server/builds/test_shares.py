@@ -23,7 +23,7 @@ from lodestream_server import running_server
 from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import jobs, worker
-from lodestream_server.builds.shares import Turns
+from lodestream_server.builds.turns import Turns
 from lodestream_server.routes import streams
 from lodestream_server.store.index import LEAST
 from tests.server.access.test_limits import ANNA
