@@ -22,7 +22,7 @@ from .access.limits import Limits
 from .access.scopes import unrouted
 from .builds.jobs import Builder
 from .builds.level_files import LevelFiles
-from .builds.level_queue import LevelQueue
+from .builds.level_maker import LevelMaker
 from .builds.work import Work
 from .operation.metrics import Metrics
 from .operation.observation import Observation
@@ -81,7 +81,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         opened: DataFolder | None = getattr(app.state, "folder", None)
         folder = await asyncio.to_thread(DataFolder, chosen.data, chosen.scratch) if opened is None else opened
         surfaces, loop = folder.surfaces, asyncio.get_running_loop()
-        builder = Builder(surfaces, Work(folder.work), chosen, metrics.built)
 
         def queue_again(lost: list[Surface]) -> None:
             for surface in lost:
@@ -95,16 +94,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             return surfaces.index.kept(owner)
 
         containers = Containers(surfaces, lost=queue_again)
-        limits = Limits(chosen, (folder.root, folder.scratch), count, builder.pending_of, kept, lambda: access.alone)
+        limits = Limits(chosen, (folder.root, folder.scratch), count, kept, lambda: access.alone)
+        builder = Builder(surfaces, Work(folder.work), chosen, limits, metrics.built)
         metrics.watch(folder.root, lambda: len(surfaces.index), lambda: builder.pending)
         files_of_levels = await asyncio.to_thread(_level_files, chosen, folder, limits)
-        levels = LevelQueue(chosen, containers, files_of_levels, builder.fork_server, limits.check_share)
+        levels = LevelMaker(chosen, containers, files_of_levels, builder.fork_server, limits)
         upkeep = Upkeep(surfaces, builder, levels)
         app.state.parts = State(
             chosen, folder, surfaces, upkeep, builder, containers, access, limits, metrics, levels, pace
         )
         try:
-            await builder.start(limits.check_owner)
+            await builder.start()
             upkeep.start()
             yield
         finally:

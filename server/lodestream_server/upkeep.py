@@ -7,7 +7,7 @@ import logging
 from contextlib import suppress
 
 from .builds.jobs import Builder
-from .builds.level_queue import LevelQueue
+from .builds.level_maker import LevelMaker
 from .store.index import IndexLostError, Surface
 from .store.surfaces import Surfaces
 
@@ -30,10 +30,10 @@ class Upkeep:
     ----------
     surfaces : Surfaces
     builder : Builder
-    levels : LevelQueue
+    levels : LevelMaker
     """
 
-    def __init__(self, surfaces: Surfaces, builder: Builder, levels: LevelQueue) -> None:
+    def __init__(self, surfaces: Surfaces, builder: Builder, levels: LevelMaker) -> None:
         self._surfaces = surfaces
         self._builder = builder
         self._levels = levels

@@ -1,7 +1,7 @@
 """Limits on concurrent work and disk space; requests beyond them are asked to come back.
 
-A *caller* is a token, or an address without a token. It may have as many uploads in progress, builds, surfaces, bytes
-on disk and streams as it leaves free for the others (`fair_share`). The rule does not apply if nobody else can write.
+A *caller* is a token, or an address without a token. What callers share stands in one table, in `Limits`: of each of it
+a caller may have as much as it leaves for the others (`shares`). The rule does not apply if nobody else can write.
 
 Everything here but the check of names runs in the event loop, between two awaits, so no lock is needed.
 """
@@ -13,6 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,12 @@ from starlette.types import Message, Receive
 
 from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT
 
-from ..operation.fair_share import exceeds_share
 from ..operation.least_rate import LeastRate, WaitingClock
 from ..operation.settings import Settings
-from ..problems import BusyError, FullError, RestartingError, SlowUploadError, TooManyError
-from .access import Caller
+from ..problems import FullError, RestartingError, SlowUploadError
+from .access import Caller, key_of
+from .shares import Held, Share
+from .turns import Turns
 
 __all__ = ["Limits"]
 
@@ -41,6 +43,9 @@ _STREAM_SHARE = 8
 # What an upload may still take when the server is told to end.
 _LAST_SECONDS = 2.0
 
+# For so many seconds it counts who has had plans made.
+_PLANS_REMEMBERED = 60.0
+
 
 class Limits:
     """Counts what the server has accepted, and refuses what exceeds the limits.
@@ -53,12 +58,18 @@ class Limits:
     surfaces : callable (owner) -> (int, int)
         Returns how many surfaces and names there are: all of them, and those of an owner. It and `kept` are called in
         threads.
-    builds : callable (caller) -> (int, int)
-        Returns how many builds wait or run: all of them, and those of the caller with this key.
     kept : callable (owner) -> int
         Returns the bytes on disk of an owner's surfaces and names.
     alone : callable
         Returns whether there is nobody to share with.
+
+    Attributes
+    ----------
+    builds, streams, openings, levels, lent : Share
+        Of the builds that wait or run, the open streams, the connections that have not shown a token yet, the requests
+        that wait for levels, and the bytes of levels that are being read.
+    plans : Turns
+        Held while a large plan is made: one at a time, because it slows down all other Python code.
     """
 
     def __init__(
@@ -66,20 +77,29 @@ class Limits:
         settings: Settings,
         folders: Sequence[Path],
         surfaces: Callable[[str | None], tuple[int, int]],
-        builds: Callable[[str], tuple[int, int]],
         kept: Callable[[str | None], int],
         alone: Callable[[], bool],
     ) -> None:
         self._settings = settings
         self._folders = folders
-        self._surfaces = surfaces
-        self._builds = builds
-        self._kept = kept
+        self._count_surfaces = surfaces
+        self._count_kept = kept
         self._alone = alone
-        self._streams: Counter[str] = Counter()
-        self._credit: Counter[str] = Counter()  # beyond the least, of all streams, by caller
-        self._openings: Counter[str] = Counter()
-        self._uploads: dict[asyncio.Timeout, Caller] = {}  # and whose they are
+        share = partial(Share, alone=alone)
+        stored = partial(share, full=FullError, beyond=FullError, advice="delete some of them")
+        # What callers share. Of the last four it is counted elsewhere who has how much.
+        self._uploads = share("uploads in progress", settings.max_uploads)
+        self.builds = share("pending builds", settings.max_builds)
+        self.streams = share("open streams", settings.max_streams)
+        self.openings = share("connections that have not sent a token yet", settings.max_streams)
+        self._credit = share("bytes of send buffers beyond the least", settings.memory_of_streams)
+        self.levels = share("requests for levels", settings.max_level_requests)
+        self.lent = share("bytes of levels that are being read", 0, advice="read them first")
+        self._indexes = share("bytes of memory for indexes of surfaces that are streamed", 0)
+        self._surfaces = stored("surfaces", settings.max_surfaces)
+        self._kept = stored("bytes of surfaces", 0, each=settings.owner_bytes)
+        self.plans = Turns(1, _PLANS_REMEMBERED)
+        self._clocks: dict[asyncio.Timeout, str | None] = {}  # of the uploads in progress, and their owners
         self._promised: Counter[str] = Counter()  # bytes, by caller
         self._taken: Counter[str | None] = Counter()  # bytes of uploads under way, by owner
 
@@ -97,44 +117,12 @@ class Limits:
         TooManyError
             If this caller has as many as allowed.
         """
-        most = self._settings.max_streams
-        self.check_share("open streams", most, (self._streams.total(), self._streams[caller.key]), caller)
-        self._streams[caller.key] += 1
-        free = self._settings.memory_of_streams - self._credit.total()
-        more = min(free // _STREAM_SHARE, MAX_CREDIT - BASE_CREDIT)
-        if not self._alone():
-            # With it the caller has at most what is left then.
-            more = max(min(more, (free - self._credit[caller.key]) // 2), 0)
-        self._credit[caller.key] += more
-        try:
-            yield BASE_CREDIT + more
-        finally:
-            _subtract(self._credit, caller.key, more)
-            _subtract(self._streams, caller.key, 1)
-
-    @contextmanager
-    def opening(self, caller: Caller) -> Iterator[None]:
-        """Count a connection that has not shown a token yet. The limit equals that of streams, and is separate from it.
-
-        Parameters
-        ----------
-        caller : Caller
-            Of the client's address.
-
-        Raises
-        ------
-        BusyError
-            If the server has as many as allowed.
-        TooManyError
-            If this caller has as many as are left for the others.
-        """
-        there = self._openings.total(), self._openings[caller.key]
-        self.check_share("connections that have not sent a token yet", self._settings.max_streams, there, caller)
-        self._openings[caller.key] += 1
-        try:
-            yield
-        finally:
-            _subtract(self._openings, caller.key, 1)
+        with self.streams.take(caller):
+            held = self._credit.held(caller.key)
+            free = (held.most - held.taken) // _STREAM_SHARE
+            more = min(free, MAX_CREDIT - BASE_CREDIT, self._credit.left(caller.key))
+            with self._credit.take(caller, more):
+                yield BASE_CREDIT + more
 
     @asynccontextmanager
     async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:
@@ -154,47 +142,41 @@ class Limits:
         RestartingError
             If the server ends meanwhile.
         """
-        uploads = list(self._uploads.values())
-        there = len(uploads), sum(other.key == caller.key for other in uploads)
-        self.check_share("uploads in progress", self._settings.max_uploads, there, caller)
         if stored:
-            self.check_builds(caller)
+            self.builds.check(caller)
         size = request.headers.get("content-length", "")
         promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
         # One that is too large anyway is refused for that.
         room = _Room(self, caller, promised if stored and promised <= self._settings.upload_bytes else 0, stored)
         clock = asyncio.timeout(None)
-        self._uploads[clock] = caller
-        self._promised[caller.key] += room.promised
-        try:
-            async with clock:
+        with self._uploads.take(caller):
+            async with self._counted(room, clock):
                 if stored:
                     await self._check_surfaces(caller, 1)
                     await self.check_disk(caller, new=True)
                 yield Request(request.scope, _watched(request, room, self._settings))
+
+    @asynccontextmanager
+    async def _counted(self, room: _Room, clock: asyncio.Timeout) -> AsyncIterator[None]:
+        caller = room.caller
+        self._clocks[clock] = caller.owner
+        self._promised[caller.key] += room.promised
+        try:
+            async with clock:
+                yield
         except TimeoutError:
             if clock.expired():
                 raise RestartingError("expected the whole upload before the server ended; send it again") from None
             raise
         finally:
-            del self._uploads[clock]
+            del self._clocks[clock]
             _subtract(self._promised, caller.key, room.promised)
             _subtract(self._taken, caller.owner, room.taken)
 
     def end(self) -> None:
         """End: uploads that do not complete soon are ended too."""
-        for clock in self._uploads:
+        for clock in self._clocks:
             clock.reschedule(asyncio.get_running_loop().time() + _LAST_SECONDS)
-
-    def check_builds(self, caller: Caller) -> None:
-        """Check that one more build is allowed.
-
-        Raises
-        ------
-        BusyError, TooManyError
-            If the server, or the caller, has as many as allowed.
-        """
-        self.check_share("pending builds", self._settings.max_builds, self._builds(caller.key), caller)
 
     async def check_disk(self, caller: Caller, *, new: bool) -> None:
         """Check that everything that a caller has announced fits on the disk.
@@ -240,17 +222,10 @@ class Limits:
         return min((disk.free - part, part) for disk, part in zip(disks, kept, strict=True))
 
     async def _check_bytes(self, owner: str | None, free: int, promised: int) -> None:
-        most, why = self._settings.owner_bytes, ""
-        if most is None and self._alone():
+        if self._settings.owner_bytes is None and self._alone():
             return
-        has = await asyncio.to_thread(self._kept, owner) + self._taken[owner]
-        if most is None:
-            most, why = (has + free) // 2, ", half of what they use there plus what is free"
-        if has + promised > most:
-            raise FullError(
-                f"expected at most {most} bytes of {_called(owner)} on the server's disk{why}, got {has} bytes and "
-                f"{promised} to come; delete some of their surfaces"
-            )
+        has = await asyncio.to_thread(self._count_kept, owner) + self._taken[owner]
+        self._kept.check(_owner(owner), promised, Held(has + free, has, has))
 
     def took(self, room: _Room, size: int) -> None:
         """Count bytes of an upload that have arrived; they are no longer announced but used."""
@@ -260,75 +235,36 @@ class Limits:
         room.promised -= size
         _subtract(self._promised, room.caller.key, size)
 
-    def check_share(self, what: str, most: int, there: tuple[int, int], caller: Caller) -> None:
-        """Check that a caller may have one more of a shared resource.
-
-        Parameters
-        ----------
-        what : str
-            What is counted, in the plural, for error messages.
-        most : int
-            How many there may be.
-        there : (int, int)
-            How many there are: all of them, and those of the caller.
-        caller : Caller
-
-        Raises
-        ------
-        BusyError, TooManyError
-            If the server, or the caller, has as many as allowed.
-        """
-        everybody, count = there
-        if everybody >= most:
-            raise BusyError(f"expected at most {most} {what} on this server, got one more; try again soon")
-        if exceeds_share(most, everybody, count) and not self._alone():
-            raise TooManyError(
-                f"expected no more {what} of {caller.name} than are left for others, got {count}, and "
-                f"{most - everybody} of {most} are left; try again when some are done"
-            )
-
-    def check_indexes(self, caller: Caller, most: int, there: tuple[int, int]) -> None:
-        """Check that a caller may have memory for one more index; the numbers are bytes, with that index.
+    def check_index(self, caller: Caller, size: int, most: int, taken: int, own: int) -> None:
+        """Check that a caller may have memory for one more index; may be called from any thread.
 
         Raises
         ------
         TooManyError
             If less would be left for others than it has.
         """
-        everybody, size = there
-        if size and exceeds_share(most, everybody, size - 1) and not self._alone():
-            raise TooManyError(
-                f"expected no more memory for indexes of surfaces that {caller.name} streams than is left for others, "
-                f"got {size >> 10} KiB, and {(most - everybody) >> 10} KiB would be left; try again when some are done"
-            )
+        self._indexes.check(caller, size, Held(most, taken, own))
 
     def names(self, caller: Caller) -> Callable[[], None]:
         """Return a check, for a thread, that one more name is allowed; names count as surfaces.
 
         It raises `FullError` if there are as many surfaces as allowed.
         """
-        uploads = list(self._uploads.values())
-        return lambda: self._check_count(caller, uploads, self._surfaces(caller.owner), 0)
+        uploads = list(self._clocks.values())
+        return lambda: self._check_count(caller.owner, uploads, self._count_surfaces(caller.owner), 0)
 
     async def _check_surfaces(self, caller: Caller, own: int) -> None:
         """Check that one more surface is allowed; uploads in progress count as surfaces, but `own` of the caller's."""
         # Before the surfaces: one that ends meanwhile counts twice, and never not at all.
-        uploads = list(self._uploads.values())
-        self._check_count(caller, uploads, await asyncio.to_thread(self._surfaces, caller.owner), own)
+        uploads = list(self._clocks.values())
+        there = await asyncio.to_thread(self._count_surfaces, caller.owner)
+        self._check_count(caller.owner, uploads, there, own)
 
-    def _check_count(self, caller: Caller, uploads: list[Caller], there: tuple[int, int], own: int) -> None:
+    def _check_count(self, owner: str | None, uploads: list[str | None], there: tuple[int, int], own: int) -> None:
         """Check that one more surface or name is allowed beside uploads in progress and what is there."""
-        most, (kept, kept_of_owner) = self._settings.max_surfaces, there
-        everybody = kept + len(uploads) - own
-        count = kept_of_owner + sum(other.owner == caller.owner for other in uploads) - own
-        if everybody >= most:
-            raise FullError(f"expected at most {most} surfaces on this server; delete some of them")
-        if exceeds_share(most, everybody, count) and not self._alone():
-            whose = _called(caller.owner)
-            raise FullError(
-                f"expected no more surfaces of {whose} than are left for others, got {count}, and "
-                f"{most - everybody} of {most} are left; delete some of them"
-            )
+        kept, kept_of_owner = there
+        taken, of_owner = kept + len(uploads) - own, kept_of_owner + uploads.count(owner) - own
+        self._surfaces.check(_owner(owner), 1, Held(self._settings.max_surfaces, taken, of_owner))
 
 
 class _Room:
@@ -353,8 +289,9 @@ class _Room:
             await self._limits.check_disk(self.caller, new=not self.promised)
 
 
-def _called(owner: str | None) -> str:
-    return "those without a token" if owner is None else owner
+def _owner(owner: str | None) -> Caller:
+    """Return an owner as a caller: all without a token are one."""
+    return Caller(key_of(owner), "those without a token" if owner is None else owner, owner)
 
 
 def _subtract(counter: Counter[Any], key: object, count: int) -> None:

@@ -32,13 +32,12 @@ import errno
 import logging
 import os
 import time
-from collections import Counter
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from lodestream import stores
 from lodestream.confinement import missing
@@ -46,7 +45,7 @@ from lodestream.errors import InputError, TooLargeError
 from lodestream.stores import AbsentError, StoreError
 
 from ..access.access import key_of
-from ..operation.logs import event
+from ..access.limits import Limits
 from ..operation.settings import Settings
 from ..problems import FullError
 from ..store.durable import discard
@@ -60,8 +59,8 @@ from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason
 from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
 from .fork_server import Allowed
-from .processes import Call, ForkServer, Pool
-from .turns import Turns
+from .processes import Call, ForkServer
+from .runner import Runner
 from .work import Work
 
 __all__ = ["Builder"]
@@ -95,6 +94,9 @@ class _Running:
 
 
 _T = TypeVar("_T")
+
+#: What became of an attempt.
+_Outcome = State | Literal["again"]
 
 _CONFINED = "landlock+seccomp"
 
@@ -136,7 +138,9 @@ class Builder:
     surfaces : Surfaces
     work : Work
     settings : Settings
-    finished : callable (state, seconds) or None
+    limits : Limits
+        An owner who uses more disk space than allowed has builds that wait.
+    finished : callable (state, seconds)
         Called when a build ends, with the state (``ready``, ``failed``, ``waiting``) and the duration of its last
         attempt.
 
@@ -153,20 +157,19 @@ class Builder:
         surfaces: Surfaces,
         work: Work,
         settings: Settings,
-        finished: Callable[[State, float], None] | None = None,
+        limits: Limits,
+        finished: Callable[[State, float], None],
     ) -> None:
         self.ready = False
         self._surfaces = surfaces
         self._work = work
         self._settings = settings
+        self._limits = limits
         self._finished = finished
         self._memory, self._threads = settings.memory_of_build, settings.threads_of_build
         self.fork_server = ForkServer(worker.preload)
-        self._pool = Pool(settings.workers, self.fork_server)
-        self._turns = Turns(settings.workers, _REMEMBERED)
+        self._runner = Runner[str]("build", settings.workers, _REMEMBERED, self.fork_server)
         self._callers: dict[str, str] = {}  # of the builds that wait or run
-        self._check_owner: Callable[[str | None], Awaitable[None]] | None = None
-        self._pending: Counter[str] = Counter()
         self._running: dict[str, _Running] = {}
         #: Since when the folder of a surface's build is held by another process.
         self._held: dict[str, float] = {}
@@ -183,19 +186,8 @@ class Builder:
         """Number of builds that wait or run."""
         return len(self._tasks)
 
-    def pending_of(self, caller: str) -> tuple[int, int]:
-        """Return the number of builds that wait or run: all of them, and those of the caller with this key."""
-        return len(self._tasks), self._pending.get(caller, 0)
-
-    async def start(self, check_owner: Callable[[str | None], Awaitable[None]] | None = None) -> None:
-        """Start the process that builds come from, and continue builds queued when the server last ended.
-
-        Parameters
-        ----------
-        check_owner : callable or None
-            Raises FullError if an owner uses more disk space than allowed; that owner's builds then wait.
-        """
-        self._check_owner = check_owner
+    async def start(self) -> None:
+        """Start the process that builds come from, and continue builds queued when the server last ended."""
         self._preloading = asyncio.create_task(self._preload())
         try:
             await asyncio.to_thread(lambda: self._work.clean(set(self._surfaces.index.queued())))
@@ -254,16 +246,14 @@ class Builder:
 
     def _count(self, surface: str, caller: str) -> None:
         self._callers[surface] = caller
-        self._pending[caller] += 1
+        self._limits.builds.add(caller)
 
     def _ended(self, surface: str) -> None:
         self._tasks.pop(surface, None)
         self._held.pop(surface, None)
         caller = self._callers.pop(surface, None)
         if caller is not None:
-            self._pending[caller] -= 1
-            if not self._pending[caller]:
-                del self._pending[caller]
+            self._limits.builds.add(caller, -1)
         if self._has_more and len(self._tasks) < _TAKEN_UP // 2 and not self._closing:
             self._has_more = False
             self._resuming = asyncio.create_task(self._resume_later())
@@ -357,8 +347,8 @@ class Builder:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await self._runner.close()
         await asyncio.to_thread(self.fork_server.close)
-        await asyncio.to_thread(self._pool.close)
 
     @property
     def confinement(self) -> str | None:
@@ -413,9 +403,7 @@ class Builder:
                 continue
             if state is not None:
                 seconds = time.monotonic() - started
-                event(_log, "build ended", surface=surface, state=state, seconds=seconds)
-                if self._finished is not None:
-                    self._finished(state, seconds)
+                self._finished(state, seconds)
             return
 
     async def _insist_or_postpone(self, surface: str) -> State | None:
@@ -442,14 +430,9 @@ class Builder:
             if surface not in self._callers:
                 self._count(surface, key_of(known.manifest.owner))
             try:
-                async with self._turns.turn(self._callers[surface], known.attempts):
-                    await self._check_share(known)
-                    with self._surfaces.upload(known) as files:
-                        problem = await self._damage(known, files)
-                        if problem is not None:
-                            return await self._do_without(surface, problem)
-                        state = await self._attempt(known, files)
-                    if state is not None:
+                work = partial(self._in_turn, known)
+                async with self._runner.job(surface, self._callers[surface], work, known.attempts) as state:
+                    if state != "again":
                         return state
             except _OverError:
                 return None
@@ -459,6 +442,14 @@ class Builder:
                 reason = self._out_of_memory() if isinstance(error, MemoryError) else f"the build failed: {error}"
                 _log.warning("%s: %s", surface, reason)
                 await self._try(partial(self._surfaces.later, surface, reason, counts=True))
+
+    async def _in_turn(self, surface: Surface, held: ExitStack) -> _Outcome:
+        await self._check_share(surface)
+        files = held.enter_context(self._surfaces.upload(surface))
+        problem = await self._damage(surface, files)
+        if problem is not None:
+            return await self._do_without(surface.id, problem)
+        return await self._attempt(surface, files)
 
     async def _try(self, note: Callable[[], object]) -> None:
         """Note something of a build that is found out again if it is lost."""
@@ -475,15 +466,15 @@ class Builder:
 
     async def _check_share(self, surface: Surface) -> None:
         # What was ready once had its share, and is given it back.
-        if self._check_owner is not None and surface.container is None:
+        if surface.container is None:
             try:
-                await self._check_owner(surface.manifest.owner)
+                await self._limits.check_owner(surface.manifest.owner)
             except FullError as error:  # which names the owner, and readers see the reason
                 _log.info("the build of %s waits: %s", surface.id, error)
                 raise _LaterError("disk space of its owner, who has as much as allowed (owner_bytes)") from None
 
-    async def _attempt(self, surface: Surface, files: Sequence[Path]) -> State | None:
-        """Build a surface once, and return its new state; None if the build must start again from nothing."""
+    async def _attempt(self, surface: Surface, files: Sequence[Path]) -> _Outcome:
+        """Build a surface once, and return its new state, or that the build must start again from nothing."""
         it = surface.manifest
         folder = self._work.new_attempt(it.id)
         job = self._job(surface, files, folder)
@@ -507,7 +498,7 @@ class Builder:
         call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
         self._running[it.id] = _Running(folder, call)
         try:
-            result: worker.Built | worker.Parsed | worker.Refused | None = await self._run(self._pool.run(call))
+            result: worker.Built | worker.Parsed | worker.Refused | None = await self._run(self._runner.call(call))
             if isinstance(result, worker.Parsed):
                 result = await self._run_by_cluster(it.id, job)
             if isinstance(result, worker.Built):
@@ -522,12 +513,12 @@ class Builder:
             # uploaded after the last owner of the first had deleted them.
             if await asyncio.to_thread(_identities, job.files) != begun:
                 await self._try(partial(self._surfaces.later, it.id))
-                return None
+                return "again"
             if continued:
                 # What it continued from may have been at fault, and is gone now.
                 _log.warning(_STARTED_AGAIN, it.id, result.reason)
                 await self._try(partial(self._surfaces.later, it.id))
-                return None
+                return "again"
             if result.final:
                 return await self._refuse(surface, files, result.reason)
             return await self._postpone(it.id, result.reason)
@@ -539,7 +530,7 @@ class Builder:
                 raise
             _log.warning(_STARTED_AGAIN, it.id, error)
             await self._try(partial(self._surfaces.later, it.id, str(error), counts=True))
-            return None
+            return "again"
         except asyncio.CancelledError:
             if counted:  # the server ends, or the surface is deleted: that is no fault of the build
                 await _carried_out(partial(self._end_early, it.id))

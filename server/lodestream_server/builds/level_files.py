@@ -75,6 +75,11 @@ class LevelFiles:
         Bytes.
     free : callable
         Returns how many bytes of the disk may be used now.
+
+    Attributes
+    ----------
+    lent : int
+        Bytes of the files that somebody reads, removed ones included.
     """
 
     def __init__(self, folder: Path, most: int, free: Callable[[], Awaitable[int]]) -> None:
@@ -83,7 +88,7 @@ class LevelFiles:
         self._free = free
         self._files: OrderedDict[Key, _File] = OrderedDict()
         self._numbers = itertools.count()
-        self._lent = 0
+        self.lent = 0
 
     def close(self) -> None:
         """Remove all files."""
@@ -97,7 +102,7 @@ class LevelFiles:
     @property
     def size(self) -> int:
         """Bytes of all files, including removed ones that are still being read."""
-        return self._lent + sum(file.size for file in self._files.values() if not file.readers)
+        return self.lent + sum(file.size for file in self._files.values() if not file.readers)
 
     def lend(self, key: Key) -> Lease | None:
         """Return a lease of a file, if it exists."""
@@ -109,13 +114,13 @@ class LevelFiles:
 
     def _lease(self, file: _File) -> Lease:
         if not file.readers:
-            self._lent += file.size
+            self.lent += file.size
         return Lease(self, file)
 
     def released(self, file: _File) -> None:
         """Count a reader less of a file; `Lease` calls this."""
         if not file.readers:
-            self._lent -= file.size
+            self.lent -= file.size
             if file.forgotten:
                 discard(file.path)
 

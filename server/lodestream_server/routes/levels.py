@@ -13,14 +13,14 @@ from lodestream.formats import written
 
 from ..access.scopes import Reader
 from ..builds.level_files import Key
-from ..builds.level_queue import Loan
+from ..builds.level_maker import Loan
 from ..builds.levels import MEDIA_TYPES, written_by
 from ..problems import BusyError, responses
 from ..store.index import Surface
 from . import examples
 from .byte_ranges import sort_out
 from .routing import Parts, matches, readable
-from .sending import SentFile, ready, still_there
+from .sending import SentFile, ready, still_there, while_there
 
 __all__ = ["router"]
 
@@ -63,7 +63,7 @@ async def level(
         return unchanged
     key = Key(found.container or "", level, format_.name)
     with still_there(parts, surface):
-        loan = await parts.levels.borrow(request, key, caller)
+        loan = await while_there(request, parts.levels.take(key, caller), Loan.release)
     try:
         sort_out(request, loan.size, etag)
         headers["content-disposition"] = f'attachment; filename="{found.id}-{level}{format_.stream_suffix}"'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, Depends
@@ -13,8 +13,7 @@ from fastapi.responses import Response
 from ..access.access import Access
 from ..access.limits import Limits
 from ..builds.jobs import Builder
-from ..builds.level_queue import LevelQueue
-from ..builds.turns import Turns
+from ..builds.level_maker import LevelMaker
 from ..operation.metrics import Metrics
 from ..operation.pace import Pace
 from ..operation.settings import Settings
@@ -25,18 +24,12 @@ from ..upkeep import Upkeep
 
 __all__ = ["Parts", "State", "matches", "readable"]
 
-# For so many seconds it counts who has had plans made.
-_PLANS_REMEMBERED = 60.0
-
 _Route = TypeVar("_Route", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
 class State:
-    """The parts of a running server.
-
-    ``planning`` is held while a large plan is made: one at a time, because it slows down all other Python code.
-    """
+    """The parts of a running server."""
 
     settings: Settings
     folder: DataFolder
@@ -47,9 +40,8 @@ class State:
     access: Access
     limits: Limits
     metrics: Metrics
-    levels: LevelQueue
+    levels: LevelMaker
     pace: Pace
-    planning: Turns = field(default_factory=lambda: Turns(1, _PLANS_REMEMBERED), init=False)
 
 
 # A coroutine, because FastAPI calls a plain function in a thread.

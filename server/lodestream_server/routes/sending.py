@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
+from fastapi import Request
 from fastapi.responses import FileResponse
+from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
 from lodestream.errors import NotFoundError
@@ -15,9 +19,11 @@ from ..problems import BuildFailedError, BusyError, NotReadyError, PostponedErro
 from ..store.index import Surface
 from .routing import State
 
-__all__ = ["SentFile", "ready", "still_there"]
+__all__ = ["SentFile", "ready", "still_there", "while_there"]
 
 _log = logging.getLogger(__name__)
+
+_Result = TypeVar("_Result")
 
 
 class SentFile(FileResponse):
@@ -92,3 +98,44 @@ def still_there(parts: State, surface: str) -> Iterator[None]:
     except BusyError:
         ready(parts, surface)
         raise
+
+
+async def while_there(
+    request: Request, work: Coroutine[Any, Any, _Result], release: Callable[[_Result], None]
+) -> _Result:
+    """Wait for work; it is cancelled when the client disconnects.
+
+    Parameters
+    ----------
+    request : Request
+        Its body must not have been read.
+    work : coroutine
+    release : callable
+        Called with a result that nobody takes any more.
+
+    Raises
+    ------
+    ClientDisconnect
+        If the client has disconnected.
+    Exception
+        From the work.
+    """
+    working, watching = asyncio.ensure_future(work), asyncio.ensure_future(_gone(request))
+    taken = False
+    try:
+        await asyncio.wait((working, watching), return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            raise ClientDisconnect
+        taken = True
+        return working.result()
+    finally:
+        working.cancel()
+        watching.cancel()
+        await asyncio.gather(working, watching, return_exceptions=True)
+        if not taken and not working.cancelled() and working.exception() is None:
+            release(working.result())
+
+
+async def _gone(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass

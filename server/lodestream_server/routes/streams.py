@@ -79,7 +79,7 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface:
         if caller is None:
             # Nothing is told of the surface, not even whether it exists, before the token was seen; and nobody takes a
             # stream from those who have one by showing none.
-            with parts.limits.opening(anybody(socket)):
+            with parts.limits.openings.take(anybody(socket)):
                 if first is None:
                     first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.reader_with(_token(first))
@@ -89,7 +89,7 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface:
                 sha256 = found.container or ""
                 container = parts.containers.open_known(sha256, caller.key)
                 if container is None:
-                    share = partial(parts.limits.check_indexes, caller)
+                    share = partial(parts.limits.check_index, caller)
                     container = await asyncio.to_thread(parts.containers.open, sha256, caller.key, share)
             sender = Sender(container.index, container.sha256, credit, container.window_errors)
             await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
@@ -184,7 +184,7 @@ class _Session:
         self._containers = parts.containers
         self._sender = sender
         self._heard = asyncio.Event()
-        self._planning = parts.planning
+        self._plans = parts.limits.plans
         self._pace = parts.pace
         # Who has the sender: a thread that plans with it, or one of the two tasks.
         self._mine = asyncio.Lock()
@@ -274,7 +274,7 @@ class _Session:
 
     async def _plan(self, work: Callable[..., _Result], *args: Any) -> _Result:
         """Run slow work in a thread, while the event loop serves other clients."""
-        async with self._planning.turn(self._caller.key):
+        async with self._plans.turn(self._caller.key):
             return await _whole(asyncio.to_thread(work, *args))
 
     async def _next(self) -> tuple[bytes | None, ByteRange | None]:

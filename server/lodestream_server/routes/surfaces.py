@@ -142,7 +142,7 @@ async def retry(caller: Writer, request: Request, parts: Parts, surface: str) ->
     """
     known = _changeable(caller, parts, surface)
     if known.state in ("failed", "waiting"):
-        parts.limits.check_builds(caller)
+        parts.limits.builds.check(caller)
     return await answer(await parts.builder.retry(surface, caller.key), caller, parts, request, located=True)
 
 

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -19,7 +19,7 @@ from lodestream.stores import AbsentError, Blob
 
 from ..problems import BusyError
 from . import damage, layout
-from .index import Surface
+from .index import IndexLostError, Surface
 from .surfaces import Surfaces
 
 if TYPE_CHECKING:
@@ -48,9 +48,9 @@ _log = logging.getLogger(__name__)
 #: Reads bytes at an offset, so many of them.
 Read = Callable[[int, int], bytes]
 
-#: Takes the bytes of memory that there are for indexes, and of these all that are taken and those of the caller, with
-#: one more index; raises an error if the caller may not have that.
-Share = Callable[[int, tuple[int, int]], None]
+#: Takes the bytes of memory that one more index needs; those that there are for indexes; and of these all that are
+#: taken, and those of the caller. Raises an error if the caller may not have the index.
+Share = Callable[[int, int, int, int], None]
 
 
 def _nothing(*_: object) -> None:
@@ -155,6 +155,12 @@ class Containers:
                 yield path
         except AbsentError:
             self._gone(sha256)
+
+    def is_used(self, sha256: str) -> bool:
+        """Return whether a surface has this container, as far as the index knows."""
+        with suppress(IndexLostError):
+            return self._surfaces.index.uses_container(sha256)
+        return True
 
     def tell_damage(self, sha256: str, error: StreamError) -> None:
         """Log that a container turned out to be damaged when it was read."""
@@ -289,7 +295,8 @@ class Containers:
             # Those that nobody has open make room. Who has nothing yet finds a place.
             everybody = self._coming.total() + self._bytes_of(set().union(*self._open.values()))
             of_caller = self._coming[caller] + self._bytes_of(self._open.get(caller, ()))
-            share(self._most, (everybody + size, of_caller + size if of_caller else 0))
+            if of_caller:
+                share(size, self._most, everybody, of_caller)
             self._coming[caller] += size
         try:
             yield

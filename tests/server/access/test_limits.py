@@ -49,14 +49,16 @@ def limits(
     **settings: Any,
 ) -> Limits:
     """Of which ``of_anna`` surfaces, ``own`` builds and ``kept`` bytes on the disk are Anna's."""
-    return Limits(
+    made = Limits(
         Settings(data=folder, **settings),
         (folder,),
         lambda owner: (surfaces, of_anna if owner == ANNA.owner else 0),
-        lambda caller: (builds, own if caller == ANNA.key else 0),
         lambda owner: kept if owner == ANNA.owner else 0,
         lambda: alone,
     )
+    made.builds.add(ANNA.key, own)
+    made.builds.add(BERT.key, builds - own)
+    return made
 
 
 def request(*chunks: bytes, length: int | str | None = None) -> Request:
@@ -273,16 +275,16 @@ def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Pat
     made = limits(tmp_path, alone=False, max_streams=4)
     with ExitStack() as held:
         for caller in (ANNA, ANNA, BERT):
-            held.enter_context(made.opening(caller))
-        with pytest.raises(TooManyError, match="got 2, and 1 of 4 are left"), made.opening(ANNA):
+            held.enter_context(made.openings.take(caller))
+        with pytest.raises(TooManyError, match="got 2, and 1 of 4 are left"), made.openings.take(ANNA):
             pass
-        held.enter_context(made.opening(CARL))
-        with pytest.raises(BusyError, match="at most 4"), made.opening(DORA):
+        held.enter_context(made.openings.take(CARL))
+        with pytest.raises(BusyError, match="at most 4"), made.openings.take(DORA):
             pass
         for caller in (ANNA, ANNA, BERT, CARL):
             held.enter_context(made.stream(caller))
     for _ in range(5):
-        with made.opening(ANNA), made.opening(ANNA):
+        with made.openings.take(ANNA), made.openings.take(ANNA):
             pass
 
 

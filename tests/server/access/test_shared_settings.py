@@ -20,9 +20,9 @@ from lodestream.stores import Folder
 from lodestream_server import Settings
 from lodestream_server.access.access import Caller
 from lodestream_server.access.limits import Limits
+from lodestream_server.access.turns import Turns
 from lodestream_server.builds.level_files import Key, LevelFiles
-from lodestream_server.builds.level_queue import LevelQueue
-from lodestream_server.builds.turns import Turns
+from lodestream_server.builds.level_maker import LevelMaker
 from lodestream_server.connections.places import Places
 from lodestream_server.problems import FullError, TooManyError
 from lodestream_server.store.containers import Containers, OpenContainer, index_memory
@@ -63,7 +63,6 @@ NOT_SHARED = {
     "build_seconds": "of one build",
     "level_memory": "of one process; levels are made in turns (max_level_requests)",
     "level_seconds": "of one level",
-    "max_client_level_requests": "of one client",
     "idle_seconds": "of one connection",
     "least_rate": "of one connection",
     "head_seconds": "of one connection",
@@ -77,13 +76,11 @@ class Town:
     def __init__(self, folder: Path, **settings: Any) -> None:
         self.settings = Settings(data=folder, keep_free=0, **settings)
         self.surfaces: Counter[str | None] = Counter()
-        self.builds: Counter[str] = Counter()
         self.bytes: Counter[str | None] = Counter()
         self.limits = Limits(
             self.settings,
             (folder,),
             lambda owner: (self.surfaces.total(), self.surfaces[owner]),
-            lambda caller: (self.builds.total(), self.builds[caller]),
             lambda owner: self.bytes[owner],
             lambda: False,
         )
@@ -95,7 +92,7 @@ def taken(take: Callable[[Caller], object], caller: Caller) -> int:
         try:
             take(caller)
         except (TooManyError, FullError) as refusal:
-            if "left for others" not in str(refusal) and "half of what" not in str(refusal):
+            if "left for others" not in str(refusal):
                 raise
             return count
     raise AssertionError("one caller takes everything")
@@ -166,15 +163,15 @@ def builds(folder: Path) -> None:
     town = Town(folder, max_builds=8)
 
     def take(caller: Caller) -> None:
-        town.limits.check_builds(caller)
-        town.builds[caller.key] += 1
+        town.limits.builds.check(caller)
+        town.limits.builds.add(caller.key)
 
     assert [taken(take, caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
 
 
 def open_streams(folder: Path) -> None:
     town = Town(folder, max_streams=8)
-    for places in (town.limits.stream, town.limits.opening):
+    for places in (town.limits.stream, town.limits.openings.take):
         with ExitStack() as held:
 
             def take(caller: Caller, held: ExitStack = held, places: Any = places) -> None:
@@ -234,10 +231,8 @@ def level_requests(folder: Path) -> None:
         return 1 << 30
 
     async def fill() -> list[int]:
-        queue = LevelQueue(
-            town.settings, nothing, LevelFiles(folder / "levels", 1 << 20, free), nothing, town.limits.check_share
-        )
-        queue._go_on = lambda: None  # type: ignore[method-assign]  # nothing is made
+        queue = LevelMaker(town.settings, nothing, LevelFiles(folder / "levels", 1 << 20, free), nothing, town.limits)
+        queue._runner._turns._free = 0  # nothing is made
         waiting: list[asyncio.Task[Any]] = []
 
         async def count(caller: Caller) -> int:
@@ -261,14 +256,14 @@ def level_requests(folder: Path) -> None:
 
 def disk_of_levels(folder: Path) -> None:
     most = 4 << 20
-    town = Town(folder, max_client_level_requests=1000)
+    town = Town(folder)
 
     async def free() -> int:
         return 1 << 30
 
     async def fill() -> int:
         files = LevelFiles(folder / "levels", most, free)
-        queue = LevelQueue(town.settings, nothing, files, nothing, town.limits.check_share)
+        queue = LevelMaker(town.settings, nothing, files, nothing, town.limits)
         for number in range(1000):
             key = Key("a" * 64, number, "npy")
             work = files.new_folder(key)
@@ -317,7 +312,7 @@ def test_memory_of_indexes_is_shared(tmp_path: Path) -> None:
     left, held = iter(names), dict[Caller, list[OpenContainer]]()
 
     def open_one(caller: Caller, name: str) -> None:
-        share = partial(town.limits.check_indexes, caller)
+        share = partial(town.limits.check_index, caller)
         held.setdefault(caller, []).append(containers.open(name, caller.key, share))
 
     assert [taken(lambda caller: open_one(caller, next(left)), caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
@@ -333,8 +328,8 @@ def test_memory_of_indexes_is_shared(tmp_path: Path) -> None:
     held.clear()
     assert containers._open == {}
     alone = Containers(surfaces, 8 * each)
-    town.limits._alone = lambda: True
-    several = [alone.open(name, ANNA.key, partial(town.limits.check_indexes, ANNA)) for name in names[:8]]
+    town.limits._indexes._alone = lambda: True
+    several = [alone.open(name, ANNA.key, partial(town.limits.check_index, ANNA)) for name in names[:8]]
     for opened in several:
         opened.close()
     surfaces.close()

@@ -17,7 +17,7 @@ from threading import Barrier, get_ident
 
 from lodestream.confinement import landlock
 from lodestream.parallel import spread, threads
-from lodestream_server.builds import jobs, level_queue, worker
+from lodestream_server.builds import jobs, level_maker, worker
 from lodestream_server.builds.fork_server import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
@@ -89,7 +89,7 @@ def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
 # The server's limits are longer, and no test leaves it at that.
 
 _allowed: Callable[..., Allowed] = jobs._allowed
-_allowed_level: Callable[..., Allowed] = level_queue._allowed
+_allowed_level: Callable[..., Allowed] = level_maker._allowed
 
 
 def weaken() -> None:

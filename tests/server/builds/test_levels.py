@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from lodestream import Block, Surface, encode
 from lodestream_server import running, running_server
-from lodestream_server.access.access import Caller, key_of
+from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
-from lodestream_server.builds import level_queue, worker
-from lodestream_server.builds.level_files import Key, Lease, LevelFiles
+from lodestream_server.builds import level_maker, worker
+from lodestream_server.builds.level_files import Key, LevelFiles
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from lodestream_server.builds.runner import Runner
 from tests.server.builds import slow
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.connections import hostile
@@ -89,23 +90,24 @@ def on_disk(data: Path) -> int:
 @pytest.fixture
 def slowly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Levels other than the coarsest are made when the file ``go`` is there."""
-    monkeypatch.setattr(level_queue, "make_level", slow.make_coarsest)
-    monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
+    monkeypatch.setattr(level_maker, "make_level", slow.make_coarsest)
+    monkeypatch.setattr(level_maker, "_allowed", slow.allow_levels_more)
 
 
 @pytest.fixture
 def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The levels for which somebody waits, as they came; when ``two`` comes, levels are made."""
     levels: list[int] = []
-    wait = level_queue.LevelQueue._wait
+    job = Runner.job
 
-    async def noted(self: level_queue.LevelQueue, key: Key, caller: Caller) -> Lease:
-        levels.append(key.level)
-        if caller.key == key_of("two"):
+    def noted(self: Runner[Key], key: Key, caller: str, *rest: Any) -> Any:
+        if isinstance(key, Key):
+            levels.append(key.level)
+        if isinstance(key, Key) and caller == key_of("two"):
             (tmp_path / "go").touch()
-        return await wait(self, key, caller)
+        return job(self, key, caller, *rest)
 
-    monkeypatch.setattr(level_queue.LevelQueue, "_wait", noted)
+    monkeypatch.setattr(Runner, "job", noted)
     return levels
 
 
@@ -246,8 +248,11 @@ def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: No
 def test_one_client_waits_for_so_many_and_all_for_so_many(tmp_path: Path, slowly: None) -> None:
     file = TokenFile(tmp_path / "tokens.json")
     one, two, three = (file.create(name, ("write",))[0] for name in ("one", "two", "three"))
-    settings = {"max_level_requests": 3, "max_client_level_requests": 2}
-    with running_server(tmp_path, workers=1, **settings) as url, client(url, one) as http, client(url, two) as other:
+    with (
+        running_server(tmp_path, workers=1, max_level_requests=3) as url,
+        client(url, one) as http,
+        client(url, two) as other,
+    ):
         surface = push(http, npy(hills()))
         with ExitStack() as held:
             for name in ("npy", "ply"):
@@ -339,11 +344,11 @@ def test_a_level_that_takes_too_much_is_refused_and_the_next_one_is_made(
     with running_server(tmp_path, workers=1, level_memory=256 << 20, level_seconds=20.0) as url, client(url) as http:
         surface = push(http, npy(hills()))
         for function, expected in ((slow.hoard_level, (413, "too-large")), (slow.raise_full, (507, "full"))):
-            monkeypatch.setattr(level_queue, "make_level", function)
+            monkeypatch.setattr(level_maker, "make_level", function)
             assert problem(http.get(finest(surface))) == expected
             assert on_disk(tmp_path) == 0
-        monkeypatch.setattr(level_queue, "make_level", slow.kill_level_once)
-        monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
+        monkeypatch.setattr(level_maker, "make_level", slow.kill_level_once)
+        monkeypatch.setattr(level_maker, "_allowed", slow.allow_levels_more)
         assert http.get(finest(surface)).content == npy(hills())
 
 
@@ -355,7 +360,7 @@ def test_a_level_that_memory_is_too_little_for_names_the_limit_and_its_setting(
     with running_server(tmp_path, workers=1, memory=512 << 20, **settings) as url, client(url) as http:
         surface = push(http, npy(hills()))
         for function in (slow.refuse_large_level, slow.lack_memory_for_level):
-            monkeypatch.setattr(level_queue, "make_level", function)
+            monkeypatch.setattr(level_maker, "make_level", function)
             answer = http.get(finest(surface))
             assert problem(answer) == (413, "too-large")
             assert answer.json()["title"] == "The request, or what it asks for, is too large"
@@ -373,7 +378,7 @@ def test_a_level_that_memory_is_too_little_for_names_the_limit_and_its_setting(
 
 @needs_landlock
 def test_a_container_may_be_built_again_while_a_level_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(level_queue, "make_level", slow.make_when_told)
+    monkeypatch.setattr(level_maker, "make_level", slow.make_when_told)
 
     def begin() -> Path:
         return eventually(lambda: next((tmp_path / "scratch" / "levels").glob("*/begun"), None), "a process to begin")
@@ -396,10 +401,10 @@ def test_no_word_of_its_process_is_believed(tmp_path: Path, monkeypatch: pytest.
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
         for function in (hostile.forge_level, hostile.forge_level_link, hostile.say_garbage_of_level):
-            monkeypatch.setattr(level_queue, "make_level", function)
+            monkeypatch.setattr(level_maker, "make_level", function)
             assert problem(http.get(finest(surface))) == (503, "busy")
             assert on_disk(tmp_path) == 0
-        monkeypatch.setattr(level_queue, "make_level", make_level)
+        monkeypatch.setattr(level_maker, "make_level", make_level)
         assert http.get(finest(surface)).content == npy(hills())
 
 
@@ -548,7 +553,7 @@ def test_a_level_larger_than_memory_is_made_by_bands_to_the_same_file(
             finest(surface)
         ]
         whole = [http.get(address, params={"format": format_name}).raise_for_status() for address in addresses]
-    monkeypatch.setattr(level_queue, "make_level", slow.make_level_by_bands)  # nothing is kept from server to server
+    monkeypatch.setattr(level_maker, "make_level", slow.make_level_by_bands)  # nothing is kept from server to server
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         for before, address in zip(whole, addresses, strict=True):
             banded = http.get(str(httpx.URL(address).path), params={"format": format_name}).raise_for_status()
@@ -567,7 +572,7 @@ def test_a_level_of_several_blocks_is_made_block_by_block_to_the_same_file(
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         told = push(http, encode(Surface(blocks=blocks)), filename="a.lode")
         whole = http.get(finest(told), params={"format": format_name}).raise_for_status()
-    monkeypatch.setattr(level_queue, "make_level", slow.make_level_by_blocks)
+    monkeypatch.setattr(level_maker, "make_level", slow.make_level_by_blocks)
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         banded = http.get(str(httpx.URL(finest(told)).path), params={"format": format_name}).raise_for_status()
         assert banded.content == whole.content

@@ -22,8 +22,8 @@ from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
+from lodestream_server.access.turns import Place, Turns
 from lodestream_server.builds import jobs, worker
-from lodestream_server.builds.turns import Turns
 from lodestream_server.routes import streams
 from lodestream_server.store.index import LEAST
 from tests.server.access.test_limits import ANNA
@@ -119,7 +119,7 @@ def test_what_one_keeps_on_the_disk_leaves_room_for_others(town: Town) -> None:
         made = push(bad, npy(hills(20, 20)))
         answer = bad.post("/v1/surfaces", content=npy(hills(20, 20, seed=2)))
         assert problem(answer) == (507, "full")
-        assert f"{LEAST + 4000} bytes of bad" in answer.json()["detail"]
+        assert f"{LEAST + 4000} bytes of surfaces of bad" in answer.json()["detail"]
         assert answer.headers["retry-after"].isdecimal()
         assert push(bad, npy(hills(20, 20))) == made, "what is there already takes no room"
         assert push(good, npy(hills(20, 20)))["state"] == "ready"
@@ -254,10 +254,10 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
 
     entering, enter = threading.Event(), Turns._enter
 
-    async def noted(self: Turns, caller: str, rank: int) -> None:
-        if caller == key_of("good"):
+    async def noted(self: Turns, place: Place) -> str:
+        if place.callers == [key_of("good")]:
             entering.set()
-        await enter(self, caller, rank)
+        return await enter(self, place)
 
     monkeypatch.setattr(Sender, "receive", patient(Sender.receive))
     monkeypatch.setattr(Turns, "_enter", noted)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from random import Random
 
-from lodestream_server.builds.turns import Turns
+from lodestream_server.access.turns import Turns
 from tests.server.helpers import PATIENCE
 
 

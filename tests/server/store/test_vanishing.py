@@ -15,10 +15,10 @@ import pytest
 
 from lodestream.protocol.messages import CODES, Error
 from lodestream_server import running_server
-from lodestream_server.access.access import Caller
 from lodestream_server.access.tokens import TokenFile
-from lodestream_server.builds import level_queue
-from lodestream_server.builds.level_files import Key, Lease
+from lodestream_server.builds import level_maker
+from lodestream_server.builds.level_files import Key
+from lodestream_server.builds.runner import Runner
 from lodestream_server.problems import BusyError
 from lodestream_server.store.containers import Containers, OpenContainer
 from tests.server.builds import slow
@@ -74,15 +74,16 @@ def test_a_level_whose_container_was_deleted_and_made_again_for_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waiting: list[str] = []
-    wait = level_queue.LevelQueue._wait
+    job = Runner.job
 
-    async def noted(self: level_queue.LevelQueue, key: Key, caller: Caller) -> Lease:
-        waiting.append(caller.key)
-        return await wait(self, key, caller)
+    def noted(self: Runner[Key], key: Key, caller: str, *rest: Any) -> Any:
+        if isinstance(key, Key):
+            waiting.append(caller)
+        return job(self, key, caller, *rest)
 
-    monkeypatch.setattr(level_queue.LevelQueue, "_wait", noted)
-    monkeypatch.setattr(level_queue, "make_level", slow.miss_when_told)
-    monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
+    monkeypatch.setattr(Runner, "job", noted)
+    monkeypatch.setattr(level_maker, "make_level", slow.miss_when_told)
+    monkeypatch.setattr(level_maker, "_allowed", slow.allow_levels_more)
     keys = TokenFile(tmp_path / "tokens.json")
     data = tmp_path / "data"
     with ExitStack() as held:
@@ -105,8 +106,8 @@ def test_a_level_whose_container_was_deleted_and_made_again_for_another(
 
 
 def test_a_level_of_a_surface_that_was_deleted_is_not_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(level_queue, "make_level", slow.miss_when_told)
-    monkeypatch.setattr(level_queue, "_allowed", slow.allow_levels_more)
+    monkeypatch.setattr(level_maker, "make_level", slow.miss_when_told)
+    monkeypatch.setattr(level_maker, "_allowed", slow.allow_levels_more)
     with running_server(tmp_path, workers=1) as url, _client(url) as http, ThreadPoolExecutor(1) as threads:
         surface = push(http, BODY)
         answer = threads.submit(http.get, finest(surface))
