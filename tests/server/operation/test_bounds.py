@@ -57,7 +57,7 @@ def test_of_uploads_each_caller_leaves_some_to_the_next(tmp_path: Path, most: in
                     with pytest.raises(kind, match=f"of {caller.name}" if left else f"at most {most} uploads"):
                         await take(caller)
                 done.set()
-        assert not made._uploads
+        assert (made._uploads.total, made._clocks) == (0, {})
         assert not made._promised
         assert not made._taken
 
@@ -126,7 +126,7 @@ def test_an_owner_keeps_as_much_as_stays_free(
     if fits:
         asyncio.run(read(made, request(b"x", length=length)))
         return
-    with pytest.raises(FullError, match="bytes of anna on the server's disk, half of what they use there"):
+    with pytest.raises(FullError, match="bytes of surfaces of anna than are left for others"):
         asyncio.run(read(made, request(b"x", length=length)))
     asyncio.run(read(made, request(b"x", length=500), BERT))
     asyncio.run(read(limits(tmp_path, kept=kept, alone=True, keep_free=0), request(b"x", length=length)))
@@ -136,9 +136,7 @@ def test_the_share_of_an_owner_may_be_chosen(tmp_path: Path, disk: dict[str, int
     for alone in (False, True):
         made = limits(tmp_path, kept=90, alone=alone, keep_free=0, owner_bytes=100)
         asyncio.run(read(made, request(b"x", length=10)))
-        with pytest.raises(
-            FullError, match="at most 100 bytes of anna on the server's disk, got 90 bytes and 11 to come"
-        ):
+        with pytest.raises(FullError, match="at most 100 bytes of surfaces of anna, got 90 and 11 more"):
             asyncio.run(read(made, request(b"x", length=11)))
         asyncio.run(read(made, request(b"x", length=100), BERT))
 
