@@ -122,14 +122,18 @@ class _Queue(QueueHandler):
         if self._lines.qsize() >= _MOST_LINES:
             self._lost += 1
             return
+        self._tell_lost()
+        self._lines.put(record)
+
+    def _tell_lost(self) -> None:
         if self._lost:
             words, self._lost = f"{self._lost} log lines were dropped, because the reader of the log was too slow", 0
             told = {"name": __name__, "levelno": logging.WARNING, "levelname": "WARNING", "msg": words}
             self._lines.put(self.prepare(logging.makeLogRecord(told)))
-        self._lines.put(record)
 
     def end(self) -> None:
         """Stop the thread once it has written what is in the queue; wait for that only so long."""
+        self._tell_lost()
         stopping = threading.Thread(target=self._writer.stop, daemon=True)
         stopping.start()
         stopping.join(_DRAIN_SECONDS)

@@ -471,12 +471,16 @@ def test_the_end_of_the_log_waits_for_its_reader_only_so_long() -> None:
             handler.handle(line())
         handler.end()
         assert os.read(read, 1 << 16).count(b"x: here\n") == 100
-    with log_to_pipe() as (handler, _):
-        for _ in range(5000):
+    with log_to_pipe() as (handler, read):
+        for _ in range(20_000):
             handler.handle(line("l" * 100))
         started = time.monotonic()
         handler.end()
         assert time.monotonic() - started < PATIENCE / 2
+        # What it has not said so far it says now, should somebody read on.
+        taken = b""
+        while b"log lines were dropped, because" not in taken:
+            taken += os.read(read, 1 << 16)
 
 
 def test_a_log_that_was_ended_is_no_longer_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
