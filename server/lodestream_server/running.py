@@ -20,8 +20,6 @@ from lodestream.protocol.messages import MAX_MESSAGE
 from .app import create_app
 from .connections.connections import connections
 from .connections.cuts import Cuts
-from .connections.frames import stream_connections
-from .connections.places import Places
 from .operation.logs import drain
 from .operation.settings import Settings
 from .store.data_folder import DataFolder
@@ -120,13 +118,13 @@ def make_server(settings: Settings, listening: Callable[[str], None]) -> Server:
         As `create_app` does.
     """
     app = create_app(settings)
-    cuts, pace = Cuts(app.state.metrics), app.state.pace
+    http, stream = connections(settings, Cuts(app.state.metrics), app.state.pace)
     config = uvicorn.Config(
         app,
         host=settings.host,
         port=settings.port,
-        http=connections(settings, cuts, pace, Places(settings, lambda: app.state.access.alone)),
-        ws=stream_connections(cuts, pace),
+        http=http,
+        ws=stream,
         ws_max_size=MAX_MESSAGE,
         # What travels is coded already, and each connection would pay 64 KiB.
         ws_per_message_deflate=False,

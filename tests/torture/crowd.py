@@ -33,7 +33,7 @@ __all__ = ["BEHAVIOURS", "Outcome", "settings", "visit"]
 #: How long the server waits for anybody: a crowd is gone soon after.
 IDLE_SECONDS = 3.0
 
-_PATIENCE = 120.0
+_PATIENCE = 40.0
 _SAMPLE_SECONDS = 0.05
 
 # How many come in a second, of each kind: a system forgets connections that come faster than they are accepted, and
@@ -240,7 +240,6 @@ BEHAVIOURS: tuple[Callable[[_Client], Awaitable[None]], ...] = (
     pings_unread,
     empty_fragments,
     endless_message,
-    one_byte_chunks,
     refused_upload,
 )
 

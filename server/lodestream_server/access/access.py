@@ -17,7 +17,6 @@ from fastapi.requests import HTTPConnection
 
 from lodestream.errors import LodestreamError
 
-from ..connections.places import network_of
 from ..operation.settings import Settings
 from ..problems import BadTokenError, ForeignOriginError, NoTokenError, SmallScopeError
 from .tokens import Tokens
@@ -242,4 +241,13 @@ def _bearer(connection: HTTPConnection) -> str | None:
 def anybody(connection: HTTPConnection) -> Caller:
     """Return a caller without a token, known by its address."""
     host = connection.client.host if connection.client is not None else "unknown"
-    return Caller(f"{_ADDRESS}{network_of(host)}", host[:80])
+    return Caller(f"{_ADDRESS}{_network_of(host)}", host[:80])
+
+
+def _network_of(host: str) -> str:
+    """Return the network of a household or machine: the address, of IPv6 its /64 network."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return host[:80]
+    return str(ipaddress.ip_network((address, 64), strict=False) if address.version == 6 else address)

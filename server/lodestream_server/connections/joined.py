@@ -8,6 +8,7 @@ only a kilobyte of them would come in the first round trip.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Any
 
 __all__ = ["Joined"]
@@ -30,10 +31,16 @@ class Joined:
     Parameters
     ----------
     transport : asyncio.Transport
+    seconds : float
+        How long it may take to send what is held, once it is told to close.
+    when_slow : callable
+        Called before the connection is broken because it took longer.
     """
 
-    def __init__(self, transport: asyncio.Transport) -> None:
+    def __init__(self, transport: asyncio.Transport, seconds: float, when_slow: Callable[[], object]) -> None:
         self._transport = transport
+        self._seconds = seconds
+        self._when_slow = when_slow
         self._loop = asyncio.get_running_loop()
         self._alone = _ALONE
         self._held: list[bytes] = []
@@ -54,8 +61,10 @@ class Joined:
             self._loop.call_soon(self._turn)
 
     def close(self) -> None:
-        """Close when everything has been sent."""
+        """Close when everything has been sent, or when that takes too long."""
         self._flush()
+        if not self._transport.is_closing() and self._transport.get_write_buffer_size():
+            self._loop.call_later(self._seconds, self._give_up)
         self._transport.close()
 
     def abort(self) -> None:
@@ -70,6 +79,11 @@ class Joined:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._transport, name)
+
+    def _give_up(self) -> None:
+        if self._transport.get_write_buffer_size():
+            self._when_slow()
+            self._transport.abort()
 
     def _turn(self) -> None:
         self._turns -= 1

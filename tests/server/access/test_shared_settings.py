@@ -23,7 +23,6 @@ from lodestream_server.access.limits import Limits
 from lodestream_server.access.turns import Turns
 from lodestream_server.builds.level_files import Key, LevelFiles
 from lodestream_server.builds.level_maker import LevelMaker
-from lodestream_server.connections.places import Places
 from lodestream_server.problems import FullError, TooManyError
 from lodestream_server.store.containers import Containers, OpenContainer, index_memory
 from lodestream_server.store.surfaces import Surfaces
@@ -63,6 +62,7 @@ NOT_SHARED = {
     "build_seconds": "of one build",
     "level_memory": "of one process; levels are made in turns (max_level_requests)",
     "level_seconds": "of one level",
+    "max_connections": "of all; a proxy limits those of an address (docs/operating.md)",
     "idle_seconds": "of one connection",
     "least_rate": "of one connection",
     "head_seconds": "of one connection",
@@ -194,36 +194,6 @@ def memory_of_streams(folder: Path) -> None:
         assert credit(CARL) >= memory // 64
 
 
-def connections(folder: Path) -> None:
-    town = Town(folder, max_connections=8, trusted_proxies=("10.0.0.0/24", "::7"))
-    places = Places(town.settings, lambda: False)
-
-    def count(*hosts: str) -> int:
-        for number, host in enumerate(itertools.cycle(hosts)):
-            refusal = places.take(host)
-            if refusal is not None:
-                places.leave(host)
-                assert refusal[:2] == (429, "too-many")
-                return number
-        raise AssertionError("unreachable")
-
-    assert count("192.0.2.1") == 4
-    # Addresses of one network are one client.
-    assert count("2001:db8::1", "2001:db8::2") == 2
-    assert count("192.0.2.2") == 1
-    # A trusted proxy stands for many clients.
-    assert places.take("10.0.0.9") is None
-    refusal = places.take("10.0.0.9")
-    assert refusal is not None
-    assert refusal[:2] == (503, "busy")
-    # What has ended makes room.
-    for host in ("10.0.0.9", "10.0.0.9", "192.0.2.1"):
-        places.leave(host)
-    assert [places.take("::7"), places.take("::7")] == [None, None]
-    alone = Places(town.settings, lambda: True)
-    assert [alone.take("127.0.0.1") for _ in range(8)] == [None] * 8
-
-
 def level_requests(folder: Path) -> None:
     town = Town(folder, max_level_requests=8)
 
@@ -342,7 +312,6 @@ SHARED: dict[str, Callable[[Path], None]] = {
     "max_builds": builds,
     "max_streams": open_streams,
     "stream_memory": memory_of_streams,
-    "max_connections": connections,
     "max_level_requests": level_requests,
     "level_disk": disk_of_levels,
     "workers": turns_of_builds,

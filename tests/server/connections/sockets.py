@@ -21,6 +21,7 @@ __all__ = [
     "CLOSE",
     "CONTINUATION",
     "PING",
+    "PONG",
     "Frames",
     "Place",
     "Reader",

@@ -27,7 +27,7 @@ from lodestream.transfer.sender import Sender
 from lodestream_server import running_server
 from lodestream_server.connections import connections
 from lodestream_server.connections.cuts import Cuts
-from lodestream_server.connections.places import Places
+from lodestream_server.connections.slow_readers import Answers
 from lodestream_server.operation.least_rate import LeastRate
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.pace import Pace
@@ -214,6 +214,7 @@ class Slow:
     def __init__(self) -> None:
         self.now, self.unsent, self.closing, self.aborted = 0.0, 0, False, False
         self.timers: list[tuple[float, Callable[[], None]]] = []
+        self.told: list[bool] = []
 
     def time(self) -> float:
         return self.now
@@ -235,6 +236,9 @@ class Slow:
     def write(self, data: bytes) -> None:
         self.unsent += len(data)
 
+    def close(self) -> None:
+        self.closing = True
+
     def abort(self) -> None:
         self.aborted = True
 
@@ -246,9 +250,11 @@ class Slow:
             work()
 
 
-def watched(rate: int, seconds: float = 10.0) -> tuple[Slow, connections._Watch]:
+def watched(rate: int, seconds: float = 10.0) -> tuple[Slow, Answers]:
     slow: Any = Slow()
-    return slow, connections._Watch(slow, slow, seconds, LeastRate(rate, seconds, slow.time))
+    return slow, Answers(
+        slow, slow, seconds, LeastRate(rate, seconds, slow.time), lambda: slow.told.append(slow.aborted)
+    )
 
 
 @pytest.mark.parametrize(
@@ -264,6 +270,7 @@ def test_an_answer_has_a_least_rate(rate: int, taken: int, stays: bool, ending: 
         slow.closing = ending
         slow.advance(10)
     assert slow.aborted is not stays
+    assert slow.told == ([] if stays else [False])
 
 
 def test_time_in_which_nothing_waits_for_the_client_does_not_count() -> None:
@@ -281,23 +288,6 @@ def test_time_in_which_nothing_waits_for_the_client_does_not_count() -> None:
     watch.write(bytes(5000))
     watch.write(bytes(5000))  # what is added while something waits changes nothing
     slow.advance(10)
-    slow.advance(10)
-    assert slow.aborted
-
-
-def test_a_stream_has_rules_of_its_own_until_it_is_closed() -> None:
-    slow, watch = watched(100)
-    watch.upgraded = True
-    slow.unsent = 5000
-    for _ in range(5):
-        slow.advance(10)
-    assert not slow.aborted
-    slow.closing = True
-    slow.advance(10)
-    assert not slow.aborted, "its time begins when it is seen to close"
-    slow.unsent -= 1000
-    slow.advance(10)
-    assert not slow.aborted
     slow.advance(10)
     assert slow.aborted
 
@@ -468,7 +458,7 @@ def test_a_reset_while_an_answer_ends_is_no_error_of_the_server(tmp_path: Path) 
                 ended.append(None)
 
         settings = Settings(data=tmp_path, workers=1)
-        kind = connections.connections(settings, Cuts(Metrics()), Pace(), Places(settings, lambda: True))
+        kind, _ = connections.connections(settings, Cuts(Metrics()), Pace())
         config = uvicorn.Config(app, http=kind, lifespan="off", log_config=None)
         config.load()
         listening = await loop.create_server(lambda: kind(config, ServerState(), {}), "127.0.0.1", 0)
@@ -532,7 +522,7 @@ def test_a_plan_that_takes_long_is_no_silence_of_the_client(tmp_path: Path, monk
 def test_nothing_of_connections_is_kept_when_they_have_ended(tmp_path: Path) -> None:
     def watches() -> int:
         gc.collect()
-        return sum(isinstance(item, connections._Watch) for item in gc.get_objects())
+        return sum(isinstance(item, Answers | connections._Http | connections._Stream) for item in gc.get_objects())
 
     # Patient: what is kept until the next look at a connection would be kept for longer than this waits.
     with running_server(tmp_path, workers=1, idle_seconds=10 * PATIENCE) as url:

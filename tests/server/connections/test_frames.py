@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import socket
 import threading
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -18,8 +20,8 @@ import lodestream as ls
 from lodestream.protocol.messages import Credit, End, Error, Open
 from lodestream.protocol.wire import serialize
 from lodestream_server import running_server
-from lodestream_server.connections import frames
-from tests.server.connections.sockets import CONTINUATION, PING, Place, frame, handshake
+from lodestream_server.connections import connections
+from tests.server.connections.sockets import CONTINUATION, PING, PONG, Frames, Place, frame, handshake
 from tests.server.helpers import PATIENCE, Keys, hills, npy, push, raw_stream
 
 
@@ -28,9 +30,19 @@ def surface(http: httpx.Client) -> dict[str, Any]:
     return push(http, npy(hills(200, 190)))
 
 
-def opened(url: str) -> socket.socket:
+def streams() -> list[Any]:
+    """The streams of servers of this process that are open."""
+    found = [item for item in gc.get_objects() if isinstance(item, connections._Stream)]
+    return [stream for stream in found if not stream.disconnected]
+
+
+def opened(url: str, buffer: int | None = None) -> socket.socket:
     place = Place.of(url)
-    connection = socket.create_connection((place.host, place.port), timeout=PATIENCE)
+    connection = socket.socket()
+    if buffer is not None:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
+    connection.settimeout(PATIENCE)
+    connection.connect((place.host, place.port))
     connection.sendall(handshake(place))
     head = b""
     while not head.endswith(b"\r\n\r\n"):
@@ -49,17 +61,61 @@ def cut_by(connection: socket.socket, pieces: Iterable[bytes], pause: float = 0.
     return False
 
 
-def test_pongs_that_nobody_takes_are_counted_in_bytes(
-    tmp_path: Path, keys: Keys, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_of_pongs_that_nobody_takes_the_last_one_waits(
+    tmp_path: Path, keys: Keys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(frames, "_FRAMES", (1e9, 0.0))
-    monkeypatch.setattr(frames, "_OTHER_FRAMES", (1e9, 0.0))
-    pings = frame(bytes(125), PING) * 500
+    monkeypatch.setattr(connections, "_FRAMES", 1e9)
     # Somebody without a token, whose open is waited for.
     settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json"}
-    with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}") as connection:
-        assert cut_by(connection, [pings] * 2000)
-    assert "connection cut: control-data" in [record.getMessage() for record in caplog.records]
+    with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}", 4096) as connection:
+        transport = streams()[0].transport
+        number, most = 0, 0
+        while number < 200_000:
+            connection.sendall(b"".join(frame(b"%0125d" % each, PING) for each in range(number, number + 500)))
+            number += 500
+            most = max(most, transport.get_write_buffer_size())
+        assert 1 << 16 <= most < 1 << 17
+        found, last, answered = Frames(), -1, 0
+        while last != number - 1:  # in their order, and the last one of all
+            data = connection.recv(1 << 20)
+            assert data
+            for opcode, payload in found.feed(data):
+                assert opcode == PONG
+                assert int(payload) > last
+                last, answered = int(payload), answered + 1
+        assert answered < number
+
+
+def test_a_stream_is_read_little_by_little(server: str, surface: dict[str, Any]) -> None:
+    with opened(server + surface["url"]) as connection:
+        # No more than may come at once, and a message that the others wait behind.
+        connection.sendall(frame(b"x" * 100, PING) * 150 + frame(serialize(Open(credit=0))))
+        found, pongs = Frames(), 0
+        while pongs < 150:
+            for opcode, _ in found.feed(connection.recv(1 << 16)):
+                pongs += opcode == PONG
+        (stream,) = streams()
+        assert len(stream.get_buffer(-1)) <= 1024
+
+
+def test_frames_that_are_no_message_are_allowed_again_with_time_and_for_messages(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, cut = [100.0], list[str]()
+    monkeypatch.setattr(connections, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    stream: Any = connections._Stream.__new__(connections._Stream)
+    stream.cuts = SimpleNamespace(note=lambda reason, client: cut.append(reason))
+    stream.transport, stream.client = SimpleNamespace(abort=lambda: None), None
+    stream._allowed, stream._counted, stream._is_cut = 200.0, 100.0, False
+    assert all(stream._count() for _ in range(200))
+    now[0] += 2
+    assert all(stream._count() for _ in range(100))
+    now[0] += 1000
+    assert all(stream._count() for _ in range(200))
+    assert not cut
+    assert not stream._count()
+    assert not stream._count()
+    assert cut == ["frames"]
 
 
 def test_a_message_in_ever_more_fragments_is_cut(
@@ -69,8 +125,8 @@ def test_a_message_in_ever_more_fragments_is_cut(
     with opened(server + surface["url"]) as connection:
         connection.sendall(frame(b"", last=False))
         # Slower than frames may come.
-        assert cut_by(connection, [empty] * (5 * frames._MOST_FRAGMENTS), 0.012)
-    assert "connection cut: fragments" in [record.getMessage() for record in caplog.records]
+        assert cut_by(connection, [empty] * (5 * connections.MOST_FRAGMENTS), 0.012)
+    assert "connection cut: frames" in [record.getMessage() for record in caplog.records]
 
 
 def test_an_honest_message_in_fragments_is_taken(server: str, surface: dict[str, Any]) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Any, cast
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,6 +21,7 @@ class Recorder:
     def __init__(self) -> None:
         self.written: list[bytes] = []
         self.closed = self.aborted = False
+        self.unsent = 1000
 
     def write(self, data: bytes) -> None:
         assert not self.closed
@@ -34,7 +37,7 @@ class Recorder:
         return self.closed
 
     def get_write_buffer_size(self) -> int:
-        return 1000
+        return self.unsent
 
     def get_extra_info(self, name: str) -> str:
         return name
@@ -45,10 +48,10 @@ async def turns(number: int) -> None:
         await asyncio.sleep(0)
 
 
-def joined() -> tuple[Joined, Recorder]:
+def joined(seconds: float = 600.0, when_slow: Callable[[], object] = bool) -> tuple[Joined, Recorder]:
     """One that has sent its first writes, and what it writes to."""
     recorder = Recorder()
-    transport = Joined(cast(Any, recorder))
+    transport = Joined(cast(Any, recorder), seconds, when_slow)
     for number in range(ALONE):
         transport.write(b"%d" % number)
     assert recorder.written == [b"0", b"1", b"2", b"3"], "the first ones go out at once"
@@ -102,5 +105,21 @@ def test_closing_sends_what_is_held_and_aborting_does_not() -> None:
         await turns(2 * TURNS)
         assert (recorder.written, recorder.aborted) == ([], True)
         assert transport.get_extra_info("peername") == "peername"
+
+    asyncio.run(run())
+
+
+@pytest.mark.parametrize("reads", [False, True])
+def test_closing_waits_for_whoever_does_not_read_for_some_time_only(reads: bool) -> None:
+    async def run() -> None:
+        slow: list[bool] = []
+        transport, recorder = joined(0.01, lambda: slow.append(recorder.aborted))
+        transport.close()
+        assert (recorder.closed, recorder.aborted) == (True, False)
+        if reads:
+            recorder.unsent = 0
+        await asyncio.sleep(0.05)
+        assert recorder.aborted is not reads
+        assert slow == ([] if reads else [False])
 
     asyncio.run(run())
