@@ -121,7 +121,7 @@ def one_fork_server() -> Iterator[None]:
     if sys.platform != "linux":
         yield
         return
-    from lodestream_server.builds import jobs
+    from lodestream_server.builds import builder
     from lodestream_server.builds.processes import ForkServer
     from tests.server.builds import slow
 
@@ -131,6 +131,6 @@ def one_fork_server() -> Iterator[None]:
 
     shared = Shared(slow.preload)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jobs, "ForkServer", lambda _: shared)
+        patch.setattr(builder, "ForkServer", lambda _: shared)
         yield
     ForkServer.close(shared)

@@ -20,7 +20,7 @@ from .access.access import Access
 from .access.gate import Gate
 from .access.limits import Limits
 from .access.scopes import unrouted
-from .builds.jobs import Builder
+from .builds.builder import Builder
 from .builds.level_files import LevelFiles
 from .builds.level_maker import LevelMaker
 from .builds.work import Work

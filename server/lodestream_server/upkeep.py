@@ -6,7 +6,7 @@ import asyncio
 import logging
 from contextlib import suppress
 
-from .builds.jobs import Builder
+from .builds.builder import Builder
 from .builds.level_maker import LevelMaker
 from .store.index import IndexLostError, Surface
 from .store.surfaces import Surfaces

@@ -25,7 +25,7 @@ from importlib import import_module
 from typing import Any
 
 from lodestream_client import program
-from lodestream_server.builds import fork_server, jobs, processes, worker
+from lodestream_server.builds import fork_server, processes, worker
 from tests import data_folder
 
 __all__ = ["DIED", "main"]
@@ -188,7 +188,7 @@ def _be(arguments: list[str], log: str) -> int:
 
 def _fork_server() -> None:
     forked = _Forked()
-    names: Any = jobs
+    names: Any = builder
     names.ForkServer = lambda preload: _ForkServer(preload, forked)
 
 

@@ -12,7 +12,7 @@ from fastapi.responses import Response
 
 from ..access.access import Access
 from ..access.limits import Limits
-from ..builds.jobs import Builder
+from ..builds.builder import Builder
 from ..builds.level_maker import LevelMaker
 from ..operation.metrics import Metrics
 from ..operation.pace import Pace

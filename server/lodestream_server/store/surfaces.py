@@ -631,7 +631,7 @@ class Surfaces:
                     if before.built_tag == surface.built_tag:
                         surface = before  # with what only the index knows: whether it waits, is built, and how often
                     elif surface.state == "queued":
-                        # What was ready once is not refused for good: `builds.jobs` has to know.
+                        # What was ready once is not refused for good: `builds.builder` has to know.
                         once = before.container, before.container_bytes
                         surface = replace(surface, attempts=before.attempts, container=once[0], container_bytes=once[1])
                 if surface is not before and surface.state == "ready" and not self._is_whole(surface):

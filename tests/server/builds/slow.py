@@ -17,7 +17,7 @@ from threading import Barrier, get_ident
 
 from lodestream.confinement import landlock
 from lodestream.parallel import spread, threads
-from lodestream_server.builds import jobs, level_maker, worker
+from lodestream_server.builds import builder, level_maker, worker
 from lodestream_server.builds.fork_server import Allowed
 from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
@@ -77,7 +77,7 @@ __all__ = [
 
 
 def allow_more(job: Job, *args: object) -> Allowed:
-    """What `jobs` allows a build, and the data folder, where those below leave a mark for the next attempt."""
+    """What `builder` allows a build, and the data folder, where those below leave a mark for the next attempt."""
     return replace(_allowed(job, *args), write=job.folder.parents[3])
 
 
@@ -88,7 +88,7 @@ def allow_levels_more(job: LevelJob, *args: int) -> Allowed:
 
 # The server's limits are longer, and no test leaves it at that.
 
-_allowed: Callable[..., Allowed] = jobs._allowed
+_allowed: Callable[..., Allowed] = builder._allowed
 _allowed_level: Callable[..., Allowed] = level_maker._allowed
 
 

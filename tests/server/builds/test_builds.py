@@ -21,7 +21,7 @@ import pytest
 
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
-from lodestream_server.builds import jobs, worker
+from lodestream_server.builds import builder, worker
 from lodestream_server.builds.work import Work
 from lodestream_server.store.data_folder import DataFolder
 from lodestream_server.store.durable import discard
@@ -103,7 +103,7 @@ def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkey
 
 def test_a_process_that_is_killed_once_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.kill_once)
-    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
+    monkeypatch.setattr(builder, "_allowed", slow.allow_more)
     with running(tmp_path / "data") as http:
         assert settled(http, post(http, 1))["state"] == "ready"
         assert (tmp_path / "data" / "killed").exists()
@@ -131,7 +131,7 @@ def test_a_build_that_needs_too_much_memory_waits(tmp_path: Path, monkeypatch: p
 
 def test_a_process_that_is_told_to_end_is_no_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.end_once)
-    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
+    monkeypatch.setattr(builder, "_allowed", slow.allow_more)
     with running(tmp_path / "data") as http:
         assert settled(http, post(http, 1))["state"] == "ready"
         assert (tmp_path / "data" / "told").exists()
@@ -262,14 +262,14 @@ def test_of_a_long_queue_some_builds_are_taken_up_at_a_time(tmp_path: Path, monk
     for number in range(11):
         folder.surfaces.accept(*upload(tmp_path, number))
     folder.close()
-    monkeypatch.setattr(jobs, "_TAKEN_UP", 4)
-    submit = jobs.Builder._submit
+    monkeypatch.setattr(builder, "_TAKEN_UP", 4)
+    submit = builder.Builder._submit
 
-    def counted(self: jobs.Builder, surface: str, caller: str | None) -> None:
+    def counted(self: builder.Builder, surface: str, caller: str | None) -> None:
         submit(self, surface, caller)
         most.append(self.pending)
 
-    monkeypatch.setattr(jobs.Builder, "_submit", counted)
+    monkeypatch.setattr(builder.Builder, "_submit", counted)
     with running(data) as http:
         for entry in http.get("/v1/surfaces").json()["surfaces"]:
             settled(http, entry["url"])
@@ -477,7 +477,7 @@ def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -
         free = threading.Event()
         busy = asyncio.ensure_future(asyncio.to_thread(free.wait, PATIENCE))
         await asyncio.sleep(0)
-        task = asyncio.ensure_future(jobs._carried_out(partial(discard, folder)))
+        task = asyncio.ensure_future(builder._carried_out(partial(discard, folder)))
         await asyncio.sleep(0.01)
         task.cancel()
         await asyncio.sleep(0.01)

@@ -28,7 +28,7 @@ import lodestream as ls
 from lodestream.encoding import cluster as clusters
 from lodestream.scratch import FolderScratch
 from lodestream_server import running_server
-from lodestream_server.builds import cluster_build, jobs, worker
+from lodestream_server.builds import builder, cluster_build, worker
 from lodestream_server.builds.answers import ProcessDiedError, UnforeseenError
 from lodestream_server.builds.clusters import build_by_cluster
 from tests.clusters import local_cluster
@@ -265,8 +265,8 @@ def test_how_a_build_by_a_cluster_ends_is_told_and_logged(
             raise result
         return result
 
-    monkeypatch.setattr(jobs, "build_by_cluster", by_cluster)
-    caplog.set_level(logging.INFO, jobs.__name__)
+    monkeypatch.setattr(builder, "build_by_cluster", by_cluster)
+    caplog.set_level(logging.INFO, builder.__name__)
     address = "tcp://127.0.0.1:8786"
     with (
         running_server(tmp_path, dask=address, **BEYOND) as url,

@@ -22,7 +22,7 @@ import pytest
 import lodestream as ls
 from lodestream.confinement import landlock
 from lodestream.stores import Folder
-from lodestream_server.builds import jobs, worker
+from lodestream_server.builds import builder, worker
 from lodestream_server.builds.answers import UnforeseenError
 from lodestream_server.builds.processes import Call, ForkServer, Pool
 from lodestream_server.maintenance.check import check
@@ -284,7 +284,7 @@ def test_the_server_says_what_the_kernel_holds_builds_to(
     lacks = (["landlock", "seccomp"], ["landlock"])
     for held, words, names in (((), "has neither", lacks[0]), (("seccomp",), "has only seccomp", lacks[1])):
         monkeypatch.setattr(Loose, "held", held)
-        monkeypatch.setattr(jobs, "ForkServer", lambda _: Loose())
+        monkeypatch.setattr(builder, "ForkServer", lambda _: Loose())
         caplog.clear()
         with running(tmp_path / str(len(held))) as other:
             answer = eventually(partial(_ready, other), "the server to be ready")

@@ -23,7 +23,7 @@ from lodestream_server import running_server
 from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.access.turns import Place, Turns
-from lodestream_server.builds import jobs, worker
+from lodestream_server.builds import builder, worker
 from lodestream_server.routes import streams
 from lodestream_server.store.index import LEAST
 from tests.server.access.test_limits import ANNA
@@ -169,7 +169,7 @@ def test_builds_of_one_caller_do_not_delay_those_of_another(town: Town, monkeypa
         assert len(theirs) == 20
         mine = good.post("/v1/surfaces", content=npy(hills())).headers["location"]
         monkeypatch.setattr(worker, "build", slow.listed)
-        monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
+        monkeypatch.setattr(builder, "_allowed", slow.allow_more)
         (town.data / "go").touch()
         assert settled(good, mine)["state"] == "ready"
         for where in theirs:
@@ -193,7 +193,7 @@ def test_after_a_restart_builds_are_their_owners(tmp_path: Path, monkeypatch: py
         theirs = [posted(town, "bad", seed) for seed in range(5)]
         mine = posted(town, "good", 9)
     monkeypatch.setattr(worker, "build", slow.listed)
-    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
+    monkeypatch.setattr(builder, "_allowed", slow.allow_more)
     (data / "go").touch()
     with running_server(data, workers=1, token_file=file.path) as url, Town(url, data, tokens).client("good") as http:
         for where in (*theirs, mine):

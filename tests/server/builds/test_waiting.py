@@ -11,7 +11,7 @@ import pytest
 
 from lodestream.errors import FormatError, TooLargeError, UnavailableError
 from lodestream.stores import Folder, FullError, StoreError, Tag
-from lodestream_server.builds import jobs, worker
+from lodestream_server.builds import builder, worker
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.waiting import retry, waiting
 from tests.server.builds import slow
@@ -78,7 +78,7 @@ def test_nobody_is_told_of_a_failure_that_a_restart_could_take_back(
         return create(store, key, data)
 
     monkeypatch.setattr(Folder, "create", broken)
-    monkeypatch.setattr(jobs, "_FIRST_DELAY", 0.01)
+    monkeypatch.setattr(builder, "_FIRST_DELAY", 0.01)
     with running(tmp_path / "data") as http:
         location = http.post("/v1/surfaces", content=BODY[:-1]).headers["location"]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lodestream_server.builds import jobs, worker
+from lodestream_server.builds import builder, worker
 from lodestream_server.store import data_folder, durable, surfaces
 from lodestream_server.store.data_folder import DataFolder
 from tests.history.site import Disk, can_fill
@@ -22,7 +22,7 @@ from .disks import CountingDisk, FullDisk, FullFolder, FullIndex, StickyDisk
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jobs, "_FIRST_DELAY", 0.01)
+    monkeypatch.setattr(builder, "_FIRST_DELAY", 0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -94,7 +94,7 @@ def test_a_second_upload_of_what_failed_at_every_step(tmp_path: Path) -> None:
 def test_a_build_at_every_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = tmp_path / "data"
     monkeypatch.setattr(worker, "build", slow.full_at_each_step)
-    monkeypatch.setattr(jobs, "_allowed", slow.allow_more)
+    monkeypatch.setattr(builder, "_allowed", slow.allow_more)
     with running(data) as http:
         surface = push(http, npy(hills()))
         assert surface["state"] == "ready"
