@@ -25,7 +25,7 @@ from importlib import import_module
 from typing import Any
 
 from lodestream_client import program
-from lodestream_server.builds import fork_server, processes, worker
+from lodestream_server.builds import builder, fork_server, processes, worker
 from tests import data_folder
 
 __all__ = ["DIED", "main"]
