@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 PEERS := .venv-peers
+MAPS := tests/web/maps
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
@@ -20,9 +21,11 @@ docs: $(STAMP) ## build the documentation site into build/docs; a link that lead
 	@$(BIN)/python -P -c 'import furo, myst_parser, sphinx' 2>/dev/null || $(BIN)/python -m pip install --quiet --group docs
 	@$(BIN)/python .ci/docs.py build/docs
 
-site: page kernels docs ## write build/site for any host of files: the documentation, and the public demo in its folder demo
-	@rm -rf build/site && cp -R build/docs build/site
-	@$(BIN)/python -m lodestream_client.demo.site build/site/demo
+site: page kernels docs $(MAPS)/node_modules/.package-lock.json ## write build/site for any host of files: the documentation, and the public demo in its folder demo
+	@rm -rf build/site build/map && cp -R build/docs build/site
+	@cd $(WEB) && npm run --silent build:library -- --outDir $(CURDIR)/build/map --logLevel error
+	@cp $(WEB)/examples/map.html $(addprefix $(MAPS)/node_modules/maplibre-gl/dist/maplibre-gl,.css .mjs -worker.mjs) build/map
+	@$(BIN)/python -m lodestream_client.demo.site build/site/demo build/map
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Four
 # of pytest's share two processors, since some of the tests wait for a clock.
@@ -77,7 +80,7 @@ WEB_SOURCES := $(shell find $(WEB)/src $(WEB)/kernels $(WEB)/scripts -type f -no
 
 page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream view` show
 
-test-web: page $(WEB_TOOLS) ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
+test-web: page $(WEB_TOOLS) $(MAPS)/node_modules/.package-lock.json ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
 	@cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent
 	@LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
 
@@ -87,6 +90,10 @@ bench-web: page $(WEB_TOOLS) ## speed of the browser's decoder, times to the fir
 $(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES) | $(WEB_TOOLS)
 	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page
 	@rm -rf $(PAGE) && cp -R $(WEB)/dist/page $(PAGE) && touch $@
+
+# MapLibre, which only tests and the public demo open.
+$(MAPS)/node_modules/.package-lock.json: $(MAPS)/package-lock.json
+	@cd $(MAPS) && npm install --no-save --silent --no-audit --no-fund && touch $(CURDIR)/$@
 
 # The compiler of the kernels, and what drives Chromium.
 $(WEB_TOOLS): $(STAMP)

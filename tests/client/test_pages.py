@@ -42,6 +42,7 @@ RUN = {
     ("docs/large.md", "bash"): "not run: the files are examples; tests/client/commands/test_large_surfaces.py has"
     " these options",
     ("docs/large.md", "python"): "not run: it needs data of the reader; tests/core/encoding/test_dask.py does the same",
+    ("docs/maps.md", "html"): "not run: it is client/web/examples/map.html, which tests/web opens",
     ("docs/maps.md", "python"): "tests/core/maps/test_page.py",
     ("docs/notebooks.md", "python"): "not run: it shows a widget; tests/client/notebook runs docs/notebook.ipynb",
     ("docs/operating.md", "console"): "tests/server/routes/test_operating_page.py",

@@ -43,6 +43,20 @@ def test_a_host_of_files_serves_five_surfaces_of_different_kinds(tmp_path: Path)
 
 
 @pytest.mark.usefixtures("built")
+def test_the_page_of_a_map_shows_what_the_site_has(tmp_path: Path) -> None:
+    given = tmp_path / "given"
+    given.mkdir()
+    example = (Path(__file__).parents[2] / "client" / "web" / "examples" / "map.html").read_text(encoding="utf-8")
+    for name, text in (("map.html", example), ("maplibre.js", "// code"), ("maplibre.js.map", "{}")):
+        (given / name).write_text(text, encoding="utf-8")
+    for _ in range(2):  # once more into what is there
+        assert site.main([str(tmp_path / "site"), str(given)]) == 0
+        copied = tmp_path / "site" / "map"
+        assert sorted(path.name for path in copied.iterdir()) == ["index.html", "maplibre.js"]
+        assert "lode://../index.html#mountains" in (copied / "index.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("built")
 def test_a_folder_with_other_files_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "view.json").write_text('{"zoom": 3}')
@@ -58,7 +72,7 @@ def test_a_page_that_is_not_built_is_told(
     assert site.main([str(tmp_path / "out")]) == 1
     assert "make page" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    assert site.main([]) == 2
+    assert site.main([]) == site.main(["a", "b", "c"]) == 2
 
 
 def test_the_blocks_of_the_moon_share_the_points_of_their_sides() -> None:

@@ -7,6 +7,7 @@ LODESTREAM_WEB, and then what is missing is a failure.
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 if not os.environ.get("LODESTREAM_WEB"):
     collect_ignore_glob = ["test_page_*.py"]
+
+WEB = Path(__file__).parents[2] / "client" / "web"
 
 # (name, see `tests.web.browser.tab`) -> page
 Tabs = Callable[..., "Tab"]
@@ -104,4 +107,13 @@ def outside(tmp_path: Path) -> Path:
     """A folder for the files of a static host."""
     folder = tmp_path / "host"
     folder.mkdir()
+    return folder
+
+
+@pytest.fixture(scope="session")
+def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of the npm package, built as they are for its registry."""
+    folder = tmp_path_factory.mktemp("library")
+    vite = [str(WEB / "node_modules" / ".bin" / "vite"), "build", "--config", "vite.library.config.ts"]
+    subprocess.run([*vite, "--outDir", str(folder), "--logLevel", "error"], cwd=WEB, check=True, timeout=300)
     return folder

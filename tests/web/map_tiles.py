@@ -1,6 +1,6 @@
 """Fields of heights of many kinds, and tiles of theirs, as JSON; ``python -m tests.web.map_tiles`` prints one a line.
 
-Each has its container, `scale`, bounds, the zoom of its cells, and heights of tiles as float32, compressed; bytes are in
+Each has its container, `scale`, bounds, the zoom of its cells, and heights of tiles as float32, compressed; bytes in
 base64.
 """
 

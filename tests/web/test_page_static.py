@@ -151,15 +151,6 @@ def test_what_is_chosen_before_the_surface_is_known_holds_for_its_first_picture(
         assert tab.view.get_by_label("Quad lines").is_checked()
 
 
-@pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The files of the npm package, built as they are for its registry."""
-    folder = tmp_path_factory.mktemp("library")
-    vite = [str(WEB / "node_modules" / ".bin" / "vite"), "build", "--config", "vite.library.config.ts"]
-    subprocess.run([*vite, "--outDir", str(folder), "--logLevel", "error"], cwd=WEB, check=True, timeout=300)
-    return folder
-
-
 def test_ten_lines_of_html_show_a_container(tabs: Tabs, outside: Path, library: Path, container: Path) -> None:
     example = WEB / "examples" / "static.html"
     assert len(example.read_text().splitlines()) <= 10

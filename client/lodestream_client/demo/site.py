@@ -1,10 +1,11 @@
 """A public demo without a server: the page and five generated surfaces as files, for any host of files with Range.
 
-``python -m lodestream_client.demo.site FOLDER`` writes it; ``make site`` writes it into ``build/site``.
+``python -m lodestream_client.demo.site FOLDER [MAP]`` writes it; ``make site`` writes it into ``build/site``.
 """
 
 from __future__ import annotations
 
+import shutil
 import sys
 import tempfile
 from collections.abc import Callable
@@ -33,11 +34,23 @@ _FACE = 65  # points along a side of each of the six blocks of the moon
 _WIND = (257, 321)
 
 
+#: Web Mercator, which maps need no library for.
+_MERCATOR = (
+    'PROJCRS["WGS 84 / Pseudo-Mercator",BASEGEOGCRS["WGS 84",DATUM["World Geodetic System 1984",'
+    'ELLIPSOID["WGS 84",6378137,298.257223563]]],CONVERSION["Popular Visualisation Pseudo-Mercator",'
+    'METHOD["Popular Visualisation Pseudo Mercator"]],CS[Cartesian,2],AXIS["easting",east],AXIS["northing",north],'
+    'LENGTHUNIT["metre",1],ID["EPSG",3857]]'
+)
+
+#: The surface that the page of the map shows, in place of what it names.
+_ON_MAP, _NAMED = "mountains", "lode://surface.lode"
+
+
 def mountains() -> ls.Surface:
-    """Return heights of whole metres on an even grid."""
+    """Return heights of whole metres on an even grid, at the equator, where metres of Web Mercator are metres."""
     rows, _ = _TERRAIN
-    place = [500_000.0, CELL, 0.0, 4_200_000.0 + rows * CELL, 0.0, -CELL]
-    metadata = {"name": "Mountains: heights, 30 m apart", "unit": "m", "geotransform": place}
+    place = [500_000.0, CELL, 0.0, rows * CELL, 0.0, -CELL]
+    metadata = {"name": "Mountains: heights, 30 m apart", "unit": "m", "geotransform": place, "crs": _MERCATOR}
     return ls.Surface(terrain(_TERRAIN), metadata=metadata)
 
 
@@ -114,13 +127,16 @@ SURFACES: dict[str, Callable[[], ls.Surface]] = {
 }
 
 
-def write_site(folder: Path) -> None:
+def write_site(folder: Path, map_page: Path | None = None) -> None:
     """Publish `SURFACES` in a folder.
 
     Parameters
     ----------
     folder : Path
         New, empty, or published before.
+    map_page : Path, optional
+        A folder with client/web/examples/map.html and what that loads. It is copied into the folder ``map``, and shows
+        the mountains there.
 
     Raises
     ------
@@ -144,6 +160,12 @@ def write_site(folder: Path) -> None:
             publications.append(Publication(name, str(surface.metadata["name"]), container, {}))
             bar.update(task, completed=float(len(publications)), figures=name)
         published = publish(open_store(folder), publications, pages)
+    if map_page is not None:
+        copy = folder / "map"
+        shutil.copytree(map_page, copy, ignore=shutil.ignore_patterns("*.map", "assets"), dirs_exist_ok=True)
+        page = (copy / "map.html").read_text(encoding="utf-8").replace(_NAMED, f"lode://../index.html#{_ON_MAP}")
+        (copy / "index.html").write_text(page, encoding="utf-8")
+        (copy / "map.html").unlink()
     for it in published.surfaces:
         console().print(cell(f"{it.name}: {human_size(it.bytes)}"))
 
@@ -179,12 +201,12 @@ def _craters(places: Floats) -> Floats:
 
 
 def main(arguments: list[str]) -> int:
-    """Write the site into the folder that is named; return the exit code."""
-    if len(arguments) != 1:
-        note("usage: python -m lodestream_client.demo.site FOLDER")
+    """Write the site into the folder that is named, perhaps with a page of a map; return the exit code."""
+    if len(arguments) not in (1, 2):
+        note("usage: python -m lodestream_client.demo.site FOLDER [MAP]")
         return 2
     try:
-        write_site(Path(arguments[0]))
+        write_site(*map(Path, arguments))
     except (LodestreamError, OSError) as error:
         note(str(error))
         return 1

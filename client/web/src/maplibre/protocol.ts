@@ -44,9 +44,11 @@ export interface TileJson {
   readonly encoding: string;
 }
 
-/** What `maplibregl.addProtocol` takes. What it gives is a `TileJson`, or an `ImageBitmap`. */
-// biome-ignore lint/suspicious/noExplicitAny: MapLibre's own type says so
-export type LodeHandler = (request: LodeRequest, abort: AbortController) => Promise<{ data: any }>;
+/** What `maplibregl.addProtocol` takes: it gives the TileJSON of a source, or the picture of a tile. */
+export type LodeHandler = (
+  request: LodeRequest,
+  abort: AbortController,
+) => Promise<{ readonly data: TileJson | ImageBitmap }>;
 
 /**
  * A handler of addresses `lode://CONTAINER`, as `maplibregl.addProtocol("lode", lodeProtocol())` takes it.

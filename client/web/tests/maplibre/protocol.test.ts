@@ -50,9 +50,9 @@ function asking(options: LodeProtocolOptions = {}, headers?: Record<string, stri
   const handler = lodeProtocol({ fetch: host.fetch, ...options });
   return {
     json: async (url: string): Promise<TileJson> =>
-      (await handler({ url, type: "json", headers }, new AbortController())).data,
+      (await handler({ url, type: "json", headers }, new AbortController())).data as TileJson,
     tile: async (url: string, abort = new AbortController()): Promise<Made> =>
-      (await handler({ url, type: "image", headers }, abort)).data,
+      (await handler({ url, type: "image", headers }, abort)).data as unknown as Made,
   };
 }
 
