@@ -32,6 +32,7 @@ from lodestream.protocol.messages import CODES, MessageError
 
 __all__ = [
     "MEANINGS",
+    "MEDIA_TYPE",
     "PROBLEM_EXAMPLE",
     "BadTokenError",
     "BuildFailedError",
@@ -39,7 +40,6 @@ __all__ = [
     "DamagedNameError",
     "ForeignOriginError",
     "FullError",
-    "LargeLevelError",
     "NoTokenError",
     "NotOwnerError",
     "NotReadyError",
@@ -49,8 +49,8 @@ __all__ = [
     "SlowUploadError",
     "SmallScopeError",
     "TooManyError",
-    "UnfitLevelError",
     "answer",
+    "document",
     "install",
     "problem",
     "refused",
@@ -58,21 +58,14 @@ __all__ = [
 ]
 
 _log = logging.getLogger(__name__)
-_MEDIA_TYPE = "application/problem+json"
+#: Of problem documents.
+MEDIA_TYPE = "application/problem+json"
 
 
 class NotReadyError(LodestreamError):
     """The surface is still being built."""
 
     headers: ClassVar = {"retry-after": "1"}
-
-
-class LargeLevelError(TooLargeError):
-    """A level takes more memory, time or bytes as a file than the server gives it."""
-
-
-class UnfitLevelError(FormatError):
-    """A level cannot be written in the format asked for."""
 
 
 class BuildFailedError(LodestreamError):
@@ -158,6 +151,7 @@ _STATUSES = {"message-too-large": 413, "internal": 500, "restarting": 503}
 #: Every code of a problem document or of a stream's ``error``; those of `CODES` have a close code there.
 MEANINGS: Mapping[str, Meaning] = {
     **{word: Meaning(_STATUSES.get(word, code.close - 4000), code.title) for word, code in CODES.items()},
+    "bad-request": Meaning(400, "Not a valid request"),
     "gone": Meaning(400, "The client disconnected"),
     "foreign-origin": Meaning(403, "Pages of other sites may not do this"),
     "not-owner": Meaning(403, "Only its owner and an admin may do this"),
@@ -255,7 +249,7 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
         status: {
             "description": http.HTTPStatus(status).phrase,
             "content": {
-                _MEDIA_TYPE: {
+                MEDIA_TYPE: {
                     "schema": {"$ref": "#/components/schemas/Problem"},
                     **({"example": PROBLEM_EXAMPLE} if status == 404 else {}),
                 }
@@ -310,13 +304,18 @@ async def _invalid(request: Request, error: Exception) -> Response:
 
 def _document(request: HTTPConnection, code: str, detail: str, headers: Mapping[str, str]) -> JSONResponse:
     request.app.state.metrics.failed(code)
+    content = document(code, detail, request.url.path)
+    return JSONResponse(content, content["status"], headers, media_type=MEDIA_TYPE)
+
+
+def document(code: str, detail: str, path: str | None) -> dict[str, Any]:
+    """Return the problem document of a code; `path` is that of the request, if it was read so far."""
     status, title = MEANINGS[code]
-    content = {
+    return {
         "type": f"urn:lodestream:{code}",
         "title": title,
         "status": status,
         "code": code,
         "detail": detail,
-        "instance": request.url.path,
+        "instance": path,
     }
-    return JSONResponse(content, status, headers, media_type=_MEDIA_TYPE)

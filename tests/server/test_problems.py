@@ -20,11 +20,9 @@ from tests.server import manual
 
 EXPECTED = [
     (errors.TooLargeError("x"), 413, "too-large"),
-    (problems.LargeLevelError("x"), 413, "too-large"),
     (errors.OptionError("x"), 422, "bad-option"),
     (errors.FormatError("x"), 422, "bad-file"),
     (errors.SwitchedOffError("x"), 422, "bad-file"),
-    (problems.UnfitLevelError("x"), 422, "bad-file"),
     (errors.InputError("x"), 422, "bad-input"),
     (errors.UnavailableError("x"), 501, "unavailable"),
     (errors.NotFoundError("x"), 404, "not-found"),
@@ -84,6 +82,7 @@ def test_every_class_of_the_server_is_tried_here() -> None:
 
 def test_every_code_is_somebodys_and_close_codes_follow_from_statuses() -> None:
     used = {kind.code for kind in problems._KINDS.values()} | set(problems._OF_THE_FRAMEWORK.values())
+    used.add("bad-request")  # of the connections, which answer without the framework
     assert used | set(CODES) == set(MEANINGS)
     assert {code for code, meaning in CODES.items() if meaning.close < 4000} == set(problems._STATUSES)
     for code, meaning in CODES.items():

@@ -27,13 +27,13 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 
-from lodestream.errors import InputError, LodestreamError, OptionError, StreamError, TooLargeError
+from lodestream.errors import FormatError, InputError, LodestreamError, OptionError, StreamError, TooLargeError
 
 from ..access.access import Caller
 from ..access.limits import Limits
 from ..access.shares import Held
 from ..operation.settings import Settings
-from ..problems import BusyError, FullError, LargeLevelError, UnfitLevelError
+from ..problems import BusyError, FullError
 from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
@@ -201,11 +201,11 @@ class LevelMaker:
             call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings))
             result: MadeLevel | RefusedLevel = await self._runner.call(call)
         except TimeoutError:
-            raise LargeLevelError(
+            raise TooLargeError(
                 f"expected a level that is made within {seconds:g} s (level_seconds); {advice}"
             ) from None
         except MemoryError:
-            raise LargeLevelError(f"expected a level that needs at most {self._memory}; {advice}") from None
+            raise TooLargeError(f"expected a level that needs at most {self._memory}; {advice}") from None
         except UnforeseenError as error:
             if error.errno in _NO_ROOM:
                 raise self._no_room(0) from None
@@ -225,15 +225,15 @@ class LevelMaker:
         if isinstance(refused, FileTooLongError):
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
-            raise LargeLevelError(
+            raise TooLargeError(
                 f"expected a level whose file has less than {wanted.most_bytes} bytes, a quarter of the disk space for "
                 f"levels (level_disk); {advice}"
             )
         if isinstance(refused, TooLargeError):  # what the decoder advises is for those who call it
             limit, _, _ = str(refused).partition("; max_vertices=")
-            raise LargeLevelError(f"expected a level that needs at most {self._memory}: {limit}; {advice}")
+            raise TooLargeError(f"expected a level that needs at most {self._memory}: {limit}; {advice}")
         if isinstance(refused, InputError) and not isinstance(refused, OptionError):
-            raise UnfitLevelError(str(refused))
+            raise FormatError(str(refused))
         if isinstance(refused, StreamError):
             self._containers.tell_damage(key.container, refused)
         raise refused

@@ -23,6 +23,7 @@ from websockets.frames import Frame
 from ..operation.least_rate import LeastRate
 from ..operation.pace import Pace
 from ..operation.settings import Settings
+from ..problems import MEDIA_TYPE, document
 from .cuts import Cuts
 from .joined import Joined
 from .open_files import most_connections
@@ -50,12 +51,6 @@ _FRAMES_A_MESSAGE = 4.0
 
 #: Fragments of a message: the longest one in pieces of 260 bytes.
 MOST_FRAGMENTS = 256
-
-_TITLES = {
-    "bad-request": "Not a valid request",
-    "busy": "The server is busy; try again later",
-    "idle": "The client was too slow",
-}
 
 
 def connections(settings: Settings, cuts: Cuts, pace: Pace) -> tuple[type[H11Protocol], type[WebSocketsSansIOProtocol]]:
@@ -114,7 +109,7 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
         super().connection_made(cast(asyncio.Transport, self._answers))
         self._follow_head()
         if len(self.connections) > self.most:
-            self._refuse(503, "busy", f"expected at most {self.most} connections; try again in a few seconds")
+            self._refuse("busy", f"expected at most {self.most} connections; try again in a few seconds")
 
     def get_buffer(self, sizehint: int) -> memoryview:
         return self.buffer if self.conn.remaining > _PIECE else self.buffer[:_PIECE]
@@ -164,7 +159,7 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
     def send_400_response(self, msg: str) -> None:
         self.cuts.note("bad-request", self.client)
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
-            self._refuse(400, "bad-request", self.conn.wrong)
+            self._refuse("bad-request", self.conn.wrong)
         else:  # the answer is under way already, or was sent
             self._socket.abort()
 
@@ -220,17 +215,17 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
         self._head_timer = None
         if self.conn.our_state is h11.IDLE:
             seconds = self.settings.head_seconds
-            self._refuse(408, "idle", f"expected the complete head of a request within {seconds:g} s")
+            self._refuse("idle", f"expected the complete head of a request within {seconds:g} s")
         else:
             self.cuts.note("refused-body", self.client)
             self._socket.abort()
 
-    def _refuse(self, status: int, code: str, detail: str) -> None:
+    def _refuse(self, code: str, detail: str) -> None:
         self._leave_request()
-        problem = {"type": f"urn:lodestream:{code}", "title": _TITLES[code], "status": status, "code": code}
-        body = json.dumps({**problem, "detail": detail, "instance": None}).encode()
+        problem = document(code, detail, None)
+        status, body = problem["status"], json.dumps(problem).encode()
         headers = [
-            ("content-type", "application/problem+json"),
+            ("content-type", MEDIA_TYPE),
             ("content-length", str(len(body))),
             ("connection", "close"),
         ]
