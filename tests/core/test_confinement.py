@@ -265,15 +265,20 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
     # The kernel's machine for it has few instructions: here the filters of both architectures run on it.
     architecture, calls = seccomp._MACHINES[machine]
     filters = {
-        rights: b"".join(seccomp._program(architecture, calls, 77, processes=rights[0], threads=rights[1]))
-        for rights in ((False, False), (False, True), (True, False))
+        rights: b"".join(seccomp._program(architecture, calls, 77, *rights))
+        for rights in ((False, False, False), (False, True, False), (True, False, False), (False, False, True))
     }
 
     def verdict(
-        name: str | int, *arguments: int, processes: bool = False, threads: bool = False, other: int = 0
+        name: str | int,
+        *arguments: int,
+        processes: bool = False,
+        threads: bool = False,
+        descriptors: bool = False,
+        other: int = 0,
     ) -> str:
         number = calls[name] if isinstance(name, str) else name
-        return _run(filters[processes, threads], number, other or architecture, arguments)
+        return _run(filters[processes, threads, descriptors], number, other or architecture, arguments)
 
     assert verdict("socket") == "error 1"
     assert verdict("socket", other=0x40000003) == "kill"
@@ -304,6 +309,7 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
     ]
     for name in {*seccomp._DENIED.split()} & calls.keys():
         assert verdict(name) == verdict(name, processes=True) == "error 1", name
+        assert verdict(name, descriptors=True) == ("allow" if name == "recvmsg" else "error 1"), name
     known = {*calls.values()}
     assert all(verdict(number) == "allow" for number in range(424) if number not in known)
 

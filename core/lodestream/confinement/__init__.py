@@ -39,12 +39,15 @@ class Rights:
         Whether it may start processes, which have the same rights.
     threads : bool
         Whether it may start threads, which have the same rights; it may where it may start processes.
+    descriptors : bool
+        Whether it may receive descriptors of open files, over a socket that it has when it confines itself.
     """
 
     read: tuple[Path, ...] = ()
     write: tuple[Path, ...] = ()
     processes: bool = False
     threads: bool = False
+    descriptors: bool = False
 
 
 def confine(rights: Rights) -> tuple[str, ...]:
@@ -72,7 +75,8 @@ def confine(rights: Rights) -> tuple[str, ...]:
     if landlock.restrict(libc, (*libraries, *rights.read), write, libraries if rights.processes else ()):
         held.append("landlock")
     _drop_capabilities(libc)
-    if seccomp.restrict(libc, os.getpid(), processes=rights.processes, threads=rights.threads):
+    calls = {"processes": rights.processes, "threads": rights.threads, "descriptors": rights.descriptors}
+    if seccomp.restrict(libc, os.getpid(), **calls):
         held.append("seccomp")
     return tuple(held)
 

@@ -121,7 +121,9 @@ def _table(text: str) -> Mapping[str, int]:
 _MACHINES = {"x86_64": (0xC000003E, _table(_X86_64)), "aarch64": (0xC00000B7, _table(_AARCH64))}
 
 
-def restrict(libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool = False) -> bool:
+def restrict(
+    libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool = False, descriptors: bool = False
+) -> bool:
     """Make no call from now on but those allowed; whether the kernel holds this process to it.
 
     Parameters
@@ -134,19 +136,21 @@ def restrict(libc: ctypes.CDLL, process: int, *, processes: bool, threads: bool 
         others: only Landlock can, from its sixth version on.
     threads : bool
         Whether further threads of this process may be started.
+    descriptors : bool
+        Whether descriptors may be received.
     """
     machine = os.uname().machine
     if machine not in _MACHINES or sys.maxsize < 1 << 32 or sys.byteorder != "little":
         return False
     architecture, calls = _MACHINES[machine]
-    code = b"".join(_program(architecture, calls, process, processes=processes, threads=threads))
+    code = b"".join(_program(architecture, calls, process, processes, threads, descriptors))
     instructions = ctypes.create_string_buffer(code, len(code))
     program = struct.pack("HxxxxxxP", len(code) // 8, ctypes.addressof(instructions))
     return bool(libc.syscall(calls["seccomp"], _SET_FILTER, _ALL_THREADS | _FULL_SPEED, program) == 0)
 
 
 def _program(
-    architecture: int, calls: Mapping[str, int], process: int, *, processes: bool, threads: bool
+    architecture: int, calls: Mapping[str, int], process: int, processes: bool, threads: bool, descriptors: bool
 ) -> Iterable[bytes]:
     # Each rule falls through to the next one, with the call's number loaded.
     yield _instruction(_LOAD, _ARCHITECTURE)
@@ -160,7 +164,8 @@ def _program(
         yield _instruction(_EQUAL, number, len(_LATE) - place, 0)
     yield _instruction(_RETURN, _ERROR | errno.ENOSYS)
     yield _instruction(_RETURN, _ALLOW)
-    for name in (*_DENIED.split(), *(() if processes else _START)):
+    denied = set(_DENIED.split()) - ({"recvmsg"} if descriptors else set())
+    for name in (*sorted(denied), *(() if processes else _START)):
         if name in calls:
             yield _instruction(_EQUAL, calls[name], 0, 1)
             yield _instruction(_RETURN, _ERROR | errno.EPERM)

@@ -59,7 +59,7 @@ from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason
 from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
 from .fork_server import Allowed
-from .processes import Call, ForkServer
+from .processes import Call, ForkServer, Pool
 from .runner import Runner
 from .work import Work
 
@@ -168,7 +168,8 @@ class Builder:
         self._finished = finished
         self._memory, self._threads = settings.memory_of_build, settings.threads_of_build
         self.fork_server = ForkServer(worker.preload)
-        self._runner = Runner[str]("build", settings.workers, _REMEMBERED, self.fork_server)
+        pool = Pool(settings.workers, self.fork_server)
+        self._runner = Runner[str, Call]("build", settings.workers, _REMEMBERED, pool)
         self._callers: dict[str, str] = {}  # of the builds that wait or run
         self._running: dict[str, _Running] = {}
         #: Since when the folder of a surface's build is held by another process.

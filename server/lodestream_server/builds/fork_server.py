@@ -25,6 +25,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import forkserver
 from pathlib import Path
+from socket import AF_UNIX, SOCK_STREAM, recv_fds, socket
 from typing import Any, NoReturn
 
 from lodestream import parallel
@@ -35,7 +36,7 @@ from .answers import answer_of
 
 assert sys.platform == "linux"  # no other system has what follows
 
-__all__ = ["Allowed", "Order", "main"]
+__all__ = ["LONGEST_REQUEST", "Allowed", "Order", "main"]
 
 _DIE_WITH_PARENT = 1  # PR_SET_PDEATHSIG
 _INHERIT_ORPHANS = 36  # PR_SET_CHILD_SUBREAPER
@@ -79,6 +80,10 @@ class Allowed:
     file_bytes: int | None = None
 
 
+#: Longest request to a process that is kept, in bytes.
+LONGEST_REQUEST = 4 << 10
+
+
 @dataclass(frozen=True)
 class Order:
     """A call for a new process; the server pickles it, and the standard library unpickles it there and runs it.
@@ -94,6 +99,8 @@ class Order:
         Process of the fork server.
     confinement : tuple of str
         How the kernel must confine the process.
+    is_kept : bool
+        Whether the process stays: the function then returns another one, which answers requests, see `_serve`.
     """
 
     function: Callable[..., Any]
@@ -102,21 +109,51 @@ class Order:
     seconds: float | None
     parent: int
     confinement: tuple[str, ...]
+    is_kept: bool = False
 
     def _bootstrap(self, _: object) -> NoReturn:
         # The name is the standard library's. Nothing of it comes after this.
         try:
             answer = (forkserver.get_inherited_fds() or [])[0]
             _stand_alone(self.parent, answer)
-            with os.fdopen(answer, "wb", 0) as pipe:
-                pipe.write(answer_of(self._call))
+            if self.is_kept:
+                with socket(AF_UNIX, SOCK_STREAM, 0, answer) as ours:
+                    _serve(ours, self._call())
+            else:
+                with os.fdopen(answer, "wb", 0) as pipe:
+                    pipe.write(answer_of(self._call))
             os._exit(0)
         finally:
             os._exit(1)
 
     def _call(self) -> Any:
-        _limit(self.allowed, self.seconds, self.confinement)
+        _limit(self.allowed, self.seconds, self.confinement, descriptors=self.is_kept)
         return self.function(*self.args)
+
+
+def _serve(ours: socket, respond: Callable[..., Any]) -> None:
+    """Answer requests until the server closes its end.
+
+    A request is the JSON of the arguments, in one message with the descriptor of a file, which is closed afterwards. An
+    answer is the number of its bytes in four bytes, and JSON as of a process that ends (`answer_of`).
+    """
+    while True:
+        message, descriptors, _, _ = recv_fds(ours, LONGEST_REQUEST, 1)
+        if not message:
+            return
+        try:
+            answer = answer_of(lambda: respond(*json.loads(message), *descriptors))  # noqa: B023  # called at once
+        finally:
+            for each in descriptors:
+                os.close(each)
+        _write(ours.fileno(), len(answer).to_bytes(4, "little") + answer)
+
+
+def _write(descriptor: int, data: bytes) -> None:
+    # Not `send`, which a confined process may not call.
+    left = memoryview(data)
+    while left:
+        left = left[os.write(descriptor, left) :]
 
 
 def main(preload: Callable[[], object] | None, listener: int) -> None:
@@ -198,7 +235,7 @@ def _stand_alone(parent: int, answer: int) -> None:
     os.closerange(answer + 1, most if most > 0 else 1 << 16)
 
 
-def _limit(allowed: Allowed, seconds: float | None, expected: tuple[str, ...]) -> None:
+def _limit(allowed: Allowed, seconds: float | None, expected: tuple[str, ...], *, descriptors: bool = False) -> None:
     if allowed.write is not None:
         tempfile.tempdir = os.environ["TMPDIR"] = os.fspath(allowed.write)
     if allowed.memory is not None:
@@ -215,7 +252,7 @@ def _limit(allowed: Allowed, seconds: float | None, expected: tuple[str, ...]) -
     write = tuple(path for path in (allowed.write, allowed.kept) if path is not None)
     os.environ[parallel.VARIABLE] = str(allowed.threads)
     os.nice(_NICE)  # streams come first
-    held = confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1))
+    held = confine(Rights(allowed.read, write, allowed.processes, allowed.threads > 1, descriptors))
     if held != expected:
         raise RuntimeError(f"this process is confined by {held}, and not by {expected}, as the first one was")
 

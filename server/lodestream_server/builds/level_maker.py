@@ -40,7 +40,7 @@ from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
 from .fork_server import Allowed
 from .level_files import Key, Lease, LevelFiles
 from .levels import FileTooLongError, LevelJob, MadeLevel, RefusedLevel, make_level
-from .processes import Call, ForkServer
+from .processes import Call, ForkServer, Pool
 from .runner import Runner
 
 __all__ = ["LevelMaker", "Loan"]
@@ -111,7 +111,7 @@ class LevelMaker:
         self._containers = containers
         self._files = files
         self._limits = limits
-        self._runner = Runner[Key]("level", 1, _REMEMBERED, fork_server)
+        self._runner = Runner[Key, Call]("level", 1, _REMEMBERED, Pool(1, fork_server))
 
     async def take(self, key: Key, caller: Caller) -> Loan:
         """Return a level file, which is made if it does not exist.

@@ -1,7 +1,8 @@
-"""Call functions in separate processes, each with one call and only the rights that the call needs.
+"""Call functions in separate processes, which have only the rights that the calls need.
 
-The processes are forked from one that has loaded everything and has read no untrusted data (`fork_server`). If one of
-them dies, the others continue, and the next call gets a new one.
+The processes are forked from one that has loaded everything and has read no untrusted data (`fork_server`). There are
+two kinds of worker: one forks a process for each call (`Pool`); the other keeps one, whose caches make its next answer
+cheap (`Keeper`). If a process dies, others continue, and the next call gets a new one.
 
 The answer of such a process is not trusted: it is JSON of bounded length, which must have the type that the function
 returns, or it is refused.
@@ -28,14 +29,15 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pipe, forkserver, reduction
 from multiprocessing.connection import Connection, wait
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Generic, TypeVar
 
 from .answers import LONGEST_ANSWER, ProcessDiedError, WrongAnswerError, result_of
-from .fork_server import Allowed, Order, main
+from .fork_server import LONGEST_REQUEST, Allowed, Order, main
 
 assert sys.platform == "linux"  # no other system has what follows
 
-__all__ = ["ONE_THREAD", "Call", "ForkServer", "Pool", "Started", "new_listener"]
+__all__ = ["ONE_THREAD", "Call", "ForkServer", "Keeper", "Pool", "Question", "Started", "Worker", "new_listener"]
 
 # A process may die between the last look at it and the call; one that dies again and again has another reason.
 _STARTS: Final = 3
@@ -147,8 +149,8 @@ class ForkServer:
                 return problem
         return None
 
-    def fork(self, call: Call) -> Process:
-        """Fork a process for a call.
+    def fork(self, call: Call, *, is_kept: bool = False) -> Process:
+        """Fork a process for a call, or one that stays and is asked (`Process.ask`).
 
         Raises
         ------
@@ -163,7 +165,9 @@ class ForkServer:
                 raise ProcessDiedError(None)
             address = os.dup(started.address)
         confinement = tuple(started.told["confinement"])
-        order = Order(call.function, call.args, call.allowed, call.seconds, started.process.pid, confinement)
+        seconds = None if is_kept else call.seconds
+        parent = started.process.pid
+        order = Order(call.function, call.args, call.allowed, seconds, parent, confinement, is_kept)
         try:
             return _fork(order, address)
         except (ConnectionError, EOFError):
@@ -232,7 +236,8 @@ class ForkServer:
 
 def _fork(order: Order, address: int) -> Process:
     text = pickle.dumps({}) + pickle.dumps(order)  # the first changes nothing in the process
-    answer, its_answer = Pipe(duplex=False)
+    answer: Connection | socket.socket
+    answer, its_answer = socket.socketpair() if order.is_kept else Pipe(duplex=False)
     status, its_status = Pipe(duplex=False)
     its_orders, orders = Pipe(duplex=False)
     try:
@@ -261,13 +266,13 @@ class Process:
         Of the process, and of its group.
     status : Connection
         From the fork server, which writes its exit code when it has ended.
-    answer : Connection
+    answer : Connection or socket
         From the process.
     """
 
     number: int
     status: Connection
-    answer: Connection
+    answer: Connection | socket.socket
 
     def finish(self, call: Call) -> bytes:
         """Wait for the end of the process with all that it has started, and return its answer.
@@ -286,7 +291,7 @@ class Process:
             answer = self._read(call, until)
             late = answer is None or not _ready([self.status], call, until)
         finally:
-            code = self._end()
+            code = self.end()
         if not call.ended and (answer is None or (late and code == -signal.SIGKILL)):
             raise TimeoutError
         if code == -signal.SIGXCPU:
@@ -299,19 +304,59 @@ class Process:
         """Return the whole answer of the process; None when it takes too long."""
         data = bytearray()
         while len(data) <= LONGEST_ANSWER:
-            ready = _ready([self.answer, self.status], call, until)
-            if not ready:
-                return None
-            if self.answer not in ready:
-                self._end_group()  # the process has ended; what it has left behind keeps its pipe open
-                continue
-            piece = os.read(self.answer.fileno(), 1 << 16)
+            piece = self._piece(call, until)
             if not piece:
-                return bytes(data)
+                return None if piece is None else bytes(data)
             data += piece
         raise WrongAnswerError(f"expected at most {LONGEST_ANSWER} bytes")
 
-    def _end(self) -> int | None:
+    def _piece(self, call: Call, until: float) -> bytes | None:
+        """Return what has come of an answer, nothing at its end; None when it takes too long."""
+        while ready := _ready([self.answer, self.status], call, until):
+            if self.answer in ready:
+                return os.read(self.answer.fileno(), 1 << 16)
+            self._end_group()  # the process has ended; what it has left behind keeps its pipe open
+        return None
+
+    def ask(self, service: Call, question: Question) -> bytes:
+        """Ask a process that is kept, and return its answer.
+
+        Raises
+        ------
+        TimeoutError
+            If it takes longer than the seconds of the service.
+        ProcessDiedError
+            If it has ended, or its answer is too long (`WrongAnswerError`).
+        OSError
+            If the file of the question cannot be opened.
+        """
+        assert isinstance(self.answer, socket.socket), "it is kept"
+        until = math.inf if service.seconds is None else time.monotonic() + service.seconds
+        request = json.dumps(question.args).encode()
+        assert len(request) <= LONGEST_REQUEST, "orders are short"
+        with question.path.open("rb") as file:
+            try:
+                # A process that does not read stops nobody: the request before was answered, so that this one fits.
+                socket.send_fds(self.answer, [request], [file.fileno()], socket.MSG_DONTWAIT)
+            except OSError:
+                raise ProcessDiedError(None) from None
+        data, size = bytearray(), 4
+        while len(data) < size:
+            piece = self._piece(service, until)
+            if piece is None:
+                raise TimeoutError
+            if not piece:
+                raise ProcessDiedError(None)
+            data += piece
+            if len(data) >= 4:
+                size = 4 + int.from_bytes(data[:4], "little")
+            if max(size, len(data)) > question.longest:
+                raise WrongAnswerError(f"expected at most {question.longest} bytes")
+        if len(data) > size:
+            raise WrongAnswerError("expected one answer")
+        return bytes(data[4:])
+
+    def end(self) -> int | None:
         """Kill the process and all that it has started, wait for their end, and return the exit code."""
         with self.status, self.answer:
             if not wait([self.status], 0):  # otherwise its number may be another's
@@ -333,7 +378,7 @@ class Process:
                 time.sleep(_GROUP_SECONDS)
 
 
-def _ready(pipes: list[Connection], call: Call, until: float) -> list[Any]:
+def _ready(pipes: list[Connection | socket.socket], call: Call, until: float) -> list[Any]:
     """Wait until a pipe can be read; return those that can: none when it is too late, or nobody waits for the call."""
     while not call.ended and (left := until - time.monotonic()) > 0:
         if ready := wait(pipes, min(left, _LOOK_SECONDS)):
@@ -373,8 +418,36 @@ class Call:
     ended: bool = field(default=False, init=False)
 
 
-class Pool:
-    """Runs up to ``size`` calls at a time.
+@dataclass(eq=False)
+class Question:
+    """What a process that is kept is asked.
+
+    Attributes
+    ----------
+    function : callable
+        Its annotation says of which type the answer must be.
+    args : tuple
+        JSON values, at most `LONGEST_REQUEST` bytes.
+    path : Path
+        A file of which the process gets a descriptor.
+    longest : int
+        Bytes of the longest answer.
+    ended : bool
+        Set when nobody waits for it any more.
+    """
+
+    function: Callable[..., Any]
+    args: tuple[Any, ...]
+    path: Path
+    longest: int = LONGEST_ANSWER
+    ended: bool = field(default=False, init=False)
+
+
+_Call = TypeVar("_Call", Call, Question)
+
+
+class Worker(Generic[_Call]):
+    """Makes up to ``size`` calls at a time, each in a thread that waits for the process.
 
     Parameters
     ----------
@@ -386,13 +459,13 @@ class Pool:
     def __init__(self, size: int, server: ForkServer) -> None:
         self._server = server
         self._threads = ThreadPoolExecutor(size, "lodestream-process")
-        self._calls = set[Call]()
+        self._calls: set[_Call] = set()
         self._closed = False
 
-    async def run(self, call: Call) -> Any:
+    async def run(self, call: _Call) -> Any:
         """Make a call when a place is free, and return its result.
 
-        Cancelling it kills the process; the process has ended when this raises.
+        Cancelling it ends the call, which has ended when this raises.
 
         Raises
         ------
@@ -405,7 +478,7 @@ class Pool:
         UnforeseenError
             If the function raised anything else.
         OSError
-            If no process could be started, or from `before`.
+            If no process could be started, or from `Call.before`, or if the file of a question cannot be opened.
         """
         self._calls.add(call)
         try:
@@ -428,7 +501,11 @@ class Pool:
             call.ended = True
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    def _run(self, call: Call) -> Any:
+    def _run(self, call: _Call) -> Any:
+        raise NotImplementedError
+
+    def _fork(self, call: Call, *, is_kept: bool = False) -> Process:
+        """Fork a process as soon as the fork server is ready."""
         call.ended |= self._closed
         died, ready = ProcessDiedError(None), False
         for _ in range(_STARTS):
@@ -439,10 +516,80 @@ class Pool:
                 if call.before is not None and not ready:
                     call.before()
                 ready = True
-                process = self._server.fork(call)
+                return self._server.fork(call, is_kept=is_kept)
             except ProcessDiedError as error:
                 died = error
-                continue
-            call.begun.set()
-            return result_of(call.function, process.finish(call))
         raise died
+
+
+class Pool(Worker[Call]):
+    """Forks a process for each call. Cancelling a call kills its process, which has ended then."""
+
+    def _run(self, call: Call) -> Any:
+        process = self._fork(call)
+        call.begun.set()
+        return result_of(call.function, process.finish(call))
+
+
+class Keeper(Worker[Question]):
+    """Asks one process, which stays: it is forked when it is first needed, and anew after a crash or many questions.
+
+    So what a file does to its reader lasts for so many questions at most. A question that was begun is answered, also
+    if nobody waits for it any more.
+
+    Parameters
+    ----------
+    server : ForkServer
+    service : Call
+        Its function returns the one that answers: from the arguments of a question and a descriptor of its file, which
+        is closed afterwards. Its seconds are those of one answer.
+    most : int
+        Questions to one process.
+    """
+
+    def __init__(self, server: ForkServer, service: Call, most: int) -> None:
+        super().__init__(1, server)
+        self._service = service
+        self._most = most
+        self._process: Process | None = None
+        self._asked = 0
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, once there is one."""
+        return None if self._process is None else self._process.number
+
+    def close(self) -> None:
+        """Kill the process."""
+        self._service.ended = True
+        super().close()
+        self._end()
+
+    def _run(self, call: Question) -> Any:
+        if call.ended or self._closed:
+            raise ProcessDiedError(None)
+        try:
+            return self._ask(call)
+        except ProcessDiedError as error:
+            # It may have died since its last answer.
+            if isinstance(error, WrongAnswerError) or self._closed:
+                raise
+            return self._ask(call)
+
+    def _ask(self, question: Question) -> Any:
+        if self._process is None:
+            self._process, self._asked = self._fork(self._service, is_kept=True), 0
+        self._asked += 1
+        try:
+            result = result_of(question.function, self._process.ask(self._service, question))
+        except BaseException:
+            self._end()
+            raise
+        if self._asked >= self._most:
+            self._end()
+        return result
+
+    def _end(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.end()

@@ -25,13 +25,14 @@ from typing import Any, Generic, TypeVar, cast
 from ..access.turns import Place, Turns
 from ..operation.logs import event
 from ..problems import RestartingError
-from .processes import Call, ForkServer, Pool
+from .processes import Call, Question, Worker
 
 __all__ = ["Runner", "Work"]
 
 _log = logging.getLogger(__name__)
 
 _Key = TypeVar("_Key", bound=Hashable)
+_Call = TypeVar("_Call", Call, Question)
 _Result = TypeVar("_Result")
 
 #: What a job does in its turn. What its result needs until everybody who waits has taken it over goes into the stack.
@@ -60,7 +61,7 @@ class _Job:
         self.task: asyncio.Task[Any]
 
 
-class Runner(Generic[_Key]):
+class Runner(Generic[_Key, _Call]):
     """Does the jobs of one kind, so many at a time.
 
     Parameters
@@ -71,14 +72,17 @@ class Runner(Generic[_Key]):
         Number of jobs at the same time.
     memory : float
         Seconds for which it counts who has had turns, see `Turns`.
-    server : ForkServer
-        May be shared; it is closed by whoever created it.
+    worker : Worker
+        Makes their calls; it is closed with the runner.
+    level : int
+        Of the line in the log for a job that ends well.
     """
 
-    def __init__(self, kind: str, size: int, memory: float, server: ForkServer) -> None:
+    def __init__(self, kind: str, size: int, memory: float, worker: Worker[_Call], level: int = logging.INFO) -> None:
         self._kind = kind
         self._turns = Turns(size, memory)
-        self._pool = Pool(size, server)
+        self._worker: Worker[_Call] = worker
+        self._level = level
         self._jobs: dict[_Key, _Job] = {}
         self._closing = False
 
@@ -138,7 +142,7 @@ class Runner(Generic[_Key]):
 
     async def _do(self, key: _Key, job: _Job, work: Work[_Result]) -> _Result:
         asked = time.monotonic()
-        begun, result = None, "given up"
+        begun, result, level = None, "given up", self._level
         try:
             async with job.place.turn():
                 begun = time.monotonic()
@@ -146,18 +150,18 @@ class Runner(Generic[_Key]):
             result = made if isinstance(made, str) else "done"
             return made
         except Exception as error:
-            result = str(error) or type(error).__name__
+            result, level = str(error) or type(error).__name__, logging.INFO
             raise
         finally:
             # Whoever asks from now on asks for another.
             self._forget(key, job)
             ended = time.monotonic()
             waited, took = (ended - asked, None) if begun is None else (begun - asked, ended - begun)
-            event(_log, "job ended", kind=self._kind, job=_name(key), result=result, waited=waited, seconds=took)
+            event(_log, "job ended", level, kind=self._kind, job=_name(key), result=result, waited=waited, seconds=took)
 
-    async def call(self, call: Call) -> Any:
-        """Make a call of a job, see `Pool.run`."""
-        return await self._pool.run(call)
+    async def call(self, call: _Call) -> Any:
+        """Make a call of a job, see `Worker.run`."""
+        return await self._worker.run(call)
 
     async def close(self) -> None:
         """Cut all jobs short, and kill their processes."""
@@ -166,7 +170,7 @@ class Runner(Generic[_Key]):
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await asyncio.to_thread(self._pool.close)
+        await asyncio.to_thread(self._worker.close)
 
 
 def _ended(job: _Job, task: asyncio.Task[Any]) -> None:

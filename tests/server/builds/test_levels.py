@@ -100,7 +100,7 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     levels: list[int] = []
     job = Runner.job
 
-    def noted(self: Runner[Key], key: Key, caller: str, *rest: Any) -> Any:
+    def noted(self: Runner[Key, Any], key: Key, caller: str, *rest: Any) -> Any:
         if isinstance(key, Key):
             levels.append(key.level)
         if isinstance(key, Key) and caller == key_of("two"):

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from lodestream_server.builds.processes import ForkServer
+from lodestream_server.builds.processes import Call, ForkServer, Pool
 from lodestream_server.builds.runner import Runner
 from lodestream_server.problems import BusyError, RestartingError
 from tests.server.helpers import PATIENCE
@@ -20,7 +20,7 @@ class Bench:
     """A runner with one place, and jobs that end when they are told to."""
 
     def __init__(self) -> None:
-        self.runner = Runner[str]("test", 1, 60.0, ForkServer())
+        self.runner = Runner[str, Call]("test", 1, 60.0, Pool(1, ForkServer()))
         self.begun: list[str] = []
         self.released: list[str] = []
         self.go: dict[str, asyncio.Event] = {}

@@ -76,7 +76,7 @@ def test_a_level_whose_container_was_deleted_and_made_again_for_another(
     waiting: list[str] = []
     job = Runner.job
 
-    def noted(self: Runner[Key], key: Key, caller: str, *rest: Any) -> Any:
+    def noted(self: Runner[Key, Any], key: Key, caller: str, *rest: Any) -> Any:
         if isinstance(key, Key):
             waiting.append(caller)
         return job(self, key, caller, *rest)
