@@ -23,12 +23,13 @@ from .access.scopes import unrouted
 from .builds.builder import Builder
 from .builds.level_files import LevelFiles
 from .builds.level_maker import LevelMaker
+from .builds.tile_maker import TileMaker
 from .builds.work import Work
 from .operation.metrics import Metrics
 from .operation.observation import Observation
 from .operation.pace import Pace, Paced
 from .operation.settings import Settings
-from .routes import files, interface, levels, names, pages, streams, surfaces
+from .routes import files, interface, levels, maps, names, pages, streams, surfaces
 from .routes.routing import State
 from .store.containers import Containers
 from .store.data_folder import DataFolder
@@ -99,9 +100,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         metrics.watch(folder.root, lambda: len(surfaces.index), lambda: builder.pending)
         files_of_levels = await asyncio.to_thread(_level_files, chosen, folder, limits)
         levels = LevelMaker(chosen, containers, files_of_levels, builder.fork_server, limits)
+        tiles = TileMaker(chosen, containers, builder.fork_server, limits)
         upkeep = Upkeep(surfaces, builder, levels)
         app.state.parts = State(
-            chosen, folder, surfaces, upkeep, builder, containers, access, limits, metrics, levels, pace
+            chosen, folder, surfaces, upkeep, builder, containers, access, limits, metrics, levels, tiles, pace
         )
         try:
             await builder.start()
@@ -109,6 +111,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             yield
         finally:
             await upkeep.close()
+            await tiles.close()
             await levels.close()
             await builder.close()
             await asyncio.to_thread(folder.close)
@@ -128,7 +131,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app)
     for status in (404, 405):  # of the framework; routes raise errors of ours
         app.add_exception_handler(status, unrouted)
-    routers = (pages.router, surfaces.router, names.router, files.router, levels.router, streams.router)
+    routers = (pages.router, surfaces.router, names.router, files.router, levels.router, maps.router, streams.router)
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]

@@ -65,9 +65,9 @@ class Limits:
 
     Attributes
     ----------
-    builds, streams, openings, levels, lent : Share
+    builds, streams, openings, levels, tiles, lent : Share
         Of the builds that wait or run, the open streams, the connections that have not shown a token yet, the requests
-        that wait for levels, and the bytes of levels that are being read.
+        that wait for levels and for tiles, and the bytes of levels that are being read.
     plans : Turns
         Held while a large plan is made: one at a time, because it slows down all other Python code.
     """
@@ -94,6 +94,7 @@ class Limits:
         self.openings = share("connections that have not sent a token yet", settings.max_streams)
         self._credit = share("bytes of send buffers beyond the least", settings.memory_of_streams)
         self.levels = share("requests for levels", settings.max_level_requests)
+        self.tiles = share("requests for tiles", settings.max_tile_requests)
         self.lent = share("bytes of levels that are being read", 0, advice="read them first")
         self._indexes = share("bytes of memory for indexes of surfaces that are streamed", 0)
         self._surfaces = stored("surfaces", settings.max_surfaces)

@@ -6,17 +6,28 @@ import json
 import signal
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from textwrap import indent
 from typing import Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_json
 
-from lodestream.errors import LodestreamError
+from lodestream.errors import (
+    FormatError,
+    InputError,
+    LodestreamError,
+    OptionError,
+    StreamError,
+    TooLargeError,
+    UnavailableError,
+)
 
 __all__ = [
     "LONGEST_ANSWER",
+    "FileTooLongError",
     "ProcessDiedError",
+    "Refusal",
     "UnforeseenError",
     "WrongAnswerError",
     "answer_of",
@@ -74,6 +85,49 @@ class UnforeseenError(LodestreamError):
         self.kind = kind
         self.errno = errno
         self.traceback = traceback
+
+
+class FileTooLongError(TooLargeError):
+    """The file of a level became longer than allowed."""
+
+
+# What an error is told as: the first class that fits.
+_KINDS: tuple[type[LodestreamError], ...] = (
+    FileTooLongError,
+    TooLargeError,
+    OptionError,
+    FormatError,
+    InputError,
+    UnavailableError,
+    StreamError,
+    LodestreamError,
+)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A level or a tile was not made.
+
+    Attributes
+    ----------
+    kind : str
+        Name of the exception class that was raised, or of a base of it.
+    reason : str
+        One line.
+    """
+
+    kind: str
+    reason: str
+
+    @classmethod
+    def of(cls, error: LodestreamError) -> Refusal:
+        """Return what is told of an error."""
+        return cls(next(kind.__name__ for kind in _KINDS if isinstance(error, kind)), str(error))
+
+    def error(self) -> LodestreamError:
+        """Return the exception, limited to known classes: the process is not trusted."""
+        kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
+        return kind(reason_of(self.reason))
 
 
 def answer_of(call: Callable[[], Any]) -> bytes:

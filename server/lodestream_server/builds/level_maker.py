@@ -36,10 +36,10 @@ from ..operation.settings import Settings
 from ..problems import BusyError, FullError
 from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
-from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError
+from .answers import FileTooLongError, ProcessDiedError, Refusal, UnforeseenError, WrongAnswerError
 from .fork_server import Allowed
 from .level_files import Key, Lease, LevelFiles
-from .levels import FileTooLongError, LevelJob, MadeLevel, RefusedLevel, make_level
+from .levels import LevelJob, MadeLevel, make_level
 from .processes import Call, ForkServer, Pool
 from .runner import Runner
 
@@ -199,7 +199,7 @@ class LevelMaker:
         seconds = self._settings.level_seconds
         try:
             call = Call(make_level, (wanted,), seconds, allowed=_allowed(wanted, self._settings))
-            result: MadeLevel | RefusedLevel = await self._runner.call(call)
+            result: MadeLevel | Refusal = await self._runner.call(call)
         except TimeoutError:
             raise TooLargeError(
                 f"expected a level that is made within {seconds:g} s (level_seconds); {advice}"

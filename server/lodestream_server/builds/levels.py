@@ -16,25 +16,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from lodestream.errors import (
-    FormatError,
     FormatWarning,
-    InputError,
     LodestreamError,
-    OptionError,
-    StreamError,
-    TooLargeError,
-    UnavailableError,
 )
 from lodestream.formats import formats
 from lodestream.operating_system import limited_file_size
 
-from .answers import reason_of
+from .answers import FileTooLongError, Refusal
 
 if TYPE_CHECKING:
     from lodestream import Surface
     from lodestream.container import Header
 
-__all__ = ["MEDIA_TYPES", "FileTooLongError", "LevelJob", "MadeLevel", "RefusedLevel", "make_level", "written_by"]
+__all__ = ["MEDIA_TYPES", "LevelJob", "MadeLevel", "make_level", "written_by"]
 
 #: Raise this with every change by which a level of the same container becomes a file of other bytes: of a writer, of
 #: tags, metadata and overviews, of what decoding gives. Caches, and readers that fetch a file by ranges, take files of
@@ -50,23 +44,6 @@ MEDIA_TYPES = {format_.name: format_.media_type for format_ in formats() if form
 
 #: Bytes for each value that decoding in one piece takes, and the part of the memory that a band may take.
 _WHOLE, _BAND = 12, 4
-
-
-class FileTooLongError(TooLargeError):
-    """The file of a level became longer than allowed."""
-
-
-# What an error is told as: the first class that fits.
-_KINDS: tuple[type[LodestreamError], ...] = (
-    FileTooLongError,
-    TooLargeError,
-    OptionError,
-    FormatError,
-    InputError,
-    UnavailableError,
-    StreamError,
-    LodestreamError,
-)
 
 
 @dataclass(frozen=True)
@@ -106,28 +83,6 @@ class MadeLevel:
     size: int
 
 
-@dataclass(frozen=True)
-class RefusedLevel:
-    """The file was not made.
-
-    Attributes
-    ----------
-    kind : str
-        Name of an exception class: `FileTooLongError` if the file became too large; otherwise the class that was
-        raised, or a base of it.
-    reason : str
-        One line.
-    """
-
-    kind: str
-    reason: str
-
-    def error(self) -> LodestreamError:
-        """Return the exception, limited to known classes: the process is not trusted."""
-        kind = next((kind for kind in _KINDS if kind.__name__ == self.kind), LodestreamError)
-        return kind(reason_of(self.reason))
-
-
 @cache
 def written_by() -> str:
     """Return hexadecimal digits that change with the programs that write level files."""
@@ -140,7 +95,7 @@ def written_by() -> str:
     return hashlib.sha256("\n".join(versions).encode()).hexdigest()[:12]
 
 
-def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+def make_level(job: LevelJob) -> MadeLevel | Refusal:
     """Decode a level and write it in a format.
 
     Raises
@@ -154,7 +109,7 @@ def make_level(job: LevelJob) -> MadeLevel | RefusedLevel:
         with _short_files(job, aside):
             path = _write(surface, job)
     except LodestreamError as error:
-        return RefusedLevel(next(kind.__name__ for kind in _KINDS if isinstance(error, kind)), str(error))
+        return Refusal.of(error)
     return MadeLevel(path.stat().st_size)
 
 

@@ -41,6 +41,7 @@ class Bounds(BaseModel):
     )
     max_streams: int = _count(2000, "open streams; the same number of connections may be waiting to authenticate")
     max_level_requests: int = _count(32, "requests for levels as files that wait at the same time")
+    max_tile_requests: int = _count(64, "requests for tiles of maps that wait at the same time")
     level_memory: int | None = _follows(
         256 << 20, "memory of the process that makes a level as a file: half of `memory`, but at least 1 GiB"
     )

@@ -22,7 +22,7 @@ from .routing import Parts, State, readable
 from .sending import ready
 from .surfaces import answer, base, owned
 
-__all__ = ["router"]
+__all__ = ["leads_to", "router"]
 
 router = APIRouter(prefix="/v1/names", tags=["names"])
 
@@ -104,7 +104,7 @@ async def page(
 )
 async def look(caller: Reader, request: Request, parts: Parts, name: _Name) -> Response:
     """Return what is told of the surface to which a name leads now; its `url` is that of the surface."""
-    described = await answer(_surface(parts, name), caller, parts, request)
+    described = await answer(leads_to(parts, name), caller, parts, request)
     described.headers["cache-control"] = "no-cache"
     return described
 
@@ -120,7 +120,7 @@ async def look(caller: Reader, request: Request, parts: Parts, name: _Name) -> R
 )
 async def find(request: Request, parts: Parts, name: _Name) -> Response:
     """Redirect to the container of the surface to which a name leads now."""
-    return await files.find(request, parts, _surface(parts, name).id)
+    return await files.find(request, parts, leads_to(parts, name).id)
 
 
 @router.delete("/{name}", status_code=204, summary="Delete a name", responses=responses(403, 404, 422, 503))
@@ -151,7 +151,7 @@ async def _asked(request: Request, parts: State) -> str | None:
     return None if surface is None else surface.removeprefix(f"{base(request)}/")
 
 
-def _surface(parts: State, name: str) -> Surface:
+def leads_to(parts: State, name: str) -> Surface:
     """Return the surface to which a name leads.
 
     Raises

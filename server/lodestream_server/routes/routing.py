@@ -14,6 +14,7 @@ from ..access.access import Access
 from ..access.limits import Limits
 from ..builds.builder import Builder
 from ..builds.level_maker import LevelMaker
+from ..builds.tile_maker import TileMaker
 from ..operation.metrics import Metrics
 from ..operation.pace import Pace
 from ..operation.settings import Settings
@@ -41,6 +42,7 @@ class State:
     limits: Limits
     metrics: Metrics
     levels: LevelMaker
+    tiles: TileMaker
     pace: Pace
 
 

@@ -18,8 +18,9 @@ from threading import Barrier, get_ident
 from lodestream.confinement import landlock
 from lodestream.parallel import spread, threads
 from lodestream_server.builds import builder, level_maker, worker
+from lodestream_server.builds.answers import Refusal
 from lodestream_server.builds.fork_server import Allowed
-from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 from lodestream_server.store import durable
 from tests.patience import PATIENCE as _PATIENCE
@@ -324,7 +325,7 @@ def full_at_each_step(job: Job) -> Built | Parsed | Refused:
     return build(job)
 
 
-def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
+def make_coarsest(job: LevelJob) -> MadeLevel | Refusal:
     """Say who makes a level, then make the coarsest at once and the others when ``go`` appears beside the folders."""
     begun = job.folder.parents[2] / "begun"
     with begun.open("a") as file:
@@ -332,12 +333,12 @@ def make_coarsest(job: LevelJob) -> MadeLevel | RefusedLevel:
     until = time.monotonic() + _PATIENCE
     while job.level and not (begun.parent / "go").exists():
         if time.monotonic() > until:
-            return RefusedLevel("OptionError", "nobody said go")
+            return Refusal("OptionError", "nobody said go")
         time.sleep(0.01)
     return make_level(job)
 
 
-def make_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
+def make_when_told(job: LevelJob) -> MadeLevel | Refusal:
     """Make a level once ``go`` appears beside ``begun`` in its folder, which is all that its process may write to."""
     begun, go = job.folder / "begun", job.folder / "go"
     begun.touch()
@@ -349,7 +350,7 @@ def make_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
     return make_level(job)
 
 
-def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
+def miss_when_told(job: LevelJob) -> MadeLevel | Refusal:
     """Miss the container of the first level once it was deleted, and say so when ``go`` appears beside the folders."""
     data, until = job.folder.parents[2], time.monotonic() + _PATIENCE
     first = not (data / "missed").exists()
@@ -365,7 +366,7 @@ def miss_when_told(job: LevelJob) -> MadeLevel | RefusedLevel:
         raise
 
 
-def make_level_by_bands(job: LevelJob) -> MadeLevel | RefusedLevel:
+def make_level_by_bands(job: LevelJob) -> MadeLevel | Refusal:
     """Make a level as one that takes more memory than there is, and say that values of it were in files."""
     made = make_level(replace(job, memory=1))
     if not (job.folder / "values").is_dir():
@@ -373,7 +374,7 @@ def make_level_by_bands(job: LevelJob) -> MadeLevel | RefusedLevel:
     return made
 
 
-def make_level_by_blocks(job: LevelJob) -> MadeLevel | RefusedLevel:
+def make_level_by_blocks(job: LevelJob) -> MadeLevel | Refusal:
     """Make a level with the memory that blocks of 1,600 values take by themselves, and say that they were in files."""
     made = make_level(replace(job, memory=2 * 40 * 1600))
     if not (job.folder / "values").is_dir():
@@ -381,12 +382,12 @@ def make_level_by_blocks(job: LevelJob) -> MadeLevel | RefusedLevel:
     return made
 
 
-def hoard_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+def hoard_level(job: LevelJob) -> MadeLevel | Refusal:
     """Take more memory than the process may have."""
-    return RefusedLevel("OptionError", f"got {len(bytearray(2 << 30))} bytes")
+    return Refusal("OptionError", f"got {len(bytearray(2 << 30))} bytes")
 
 
-def kill_level_once(job: LevelJob) -> MadeLevel | RefusedLevel:
+def kill_level_once(job: LevelJob) -> MadeLevel | Refusal:
     """Be killed the first time, with half a file written."""
     marker = job.folder.parents[2] / "killed"
     if not marker.exists():
@@ -401,20 +402,20 @@ def find_full(job: Job) -> Built | Parsed | Refused:
     raise OSError(errno.ENOSPC, "no space left", str(job.folder))
 
 
-def raise_full(job: LevelJob) -> MadeLevel | RefusedLevel:
+def raise_full(job: LevelJob) -> MadeLevel | Refusal:
     """Find the disk full."""
     raise OSError(errno.ENOSPC, "no space left", str(job.folder))
 
 
-def refuse_large_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+def refuse_large_level(job: LevelJob) -> MadeLevel | Refusal:
     """What the decoder says of a level that does not fit into memory."""
     words = (
         "expected a surface that takes at most 9 MiB to decode (50% of the available memory), got one that takes more"
     )
-    return RefusedLevel("TooLargeError", f"{words}; max_vertices=7 allows it")
+    return Refusal("TooLargeError", f"{words}; max_vertices=7 allows it")
 
 
-def lack_memory_for_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+def lack_memory_for_level(job: LevelJob) -> MadeLevel | Refusal:
     """No memory is left."""
     raise MemoryError
 

@@ -25,8 +25,9 @@ from lodestream_server import running, running_server
 from lodestream_server.access.access import key_of
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_maker, worker
+from lodestream_server.builds.answers import Refusal
 from lodestream_server.builds.level_files import Key, LevelFiles
-from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel, make_level
+from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
 from lodestream_server.builds.runner import Runner
 from tests.server.builds import slow
 from tests.server.builds.test_confinement import needs_landlock
@@ -530,10 +531,10 @@ def test_the_process_makes_no_file_that_is_longer(tmp_path: Path) -> None:
         container = tmp_path / "data" / "containers" / f"{surface['container']}.lode"
         level = len(surface["levels"]) - 1
         refused = make_level(LevelJob(container, level, "npy", _new(tmp_path / "a"), 1000, 1 << 28))
-        assert isinstance(refused, RefusedLevel)
+        assert isinstance(refused, Refusal)
         assert refused.kind == "FileTooLongError"
         made = make_level(LevelJob(container, level, "npy", _new(tmp_path / "b"), 10_000, 1 << 28))
-        assert not isinstance(made, RefusedLevel)
+        assert not isinstance(made, Refusal)
         assert (tmp_path / "b" / "level").read_bytes() == npy(hills())
         assert made.size == len(npy(hills()))
 
@@ -585,7 +586,7 @@ def test_values_in_files_count_for_the_room_of_a_level(tmp_path: Path) -> None:
     level, size = len(surface["levels"]) - 1, len(npy(hills()))
     for name, most in (("a", 40 * 30 * 4), ("b", 40 * 30 * 4 + size - 1)):
         refused = make_level(LevelJob(container, level, "npy", _new(tmp_path / name), most, 1 << 10))
-        assert isinstance(refused, RefusedLevel)
+        assert isinstance(refused, Refusal)
         assert refused.kind == "FileTooLongError"
     made = make_level(LevelJob(container, level, "npy", _new(tmp_path / "c"), 40 * 30 * 4 + size, 1 << 10))
     assert isinstance(made, MadeLevel)

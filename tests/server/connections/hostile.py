@@ -25,7 +25,8 @@ import numpy as np
 from lodestream.library import library
 from lodestream.parallel import VARIABLE
 from lodestream_server.builds import worker
-from lodestream_server.builds.levels import LevelJob, MadeLevel, RefusedLevel
+from lodestream_server.builds.answers import Refusal
+from lodestream_server.builds.levels import LevelJob, MadeLevel
 from lodestream_server.builds.worker import Built, Job, Parsed, Refused, build
 from tests.patience import PATIENCE
 
@@ -287,18 +288,18 @@ def forge_reason(job: Job) -> Built | Parsed | Refused:
     return Refused("two\nlines \x1b[31m" + "and more " * 1000)
 
 
-def forge_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+def forge_level(job: LevelJob) -> MadeLevel | Refusal:
     """Say that a level was made, where none was."""
     return MadeLevel(5)
 
 
-def forge_level_link(job: LevelJob) -> MadeLevel | RefusedLevel:
+def forge_level_link(job: LevelJob) -> MadeLevel | Refusal:
     """Make a link to the container in its place."""
     job.path.symlink_to(job.container)
     return MadeLevel(job.container.stat().st_size)
 
 
-def say_garbage_of_level(job: LevelJob) -> MadeLevel | RefusedLevel:
+def say_garbage_of_level(job: LevelJob) -> MadeLevel | Refusal:
     _say(bytes(range(256)))
 
 

@@ -1,0 +1,140 @@
+"""Tiles for maps and globes: made one at a time by a confined process that is kept, while a client waits for them.
+
+What happens to a request:
+
+======================================  ================================================================================
+somebody waits for the same tile        it joins (`runner`)
+otherwise                               it waits its turn; with an index and blocks in memory a tile takes milliseconds
+the client disconnects                  it leaves the queue; a tile that was begun is made to its end
+the surface has no CRS, is no block of  422
+heights, or an option is wrong
+the surface does not reach the tile     404, by the route
+it needs too much memory or time        413; the process is started anew
+too many requests wait, or the process  429, 503
+dies
+======================================  ================================================================================
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from base64 import b64decode
+from binascii import Error
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+from lodestream.errors import StreamError, TooLargeError
+
+from ..access.access import Caller
+from ..access.limits import Limits
+from ..operation.settings import Settings
+from ..problems import BusyError
+from ..store.containers import Containers
+from . import tiles
+from .answers import ProcessDiedError, Refusal, UnforeseenError
+from .fork_server import Allowed
+from .processes import Call, ForkServer, Keeper, Question
+from .runner import Runner
+from .tiles import MadeTile, TileOrder
+
+__all__ = ["TileMaker"]
+
+_log = logging.getLogger(__name__)
+
+# Of decoded blocks in the process, which may take so much in all.
+_BLOCKS = 64 << 20
+_MEMORY = 512 << 20
+
+# Questions to one process: what a file may have done to it does not last.
+_QUESTIONS = 2000
+
+_SECONDS = 30.0
+
+# The longest image is one of 512 x 512 pixels of four bytes, which is not compressed; and its base64.
+_LONGEST = 2 << 20
+
+# For so many seconds it counts for whom tiles were made.
+_REMEMBERED = 60.0
+
+_Key = tuple[str, TileOrder]
+
+
+class TileMaker:
+    """Makes tiles of containers.
+
+    Parameters
+    ----------
+    settings : Settings
+    containers : Containers
+    fork_server : ForkServer
+        See `Builder.fork_server`.
+    limits : Limits
+    """
+
+    def __init__(self, settings: Settings, containers: Containers, fork_server: ForkServer, limits: Limits) -> None:
+        self._containers = containers
+        self._limits = limits
+        service = Call(tiles.service, (_BLOCKS, settings.max_vertices), _SECONDS, allowed=Allowed(memory=_MEMORY))
+        keeper = Keeper(fork_server, service, _QUESTIONS)
+        self._runner = Runner[_Key, Question]("tile", 1, _REMEMBERED, keeper, logging.DEBUG)
+
+    async def make(self, container: str, order: TileOrder, caller: Caller) -> bytes:
+        """Make what is ordered of a container, and return its bytes: none where the surface does not reach the tile.
+
+        Raises
+        ------
+        TooManyError, BusyError
+            If this caller, or all, have too many requests; BusyError also if the process dies.
+        NotFoundError
+            If there is no such container.
+        InputError, OptionError
+            If the surface cannot be shown on a map, or an option is wrong.
+        TooLargeError
+            If it takes too much memory or time.
+        UnavailableError
+            If a library is missing.
+        RestartingError
+            If the server ends.
+        """
+        with self._limits.tiles.take(caller):
+            async with self._runner.job((container, order), caller.key, partial(self._make, container, order)) as made:
+                return made
+
+    async def close(self) -> None:
+        """Kill the process."""
+        await self._runner.close()
+
+    async def _make(self, container: str, order: TileOrder, held: ExitStack) -> bytes:
+        # A file of this machine, which a thread may have to fetch.
+        path = await asyncio.to_thread(held.enter_context, self._containers.local(container))
+        return await self._ask(container, order, path)
+
+    async def _ask(self, container: str, order: TileOrder, path: Path) -> bytes:
+        question = Question(tiles.answer, (container, order), path, _LONGEST)
+        try:
+            made: MadeTile | Refusal = await self._runner.call(question)
+        except TimeoutError:
+            raise TooLargeError(f"expected a tile that is made within {_SECONDS:g} s") from None
+        except MemoryError:
+            raise TooLargeError(f"expected a tile that needs at most {_MEMORY >> 20} MiB of memory") from None
+        except ProcessDiedError as error:
+            _log.warning("a tile of %s: %s", container, error)
+            raise BusyError("the process that makes tiles was killed; try again soon") from None
+        except UnforeseenError as error:
+            _log.error("making a tile failed unexpectedly: %s", error.traceback)
+            raise
+        except FileNotFoundError:
+            raise BusyError(f"the container {container} was deleted or stored again meanwhile; try again") from None
+        except OSError as error:
+            raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
+        if isinstance(made, Refusal):
+            refusal = made.error()
+            if isinstance(refusal, StreamError):
+                self._containers.tell_damage(container, refusal)
+            raise refusal
+        try:
+            return b64decode(made.data, validate=True)
+        except (Error, ValueError):
+            raise BusyError("the process that makes tiles gave an invalid answer; try again") from None

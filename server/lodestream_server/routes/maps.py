@@ -1,0 +1,248 @@
+"""The routes of maps and globes: TileJSON and image tiles, layer.json and quantized meshes.
+
+A document names its tiles with the version of the container, ``?v=``: with it a tile never changes, and may be kept for
+ever. So a name (``/v1/names/``) may lead to another surface later, and its tiles have another version then.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Query, Request
+from fastapi.responses import Response
+
+from lodestream.errors import NotFoundError
+
+from ..access.access import Caller
+from ..access.scopes import Reader
+from ..builds.tiles import REVISION, TileOrder
+from ..problems import responses
+from ..store.index import Surface
+from .names import leads_to
+from .routing import Parts, State, matches, readable
+from .sending import ready, still_there, while_there
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/v1", tags=["maps"])
+
+_JSON, _MESH = "application/json", "application/vnd.quantized-mesh"
+_NORMALS = "octvertexnormals"
+_VERSION = 12
+
+_ERRORS = responses(404, 409, 413, 422, 424, 429, 501, 503)
+
+_Encoding = Annotated[
+    Literal["terrain-rgb", "terrarium", "shade"],
+    Query(description="how heights are colours; shade is a relief for the eye"),
+]
+_Size = Annotated[Literal["256", "512"], Query(description="pixels along an edge")]
+_Height = Annotated[float, Query(ge=-20_000, le=20_000, description="metres where there are no heights")]
+_Scale = Annotated[
+    float | None,
+    Query(allow_inf_nan=False, description="metres upwards of one unit of the heights; by default as the surface says"),
+]
+_Version = Annotated[str | None, Query(max_length=64, description="as a document names it; tiles with it never change")]
+
+
+# A coroutine, because FastAPI calls a plain function in a thread.
+async def _found(request: Request, parts: Parts, surface: str) -> Surface:
+    """Return the surface of a request, which a name may lead to."""
+    if request.scope["route"].path.startswith("/v1/names/"):
+        surface = leads_to(parts, surface).id
+    return ready(parts, surface)
+
+
+_Found = Annotated[Surface, Depends(_found)]
+
+
+@readable(
+    router,
+    "/names/{surface}/map.json",
+    summary="Describe the tiles of what a name leads to",
+    response_class=Response,
+    responses={200: {"description": "TileJSON 3.0.0", "content": {_JSON: {}}}, **_ERRORS},
+)
+@readable(
+    router,
+    "/surfaces/{surface}/map.json",
+    summary="Describe the tiles of a surface",
+    response_class=Response,
+    responses={200: {"description": "TileJSON 3.0.0", "content": {_JSON: {}}}, **_ERRORS},
+)
+async def map_json(
+    caller: Reader,
+    request: Request,
+    parts: Parts,
+    found: _Found,
+    encoding: _Encoding = "terrain-rgb",
+    size: _Size = "256",
+    scale: _Scale = None,
+    nodata: _Height = 0.0,
+) -> Response:
+    """Return the TileJSON of a surface with a CRS: its bounds, its zooms and the address of its tiles.
+
+    A map takes it as the `url` of a source of type `raster-dem` (`raster` for a relief).
+    """
+    place = f"{request.url.scheme}://{request.url.netloc}{request.url.path.removesuffix('/map.json')}"
+    options: dict[str, Any] = {"encoding": encoding, "size": size}
+    options |= {} if scale is None else {"scale": scale}
+    options |= {"nodata": nodata} if nodata else {}
+    query = "&".join(f"{name}={value}" for name, value in options.items())
+    address = f"{place}/tiles/{{z}}/{{x}}/{{y}}.png?{query}&v={_version(found)}"
+    order = TileOrder("map", address=address, encoding=encoding, size=int(size), scale=scale)
+    return await _made(request, parts, caller, found, order, _JSON, version=None)
+
+
+@readable(
+    router,
+    "/names/{surface}/tiles/{z}/{x}/{y}.{image}",
+    summary="Fetch a tile of what a name leads to",
+    response_class=Response,
+    responses={200: {"description": "An image", "content": {"image/png": {}, "image/webp": {}}}, **_ERRORS},
+)
+@readable(
+    router,
+    "/surfaces/{surface}/tiles/{z}/{x}/{y}.{image}",
+    summary="Fetch a tile of a surface",
+    response_class=Response,
+    responses={200: {"description": "An image", "content": {"image/png": {}, "image/webp": {}}}, **_ERRORS},
+)
+async def tile(
+    caller: Reader,
+    request: Request,
+    parts: Parts,
+    found: _Found,
+    z: int,
+    x: int,
+    y: int,
+    image: Literal["png", "webp"],
+    encoding: _Encoding = "terrain-rgb",
+    size: _Size = "256",
+    nodata: _Height = 0.0,
+    scale: _Scale = None,
+    v: _Version = None,
+) -> Response:
+    """Return a tile in Web Mercator, y from the north; 404 where the surface does not reach.
+
+    Heights are never drawn higher than they are: maps do that themselves.
+    """
+    order = TileOrder("tile", z, x, y, "", encoding, image, int(size), nodata, scale)
+    return await _made(request, parts, caller, found, order, f"image/{image}", version=v)
+
+
+@readable(
+    router,
+    "/names/{surface}/terrain/layer.json",
+    summary="Describe the meshes of what a name leads to",
+    response_class=Response,
+    responses={200: {"description": "A layer.json", "content": {_JSON: {}}}, **_ERRORS},
+)
+@readable(
+    router,
+    "/surfaces/{surface}/terrain/layer.json",
+    summary="Describe the meshes of a surface",
+    response_class=Response,
+    responses={200: {"description": "A layer.json", "content": {_JSON: {}}}, **_ERRORS},
+)
+async def layer_json(
+    caller: Reader,
+    request: Request,
+    parts: Parts,
+    found: _Found,
+    offset: _Height = 0.0,
+    nodata: _Height = 0.0,
+    scale: _Scale = None,
+) -> Response:
+    """Return the layer.json of a surface with a CRS; CesiumJS takes the address of its folder, ``.../terrain``.
+
+    `offset` lifts heights above the geoid to those above the ellipsoid, which globes draw: -100 to 85 m.
+    """
+    options = {name: value for name, value in (("offset", offset), ("nodata", nodata)) if value}
+    options |= {} if scale is None else {"scale": scale}
+    query = "".join(f"&{name}={value}" for name, value in options.items())
+    order = TileOrder("layers", address=f"{{z}}/{{x}}/{{y}}.terrain?v={_version(found)}{query}", scale=scale)
+    return await _made(request, parts, caller, found, order, _JSON, version=None)
+
+
+@readable(
+    router,
+    "/names/{surface}/terrain/{z}/{x}/{y}.terrain",
+    summary="Fetch a mesh of what a name leads to",
+    response_class=Response,
+    responses={200: {"description": "quantized-mesh-1.0", "content": {_MESH: {}}}, **_ERRORS},
+)
+@readable(
+    router,
+    "/surfaces/{surface}/terrain/{z}/{x}/{y}.terrain",
+    summary="Fetch a mesh of a surface",
+    response_class=Response,
+    responses={200: {"description": "quantized-mesh-1.0", "content": {_MESH: {}}}, **_ERRORS},
+)
+async def mesh(
+    caller: Reader,
+    request: Request,
+    parts: Parts,
+    found: _Found,
+    z: int,
+    x: int,
+    y: int,
+    offset: _Height = 0.0,
+    nodata: _Height = 0.0,
+    scale: _Scale = None,
+    v: _Version = None,
+) -> Response:
+    """Return a quantized mesh in the geographic scheme TMS, y from the south; 404 where the surface does not reach.
+
+    With ``Accept: ...;extensions=octvertexnormals`` it has normals, for light.
+    """
+    order = TileOrder(
+        "mesh",
+        z,
+        x,
+        y,
+        nodata=nodata,
+        scale=scale,
+        offset=offset,
+        normals=_NORMALS in request.headers.get("accept", ""),
+        is_gzipped="gzip" in request.headers.get("accept-encoding", ""),
+    )
+    return await _made(request, parts, caller, found, order, _MESH, version=v)
+
+
+async def _made(
+    request: Request,
+    parts: State,
+    caller: Caller,
+    found: Surface,
+    order: TileOrder,
+    media_type: str,
+    version: str | None,
+) -> Response:
+    container = found.container or ""
+    named = hashlib.sha256(repr((REVISION, container, order)).encode()).hexdigest()[:32]
+    etag = f'"{named}"'
+    headers = {"etag": etag, "cache-control": "no-cache"}
+    if version == _version(found):
+        # What needs a token must not come out of a shared cache for those who have none.
+        shared = "public" if parts.settings.public_reads else "private"
+        headers["cache-control"] = f"{shared}, max-age=31536000, immutable"
+    if order.what == "mesh":
+        headers["vary"] = "accept, accept-encoding"
+    if order.is_gzipped:
+        headers["content-encoding"] = "gzip"
+    unchanged = matches(request.headers.get("if-none-match"), etag)
+    if unchanged is not None:
+        unchanged.headers.update(headers)
+        return unchanged
+    with still_there(parts, found.id):
+        data = await while_there(request, parts.tiles.make(container, order, caller), lambda _: None)
+    if not data:
+        raise NotFoundError(f"expected a tile that the surface reaches, got {order.z}/{order.x}/{order.y}")
+    return Response(data, media_type=media_type, headers=headers)
+
+
+def _version(found: Surface) -> str:
+    """Return what tells tiles of this container, made by this revision, from all others."""
+    return f"{(found.container or '')[:_VERSION]}-{REVISION}"

@@ -1,0 +1,142 @@
+"""Tiles over HTTP: what is told, what is kept for how long, and what is refused."""
+
+from __future__ import annotations
+
+import gzip
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+import lodestream as ls
+from lodestream_server import running_server
+from tests.server.helpers import PATIENCE, hills, npy, problem, push
+
+pytest.importorskip("pyproj")
+maps = pytest.importorskip("lodestream.maps")
+
+
+def terrain(seed: int = 0) -> bytes:
+    """A container of heights with a position: 100 x 120 nodes, 0.01 degrees apart, around 46 N 7 E."""
+    surface = ls.Surface(hills(100, 120, seed=seed) * 100)
+    surface.metadata |= {"crs": maps.crs_wkt("EPSG:4326"), "geotransform": [7, 0.01, 0, 46, 0, -0.01]}
+    return ls.encode(surface)
+
+
+@pytest.fixture(scope="module")
+def http(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    with (
+        running_server(tmp_path_factory.mktemp("maps"), workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as made,
+    ):
+        yield made
+
+
+@pytest.fixture(scope="module")
+def hill(http: httpx.Client) -> dict[str, Any]:
+    return push(http, terrain(), filename="hill.lode")
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    path = tmp_path_factory.mktemp("field") / "hill.lode"
+    path.write_bytes(terrain())
+    return maps.HeightField.open(path)
+
+
+def test_a_map_finds_its_tiles_by_the_document(http: httpx.Client, hill: dict[str, Any], field: Any) -> None:
+    for encoding in ("terrain-rgb", "terrarium", "shade"):
+        described = http.get(f"{hill['url']}/map.json", params={"encoding": encoding}).raise_for_status()
+        assert described.headers["cache-control"] == "no-cache"
+        told = described.json()
+        assert told["bounds"] == pytest.approx([7, 45, 8.2, 46], abs=0.01)
+        z = told["maxzoom"]
+        x, y = int((7.5 + 180) / 360 * 2**z), int((1 - np.arcsinh(np.tan(np.radians(45.5))) / np.pi) / 2 * 2**z)
+        address = told["tiles"][0].format(z=z, x=x, y=y)
+        assert address.startswith(str(http.base_url))
+        tile = http.get(address).raise_for_status()
+        assert tile.headers["content-type"] == "image/png"
+        assert tile.headers["cache-control"] == "private, max-age=31536000, immutable"
+        assert tile.content == maps.web_tile(field, z, x, y, encoding=encoding)
+        assert http.get(address, headers={"if-none-match": tile.headers["etag"]}).status_code == 304
+
+
+def test_a_globe_finds_its_meshes_by_the_document(http: httpx.Client, hill: dict[str, Any], field: Any) -> None:
+    told = http.get(f"{hill['url']}/terrain/layer.json").raise_for_status().json()
+    place = f"{hill['url']}/terrain/" + told["tiles"][0]
+    (tiles,) = told["available"][6]
+    for z, x, y in ((0, 0, 0), (0, 1, 0), (6, tiles["startX"], tiles["startY"])):
+        plain = http.get(place.format(z=z, x=x, y=y), headers={"accept-encoding": "identity"}).raise_for_status()
+        assert plain.content == maps.mesh_tile(field, z, x, y, normals=False)
+        assert "content-encoding" not in plain.headers
+        headers = {"accept": "application/vnd.quantized-mesh;extensions=octvertexnormals"}
+        with http.stream("GET", place.format(z=z, x=x, y=y), headers=headers) as packed:
+            assert packed.headers["content-encoding"] == "gzip"
+            assert gzip.decompress(b"".join(packed.iter_raw())) == maps.mesh_tile(field, z, x, y)
+        assert packed.headers["etag"] != plain.headers["etag"]
+        assert packed.headers["vary"] == "accept, accept-encoding"
+
+
+def test_options_reach_the_tiles(http: httpx.Client, hill: dict[str, Any], field: Any) -> None:
+    options: dict[str, Any] = {"encoding": "terrarium", "size": "512", "nodata": "-12.5", "scale": "2.0"}
+    told = http.get(f"{hill['url']}/map.json", params=options).raise_for_status().json()
+    tile = http.get(told["tiles"][0].format(z=7, x=66, y=45)).raise_for_status()
+    plain = http.get(f"{hill['url']}/tiles/7/66/45.png", params={"encoding": "terrarium"}).raise_for_status()
+    assert tile.content != plain.content
+    lifted = http.get(f"{hill['url']}/terrain/0/1/0.terrain", params={"offset": 40}).raise_for_status()
+    assert lifted.content == maps.mesh_tile(field, 0, 1, 0, offset=40.0, normals=False)
+
+
+def test_a_name_has_tiles_of_the_version_to_which_it_leads(http: httpx.Client, hill: dict[str, Any]) -> None:
+    other = push(http, terrain(seed=3), filename="other.lode")
+    seen = set[str]()
+    for surface in (hill, other):
+        http.put("/v1/names/place", json={"surface": surface["id"]}).raise_for_status()
+        (address,) = http.get("/v1/names/place/map.json").raise_for_status().json()["tiles"]
+        assert "/v1/names/place/tiles/" in address
+        tile = http.get(address.format(z=7, x=66, y=45)).raise_for_status()
+        assert "immutable" in tile.headers["cache-control"]
+        seen.add(address)
+    # What was told of the surface before is not kept as if it were that.
+    kept = sorted(http.get(each.format(z=7, x=66, y=45)).headers["cache-control"] for each in seen)
+    assert kept == ["no-cache", "private, max-age=31536000, immutable"]
+
+
+@pytest.mark.parametrize(
+    ("path", "expected"),
+    [
+        ("tiles/7/0/0.png", (404, "not-found")),
+        ("tiles/30/0/0.png", (422, "bad-option")),
+        ("tiles/7/66/4500.png", (422, "bad-option")),
+        ("tiles/7/66/-1.png", (422, "bad-option")),
+        ("tiles/99999999999999999999/0/0.png", (422, "bad-option")),
+        ("tiles/7/66/45.gif", (422, "bad-option")),
+        ("tiles/7/66/45.png?size=300", (422, "bad-option")),
+        ("tiles/7/66/45.png?nodata=nan", (422, "bad-option")),
+        ("tiles/7/66/45.png?scale=0", (422, "bad-option")),
+        ("tiles/7/66/45.png?scale=inf", (422, "bad-option")),
+        ("map.json?encoding=jpeg", (422, "bad-option")),
+        ("terrain/6/0/0.terrain", (404, "not-found")),
+        ("terrain/40/0/0.terrain", (422, "bad-option")),
+        ("terrain/6/0/0.terrain?offset=1e9", (422, "bad-option")),
+    ],
+)
+def test_what_is_no_tile_is_refused(
+    http: httpx.Client, hill: dict[str, Any], path: str, expected: tuple[int, str]
+) -> None:
+    assert problem(http.get(f"{hill['url']}/{path}")) == expected
+
+
+def test_a_surface_without_a_place_says_what_it_lacks(http: httpx.Client) -> None:
+    surface = push(http, npy(hills(30, 20)))
+    answer = http.get(f"{surface['url']}/map.json")
+    assert problem(answer) == (422, "bad-input")
+    assert "CRS" in answer.json()["detail"]
+
+
+def test_of_what_is_not_there_nothing_is_made(http: httpx.Client, tmp_path: Path) -> None:
+    assert problem(http.get("/v1/surfaces/0123/map.json")) == (404, "not-found")
+    assert problem(http.get("/v1/names/nobody/map.json")) == (404, "not-found")
