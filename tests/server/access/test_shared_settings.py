@@ -224,6 +224,16 @@ def level_requests(folder: Path) -> None:
     assert asyncio.run(fill()) == [4, 2, 1]
 
 
+def tile_requests(folder: Path) -> None:
+    town = Town(folder, max_tile_requests=8)
+    with ExitStack() as held:
+
+        def take(caller: Caller) -> None:
+            held.enter_context(town.limits.tiles.take(caller))
+
+        assert [taken(take, caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
+
+
 def disk_of_levels(folder: Path) -> None:
     most = 4 << 20
     town = Town(folder)
@@ -313,6 +323,7 @@ SHARED: dict[str, Callable[[Path], None]] = {
     "max_streams": open_streams,
     "stream_memory": memory_of_streams,
     "max_level_requests": level_requests,
+    "max_tile_requests": tile_requests,
     "level_disk": disk_of_levels,
     "workers": turns_of_builds,
 }

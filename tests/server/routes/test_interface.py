@@ -31,8 +31,11 @@ OPERATIONS = {
 }
 POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE
 
-#: What no schema can say: whether bytes are a surface, how many levels one has.
-INDESCRIBABLE = {"POST /v1/surfaces", "GET /v1/surfaces/{surface}/levels/{level}"}
+#: Of what has tiles if it has a CRS.
+MAPS = {name for name in OPERATIONS if "/map.json" in name or "/tiles/" in name or "/terrain/" in name}
+
+#: What no schema can say: whether bytes are a surface, how many levels one has, whether it lies on the Earth.
+INDESCRIBABLE = {"POST /v1/surfaces", "GET /v1/surfaces/{surface}/levels/{level}", *MAPS}
 
 #: Where something can be wrong that a schema does say; any text may be the name of a surface.
 FALLIBLE = {"GET /v1/surfaces", "GET /v1/names", "GET /v1/names/{name}", "PUT /v1/names/{name}", *INDESCRIBABLE}

@@ -303,6 +303,16 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/v1/names",
         "/v1/names/{name}",
         "/v1/names/{name}/container",
+        *(
+            f"/v1/{kind}/{{surface}}/{path}"
+            for kind in ("surfaces", "names")
+            for path in (
+                "map.json",
+                "tiles/{z}/{x}/{y}.{image}",
+                "terrain/layer.json",
+                "terrain/{z}/{x}/{y}.terrain",
+            )
+        ),
     }
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
