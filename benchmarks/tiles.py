@@ -21,7 +21,7 @@ from .arrays import fractal
 from .measure import gate, note, table
 from .terrain import write_terrain
 
-__all__ = ["main"]
+__all__ = ["main", "smooth_terrain"]
 
 _STEP = 10.0  # metres
 #: Zooms from that of the cells upwards.
@@ -43,7 +43,7 @@ def main() -> None:
         "terrain-RGB, WebP": partial(web_tile, image="webp"),
         "mesh of 65 x 65": mesh_tile,
     }
-    _tables("smooth terrain", _smooth(4097), kinds)
+    _tables("smooth terrain", smooth_terrain(4097), kinds)
     _tables("rough terrain", (fractal(2049) - 32768).astype(np.int16), {"terrain-RGB, PNG": web_tile})
     note(
         "Processor time of one core. `first`: no block is decoded yet, but the container is open; `again`: the same "
@@ -78,7 +78,8 @@ def _tables(name: str, heights: NDArray[np.int16], kinds: dict[str, _Make]) -> N
     table(f"Tiles of {name}: {side} heights, {_STEP:g} m apart, {len(container):,} bytes", head, rows)
 
 
-def _smooth(side: int) -> NDArray[np.int16]:
+def smooth_terrain(side: int) -> NDArray[np.int16]:
+    """Return heights in decimetres, as tables of tiles have them, shape (side, side)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "heights.npy"
         write_terrain(path, side)

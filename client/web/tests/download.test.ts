@@ -270,6 +270,19 @@ describe.each(KINDS)("%s", (kind) => {
     );
   });
 
+  it.each(TARGETS)("for %j limits say how many requests are under way, and how few bytes too many come", (options) => {
+    const bytes = [BASE_CREDIT, 0].map((gap) => {
+      const target = makeTarget(options);
+      const received = reception(target);
+      const download = new RangeDownload(received, undefined, { requests: 5, gap });
+      const served = serveRanges(download, DATA[kind]!, Array(10_000).fill(500).values(), []);
+      checkEnd(received, kind, target);
+      expect(served.most).toBeLessThanOrEqual(5);
+      return received.wireBytes;
+    });
+    expect(bytes[1]).toBeLessThanOrEqual(bytes[0]!);
+  });
+
   it("answers end where the plan does, whenever one looks elsewhere and wants something else", () => {
     const whole = TARGETS.filter((target) => target.region === undefined);
     const change = fc.oneof(

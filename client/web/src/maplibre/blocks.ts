@@ -4,10 +4,10 @@ import type { Region, Shape } from "../types";
 import type { BlockCache } from "./block-cache";
 
 /** Rows and columns of a block. */
-export const BLOCK = 128;
+export const BLOCK = 64;
 
 /** Blocks that are received together at most. */
-const MOST = 64;
+const MOST = 256;
 
 /** Gives a window of a level, (row, column), in metres; NaN in holes. Only one is asked for at a time. */
 export type WindowReader = (level: number, window: Region, signal: AbortSignal) => Promise<Float32Array>;

@@ -20,6 +20,12 @@ const MOST_KEPT = 32 * 1024 * 1024;
 /** What every window begins with; requests for the first bytes of a container ask for so many. */
 const HEAD = 4096;
 
+/**
+ * Of the slices of a window many are short and far from each other. A map is to need few bytes: what lies between is not
+ * taken along, but more of them are asked for at once.
+ */
+const RANGES = { requests: 4, gap: 4096 };
+
 /** Where a container is. */
 export interface Source {
   readonly url: string;
@@ -155,7 +161,13 @@ async function received(source: Source, options: TargetOptions, known: Known, si
   const { region, attributes, level } = target;
   const decoder = new Decoder(await loadKernels(), { region, attributes, level });
   const { url, token } = source;
-  const stream = new Stream<View>(url, target, decoder, { ...known, token, transport: "http", latest: true });
+  const stream = new Stream<View>(url, target, decoder, {
+    ...known,
+    token,
+    transport: "http",
+    ranges: RANGES,
+    latest: true,
+  });
   const stop = (): void => void stream.close();
   signal?.throwIfAborted();
   signal?.addEventListener("abort", stop);

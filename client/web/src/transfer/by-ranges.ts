@@ -3,7 +3,7 @@
 import { MIN_WINDOW } from "../protocol/messages";
 import type { ViewInfo } from "../types";
 import type { Journey } from "./journey";
-import { RangeDownload, type RangeRequest } from "./range-download";
+import { RangeDownload, type RangeLimits, type RangeRequest } from "./range-download";
 import type { RangeAnswer, RangeSource } from "./range-sources";
 import { seconds } from "./waiting";
 
@@ -22,7 +22,7 @@ interface Landed {
   readonly slice?: Uint8Array | undefined;
 }
 
-/** Up to two requests at a time. */
+/** Several requests at a time. */
 export class RangeTransport<View extends ViewInfo> {
   private readonly download: RangeDownload<View>;
   private readonly flights = new Set<Flight>();
@@ -32,8 +32,9 @@ export class RangeTransport<View extends ViewInfo> {
     private readonly journey: Journey<View>,
     private readonly source: RangeSource,
     version?: string,
+    limits?: RangeLimits,
   ) {
-    this.download = new RangeDownload(journey.reception, version);
+    this.download = new RangeDownload(journey.reception, version, limits);
   }
 
   /** Identifies this version of the file: its entity tag, or else its date; undefined if it has neither. */

@@ -1,6 +1,7 @@
 /** What a stream may be told, and what it tells. */
 
 import type { Ended } from "../planning/plan";
+import type { RangeLimits } from "./range-download";
 import type { Sink } from "./receiver-state";
 import type { SocketClass } from "./socket";
 import type { Store } from "./store";
@@ -75,6 +76,8 @@ export interface StreamOptions extends PlainStreamOptions {
   readonly store?: Store | undefined;
   /** What tells the version of the file that they belong to: its entity tag, or else its date. */
   readonly version?: string | undefined;
+  /** How a file is asked for by Range; left out: whatever takes the least time. */
+  readonly ranges?: RangeLimits | undefined;
   /** In place of the platform's own; Node 20 has no WebSocket. */
   readonly WebSocket?: SocketClass | undefined;
   readonly fetch?: typeof globalThis.fetch | undefined;

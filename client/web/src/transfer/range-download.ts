@@ -26,8 +26,15 @@ const TAIL_LEAST = 4096;
 const TAIL_MOST = 64 * 1024;
 const REST = 64 * 1024;
 
-/** The most requests under way at once: while one answer arrives, the next one is on its way. */
-export const MOST_REQUESTS = 2;
+/** How parts of a file are asked for. */
+export interface RangeLimits {
+  /** Requests under way at once, at most; 2: while one answer arrives, the next one is on its way. */
+  readonly requests: number;
+  /** Bytes between two slices that are taken along, at most, even where a request for each would take longer. */
+  readonly gap: number;
+}
+
+const LIMITS: RangeLimits = { requests: 2, gap: BASE_CREDIT };
 
 const CONTENT_RANGE = /^\s*bytes\s+(\d{1,15})-(\d{1,15})\/(\d{1,15})\s*$/;
 const CONTAINER_TAG = /^"([0-9a-f]{64})"$/;
@@ -80,8 +87,8 @@ export interface Asked<View> {
  * Receiving a surface over HTTP Range: requests out, parts of the file in.
  *
  * The caller makes the request that `request` gives, passes status and headers of its answer to `answer` and its body,
- * cut anywhere, to `receive`, then calls `finish`. It may ask for another request while up to `MOST_REQUESTS`
- * are under way. With no request under way and none given, the stream has ended. If a connection breaks, the caller
+ * cut anywhere, to `receive`, then calls `finish`. It may ask for another request while as many as `RangeLimits`
+ * allow are under way. With no request under way and none given, the stream has ended. If a connection breaks, the caller
  * calls `leave`, and continues with the next `request`.
  */
 export class RangeDownload<View extends ViewInfo> {
@@ -90,14 +97,16 @@ export class RangeDownload<View extends ViewInfo> {
   private validator: string | undefined;
   private etag: string | undefined;
   private needed: Place | undefined;
-  private gap = MIN_WINDOW;
+  private gap: number;
   private readonly underWay = new Set<RangeRequest>();
 
   /** @param version See `version`, of a file of which something is cached. */
   constructor(
     readonly reception: ReceiverState<View>,
     version?: string,
+    private readonly limits: RangeLimits = LIMITS,
   ) {
+    this.gap = Math.min(MIN_WINDOW, limits.gap);
     this.validator = version;
     this.etag = version?.startsWith('"') ? version : undefined;
     reception.keep();
@@ -119,7 +128,8 @@ export class RangeDownload<View extends ViewInfo> {
    */
   request(now?: number): Asked<View> {
     const views: View[] = [];
-    if (this.reception.ended !== undefined || this.underWay.size >= MOST_REQUESTS) return { request: undefined, views };
+    if (this.reception.ended !== undefined || this.underWay.size >= this.limits.requests)
+      return { request: undefined, views };
     let place: Place | undefined;
     if (this.reception.plan === undefined) {
       place = this.first();
@@ -234,7 +244,7 @@ export class RangeDownload<View extends ViewInfo> {
     const roundTrip = request.answeredAt - request.askedAt;
     if (got < MIN_WINDOW || roundTrip <= 0) return;
     const rate = got / Math.max(now - request.answeredAt, roundTrip);
-    this.gap = Math.round(Math.min(Math.max(rate * roundTrip, MIN_WINDOW), BASE_CREDIT));
+    this.gap = Math.round(Math.min(Math.max(rate * roundTrip, MIN_WINDOW), this.limits.gap));
   }
 
   private checkSame(headers: AnswerHeaders, status: number): void {

@@ -74,14 +74,14 @@ export class Stream<View extends ViewInfo> implements AsyncIterableIterator<View
       const fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
       const place = new Place(transports.url, token, fetch);
       const http = new HttpRanges(place, fetch);
-      this.makeRanges = () => new RangeTransport(this, http, options.version);
+      this.makeRanges = () => new RangeTransport(this, http, options.version, options.ranges);
       const window = options.window ?? (limitRate === undefined ? undefined : windowFor(limitRate));
       this.socket = new SocketTransport(this, place, { token, window }, sockets);
       this.place = place;
       this.transports = transports;
     } else {
       const ranges = source instanceof Blob ? new BlobRanges(source) : source;
-      this.makeRanges = () => new RangeTransport(this, ranges);
+      this.makeRanges = () => new RangeTransport(this, ranges, undefined, options.ranges);
     }
     this.reception = new ReceiverState(target, decoder, {
       store: options.store,

@@ -82,12 +82,12 @@ describe("blocks", () => {
 
   it("are received in windows of a limited size", async () => {
     const { asked, read } = reader();
-    const shape = [20 * BLOCK, 20 * BLOCK] as const;
+    const shape = [40 * BLOCK, 40 * BLOCK] as const;
     const blocks = new Blocks("field", new BlockCache(2 ** 26), () => shape, read);
-    const line = Array.from({ length: 20 }, (_, i) => i);
+    const line = Array.from({ length: 40 }, (_, i) => i);
     await blocks.get(0, rectangle(line, line), NEVER);
     for (const [rows, columns] of asked) {
-      expect((rows[1] - rows[0]) * (columns[1] - columns[0])).toBeLessThanOrEqual(64 * BLOCK * BLOCK);
+      expect((rows[1] - rows[0]) * (columns[1] - columns[0])).toBeLessThanOrEqual(256 * BLOCK * BLOCK);
     }
     expect(asked.length).toBeLessThan(20);
   });
