@@ -12,22 +12,23 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from lodestream.confinement import available, missing
-from tests.examples import USUAL
+from tests.examples import EXAMPLES, LONG, PROFILE, USUAL, left_out
 
 # No deadline: no test here is about time. The same examples in every run, so that a change is judged by what it
-# changes; HYPOTHESIS_PROFILE=torture tries others, and 100 times as many, see `tests.examples`.
+# changes; HYPOTHESIS_PROFILE=torture tries others, and 200 times as many, see `tests.examples`.
 settings.register_profile(
-    "default",
+    "whole",
     deadline=None,
-    max_examples=USUAL,
+    max_examples=int(os.environ.get(EXAMPLES, USUAL)),
     derandomize=True,
     print_blob=True,
     suppress_health_check=[HealthCheck.too_slow],
 )
+settings.register_profile("default", settings.get_profile("whole"), max_examples=USUAL // 2)
 settings.register_profile("ci", settings.get_profile("default"))
-settings.register_profile("torture", settings.get_profile("default"), derandomize=False, max_examples=2000)
-settings.register_profile("sanitizers", settings.get_profile("default"), max_examples=10)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default"))
+settings.register_profile("torture", settings.get_profile("whole"), derandomize=False, max_examples=2000)
+settings.register_profile("sanitizers", settings.get_profile("default"))
+settings.load_profile(PROFILE)
 
 
 #: Tests of what needs Linux, beside those that start a server in this process, which are skipped one by one.
@@ -70,6 +71,7 @@ LONGEST = (
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of pytest-xdist take files in their order here, and not those of the most tests first."""
+    config.addinivalue_line("markers", "sweep(count): of its cases `make test` takes so many, see tests.examples")
     config.option.loadscopereorder = False
     gc.disable()  # what is collected stays: to look through it again and again frees nothing
 
@@ -80,8 +82,13 @@ def pytest_collection_finish() -> None:
     gc.enable()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the files that take longest."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Take samples of sweeps, unless a test is named; begin with the files that take longest."""
+    named = config.option.keyword or config.option.markexpr or any("::" in each for each in config.args)
+    if PROFILE not in LONG and not named:
+        others = left_out(items)
+        config.hook.pytest_deselected(items=[item for item in items if item in others])
+        items[:] = [item for item in items if item not in others]
     places = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(LONGEST)))
 

@@ -137,6 +137,7 @@ def written(surface: Surface, kind: str) -> bytes:
     return file.getvalue()
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("row", ROWS, ids=names)
 def test_a_real_file_is_read_as_its_readme_says(row: Row) -> None:
     surface = read(row)
@@ -148,6 +149,7 @@ def test_a_real_file_is_read_as_its_readme_says(row: Row) -> None:
     assert ("plane" in surface.metadata) == (row.default_plane or "plane" in row.options)
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize("row", ROWS, ids=names)
 def test_a_real_file_streams_bit_for_bit(row: Row) -> None:
     surface = read(row)
@@ -167,6 +169,7 @@ def test_a_real_file_streams_bit_for_bit(row: Row) -> None:
         assert back.metadata[key] == value
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize("row", ROWS, ids=names)
 def test_a_real_file_is_written_as_one_welded_mesh(row: Row) -> None:
     trimesh = pytest.importorskip("trimesh")

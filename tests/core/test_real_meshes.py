@@ -85,6 +85,7 @@ def test_what_is_recognised(name: str) -> None:
     assert surface_of(name).metadata["recognised"] == READ[name]
 
 
+@pytest.mark.sweep(4)
 @pytest.mark.parametrize("name", READ)
 def test_the_mesh_is_the_same(name: str) -> None:
     points, faces = plain_mesh(path_of(name))
@@ -106,6 +107,7 @@ def shuffled(points: NDArray[np.float64], faces: list[list[int]]) -> str:
     return "\n".join([*lines, *("f " + " ".join(map(str, face)) for face in turned)])
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize("name", [name for name in READ if name != "torus_tri_blender.obj"])
 def test_in_another_order(name: str, tmp_path: Path) -> None:
     points, faces = plain_mesh(path_of(name))

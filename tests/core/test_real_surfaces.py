@@ -132,6 +132,7 @@ def test_a_real_surface_is_read_as_its_readme_says(row: Row) -> None:
         assert (float(heights.min()), float(heights.max())) == pytest.approx(row.span, abs=1)
 
 
+@pytest.mark.sweep(5)
 @rows
 def test_a_real_surface_streams_bit_for_bit(row: Row) -> None:
     surface, container = streamed(row.files[0])
@@ -239,6 +240,7 @@ def test_another_library_finds_heights_holes_and_place(tmp_path: Path, name: str
             np.testing.assert_array_equal(heights, dataset.read(1))
 
 
+@pytest.mark.sweep(3)
 @pytest.mark.parametrize("name", ["SainteHelens.dem", "lidar_dsm_2m.tif", BIJOU])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_heights_given_as_xyz_take_hardly_more_bytes(name: str, dtype: str) -> None:

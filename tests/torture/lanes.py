@@ -23,7 +23,11 @@ __all__ = ["STAGES", "Lanes", "Wish"]
 #: time: these lanes run side by side, the parts of each one after another.
 STAGES = (
     (("throughput", "crowds"),),
-    (("streams",), ("kills", "disk", "history", "faults"), ("fuzz", "kernels", "decoders", "layouts", "mutants")),
+    (
+        ("streams",),
+        ("kills", "disk", "history", "faults"),
+        ("fuzz", "kernels", "decoders", "layouts", "tests", "mutants"),
+    ),
 )
 
 # Long enough to end servers and remove folders.

@@ -12,7 +12,9 @@ import hashlib
 import io
 import json
 import math
+import os
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
@@ -22,6 +24,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.examples import EXAMPLES
 
 __all__ = ["PARTS", "Part", "Result", "sent"]
 
@@ -288,6 +292,15 @@ def _layouts(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
     )
 
 
+def _tests(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    environment = {**os.environ, "HYPOTHESIS_PROFILE": "whole", EXAMPLES: str(count)}
+    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "-m", "sweep or hypothesis"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return count, (f"every case of each sweep, and every property: {done.stdout.strip().splitlines()[-1].strip('= ')}",)
+
+
 def _mutants(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
     from . import mutations
     from .mutants import MUTANTS
@@ -322,6 +335,7 @@ PARTS = {
         ),
         Part("decoders", "The compiled decoder and the reference", "surfaces", 2000, _decoders),
         Part("layouts", "Random cells of triangle meshes, paired into blocks", "layouts", 1000, _layouts),
+        Part("tests", "Tests of which every run takes a sample", "examples of each property", 20, _tests),
         Part("mutants", "Rules of the format changed one by one, beside the golden files", "mutants", 160, _mutants),
         Part(
             "kernels",

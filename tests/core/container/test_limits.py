@@ -98,6 +98,7 @@ def refused(reader: str, data: bytes, words: str = "") -> None:
         tracemalloc.stop()
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("count", [limits.LAYERS + 1, 20_000, 100_000])
 def test_too_many_layers_are_refused_at_the_header(reader: str, count: int, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -187,6 +187,7 @@ SPACINGS: dict[str, Callable[[int], NDArray[Any]]] = {
 UNCONSOLIDATED: dict[str, dict[str, Any]] = {"nc": {}, "zarr": {"consolidated": False}}
 
 
+@pytest.mark.sweep(7)
 @pytest.mark.parametrize("suffix", ["nc", "zarr"])
 @pytest.mark.parametrize("order", [("y", "x"), ("x", "y")])
 @pytest.mark.parametrize(

@@ -62,6 +62,7 @@ def coded_level(index: Index, level: int) -> int:
     return max(found for found in levels if found <= level)
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_every_level_has_exactly_the_recorded_errors(name: str) -> None:
     container, index = contained(name)
@@ -96,6 +97,7 @@ def test_tiles_that_no_layer_names_are_known_with_their_level(monkeypatch: pytes
     assert levels & {tiles[number].level for number in named} - {index.header.levels}
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_every_prefix_decodes_to_its_last_whole_layer(name: str) -> None:
     container, _ = contained(name)
@@ -134,6 +136,7 @@ def chunkings(length: int) -> list[list[int]]:
     return [[length], list(range(1, length + 1)), [length, length], *cuts]
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_every_chunking_gives_the_same_views(name: str) -> None:
     container, index = contained(name)
@@ -165,6 +168,7 @@ def some_targets(name: str) -> list[Target]:
     return found
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("name", SAMPLES)
 def test_every_plan_leads_to_the_state_that_it_says(name: str) -> None:
     container, index = contained(name)

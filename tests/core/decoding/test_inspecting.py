@@ -21,6 +21,7 @@ def _inspected(data: bytes, memory: int = 1, told: list[float] | None = None) ->
     return inspect(io.BytesIO(data), max_vertices=MOST, memory=memory, progress=told.append)
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("name", SURFACES)
 def test_sound_containers_pass(name: str) -> None:
     data, told = container_of(name), list[float]()
@@ -32,6 +33,7 @@ def test_sound_containers_pass(name: str) -> None:
     assert told[-1] == 1.0
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("name", ["integers", "holes", "attributes", "torus"])
 @pytest.mark.parametrize("part", [0.0, 0.2])
 @pytest.mark.parametrize("place", [0, 1])

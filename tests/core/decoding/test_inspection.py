@@ -57,6 +57,7 @@ def near() -> bytes:
     return ls.encode(hills(), 0.05)
 
 
+@pytest.mark.sweep(36)
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_golden_containers_are_sound(path: Path) -> None:
     data = path.read_bytes()

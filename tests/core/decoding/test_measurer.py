@@ -107,6 +107,7 @@ def errors_by_definition(shown: NDArray[Any], wanted: NDArray[Any]) -> tuple[flo
     return math.sqrt(squares.mean()), math.sqrt(squares.max())
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize("seed", [0, 1, 2, 4, *range(120, 132, 2)])
 def test_errors_are_those_of_their_definition(seed: int) -> None:
     rng = np.random.default_rng(seed)

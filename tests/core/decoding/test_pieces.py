@@ -29,6 +29,7 @@ def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
     return PiecewiseDecoder(read, read_index(read, len(container)), level)
 
 
+@pytest.mark.sweep(16)
 @pytest.mark.parametrize("name", SURFACES)
 @pytest.mark.parametrize("memory", [1, 1 << 21])
 def test_rows_make_the_surface(name: str, memory: int, tmp_path: Path) -> None:
@@ -74,6 +75,7 @@ def _check_levels(container: bytes) -> None:
             np.testing.assert_array_equal(own[1], other[1])
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("name", SURFACES)
 def test_rows_make_every_level(name: str) -> None:
     container = container_of(name)

@@ -32,6 +32,7 @@ def index_of(name: str) -> Index:
     return read_index(file_of(name), decoded(name)[0])
 
 
+@pytest.mark.sweep(32)
 @golden
 def test_a_golden_file_gives_what_is_expected_of_it(name: str) -> None:
     for what, found, expected in compared(reference, name, max(2, AFFORDED // values_of(name))):
@@ -44,6 +45,7 @@ def test_the_files_have_chunks_of_every_rule() -> None:
     assert {chunk[0] & 3 for chunk in chunks} == {0, 1, 2, 3}
 
 
+@pytest.mark.sweep(16)
 @small
 def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     index = index_of(name)

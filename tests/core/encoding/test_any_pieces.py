@@ -54,6 +54,7 @@ def built(prepared: Prepared, points: int, core_points: int, threads: int = 1, f
     return out.getvalue()
 
 
+@pytest.mark.sweep(7)
 @pytest.mark.parametrize("name", SURFACES)
 def test_any_pieces_of_a_grid_give_the_container(name: str) -> None:
     surface, quality = SURFACES[name]
@@ -254,6 +255,7 @@ _LARGER_THAN_MEMORY = {
 }
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize(
     ("name", "wanted"),
     [("a torus", True), ("integers of 64 bits", False), ("plates", False), ("cylinders", True)],

@@ -51,6 +51,7 @@ def test_values_are_the_same_and_another_decoder_shows_them_too(
     agree_on(container, layer, level)
 
 
+@pytest.mark.sweep(5)
 @every_effort
 @pytest.mark.parametrize(
     "surface",
@@ -114,6 +115,7 @@ def test_fast_has_small_units_where_large_ones_take_many_more_bytes() -> None:
     assert len(ls.encode(steps, effort="fast")) < 1.05 * len(ls.encode(steps))
 
 
+@pytest.mark.sweep(3)
 @every_effort
 @pytest.mark.parametrize("name", ["integers", "holes", "torus with attributes"])
 def test_a_build_by_bands_has_the_same_bytes(name: str, effort: Effort, tmp_path: Path) -> None:

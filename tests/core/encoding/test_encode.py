@@ -106,6 +106,7 @@ def test_processes_share_the_work(tmp_path: Path) -> None:
         assert ls.encode(mapped, executor=executor, memory=LITTLE) == _container()
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("shape", [(1, 2), (2, 3), (40, 50), (150, 150)])
 @pytest.mark.parametrize("kind", ["heights", "holes", "closed columns", "closed rows", "closed both"])
 def test_small_surfaces_are_built_by_an_executor_too(shape: tuple[int, int], kind: str) -> None:

@@ -67,6 +67,7 @@ def kinds(shape: tuple[int, ...], dtype: str) -> dict[str, NDArray[Any]]:
     }
 
 
+@pytest.mark.sweep(4)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_every_type_shape_and_closure_comes_back_bit_for_bit(dtype: str) -> None:
     for number, shape in enumerate(SHAPES):

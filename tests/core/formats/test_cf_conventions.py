@@ -201,6 +201,7 @@ def mapped(kind: str, said: str = "crs") -> xr.Dataset:
     return data.assign_coords(x=("x", x, east), y=("y", y, north))
 
 
+@pytest.mark.sweep(14)
 @every_opener
 @pytest.mark.parametrize(
     ("kind", "said"),
@@ -530,6 +531,7 @@ def test_values_outside_the_valid_range_are_missing(
     np.testing.assert_array_equal(mask, np.ones(stored.shape, np.bool_) if again.mask is None else again.mask)
 
 
+@pytest.mark.sweep(20)
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "i4", "f4", "f8"])
 @pytest.mark.parametrize("fill", [False, True])
 @pytest.mark.parametrize(

@@ -46,6 +46,7 @@ def centres(transform: list[float]) -> tuple[NDArray[Any], NDArray[Any]]:
     return x + dx_column * column + dx_row * row, y + dy_column * column + dy_row * row
 
 
+@pytest.mark.sweep(6)
 @every_opener
 @pytest.mark.parametrize(
     ("transform", "wkt"),
@@ -83,6 +84,7 @@ def test_without_coordinates_a_grid_around_the_earth_is_closed(
     assert opener(mapped([-180.0, 10.0, 0.0, 90.0, 0.0, -10.0], UTM), tmp_path).closed == (False, False)
 
 
+@pytest.mark.sweep(8)
 @every_opener
 @pytest.mark.parametrize("curved", [False, True])
 @pytest.mark.parametrize(("shift", "words"), [(0.0, ""), (0.001, ""), (3.0, ""), (3.25, "by 3.25 cells")])
@@ -161,6 +163,7 @@ def disk(units: str = "rad", factor: float = 1.0, kind: str = "projection") -> x
     return data.assign_coords(x=("x", x / factor, said["x"]), y=("y", y / factor, said["y"]))
 
 
+@pytest.mark.sweep(10)
 @every_opener
 @pytest.mark.parametrize(
     ("units", "factor"),

@@ -31,6 +31,7 @@ def field(dtype: str = "f4", **attributes: Any) -> xr.Dataset:
 # The number that stands for missing values
 
 
+@pytest.mark.sweep(10)
 @every_opener
 @pytest.mark.parametrize("key", ["_FillValue", "missing_value"])
 @pytest.mark.parametrize(("dtype", "number"), [("i2", 7), ("i4", -99999), ("u1", 255), ("f4", 1e20), ("f8", -9999.0)])
@@ -101,6 +102,7 @@ def test_a_number_that_a_writer_chose_is_none_of_the_surface(tmp_path: Path) -> 
 # The type of axes
 
 
+@pytest.mark.sweep(10)
 @every_opener
 @pytest.mark.parametrize("dtype", ["f4", "f8", "i2", "i4", "i8"])
 @pytest.mark.parametrize("descending", [False, True])

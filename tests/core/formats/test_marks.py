@@ -57,6 +57,7 @@ def mark_of(surface: ls.Surface) -> Any:
     return json.loads(data.attrs["lodestream"])
 
 
+@pytest.mark.sweep(30)
 @every_opener
 @pytest.mark.parametrize("curved", [False, True])
 @pytest.mark.parametrize(

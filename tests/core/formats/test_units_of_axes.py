@@ -77,6 +77,7 @@ def positions(surface: ls.Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     return coordinates(surface) if surface.points.ndim == 2 else (surface.points[..., 0], surface.points[..., 1])
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize(
     ("opener", "units"),
     [*((_file, units) for units in METRES), (_decoded, "km"), (_decoded, "1000 m"), (_decoded, "ft")],

@@ -43,6 +43,7 @@ def name_of(value: object) -> str | None:
     return getattr(value, "__name__", None)
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize(("maker", "count"), many_patches.READ, ids=name_of)
 def test_very_many_patches_are_read(maker: Maker, count: int, tmp_path: Path) -> None:
     """Whether in proportion to their number, `make bench ARGS=patches` measures with more of them."""
@@ -52,6 +53,7 @@ def test_very_many_patches_are_read(maker: Maker, count: int, tmp_path: Path) ->
     assert sum(block.points.size for block in surface.blocks) > 1
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize(("maker", "count", "error", "reason"), REFUSED, ids=name_of)
 def test_a_limit_refuses_very_many_patches(
     maker: Maker, count: int, error: type[InputError], reason: str, tmp_path: Path

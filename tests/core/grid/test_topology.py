@@ -204,6 +204,7 @@ SURFACES: dict[str, Callable[[], ls.Surface]] = {
 }
 
 
+@pytest.mark.sweep(4)
 @pytest.mark.parametrize("name", SURFACES)
 def test_faces_are_the_same_after_every_layer(name: str) -> None:
     surface = SURFACES[name]()
@@ -215,6 +216,7 @@ def test_faces_are_the_same_after_every_layer(name: str) -> None:
     assert topologies(roughly(decoder.surface())) == expected
 
 
+@pytest.mark.sweep(4)
 @pytest.mark.parametrize("name", SURFACES)
 def test_faces_of_a_level_are_the_same_after_every_layer(name: str) -> None:
     decoder = decoded(SURFACES[name]())

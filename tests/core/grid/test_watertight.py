@@ -177,6 +177,7 @@ FILES: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.sweep(3)
 @pytest.mark.filterwarnings("ignore:materials .* left out:lodestream.errors.FormatWarning")
 @pytest.mark.parametrize("name", FILES)
 def test_real_surfaces_stay_together_and_keep_their_faces(name: str) -> None:

@@ -113,6 +113,7 @@ HANDED = [
 LOST = {("xarray", "empty", "unit"), ("xarray", "empty", "crs")}
 
 
+@pytest.mark.sweep(88)
 @pytest.mark.parametrize("text", TEXTS)
 @pytest.mark.parametrize(("library", "place"), HANDED)
 def test_any_text_reaches_every_library(library: str, text: str, place: str, tmp_path: Path) -> None:
@@ -134,6 +135,7 @@ NEEDS |= {".vts": "vtkmodules", ".png": "PIL"}
 REFUSED = {(".zarr", "4 KB"), (".zarr", "4 KB, not ASCII")}
 
 
+@pytest.mark.sweep(52)
 @pytest.mark.parametrize("places", [METADATA, ("attribute",)], ids=["metadata", "attribute"])
 @pytest.mark.parametrize("text", TEXTS)
 @pytest.mark.parametrize("suffix", [*WRITTEN, *UNREAD])
@@ -158,6 +160,7 @@ def test_any_text_is_written_and_what_is_written_is_read(
     assert np.array_equal(np.sort(heights, axis=None), np.arange(12))  # some formats begin with the last row
 
 
+@pytest.mark.sweep(10)
 @pytest.mark.parametrize("place", ["name", "unit", "crs", "tag", "attribute"])
 @pytest.mark.parametrize("suffix", [".nc", ".tif", ".cog.tif", ".vts", ".obj"])
 def test_nul_is_written_as_python_writes_it_with_a_note(suffix: str, place: str, tmp_path: Path) -> None:

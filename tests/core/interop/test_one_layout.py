@@ -136,12 +136,14 @@ def assert_says_the_same(surface: ls.Surface, path: Path) -> None:
         assert found == expected
 
 
+@pytest.mark.sweep(18)
 @both
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_file_says_what_the_dataset_says(name: str, suffix: str, tmp_path: Path) -> None:
     assert_says_the_same(SURFACES[name], tmp_path / f"a{suffix}")
 
 
+@pytest.mark.sweep(13)
 @both
 @pytest.mark.parametrize("name", CASES)
 def test_a_file_says_what_the_dataset_says_of_every_convention(name: str, suffix: str, tmp_path: Path) -> None:
@@ -176,6 +178,7 @@ def assert_whole(back: ls.Surface, surface: ls.Surface) -> None:
     assert found == wanted
 
 
+@pytest.mark.sweep(16)
 @both
 @pytest.mark.parametrize("name", [name for name in SURFACES if name not in ("four channels", "curve")])
 def test_a_file_of_lodestream_is_the_surface_again(name: str, suffix: str, tmp_path: Path) -> None:
@@ -197,6 +200,7 @@ def test_a_file_of_lodestream_is_the_surface_again(name: str, suffix: str, tmp_p
         assert_whole(back, surface)
 
 
+@pytest.mark.sweep(12)
 @both
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
 @pytest.mark.parametrize("channels", [0, 2, 3])

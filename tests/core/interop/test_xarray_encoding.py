@@ -74,6 +74,7 @@ def by_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scratch, "_AT_ONCE", 4_000)
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("make", [_even, _uneven, _curvilinear, _rotated, _flags, _with_holes])
 @pytest.mark.parametrize("lazy", ["memory", "file", "dask"])
 def test_the_bytes_are_those_of_from_xarray(

@@ -319,6 +319,7 @@ def named(case: object) -> Iterator[None]:
 DECODINGS: list[dict[str, Any]] = [{}, {"decode_times": False}, {"mask_and_scale": False}, {"decode_coords": "all"}]
 
 
+@pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
 def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
@@ -332,6 +333,7 @@ def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
             assert words(notes) == words(rest)
 
 
+@pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
 def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
@@ -350,6 +352,7 @@ def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any
     assert words(notes) == words([text for text in said if not text.startswith("left out variables of the same grid")])
 
 
+@pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
 def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str, written: Any) -> None:
     make, options, _ = CASES[name]
@@ -363,6 +366,7 @@ def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str,
     assert_same(there, here)
 
 
+@pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
 def test_containers_are_the_same(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]

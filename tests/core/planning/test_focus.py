@@ -177,6 +177,7 @@ def test_whenever_one_looks_elsewhere_and_the_link_breaks(
     check_end(reception, kind, target)
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("target", TARGETS, ids=repr)
 def test_what_the_region_needs_comes_within_the_credit_that_is_outstanding(kind: str, target: ls.Target) -> None:
@@ -383,6 +384,7 @@ def test_a_region_without_a_point_is_refused_before_anything_is_known(region: Re
         ls.Target(first=region)
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("target", TARGETS, ids=repr)
 def test_a_region_that_comes_first_from_the_beginning(kind: str, target: ls.Target) -> None:

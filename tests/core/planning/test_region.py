@@ -83,6 +83,7 @@ def surface_of(kind: str, rows: int, columns: int) -> ls.Surface:
     }[kind]()
 
 
+@pytest.mark.sweep(12)
 @pytest.mark.parametrize("region", REGIONS)
 @pytest.mark.parametrize("kind", ["integers", "floats", "closed", "xyz", "holes", "plane", "attributes", "terraces"])
 def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> None:
@@ -110,6 +111,7 @@ FEWER = [((0, 20), (0, 30)), ((30, 60), (200, 259)), ((79, 80), (0, 270)), ((0, 
 SIZES = [((4, 4), (4, 4)), ((1, 7), (9, 7)), ((3, 6), (7, 1)), ((8, 8), (5, 3))]
 
 
+@pytest.mark.sweep(6)
 @pytest.mark.parametrize(("tile", "chunk"), SIZES, ids=repr)
 @pytest.mark.parametrize("kind", ["integers", "floats", "holes"])
 def test_tiles_and_chunks_of_any_size_are_read(

@@ -48,6 +48,7 @@ def test_values_are_those_of_the_lattice_bit_for_bit(dtype: str) -> None:
         assert not points[..., :-1].any()
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_distances_are_those_of_the_reconstruction(dtype: str) -> None:
     for shape, geometric in itertools.product([(259, 515), (1, 3), (3, 1025)], (1, 2, 3)):
@@ -103,6 +104,7 @@ def plain_distances(
     return math.sqrt(math.fsum(totals) / np.count_nonzero(counted)), math.sqrt(squares.max())
 
 
+@pytest.mark.sweep(5)
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for shape, geometric in itertools.product([(259, 1027), (1, 3), (2, 512)], (1, 3)):

@@ -42,6 +42,7 @@ def remeshed(request: pytest.FixtureRequest) -> tuple[str, Remeshing]:
     return request.param, remesh_triangles(*ALL[request.param](), blocks=24, error=1e-2)
 
 
+@pytest.mark.sweep(4)
 def test_a_closed_surface_stays_closed_and_no_edge_has_three_quads(remeshed: tuple[str, Remeshing]) -> None:
     name, result = remeshed
     _, count = edges_of(result)
@@ -49,6 +50,7 @@ def test_a_closed_surface_stays_closed_and_no_edge_has_three_quads(remeshed: tup
     assert (count.min() == 2) == (name in scenes.CLOSED)
 
 
+@pytest.mark.sweep(4)
 def test_the_genus_is_kept(remeshed: tuple[str, Remeshing]) -> None:
     _, result = remeshed
     edges, _ = edges_of(result)
@@ -57,6 +59,7 @@ def test_the_genus_is_kept(remeshed: tuple[str, Remeshing]) -> None:
     assert len(np.unique(result.grids.numbers)) == result.grids.count
 
 
+@pytest.mark.sweep(4)
 def test_the_surface_is_near_both_ways(remeshed: tuple[str, Remeshing]) -> None:
     _, result = remeshed
     assert result.distances.rms < 1e-2
@@ -65,6 +68,7 @@ def test_the_surface_is_near_both_ways(remeshed: tuple[str, Remeshing]) -> None:
     assert result.folds == folded_quads(result.mesh, quads_of(result.grids.numbers), result.points).sum()
 
 
+@pytest.mark.sweep(4)
 def test_faces_look_the_way_of_the_input(remeshed: tuple[str, Remeshing]) -> None:
     _, result = remeshed
     corners = result.points[quads_of(result.grids.numbers)]

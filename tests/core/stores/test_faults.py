@@ -75,6 +75,7 @@ def again(faults: list[Fault], where: str = "PUT") -> list[Fault]:
     return [Fault(fault.kind, fault.times, where) for fault in faults]
 
 
+@pytest.mark.sweep(8)
 @pytest.mark.parametrize("faults", ONCE)
 def test_what_is_created_is_there_and_known(store: Bucket, proxy: FaultProxy, faults: list[Fault]) -> None:
     proxy.faults, data = again(faults), body()
@@ -82,6 +83,7 @@ def test_what_is_created_is_there_and_known(store: Bucket, proxy: FaultProxy, fa
     assert store.get("a") == (data, tag)
 
 
+@pytest.mark.sweep(4)
 @pytest.mark.parametrize("faults", ONCE)
 def test_what_is_replaced_is_there_and_known(store: Bucket, proxy: FaultProxy, faults: list[Fault]) -> None:
     old, data = store.create("a", body()), body()
@@ -91,6 +93,7 @@ def test_what_is_replaced_is_there_and_known(store: Bucket, proxy: FaultProxy, f
     assert tag != old
 
 
+@pytest.mark.sweep(9)
 @pytest.mark.parametrize("faults", ONCE)
 @pytest.mark.parametrize("size", [1000, 9 << 20], ids=["whole", "parts"])
 def test_a_file_is_whole_or_not_there(
@@ -104,6 +107,7 @@ def test_a_file_is_whole_or_not_there(
         assert blob.read(0, size + 1) == data
 
 
+@pytest.mark.sweep(7)
 @pytest.mark.parametrize("faults", [each for each in ONCE if "409" not in str(each.id)])
 def test_reads_deletes_and_lists_end_right(store: Bucket, proxy: FaultProxy, faults: list[Fault]) -> None:
     data = body()
