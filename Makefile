@@ -80,9 +80,14 @@ WEB_SOURCES := $(shell find $(WEB)/src $(WEB)/kernels $(WEB)/scripts -type f -no
 
 page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream view` show
 
+# Both wait for links and clocks much of the time, so they run at the same time.
 test-web: page $(WEB_TOOLS) $(MAPS)/node_modules/.package-lock.json ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
-	@cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent
-	@LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
+	@status=0; said=$$(mktemp); \
+	(cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent) > $$said 2>&1 & package=$$!; \
+	LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS) || status=1; \
+	wait $$package || status=1; \
+	cat $$said; rm -f $$said; \
+	exit $$status
 
 bench-web: page $(WEB_TOOLS) ## speed of the browser's decoder, times to the first picture, and the size of the bundle
 	@$(BIN)/python -m benchmarks.web $(ARGS)
@@ -110,9 +115,11 @@ LAID_OUT := $(C) $(wildcard client/web/kernels/*.[ch])
 CLANG_FORMAT := $(BIN)/clang-format --style=file:core/kernels/.clang-format
 C_WARNINGS := -std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Werror -DLODE_SOURCES='"lint"' -Icore/kernels
 
+# mypy takes about as long as all the others, each on one processor.
 lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-format, warnings of gcc and clang, workflows; lines of code
-	@status=0; \
-	for check in "ruff check" "ruff format --check" mypy "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
+	@status=0; said=$$(mktemp); \
+	$(BIN)/mypy > $$said 2>&1 & types=$$!; \
+	for check in "ruff check" "ruff format --check" "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
 	$(CLANG_FORMAT) --dry-run -Werror $(LAID_OUT) || status=1; \
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml || status=1; \
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker/compose.yaml || status=1; \
@@ -124,6 +131,8 @@ lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-for
 		fi; \
 	done; \
 	$(BIN)/python .ci/lines.py; \
+	wait $$types || status=1; \
+	cat $$said; rm -f $$said; \
 	exit $$status
 
 format: $(STAMP) ## let ruff lay out the code and sort its imports, and clang-format lay out the C

@@ -46,7 +46,7 @@ MORE_TESTS = tuple(
 PLANTED = "tests/kernels/test_sanitizers.py"
 PLANTED_WANTED = "LODESTREAM_SANITIZERS"
 
-_SECONDS = 60.0
+_SECONDS = 20.0
 
 
 def main() -> int:
