@@ -246,7 +246,6 @@ CASES = (
 )
 
 
-@pytest.mark.sweep(13)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_the_height_at_a_place(case: Case) -> None:
     made = case.make()
@@ -266,7 +265,6 @@ def test_a_level_around_the_earth_as_a_surface_has_a_shorter_step_over_the_seam(
     assert at(made, 10 + 4.8 * 73.5, 30) == pytest.approx(over)
 
 
-@pytest.mark.sweep(9)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_tile_has_the_height_too_and_the_bounds_have_the_place(case: Case) -> None:
     made = case.make()
