@@ -80,7 +80,14 @@ class Turns:
             raise
 
     def _wait(self, caller: str, place: Place) -> None:
-        heapq.heappush(self._waiting.setdefault(caller, []), (place.rank, next(self._numbers), place))
+        if caller not in place.lines:
+            place.lines.add(caller)
+            heapq.heappush(self._waiting.setdefault(caller, []), (place.rank, next(self._numbers), place))
+
+    def _step_out(self, caller: str) -> Place:
+        place = heapq.heappop(self._waiting[caller])[2]
+        place.lines.discard(caller)
+        return place
 
     def _leave(self, caller: str) -> None:
         self._running[caller] -= 1
@@ -98,13 +105,13 @@ class Turns:
         now = self._clock()
         for caller, waiting in list(self._waiting.items()):
             while waiting and not waiting[0][2].waits_for(caller):
-                heapq.heappop(waiting)
+                self._step_out(caller)
             if not waiting:
                 del self._waiting[caller]
         if not self._waiting:
             return None
         chosen = min(self._waiting, key=lambda caller: self._order(caller, now))
-        given = heapq.heappop(self._waiting[chosen])[2].given
+        given = self._step_out(chosen).given
         assert given is not None, "it waits"
         return chosen, given
 
@@ -139,18 +146,21 @@ class Place:
         Who waits for the task, once for each time; in order of arrival.
     given : future or None
         While it waits for its turn: whose turn it came in.
+    lines : set of str
+        Callers in whose lines it stands; those who have left may be among them.
     """
 
     def __init__(self, turns: Turns, rank: int = 0) -> None:
         self.rank = rank
         self.callers: list[str] = []
         self.given: asyncio.Future[str] | None = None
+        self.lines = set[str]()
         self._turns = turns
 
     def join(self, caller: str) -> None:
         """Let the task come in the turns of this caller too."""
         self.callers.append(caller)
-        if self.given is not None and not self.given.done() and self.callers.count(caller) == 1:
+        if self.waits_for(caller):
             self._turns._wait(caller, self)
 
     def leave(self, caller: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from random import Random
 
-from lodestream_server.access.turns import Turns
+from lodestream_server.access.turns import Place, Turns
 from tests.server.helpers import PATIENCE
 
 
@@ -127,3 +127,31 @@ def test_callers_are_forgotten_in_the_end() -> None:
         return turns
 
     assert len(asyncio.run(many())._used) <= 1000
+
+
+def test_whoever_comes_and_goes_stands_in_line_once() -> None:
+    async def come_and_go() -> None:
+        turns, order = Turns(1, 600.0), list[str]()
+        places = {name: Place(turns) for name in ("first", "second")}
+
+        async def work(name: str) -> None:
+            async with places[name].turn():
+                order.append(name)
+
+        async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group, turns.turn("zoe"):
+            for name, place in places.items():
+                place.join("anna")
+                group.create_task(work(name))
+            await asyncio.sleep(0)
+            for _ in range(1000):
+                places["second"].join("bert")
+                places["first"].join("bert")
+                places["first"].leave("bert")
+            assert len(turns._waiting["bert"]) == 2
+            # One that left is in nobody's way, and one that came back has a turn.
+            places["first"].leave("anna")
+            places["first"].join("bert")
+        assert sorted(order) == ["first", "second"]
+        assert (turns._free, turns._running, turns._waiting) == (1, {}, {})
+
+    asyncio.run(come_and_go())
