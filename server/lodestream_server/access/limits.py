@@ -122,7 +122,7 @@ class Limits:
             held = self._credit.held(caller.key)
             free = (held.most - held.taken) // _STREAM_SHARE
             more = min(free, MAX_CREDIT - BASE_CREDIT, self._credit.left(caller.key))
-            with self._credit.take(caller, more):
+            with self._credit.counted(caller, more):  # none, for one that has more than its share by now
                 yield BASE_CREDIT + more
 
     @asynccontextmanager

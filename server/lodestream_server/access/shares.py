@@ -144,6 +144,12 @@ class Share:
     def take(self, caller: Caller, amount: int = 1) -> Iterator[None]:
         """Check that a caller may take more, and count it for the length of the block; raise as `check` does."""
         self.check(caller, amount)
+        with self.counted(caller, amount):
+            yield
+
+    @contextmanager
+    def counted(self, caller: Caller, amount: int) -> Iterator[None]:
+        """Count what a caller takes for the length of the block; nothing is checked."""
         self.add(caller.key, amount)
         try:
             yield

@@ -271,6 +271,17 @@ def test_streams_together_have_no_more_under_way_than_their_memory(tmp_path: Pat
         assert memory / 2 < sum(credits) - 100 * BASE_CREDIT <= memory
 
 
+def test_who_has_more_than_its_share_of_credit_gets_the_least(tmp_path: Path) -> None:
+    made = limits(tmp_path, alone=False, stream_memory=4 * MAX_CREDIT, max_streams=1000)
+    with ExitStack() as held:
+        for caller in (ANNA, BERT):
+            for _ in range(60):
+                held.enter_context(made.stream(caller))
+        # Half of it when nobody else was there.
+        assert held.enter_context(made.stream(ANNA)) == BASE_CREDIT
+    assert (made._credit.total, made.streams.total) == (0, 0)
+
+
 def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Path) -> None:
     made = limits(tmp_path, alone=False, max_streams=4)
     with ExitStack() as held:
