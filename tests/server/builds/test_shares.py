@@ -6,6 +6,7 @@ import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,8 @@ from lodestream_server.access.tokens import TokenFile
 from lodestream_server.access.turns import Place, Turns
 from lodestream_server.builds import builder, worker
 from lodestream_server.routes import streams
-from lodestream_server.store.index import LEAST
+from lodestream_server.store.index import LEAST, Surface
+from lodestream_server.store.surfaces import Surfaces
 from tests.server.access.test_limits import ANNA
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, Raw, data_of, eventually, hills, npy, problem, push, raw_stream, settled
@@ -217,6 +219,28 @@ def test_asking_for_more_attempts_is_asking_for_builds(tmp_path: Path, monkeypat
             assert problem(answers[2]) == (429, "too-many")
             assert good.post("/v1/surfaces", content=npy(hills())).status_code == 202
             (data / "go").touch()
+
+
+def test_attempts_asked_for_at_the_same_time_are_counted_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = TokenFile(tmp_path / "tokens.json")
+    tokens = {"bad": file.create("bad", ("write",))[0]}
+    data, refused, retry = tmp_path / "data", threading.Event(), Surfaces.retry
+
+    def late(self: Surfaces, surface: str) -> Surface:
+        refused.wait(PATIENCE)
+        return retry(self, surface)
+
+    with (
+        running_server(data, workers=1, token_file=file.path, max_builds=4) as url,
+        Town(url, data, tokens).client("bad") as bad,
+        ThreadPoolExecutor(3) as threads,
+    ):
+        failed = [push(bad, npy(hills(seed=seed))[:-1]) for seed in range(3)]
+        monkeypatch.setattr(Surfaces, "retry", late)
+        asked = [threads.submit(bad.post, f"{surface['url']}/retry") for surface in failed]
+        wait(asked, PATIENCE, FIRST_COMPLETED)
+        refused.set()
+        assert sorted(each.result().status_code for each in asked) == [202, 202, 429]
 
 
 def test_keys_of_builds_are_keys_of_callers() -> None:
