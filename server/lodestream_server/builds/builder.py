@@ -60,7 +60,7 @@ from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
 from .fork_server import Allowed
 from .processes import Call, ForkServer, Pool
-from .runner import Runner
+from .runner import Runner, carried_out
 from .work import Work
 
 __all__ = ["Builder"]
@@ -320,8 +320,7 @@ class Builder:
             if task is not None:
                 if not task.cancelling():  # a second time it would not wait for the end of its process
                     task.cancel()
-                with suppress(asyncio.CancelledError):
-                    await task
+                await asyncio.wait((task,))  # which does not cancel it either, if whoever deletes is cut short
             await asyncio.to_thread(self._surfaces.delete, surface)
             await asyncio.to_thread(self._work.forget, surface)
         finally:
@@ -534,13 +533,13 @@ class Builder:
             return "again"
         except asyncio.CancelledError:
             if counted:  # the server ends, or the surface is deleted: that is no fault of the build
-                await _carried_out(partial(self._end_early, it.id))
+                await carried_out(partial(self._end_early, it.id))
             raise
         finally:
             self._running.pop(it.id, None)
             # The process has ended, or has given its result: nobody writes here any more.
             keeps = held or (self._closing and not ended)
-            await _carried_out(partial(self._work.end, it.id, folder, keeps))
+            await carried_out(partial(self._work.end, it.id, folder, keeps))
 
     def _end_early(self, surface: str) -> None:
         with suppress(StoreError, IndexLostError):
@@ -653,16 +652,6 @@ def _lacking(error: Exception) -> str:
     if isinstance(error, _LaterError):
         return str(error)
     return f"waits for {_ROOM if isinstance(error, stores.FullError) else 'the data of the server'}"
-
-
-async def _carried_out(remove: Callable[[], None]) -> None:
-    """Remove the files of a build, even if the task is cancelled: a thread that has not begun would never run."""
-    removing = asyncio.ensure_future(asyncio.to_thread(remove))
-    try:
-        await asyncio.shield(removing)
-    except asyncio.CancelledError:
-        await removing
-        raise
 
 
 def _allowed(job: worker.Job, size: int, memory: int, threads: int) -> Allowed:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 import itertools
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from ..store.durable import discard
+from .runner import carried_out
 
 __all__ = ["Key", "Lease", "LevelFiles"]
 
@@ -140,7 +141,7 @@ class LevelFiles:
             # Meanwhile its container may have gone, or somebody may have begun to read it.
             if self._files.get(key) is file and not file.readers:
                 del self._files[key]
-                await asyncio.to_thread(discard, file.path)
+                await carried_out(partial(discard, file.path))
 
     def new_folder(self, key: Key) -> Path:
         """Return the path of a folder in which to make a file."""

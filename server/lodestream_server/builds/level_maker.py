@@ -41,7 +41,7 @@ from .fork_server import Allowed
 from .level_files import Key, Lease, LevelFiles
 from .levels import LevelJob, MadeLevel, make_level
 from .processes import Call, ForkServer, Pool
-from .runner import Runner
+from .runner import Runner, carried_out
 
 __all__ = ["LevelMaker", "Loan"]
 
@@ -165,25 +165,25 @@ class LevelMaker:
         with ExitStack() as stack:  # a file of this machine, which a thread may have to fetch
             local = self._containers.local(key.container)
             container = await asyncio.to_thread(stack.enter_context, local)
-            lease = await self._make_from(container, key, most)
-        held.callback(lease.release)
-        return lease
+            return await self._make_from(container, key, most, held)
 
-    async def _make_from(self, container: Path, key: Key, most: int) -> Lease:
+    async def _make_from(self, container: Path, key: Key, most: int, held: ExitStack) -> Lease:
         folder = self._files.new_folder(key)
         memory = self._settings.memory_of_levels
         wanted = LevelJob(container, key.level, key.format_name, folder, most, memory)
         try:
-            await asyncio.to_thread(_make_folders, folder)
+            await carried_out(partial(_make_folders, folder))
             size = await self._insist(wanted, key)
             # Of a surface that was deleted meanwhile nobody will ask for it again.
-            return self._files.add(key, wanted.path, size, kept=self._containers.is_used(key.container))
+            lease = self._files.add(key, wanted.path, size, kept=self._containers.is_used(key.container))
+            held.callback(lease.release)
+            return lease
         except (FileNotFoundError, WrongAnswerError) as error:
             if folder.exists():
                 raise
             raise BusyError("the server's scratch folder was removed meanwhile; ask again") from error
         finally:
-            await asyncio.to_thread(discard, folder)
+            await carried_out(partial(discard, folder))
 
     async def _insist(self, wanted: LevelJob, key: Key) -> int:
         for _ in range(_DEATHS):
@@ -191,7 +191,7 @@ class LevelMaker:
                 return await self._run(wanted, key)
             except (ProcessDiedError, _ReplacedError) as error:
                 _log.warning("level %d of %s: %s", key.level, key.container, error)
-                await asyncio.to_thread(_empty, wanted.folder)
+                await carried_out(partial(_empty, wanted.folder))
         raise BusyError("the process that made the level was killed, or its container was replaced; try again soon")
 
     async def _run(self, wanted: LevelJob, key: Key) -> int:

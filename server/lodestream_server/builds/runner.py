@@ -27,7 +27,7 @@ from ..operation.logs import event
 from ..problems import RestartingError
 from .processes import Call, Question, Worker
 
-__all__ = ["Runner", "Work"]
+__all__ = ["Runner", "Work", "carried_out"]
 
 _log = logging.getLogger(__name__)
 
@@ -84,6 +84,7 @@ class Runner(Generic[_Key, _Call]):
         self._worker: Worker[_Call] = worker
         self._level = level
         self._jobs: dict[_Key, _Job] = {}
+        self._tasks = set[asyncio.Task[Any]]()  # also of jobs that nobody waits for any more, until they have ended
         self._closing = False
 
     @asynccontextmanager
@@ -114,6 +115,8 @@ class Runner(Generic[_Key, _Call]):
         if job is None:
             job = self._jobs[key] = _Job(Place(self._turns, rank))
             job.task = asyncio.create_task(self._do(key, job, work))
+            self._tasks.add(job.task)
+            job.task.add_done_callback(self._tasks.discard)
         job.place.join(caller)
         job.waiting += 1
         try:
@@ -131,10 +134,12 @@ class Runner(Generic[_Key, _Call]):
     async def _leave(self, key: _Key, job: _Job) -> None:
         """End a job for which nobody waits any more."""
         self._forget(key, job)
-        job.task.cancel()
         # By the task's own end, since who waits for that here may be cancelled a second time.
         job.task.add_done_callback(partial(_ended, job))
-        await asyncio.wait((job.task,))
+        # Whoever has taken over a result comes here too, and would lose it if it were cancelled in a wait.
+        if not job.task.done():
+            _cut_short(job.task)
+            await asyncio.wait((job.task,))
 
     def _forget(self, key: _Key, job: _Job) -> None:
         if self._jobs.get(key) is job:
@@ -166,11 +171,29 @@ class Runner(Generic[_Key, _Call]):
     async def close(self) -> None:
         """Cut all jobs short, and kill their processes."""
         self._closing = True
-        tasks = [job.task for job in self._jobs.values()]
+        tasks = list(self._tasks)
         for task in tasks:
-            task.cancel()
+            _cut_short(task)
         await asyncio.gather(*tasks, return_exceptions=True)
         await asyncio.to_thread(self._worker.close)
+
+
+async def carried_out(change: Callable[[], None]) -> None:
+    """Make or remove files of a job in a thread, to the end even if the task is cancelled.
+
+    Otherwise a thread that has not begun would never run, and one that has would go on beside what comes next.
+    """
+    changing = asyncio.ensure_future(asyncio.to_thread(change))
+    try:
+        await asyncio.shield(changing)
+    except asyncio.CancelledError:
+        await asyncio.gather(changing, return_exceptions=True)
+        raise
+
+
+def _cut_short(task: asyncio.Task[Any]) -> None:
+    if not task.cancelling():  # a second time it would not wait for the end of its process
+        task.cancel()
 
 
 def _ended(job: _Job, task: asyncio.Task[Any]) -> None:

@@ -122,18 +122,26 @@ async def while_there(
     """
     working, watching = asyncio.ensure_future(work), asyncio.ensure_future(_gone(request))
     taken = False
+
+    def let_go(_: object) -> None:
+        if not taken and not working.cancelled() and working.exception() is None:
+            release(working.result())
+
     try:
         await asyncio.wait((working, watching), return_when=asyncio.FIRST_COMPLETED)
         if not working.done():
             raise ClientDisconnect
-        taken = True
+        watching.cancel()
+        await asyncio.gather(watching, return_exceptions=True)
+        taken = True  # nothing is waited for from here on
         return working.result()
     finally:
-        working.cancel()
-        watching.cancel()
-        await asyncio.gather(working, watching, return_exceptions=True)
-        if not taken and not working.cancelled() and working.exception() is None:
-            release(working.result())
+        if not taken:
+            working.cancel()
+            watching.cancel()
+            # By its own end, since who waits for that here may be cancelled a second time.
+            working.add_done_callback(let_go)
+            await asyncio.gather(working, watching, return_exceptions=True)
 
 
 async def _gone(request: Request) -> None:

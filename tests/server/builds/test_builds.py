@@ -22,6 +22,7 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.builds import builder, worker
+from lodestream_server.builds.runner import carried_out
 from lodestream_server.builds.work import Work
 from lodestream_server.store.data_folder import DataFolder
 from lodestream_server.store.durable import discard
@@ -477,7 +478,7 @@ def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -
         free = threading.Event()
         busy = asyncio.ensure_future(asyncio.to_thread(free.wait, PATIENCE))
         await asyncio.sleep(0)
-        task = asyncio.ensure_future(builder._carried_out(partial(discard, folder)))
+        task = asyncio.ensure_future(carried_out(partial(discard, folder)))
         await asyncio.sleep(0.01)
         task.cancel()
         await asyncio.sleep(0.01)

@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 import httpx
 import numpy as np
 import pytest
+from fastapi import Request
 from numpy.typing import NDArray
 
 from lodestream import Block, Surface, encode
@@ -27,8 +28,12 @@ from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import level_maker, worker
 from lodestream_server.builds.answers import Refusal
 from lodestream_server.builds.level_files import Key, LevelFiles
+from lodestream_server.builds.level_maker import LevelMaker
 from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
+from lodestream_server.builds.processes import Call, ForkServer
 from lodestream_server.builds.runner import Runner
+from lodestream_server.routes.sending import while_there
+from tests.server.access.test_limits import ANNA, limits
 from tests.server.builds import slow
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.connections import hostile
@@ -515,14 +520,113 @@ def test_a_container_may_go_while_room_is_made(tmp_path: Path, monkeypatch: pyte
     for number in range(3):
         put(made, number, 200).release()
 
-    async def gone_meanwhile(function: Callable[..., None], path: Path) -> None:
-        function(path)
+    async def gone_meanwhile(function: Callable[[], None]) -> None:
+        function()
         made.forget("b" * 64)
 
     monkeypatch.setattr(asyncio, "to_thread", gone_meanwhile)
     assert asyncio.run(made.make_room()) == 250
     assert numbers(made) == {1, 2}
     assert len(list(tmp_path.iterdir())) == 2
+
+
+class Stored:
+    """Containers that are there."""
+
+    @contextmanager
+    def local(self, _: str) -> Iterator[Path]:
+        yield Path("container")
+
+    def is_used(self, _: str) -> bool:
+        return True
+
+
+def test_whoever_goes_at_any_moment_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cancellation at each step of the event loop; a thread may begin late or not at all, and end unnoticed."""
+    stored: Any = Stored()
+    most = 1 << 20
+
+    async def in_a_thread(function: Callable[..., Any], *args: Any) -> Any:
+        await asyncio.sleep(0)
+        result = function(*args)
+        await asyncio.sleep(0)
+        return result
+
+    async def make(call: Call) -> MadeLevel:
+        await asyncio.sleep(0)
+        job: LevelJob = call.args[0]
+        job.path.write_bytes(bytes(1000))
+        await asyncio.sleep(0)
+        return MadeLevel(1000)
+
+    monkeypatch.setattr(asyncio, "to_thread", in_a_thread)
+
+    async def go(step: int) -> bool:
+        folder = tmp_path / str(step)
+        room = files(folder / "levels", most)
+        room.folder.mkdir(parents=True)
+        for number in range(1, 4):  # of which some must go
+            put(room, number, most // 4).release()
+        there = limits(folder, alone=False)
+        queue = LevelMaker(there._settings, stored, room, ForkServer(), there)
+        monkeypatch.setattr(queue._runner, "call", make)
+        asked = asyncio.create_task(queue.take(Key("a" * 64, 0, "npy"), ANNA))
+        for _ in range(step):
+            await asyncio.sleep(0)
+        has_it = asked.done()
+        asked.cancel()
+        await asyncio.wait((asked,))
+        for _ in range(100):
+            await asyncio.sleep(0)
+        if not asked.cancelled():
+            asked.result().release()
+        assert (room.lent, there.lent.total, there.levels.total) == (0, 0, 0)
+        assert (queue._runner._jobs, queue._runner._turns._free) == ({}, 1)
+        assert {path.stat().st_size for path in room.folder.iterdir()} <= {1000, most // 4}
+        assert sum(path.stat().st_size for path in room.folder.iterdir()) == room.size
+        return has_it
+
+    step = 0
+    while not asyncio.run(go(step)):
+        step += 1
+    assert step > 20
+
+
+@pytest.mark.parametrize("again", [0, 1, 2, 3])
+def test_a_request_that_is_cancelled_loses_no_loan(again: int) -> None:
+    """Once, and a second time some steps later."""
+    asked = Request({"type": "http", "headers": []}, receive=lambda: asyncio.sleep(PATIENCE, {"type": "http.request"}))
+
+    async def ask(step: int) -> bool:
+        lent, released, got = list[str](), list[str](), list[str]()
+
+        async def work() -> str:
+            for _ in range(3):
+                await asyncio.sleep(0)
+            lent.append("loan")
+            return "loan"
+
+        async def request() -> None:
+            got.append(await while_there(asked, work(), released.append))
+
+        task = asyncio.create_task(request())
+        for _ in range(step):
+            await asyncio.sleep(0)
+        ended = task.done()
+        task.cancel()
+        for _ in range(again):
+            await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.wait((task,))
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert lent == got + released
+        return ended
+
+    step = 0
+    while not asyncio.run(ask(step)):
+        step += 1
+    assert step > 5
 
 
 def test_the_process_makes_no_file_that_is_longer(tmp_path: Path) -> None:

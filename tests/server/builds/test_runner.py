@@ -162,6 +162,72 @@ def test_a_server_that_ends_tells_who_waits() -> None:
     bench(play)
 
 
+def test_whoever_has_a_result_keeps_it_however_late_it_is_cancelled() -> None:
+    async def play(made: Bench) -> None:
+        taken: list[str] = []
+
+        async def take() -> None:
+            async with made.runner.job("a", "anna", made.work("a")) as result:
+                taken.append(result)
+            taken.remove(result)  # it is given back by whoever has it, and nobody else
+
+        made.go.setdefault("a", asyncio.Event()).set()
+        for step in range(20):
+            task = asyncio.create_task(take())
+            for _ in range(step):
+                await asyncio.sleep(0)
+            task.cancel()
+            await asyncio.wait((task,))
+            await settle()
+            assert taken == []
+        assert not task.cancelled()
+
+    bench(play)
+
+
+def test_whoever_comes_when_a_job_is_done_asks_for_another() -> None:
+    async def play(made: Bench) -> None:
+        made.go.setdefault("a", asyncio.Event()).set()
+        async with made.runner.job("a", "anna", made.work("a")):
+            assert await made.ask("a", "bert") == "A"
+            assert made.begun == ["a", "a"]
+            await settle()
+            assert made.released == ["a"]  # of bert's
+
+    bench(play)
+
+
+def test_a_server_that_ends_waits_for_jobs_that_nobody_waits_for() -> None:
+    async def play(made: Bench) -> None:
+        ends, ended = asyncio.Event(), list[str]()
+
+        async def tidy(_: ExitStack) -> str:
+            try:
+                return await asyncio.Future()
+            finally:
+                await ends.wait()
+                ended.append("a")
+
+        async def ask() -> None:
+            async with made.runner.job("a", "anna", tidy):
+                pass
+
+        asked = asyncio.create_task(ask())
+        await settle()
+        for _ in range(2):
+            asked.cancel()
+            await settle()
+        assert asked.cancelled()
+        closing = asyncio.create_task(made.runner.close())
+        await settle()
+        assert (ended, closing.done()) == ([], False)
+        ends.set()
+        await closing
+        assert ended == ["a"]
+
+    bench(play)
+
+
 def test_the_log_has_a_line_for_every_job_however_it_ended(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import logging
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 from lodestream.errors import FormatError, TooLargeError, UnavailableError
 from lodestream.stores import Folder, FullError, StoreError, Tag
+from lodestream_server import Settings
 from lodestream_server.builds import builder, worker
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.waiting import retry, waiting
@@ -197,3 +200,34 @@ def test_an_upload_that_cannot_be_read_is_not_refused(
         # The same file again makes it whole, also for the other surface.
         assert push(http, BODY)["state"] == "ready"
         assert (upload_of(data, other) / "0").read_bytes() == BODY
+
+
+def test_a_delete_that_is_cut_short_lets_the_build_end_and_deletes_nothing(tmp_path: Path) -> None:
+    """Otherwise the files would go while the process of the build still runs."""
+    deleted, nothing = list[str](), MagicMock()
+    surfaces = MagicMock()
+    surfaces.delete = deleted.append
+    surfaces.index.find.return_value = None
+
+    async def delete() -> None:
+        made = builder.Builder(surfaces, nothing, Settings(data=tmp_path), nothing, nothing)
+        ends = asyncio.Event()
+
+        async def build() -> None:
+            try:
+                await asyncio.Future()
+            finally:
+                await ends.wait()
+
+        build_task = made._tasks["a"] = asyncio.create_task(build())
+        await asyncio.sleep(0)
+        asked = asyncio.create_task(made.delete("a"))
+        await asyncio.sleep(0)
+        asked.cancel()
+        await asyncio.wait((asked,))
+        assert (asked.cancelled(), build_task.done(), build_task.cancelling(), deleted) == (True, False, 1, [])
+        ends.set()
+        await made.delete("a")
+        assert (build_task.cancelled(), deleted, made._deleting) == (True, ["a"], set())
+
+    asyncio.run(delete())
