@@ -217,6 +217,14 @@ def preload() -> None:
     """
     import numpy.ma  # noqa: F401  # numpy itself imports it when it first looks for the different values of an array
 
+    import lodestream.decoding.decoder
+    import lodestream.decoding.inspection
+    import lodestream.encoding.encode
+    import lodestream.encoding.request
+    import lodestream.encoding.stored_surface
+    import lodestream.formats
+    import lodestream.mesh.recognise
+    import lodestream.planning.planner  # noqa: F401
     from lodestream.library import library
 
     from . import levels  # noqa: F401
