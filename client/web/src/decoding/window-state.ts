@@ -19,6 +19,7 @@ export class WindowState {
   readonly #header: Header;
   readonly #region: Region;
   readonly #inside: Uint8Array; // tiles
+  readonly #initial: Int8Array; // (tile, channel)
   readonly #section = new ByteBuffer();
   #figures: WindowFigures;
   #index: Index | null = null;
@@ -29,6 +30,7 @@ export class WindowState {
     this.#header = header;
     this.#region = region;
     this.#inside = selectedTiles(selection, header);
+    this.#initial = initialState(header);
     this.#figures = new WindowFigures(header, region);
   }
 
@@ -71,10 +73,9 @@ export class WindowState {
     };
     // Where the file comes in its own order, all of the state is known as it is.
     if (!made.complete && !Number.isNaN(made.rms) && made.wholeLevel < 0 && this.#knownFrom === null) return;
-    const initial = initialState(header);
     for (let unit = 0; unit < state.length; unit++) {
       const tile = Math.floor(unit / channels);
-      if (!this.#inside[tile]) state[unit] = isKnown(tile, unit % channels) ? 0 : initial[unit]!;
+      if (!this.#inside[tile]) state[unit] = isKnown(tile, unit % channels) ? 0 : this.#initial[unit]!;
     }
   }
 }
