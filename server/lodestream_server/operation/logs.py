@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import secrets
+import select
 import threading
 from contextlib import suppress
 from contextvars import ContextVar
@@ -93,7 +94,7 @@ class _Worth(logging.Filter):
             if record.created < self._next:
                 return False
             self._next = record.created + _NO_FILES_SECONDS
-        return record.msg not in _UNWORTHY
+        return str(record.msg) not in _UNWORTHY
 
 
 def _fields(record: logging.LogRecord) -> dict[str, Any]:
@@ -155,7 +156,10 @@ class _Writer(QueueListener):
         data = f"{record.getMessage()}\n".encode("utf-8", "backslashreplace")
         with suppress(OSError):
             while data:
-                data = data[os.write(self._descriptor, data) :]
+                try:
+                    data = data[os.write(self._descriptor, data) :]
+                except BlockingIOError:  # whoever shares a terminal or a pipe may have set that for all
+                    select.select((), (self._descriptor,), ())
 
 
 class _Text(logging.Formatter):

@@ -483,6 +483,18 @@ def test_the_end_of_the_log_waits_for_its_reader_only_so_long() -> None:
             taken += os.read(read, 1 << 16)
 
 
+def test_no_line_is_lost_where_writing_does_not_wait() -> None:
+    with log_to_pipe() as (handler, read):
+        os.set_blocking(handler._writer._descriptor, False)
+        for _ in range(1000):
+            handler.handle(line("l" * 1000))
+        handler.end()  # most of it is not written yet
+        taken = b""
+        while taken.count(b"\n") < 1000:
+            taken += os.read(read, 1 << 20)
+        assert taken.count(b": " + b"l" * 1000 + b"\n") == 1000
+
+
 def test_a_log_that_was_ended_is_no_longer_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
     root = logging.getLogger()
     monkeypatch.setattr(root, "handlers", [])
@@ -505,6 +517,9 @@ def test_a_lack_of_files_is_told_once_a_minute_and_what_strangers_send_not_at_al
     assert [worth.filter(record) for record in lack] == [True, False, True]
     assert not worth.filter(line("Invalid HTTP request received."))
     assert worth.filter(line("anything else"))
+    odd = line()
+    odd.msg = ["of", "a", "library"]
+    assert worth.filter(odd)
 
 
 def test_lines_of_threads_have_the_id_of_their_request() -> None:
