@@ -280,6 +280,7 @@ def test_who_has_more_than_its_share_of_credit_gets_the_least(tmp_path: Path) ->
         # Half of it when nobody else was there.
         assert held.enter_context(made.stream(ANNA)) == BASE_CREDIT
     assert (made._credit.total, made.streams.total) == (0, 0)
+    assert (made._credit._taken, made.streams._taken) == ({}, {})  # of those who are gone nothing is kept
 
 
 def test_connections_without_a_token_yet_in_all_and_of_one_address(tmp_path: Path) -> None:

@@ -84,6 +84,52 @@ def test_two_at_a_time_are_of_two_callers() -> None:
     asyncio.run(crowd())
 
 
+def test_whoever_has_fewer_turns_now_comes_first_even_if_it_has_used_more() -> None:
+    async def crowd() -> list[str]:
+        clock = Clock()
+        turns, order = Turns(2, 600.0, clock), list[str]()
+
+        async def work(caller: str) -> None:
+            async with turns.turn(caller):
+                order.append(caller)
+
+        async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group:
+            async with turns.turn("bert"):
+                clock.now += 20
+            async with turns.turn("anna"):
+                async with turns.turn("carl"):
+                    for caller in ("anna", "bert"):
+                        group.create_task(work(caller))
+                        await asyncio.sleep(0)
+                for _ in range(5):
+                    await asyncio.sleep(0)
+        return order
+
+    assert asyncio.run(crowd()) == ["bert", "anna"]
+
+
+def test_a_turn_is_charged_to_the_caller_in_whose_turn_the_task_came() -> None:
+    async def share() -> dict[str, int]:
+        clock = Clock()
+        turns = Turns(1, 600.0, clock)
+        async with turns.turn("bert"):
+            clock.now += 100
+        place = Place(turns)
+
+        async def work() -> None:
+            async with place.turn():
+                clock.now += 10
+
+        async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group, turns.turn("zoe"):
+            for caller in ("bert", "anna"):
+                place.join(caller)
+            group.create_task(work())
+            await asyncio.sleep(0)
+        return {caller: round(turns._use(caller, clock.now)) for caller in ("anna", "bert")}
+
+    assert asyncio.run(share()) == {"anna": 10, "bert": 91}
+
+
 def test_a_turn_that_nobody_takes_goes_to_the_next() -> None:
     async def crowd(seed: int) -> None:
         random, turns = Random(seed), Turns(2, 600.0)
