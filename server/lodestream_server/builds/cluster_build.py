@@ -5,8 +5,8 @@ to its standard output. It ends when its standard input does: with the server.
 
 What the confined process has left is not trusted. Before anything is opened or written in its folder, it is looked
 through: there may be nothing but folders and plain files of their own, and all but the parsed arrays are removed. The
-arrays are read as numbers. Tasks are files that this process writes, into a temporary folder beside them. By then
-nobody else can write there: the confined process has ended with all that it had started, see `processes`.
+arrays are read as numbers. Tasks are files that this process writes into a folder of its own (`work.tasks_of`), where
+the confined process could never write.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from pydantic import TypeAdapter
 from lodestream.errors import FormatWarning, InputError, LodestreamError, OptionError, TooLargeError, UnavailableError
 from lodestream.operating_system import lower_limit
 
-from ..store.durable import remove
+from ..store.durable import discard, make_folder, remove
 from .answers import answer_of
+from .work import tasks_of
 from .worker import Built, Job, Refused, may_pass, moved, raise_passing, reporter
 
 __all__ = ["ClusterJob", "build", "check_plain", "keep_parsed"]
@@ -104,8 +105,11 @@ def _build(task: ClusterJob) -> Built | Refused:
     if vertices > job.max_vertices:
         raise TooLargeError(f"expected at most {job.max_vertices:,} vertices, got {vertices:,}")
     quality, _ = without_quality(job.options)
-    container = job.scratch / "made"
+    tasks = tasks_of(job.folder)
+    make_folder(tasks)
+    container = tasks / "made"
     with ExitStack() as stack:
+        stack.callback(discard, tasks)
         try:
             executor = stack.enter_context(executor_of(task.address))
         except (OptionError, UnavailableError) as error:
@@ -131,7 +135,7 @@ def _build(task: ClusterJob) -> Built | Refused:
             # Of Dask: workers died, the scheduler has gone, a worker lacks this package or has another version.
             words = str(error) or "the scheduler has ended, or has dropped the tasks"
             return Refused(f"LODESTREAM_DASK: the cluster gave up: {type(error).__name__}: {words}", final=False)
-    return Built(moved(container, job.container))
+        return Built(moved(container, job.container))
 
 
 def keep_parsed(job: Job) -> None:

@@ -2,13 +2,16 @@
 
 ::
 
-    SCRATCH/work/{id}/{attempt}/    an attempt, while it goes on
-    SCRATCH/work/{id}/bands/        files of tasks, by the rule of `lodestream.encode(scratch=)`
+    SCRATCH/work/{id}/{attempt}/          an attempt, while it goes on
+    SCRATCH/work/{id}/{attempt}.tasks/    files of its tasks, if they go to a cluster
+    SCRATCH/work/{id}/bands/              files of tasks, by the rule of `lodestream.encode(scratch=)`
 
-The second is kept when the server ends meanwhile. The process of a build may write to both, and to no folder above, so
-that neither can become a link. The server itself reads nothing in them: a stranger's file may have taken over the
-process that wrote there, and some of the files are pickles. Only the next process reads them, which is confined in the
-same way and to the same surface. All is removed when the surface is ready, refused, postponed or deleted.
+The last is kept when the server ends meanwhile. The process of a build may write to it and to the first, and to no
+folder above, so that neither can become a link. The server itself reads nothing in them: a stranger's file may have
+taken over the process that wrote there, and some of the files are pickles. Only the next process reads them, which is
+confined in the same way and to the same surface. The tasks for a cluster are pickles that are read by processes that are
+not confined: they lie where none that has read a stranger's file could write. All is removed when the surface is ready,
+refused, postponed or deleted.
 
 The same upload is the same surface: one may be deleted, uploaded and begun again before the attempt for the first has
 ended. So an attempt removes its own folder, and the rest only where no other one goes on.
@@ -26,7 +29,7 @@ from pathlib import Path
 
 from ..store.durable import discard, make_folder, remove
 
-__all__ = ["Work"]
+__all__ = ["Work", "tasks_of"]
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +86,8 @@ class Work:
     def end(self, surface: str, attempt: Path, keep: bool = False) -> None:
         """Remove the files of an attempt; unless ``keep``, also those from which others would continue."""
         with self._lock:
-            discard(attempt)
+            for folder in (attempt, tasks_of(attempt)):
+                discard(folder)
             if not keep or _is_empty(self.bands(surface)):
                 self._forget(surface)
 
@@ -110,6 +114,11 @@ class Work:
                     discard(path / name)
             if _is_empty(path / _BANDS):
                 discard(path)
+
+
+def tasks_of(attempt: Path) -> Path:
+    """Return the folder of an attempt's tasks for a cluster."""
+    return attempt.with_name(f"{attempt.name}.tasks")
 
 
 def _is_folder(path: Path) -> bool:

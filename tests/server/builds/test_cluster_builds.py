@@ -150,6 +150,23 @@ def test_only_the_parsed_arrays_are_kept_of_what_a_parser_has_left(job: worker.J
 
 
 @pytest.mark.usefixtures("at_once")
+def test_tasks_lie_where_no_parser_can_write(job: worker.Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[Path, ...]] = []
+    encode = ls.encode
+
+    def noted(*args: Any, out: Path, **options: Any) -> Any:
+        made = encode(*args, out=out, **options)
+        seen.append((out.parent, *(path for path in (job.folder, *job.folder.parents) if path == out.parent)))
+        return made
+
+    monkeypatch.setattr("lodestream.encode", noted)
+    assert isinstance(cluster_build.build(task_of(job)), worker.Built)
+    # Neither in a folder that the parser may write to, nor above one, through which it could be another.
+    assert seen == [(job.folder.with_name(f"{job.folder.name}.tasks"),)]
+    assert not seen[0][0].exists()
+
+
+@pytest.mark.usefixtures("at_once")
 def test_what_is_unreadable_or_missing_or_too_large_is_refused(job: worker.Job, tmp_path: Path) -> None:
     def reason(changed: worker.Job) -> str:
         refused = cluster_build.build(task_of(changed))
