@@ -35,6 +35,9 @@ _STEPS = 32767
 #: Heights of less relief than so many metres have the same step, 1/128 m.
 _RELIEF = 256.0
 
+#: Metres beyond which heights, up or down, are told as so many: further down, the Earth has a middle.
+_HIGHEST = 1e6
+
 _NORMALS = 1  # the extension octvertexnormals
 
 
@@ -42,6 +45,8 @@ def mesh_tile(
     field: HeightField, z: int, x: int, y: int, *, nodata: float = 0.0, offset: float = 0.0, normals: bool = True
 ) -> bytes:
     """Return a tile of the geographic scheme TMS as a quantized mesh of 65 x 65 nodes, not compressed.
+
+    Heights beyond 1,000 km up or down are told as that.
 
     Parameters
     ----------
@@ -81,7 +86,8 @@ def mesh_tile(
     # One node more around the tile, so that normals along an edge are those of the neighbour.
     grid = mesh_grid(z, x, y, field.placement.latitude, margin=1)
     heights = field.heights(grid.longitudes, grid.latitudes, metres=grid.metres)
-    return quantized_mesh(grid, np.where(np.isfinite(heights), heights, nodata) + offset, normals)
+    metres = np.clip(np.where(np.isfinite(heights), heights, nodata) + offset, -_HIGHEST, _HIGHEST)
+    return quantized_mesh(grid, metres, normals)
 
 
 def quantized_mesh(grid: TileGrid, heights: NDArray[np.float64], normals: bool = True) -> bytes:

@@ -55,6 +55,9 @@ _SECONDS = 30.0
 # The longest image is one of 512 x 512 pixels of four bytes, which is not compressed; and its base64.
 _LONGEST = 2 << 20
 
+# Letters of an address, which begins with the Host of a stranger; each takes six bytes of a question at most.
+_LONGEST_ADDRESS = 512
+
 # For so many seconds it counts for whom tiles were made.
 _REMEMBERED = 60.0
 
@@ -92,12 +95,14 @@ class TileMaker:
         InputError, OptionError
             If the surface cannot be shown on a map, or an option is wrong.
         TooLargeError
-            If it takes too much memory or time.
+            If it takes too much memory or time, or its address is too long.
         UnavailableError
             If a library is missing.
         RestartingError
             If the server ends.
         """
+        if len(order.address) > _LONGEST_ADDRESS:
+            raise TooLargeError(f"expected addresses of at most {_LONGEST_ADDRESS} letters, got {len(order.address)}")
         with self._limits.tiles.take(caller):
             async with self._runner.job((container, order), caller.key, partial(self._make, container, order)) as made:
                 return made

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from lodestream.errors import LodestreamError, OptionError
+from lodestream.errors import LodestreamError
 
 from .answers import Refusal
 
@@ -168,20 +168,13 @@ def _made(field: HeightField, order: TileOrder) -> bytes:
         case "layers":
             return _document(layer_json(field, order.address))
         case "tile":
-            _check_zoom(order.z)
             made = web_tile(field, *place, encoding=encoding, image=image, size=order.size, nodata=order.nodata)
             box = box_of_web(*place)
         case "mesh":
-            _check_zoom(order.z)
             made = mesh_tile(field, *place, nodata=order.nodata, offset=order.offset, normals=order.normals)
             # A globe shows nothing before it has both tiles of zoom 0.
             box = box_of_mesh(*place) if order.z else field.bounds
     return made if field.placement.meets(box) else b""
-
-
-def _check_zoom(z: int) -> None:
-    if not 0 <= z < 64:  # beyond it, numbers of tiles are none of numpy
-        raise OptionError(f"expected a zoom of 0 to 63, got {z}")
 
 
 def _document(content: dict[str, Any]) -> bytes:

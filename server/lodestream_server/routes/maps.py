@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import Response
 
 from lodestream.errors import NotFoundError
@@ -33,6 +33,8 @@ _VERSION = 12
 
 _ERRORS = responses(404, 409, 413, 422, 424, 429, 501, 503)
 
+_Zoom = Annotated[int, Path(ge=0, le=30)]
+_Place = Annotated[int, Path(ge=0, lt=1 << 31, description="of the tile")]
 _Encoding = Annotated[
     Literal["terrain-rgb", "terrarium", "shade"],
     Query(description="how heights are colours; shade is a relief for the eye"),
@@ -114,9 +116,9 @@ async def tile(
     request: Request,
     parts: Parts,
     found: _Found,
-    z: int,
-    x: int,
-    y: int,
+    z: _Zoom,
+    x: _Place,
+    y: _Place,
     image: Literal["png", "webp"],
     encoding: _Encoding = "terrain-rgb",
     size: _Size = "256",
@@ -185,9 +187,9 @@ async def mesh(
     request: Request,
     parts: Parts,
     found: _Found,
-    z: int,
-    x: int,
-    y: int,
+    z: _Zoom,
+    x: _Place,
+    y: _Place,
     offset: _Height = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,

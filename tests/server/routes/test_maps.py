@@ -113,6 +113,8 @@ def test_a_name_has_tiles_of_the_version_to_which_it_leads(http: httpx.Client, h
         ("tiles/7/66/4500.png", (422, "bad-option")),
         ("tiles/7/66/-1.png", (422, "bad-option")),
         ("tiles/99999999999999999999/0/0.png", (422, "bad-option")),
+        (f"tiles/7/{'9' * 4200}/45.png", (422, "bad-option")),
+        (f"terrain/7/-{'9' * 4200}/45.terrain", (422, "bad-option")),
         ("tiles/7/66/45.gif", (422, "bad-option")),
         ("tiles/7/66/45.png?size=300", (422, "bad-option")),
         ("tiles/7/66/45.png?nodata=nan", (422, "bad-option")),
@@ -128,6 +130,25 @@ def test_what_is_no_tile_is_refused(
     http: httpx.Client, hill: dict[str, Any], path: str, expected: tuple[int, str]
 ) -> None:
     assert problem(http.get(f"{hill['url']}/{path}")) == expected
+
+
+def test_a_long_host_is_refused(tmp_path: Path) -> None:
+    with (
+        running_server(tmp_path, workers=1, public_reads=True) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        place = push(http, terrain(), filename="hill.lode")["url"]
+        assert problem(http.get(f"{place}/map.json", headers={"host": "a" * 8000})) == (413, "too-large")
+        assert http.get(f"{place}/map.json", headers=[(b"host", b"\xff" * 250)]).status_code == 200
+
+
+def test_heights_beyond_all_numbers_are_no_failure(http: httpx.Client) -> None:
+    surface = ls.Surface((hills(100, 120) - hills(100, 120).mean()) * 100)
+    surface.metadata |= {"crs": maps.crs_wkt("EPSG:4326"), "geotransform": [7, 0.01, 0, 46, 0, -0.01]}
+    url = push(http, ls.encode(surface), filename="hill.lode")["url"]
+    for power in (30, 35, 36, 37, 300, -300):
+        for path in ("terrain/6/66/48.terrain", "tiles/7/66/45.png"):
+            http.get(f"{url}/{path}", params={"scale": f"1e{power}"}).raise_for_status()
 
 
 def test_a_surface_without_a_place_says_what_it_lacks(http: httpx.Client) -> None:
