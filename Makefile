@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help demo docs site kernels page check test cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal image-check clean
+.PHONY: help demo docs site kernels page check test test-rest cover test-web bench-web test-lowest sanitize portable torture lint format bench bench-peers bench-server bench-stream wheels release-rehearsal image-check clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -40,6 +40,9 @@ ifdef COVER
 else
 	@PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(ARGS)
 endif
+
+test-rest: kernels ## run the tests that `make test` leaves out because they are long, and the other cases of its sweeps
+	@HYPOTHESIS_PROFILE=rest PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(ARGS)
 
 cover: ## run the tests and say which lines of Python none of them runs, in whatever process
 	@$(MAKE) --no-print-directory test COVER=1

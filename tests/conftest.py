@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from lodestream.confinement import available, missing
-from tests.examples import EXAMPLES, LONG, PROFILE, USUAL, left_out
+from tests.examples import EXAMPLES, LONG, PROFILE, REST, USUAL, left_out
 
 # No deadline: no test here is about time. The same examples in every run, so that a change is judged by what it
 # changes; HYPOTHESIS_PROFILE=torture tries others, and 200 times as many, see `tests.examples`.
@@ -26,6 +26,7 @@ settings.register_profile(
 )
 settings.register_profile("default", settings.get_profile("whole"), max_examples=USUAL // 2)
 settings.register_profile("ci", settings.get_profile("default"))
+settings.register_profile(REST, settings.get_profile("default"))
 settings.register_profile("torture", settings.get_profile("whole"), derandomize=False, max_examples=2000)
 settings.register_profile("sanitizers", settings.get_profile("default"))
 settings.load_profile(PROFILE)
@@ -72,6 +73,7 @@ LONGEST = (
 def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of pytest-xdist take files in their order here, and not those of the most tests first."""
     config.addinivalue_line("markers", "sweep(count): of its cases `make test` takes so many, see tests.examples")
+    config.addinivalue_line("markers", "long: `make test` leaves it out, and `make test-rest` runs it")
     config.option.loadscopereorder = False
     gc.disable()  # what is collected stays: to look through it again and again frees nothing
 
@@ -83,10 +85,14 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Take samples of sweeps, unless a test is named; begin with the files that take longest."""
+    """Leave out what is long, and all but samples of sweeps, unless a test is named, or take just that for the profile
+    `REST`; begin with the files that take longest.
+    """
     named = config.option.keyword or config.option.markexpr or any("::" in each for each in config.args)
     if PROFILE not in LONG and not named:
         others = left_out(items)
+        if PROFILE == REST:
+            others = set(items) - others
         config.hook.pytest_deselected(items=[item for item in items if item in others])
         items[:] = [item for item in items if item not in others]
     places = {name: place for place, name in enumerate(LONGEST)}

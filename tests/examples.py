@@ -1,7 +1,8 @@
 """How many examples a property is tried with, and how many cases of a sweep there are, in `make test` and beyond.
 
-`make test` takes samples; HYPOTHESIS_PROFILE=whole takes all cases and twice as many examples, and so does the part
-`tests` of `make torture`, which may ask for more; HYPOTHESIS_PROFILE=torture takes 200 times as many, others each time.
+`make test` takes samples, and leaves out what is long; `make test-rest` runs what that leaves out.
+HYPOTHESIS_PROFILE=whole takes all cases and twice as many examples, and so does the part `tests` of `make torture`,
+which may ask for more; HYPOTHESIS_PROFILE=torture takes 200 times as many, others each time.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 import pytest
 from hypothesis import settings
 
-__all__ = ["EXAMPLES", "LONG", "PROFILE", "USUAL", "examples", "left_out"]
+__all__ = ["EXAMPLES", "LONG", "PROFILE", "REST", "USUAL", "examples", "left_out"]
 
 #: Of hypothesis, and of what is done here.
 PROFILE = os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "default")
@@ -22,6 +23,9 @@ EXAMPLES = "LODESTREAM_EXAMPLES"
 
 #: Profiles that take all cases of each sweep.
 LONG = ("whole", "torture")
+
+#: The profile of what `make test` leaves out.
+REST = "rest"
 
 #: Examples of a property that says nothing of them where all cases are taken; see `tests.conftest`.
 USUAL = 20
@@ -36,7 +40,7 @@ def examples(count: int) -> settings:
 
 
 def left_out(items: Sequence[pytest.Item]) -> set[pytest.Item]:
-    """Return the cases of sweeps that `make test` leaves out.
+    """Return what `make test` leaves out: tests marked ``long``, and cases of sweeps.
 
     A sweep is a test of many cases, marked ``sweep(count)``: so many are kept, none of 0. One after another that case
     is kept with the most values of parameters, and pairs of them, that no kept one has.
@@ -45,7 +49,7 @@ def left_out(items: Sequence[pytest.Item]) -> set[pytest.Item]:
     for item in items:
         if item.get_closest_marker("sweep") is not None:
             sweeps.setdefault(item.nodeid.partition("[")[0], []).append(item)
-    found: set[pytest.Item] = set()
+    found = {item for item in items if item.get_closest_marker("long") is not None}
     for cases in sweeps.values():
         mark = cases[0].get_closest_marker("sweep")
         assert mark is not None

@@ -22,6 +22,7 @@ def test_the_limit_is_half_an_hour() -> None:
 
 
 @pytest.mark.parametrize("processes", [[], ["-n", "1"]], ids=["alone", "by xdist"])
+@pytest.mark.long
 def test_a_test_that_hangs_is_named(tmp_path: Path, processes: list[str]) -> None:
     (tmp_path / "test_one.py").write_text("import time\n\ndef test_that_hangs():\n    time.sleep(36_000)\n")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", str(tmp_path / "pytest.ini")]

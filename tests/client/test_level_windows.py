@@ -64,6 +64,7 @@ def cut(container: bytes, level: int) -> NDArray[Any]:
 
 @pytest.mark.parametrize("order", ["quality", "level"])
 @pytest.mark.parametrize("transport", ["ws", "http"])
+@pytest.mark.long
 def test_streams_receive_it_alone(
     address: str, container: bytes, asynchronous: bool, transport: str, order: ls.Order
 ) -> None:

@@ -92,6 +92,7 @@ def cut(array: NDArray[Any], region: Any) -> NDArray[Any]:
     [(WINDOW, None), (None, ("kind",)), (None, ()), (WINDOW, ("speed",)), (WINDOW, ())],
     ids=["window", "one attribute", "no attribute", "window of one", "window of none"],
 )
+@pytest.mark.long
 def test_it_is_what_cutting_the_whole_gives(
     address: str,
     container: bytes,

@@ -14,6 +14,7 @@ from tests.client.files import ranged
 
 
 @pytest.mark.usefixtures("built")
+@pytest.mark.long
 def test_a_host_of_files_serves_five_surfaces_of_different_kinds(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "site"
     assert site.main([str(folder)]) == 0

@@ -88,6 +88,7 @@ def test_a_file_is_uploaded_and_what_is_in_memory_is_refused(bare: Bare, server:
     assert [each.details["name"] for each in sync.list(server)].count("uploaded without kernels") == 1
 
 
+@pytest.mark.long
 def test_a_server_does_not_start(bare: Bare, tmp_path: Path) -> None:
     data = tmp_path / "data"
     assert "serving surfaces is not possible here" in bare.refused("serve", "--data", data, "--port", "0")

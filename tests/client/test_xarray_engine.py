@@ -72,6 +72,7 @@ KEYS: list[Any] = [
 
 
 @pytest.mark.parametrize("key", KEYS)
+@pytest.mark.long
 def test_whatever_is_indexed_is_exact(path: Path, original: ls.Surface, key: Any) -> None:
     wanted = original.to_xarray()
     assert isinstance(wanted, xr.Dataset)
@@ -103,6 +104,7 @@ def test_integers_with_holes_are_integers_again_where_the_surface_has_a_value_fo
         assert "_FillValue" not in other.z.encoding
 
 
+@pytest.mark.long
 def test_a_window_reads_a_part_of_the_file(original: ls.Surface, tmp_path: Path) -> None:
     x = np.mgrid[:2048, :2048][1]
     rough = np.random.default_rng(1).normal(0, 30, x.shape) + x
@@ -121,6 +123,7 @@ def test_a_window_reads_a_part_of_the_file(original: ls.Surface, tmp_path: Path)
         assert len(server.requests) == before
 
 
+@pytest.mark.long
 def test_a_window_of_a_level_reads_what_it_needs_alone(tmp_path: Path) -> None:
     x = np.mgrid[:2048, :2048][1]
     rough = (np.random.default_rng(1).normal(0, 30, x.shape) + x).round().astype("i2")
@@ -332,6 +335,7 @@ DECODERS: tuple[dict[str, Any], ...] = (
 
 
 @pytest.mark.parametrize("options", DECODERS)
+@pytest.mark.long
 def test_arguments_of_every_engine_are_taken(path: Path, original: ls.Surface, options: dict[str, Any]) -> None:
     with opened(path, **options) as found:
         xr.testing.assert_equal(found, original.to_xarray())

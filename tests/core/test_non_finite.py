@@ -152,6 +152,7 @@ def surfaces(draw: st.DrawFn) -> ls.Surface:
 
 @examples(15)
 @given(surfaces())
+@pytest.mark.long
 def test_every_surface_comes_back_bit_for_bit(surface: ls.Surface) -> None:
     assert_comes_back(surface)
 

@@ -209,6 +209,7 @@ print(ended)
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="no timers that send signals on this system")
+@pytest.mark.long
 def test_an_interrupt_at_any_moment_leaves_nobody_waiting() -> None:
     # coverage takes locks of its own wherever an interrupt may come.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("COVERAGE_")}

@@ -151,6 +151,7 @@ def test_a_real_file_is_read_as_its_readme_says(row: Row) -> None:
 
 @pytest.mark.sweep(5)
 @pytest.mark.parametrize("row", ROWS, ids=names)
+@pytest.mark.long
 def test_a_real_file_streams_bit_for_bit(row: Row) -> None:
     surface = read(row)
     back = ls.decode(streamed(row))
@@ -171,6 +172,7 @@ def test_a_real_file_streams_bit_for_bit(row: Row) -> None:
 
 @pytest.mark.sweep(5)
 @pytest.mark.parametrize("row", ROWS, ids=names)
+@pytest.mark.long
 def test_a_real_file_is_written_as_one_welded_mesh(row: Row) -> None:
     trimesh = pytest.importorskip("trimesh")
     surface = read(row)

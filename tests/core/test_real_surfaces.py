@@ -134,6 +134,7 @@ def test_a_real_surface_is_read_as_its_readme_says(row: Row) -> None:
 
 @pytest.mark.sweep(5)
 @rows
+@pytest.mark.long
 def test_a_real_surface_streams_bit_for_bit(row: Row) -> None:
     surface, container = streamed(row.files[0])
     back = ls.decode(container)

@@ -45,6 +45,7 @@ def test_a_source_is_read_once_window_by_window(tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.sweep(4)
 @pytest.mark.parametrize("kind", ["h5py", "zarr", "dask", "xyz"])
+@pytest.mark.long
 def test_arrays_of_other_libraries(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sources, "_AT_ONCE", 20_000)
     values: NDArray[Any] = HEIGHTS

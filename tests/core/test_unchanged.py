@@ -26,6 +26,7 @@ def digests_of(seed: int) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.long
 def test_containers_and_values_are_those_of_before(seed: int) -> None:
     assert digests_of(seed) == json.loads(SAMPLE.read_text())[str(seed)]
 

@@ -12,6 +12,7 @@ from tests.faults.shim import CannotError
 from tests.server.helpers import eventually
 
 
+@pytest.mark.long
 def test_a_server_ends_with_the_process_it_comes_from(tmp_path: Path) -> None:
     try:
         programs = Programs(tmp_path / "programs")

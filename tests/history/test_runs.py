@@ -27,10 +27,12 @@ def told(folder: Path, *kinds: str, owners: bool = False) -> history.Done:
     return done
 
 
+@pytest.mark.long
 def test_a_server_that_is_ended_and_does_not_find_its_index_or_an_extra(tmp_path: Path) -> None:
     assert told(tmp_path, "restart", "index", "extra").uploads > 0
 
 
+@pytest.mark.long
 def test_a_server_whose_index_is_lost_while_it_runs_and_whose_strays_are_removed(tmp_path: Path) -> None:
     assert told(tmp_path, "live-index", "collect", owners=True).uploads > 0
 
@@ -40,6 +42,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
     assert told(tmp_path, "full").refused > 0
 
 
+@pytest.mark.long
 def test_two_owners_a_server_that_is_killed_and_a_backup_under_load_that_is_restored(tmp_path: Path) -> None:
     assert told(tmp_path, "kill", "backup", owners=True).owners == 2
 
@@ -95,6 +98,7 @@ def test_two_servers_that_know_nothing_of_each_other_are_found_out() -> None:
         ("no owners", {"mixed"}),
     ],
 )
+@pytest.mark.long
 def test_a_server_that_does_one_thing_wrong_is_found_out(fault: Fault, rules: set[str]) -> None:
     with simple_server(TOKENS, fault) as url:
         assert rules <= {finding.rule for finding in crowded(url)}

@@ -65,6 +65,7 @@ def changed(kernel: Kernel, values: Values_) -> Iterator[Values_]:
 
 
 @pytest.mark.parametrize("name", list(declarations()))
+@pytest.mark.long
 def test_what_does_not_fit_is_refused(calls: dict[str, list[tuple[Kernel, Values_]]], name: str) -> None:
     assert calls[name]
     made = refused = 0

@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.long
 def test_the_main_paths_run_on_an_imitated_system(system: str, tmp_path: Path) -> None:
     for library in ("h5netcdf", "matplotlib", "rasterio", "rich", "xarray"):
         pytest.importorskip(library)
@@ -39,6 +40,7 @@ def test_the_main_paths_run_on_an_imitated_system(system: str, tmp_path: Path) -
     assert folder.is_dir()
 
 
+@pytest.mark.long
 def test_the_tests_without_a_server_are_collected_where_there_is_none_and_the_others_skipped() -> None:
     command = [sys.executable, "-m", "pytest", "-p", "tests.other_systems.plugin", "-p", "no:cacheprovider", "-n", "0"]
     environment = {**os.environ, "LODESTREAM_IMITATED": "win32", "PYTHONIOENCODING": "utf-8"}

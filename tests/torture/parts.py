@@ -294,7 +294,18 @@ def _layouts(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
 
 def _tests(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
     environment = {**os.environ, "HYPOTHESIS_PROFILE": "whole", EXAMPLES: str(count)}
-    command = [sys.executable, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "-m", "sweep or hypothesis"]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-n",
+        "2",
+        "--dist",
+        "loadfile",
+        "-m",
+        "sweep or long or hypothesis",
+    ]
     root = Path(__file__).parents[2]
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

@@ -43,6 +43,7 @@ def test_memory_that_grows_is_told_from_memory_that_is_warm_or_uneven() -> None:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc tells what is free")
+@pytest.mark.long
 def test_holes_between_blocks_in_use_are_not_in_use() -> None:
     before = streams.memory(0)
     # Each smaller than what glibc maps for itself, so that all lie one after another.
@@ -78,6 +79,7 @@ def with_server(process: int, name: str) -> list[psutil.Process]:
     return []
 
 
+@pytest.mark.long
 def test_a_run_that_is_interrupted_leaves_what_there_is(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Reliability\n\n## One run\n\nan old one\n")
@@ -96,6 +98,7 @@ def test_a_run_that_is_interrupted_leaves_what_there_is(tmp_path: Path) -> None:
     assert re.search(r"`disk` \(requests\): 0 in \d+ s, \*\*of 100\*\*\.", text)
 
 
+@pytest.mark.long
 def test_what_fails_because_it_was_ended_has_not_failed(tmp_path: Path) -> None:
     page, kept = tmp_path / "page.md", tmp_path / "kept"
     with torture(page, "fuzz", "--resume", str(kept)) as process:

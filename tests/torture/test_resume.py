@@ -54,6 +54,7 @@ def test_a_folder_of_another_program_is_refused(tmp_path: Path) -> None:
     assert not command._of_this_program(tmp_path / "kept")
 
 
+@pytest.mark.long
 def test_a_fuzzer_goes_on_with_what_it_had(tmp_path: Path) -> None:
     first = fuzz.run("messages", 300, folder=tmp_path / "messages")
     assert first.cases == 300

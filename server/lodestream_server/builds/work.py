@@ -9,7 +9,7 @@
 The last is kept when the server ends meanwhile. The process of a build may write to it and to the first, and to no
 folder above, so that neither can become a link. The server itself reads nothing in them: a stranger's file may have
 taken over the process that wrote there, and some of the files are pickles. Only the next process reads them, which is
-confined in the same way and to the same surface. The tasks for a cluster are pickles that are read by processes that are
+confined in the same way and to the same surface. The tasks for a cluster are pickles too, read by processes that are
 not confined: they lie where none that has read a stranger's file could write. All is removed when the surface is ready,
 refused, postponed or deleted.
 

@@ -106,6 +106,7 @@ def test_a_torus_is_decoded_by_bands(run: Run, container: Path) -> None:
 
 
 @pytest.mark.parametrize("out", ["a.vtm", "a.p3d"])
+@pytest.mark.long
 def test_blocks_are_decoded_and_written_one_after_another(
     run: Run, container: Path, out: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

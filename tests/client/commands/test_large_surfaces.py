@@ -105,6 +105,7 @@ def repeated(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return called
 
 
+@pytest.mark.long
 def test_little_memory_gives_the_same_bytes(
     run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
 ) -> None:
@@ -121,6 +122,7 @@ def test_little_memory_gives_the_same_bytes(
 
 
 @pytest.mark.parametrize("out", ["a.npy", "a.tif", "a.nc", "a.zarr"])
+@pytest.mark.long
 def test_decode_with_little_memory_writes_the_same_file(
     run: Run, expected: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, out: str
 ) -> None:
@@ -180,6 +182,7 @@ def test_errors_name_the_file_and_not_the_folder_on_the_way(
 @signals
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
 @pytest.mark.usefixtures("interrupts")
+@pytest.mark.long
 def test_a_build_that_is_cut_goes_on_in_its_folder(
     run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str], name: str
 ) -> None:
@@ -214,6 +217,7 @@ def test_the_folder_is_named_where_the_command_goes_on(
 
 
 @signals
+@pytest.mark.long
 def test_another_command_in_the_folder_of_a_build_that_was_cut_begins_anew(
     run: Run, file: Path, expected: bytes, tmp_path: Path, repeated: list[str]
 ) -> None:
@@ -277,6 +281,7 @@ def test_what_cannot_be_built_by_bands_says_why(
     assert not (tmp_path / "a.lode").exists()
 
 
+@pytest.mark.long
 def test_workers_of_a_cluster_give_the_same_bytes(run: Run, file: Path, expected: bytes, tmp_path: Path) -> None:
     with local_cluster(2) as workers:
         code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE, "--dask", workers.scheduler_address)

@@ -146,6 +146,7 @@ def test_completion_without_its_library_says_what_to_install(monkeypatch: pytest
         completion.complete(build_parser())
 
 
+@pytest.mark.long
 def test_the_package_runs_as_a_module() -> None:
     command = [sys.executable, "-m", "lodestream"]
     for arguments in (["--version"], ["formats", "--json"], ["nonsense"]):

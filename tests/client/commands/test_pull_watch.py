@@ -85,6 +85,7 @@ def test_what_is_written_early_has_its_place_and_notes_come_once(run: Run, serve
     assert stderr.count("npy is written without") + stderr.count("NPY is written without") == 1
 
 
+@pytest.mark.long
 def test_a_picture_is_drawn_beside_it(run: Run, surface: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, picture = tmp_path / "out.npy", tmp_path / "out.png"
     assert run("pull", surface, out, "--picture", picture)[0] == 0
@@ -209,6 +210,7 @@ def test_the_stream_does_not_wait_for_a_picture(
         ("raise SystemExit(3)", "out.png: the process that draws pictures ended with code 3"),
     ],
 )
+@pytest.mark.long
 def test_a_picture_that_cannot_be_drawn_is_told_after_the_surface_is_written(
     run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, words: str
 ) -> None:
@@ -273,6 +275,7 @@ class Pictures:
         monkeypatch.setattr(Picture, "of", of)
 
 
+@pytest.mark.long
 def test_the_last_state_is_drawn_once(
     run: Run, surface: str, tmp_path: Path, terrain: Terrain, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -366,6 +369,7 @@ def test_an_out_that_cannot_be_replaced_ends_it(
 
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
+@pytest.mark.long
 def test_a_stream_stops_when_its_picture_looks_done(
     run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transport: str
 ) -> None:

@@ -121,6 +121,7 @@ def test_an_upload_that_replaces_what_a_name_leads_to() -> None:
         assert not [asked for asked in server.asked if asked.method != "GET"], "nothing is sent before"
 
 
+@pytest.mark.long
 def test_a_name_of_another_owner_and_a_redirect_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     # For the answer that never comes whole.
     monkeypatch.setattr(calls, "client_options", lambda url, _, **more: client_options(url, 2.0, **more))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from tests.torture import streams
 
 
+@pytest.mark.long
 def test_whatever_a_link_does_the_surface_is_the_same_in_the_end() -> None:
     report = streams.run(100)
     assert report.problems == []

@@ -222,6 +222,7 @@ def test_for_people_there_is_a_line_of_figures(relief_surface: str, folder: Path
     assert last.startswith("lodestream: the data received so far are written to ")
 
 
+@pytest.mark.long
 def test_a_server_that_is_killed(relief_file: Path, folder: Path, tmp_path: Path, relief: Terrain, run: Run) -> None:
     out = tmp_path / "o.npy"
     server = Server(tmp_path / "data")
@@ -319,6 +320,7 @@ def test_an_interrupt_of_the_writing_loses_nothing(
     check_resumed((relief_surface, "--transport", "ws"), places / "o.npy", folder, relief, run)
 
 
+@pytest.mark.long
 def test_a_pull_that_is_killed_is_gone_on_from_unasked(
     source: tuple[str, ...], folder: Path, tmp_path: Path, relief: Terrain, run: Run
 ) -> None:
@@ -510,6 +512,7 @@ def test_what_a_stream_gives_to_a_sink(surface: str, container_file: Path) -> No
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.long
 def test_encode_and_decode_leave_no_half_of_a_file(
     relief_file: Path, tmp_path: Path, number: signal.Signals, code: int
 ) -> None:

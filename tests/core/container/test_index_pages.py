@@ -64,6 +64,7 @@ def written(seed: int, attribute: bool) -> bytes:
 
 @pytest.mark.parametrize("attribute", [False, True])
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_an_index_of_several_pages_comes_back(seed: int, attribute: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(container_index, "PAGE", 64)
     monkeypatch.setattr("tests.reference.index.PAGE", 64)

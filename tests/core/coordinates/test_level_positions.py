@@ -194,6 +194,7 @@ UNCONSOLIDATED: dict[str, dict[str, Any]] = {"nc": {}, "zarr": {"consolidated": 
     ("across", "down"),
     [("growing", "even"), ("even", "Mercator"), ("to and fro", "falling"), ("numbers", "growing"), ("falling",) * 2],
 )
+@pytest.mark.long
 def test_uneven_axes_of_files_are_kept_at_every_level(
     across: str, down: str, order: tuple[str, str], suffix: str, tmp_path: Path
 ) -> None:

@@ -99,6 +99,7 @@ def test_tiles_that_no_layer_names_are_known_with_their_level(monkeypatch: pytes
 
 @pytest.mark.sweep(6)
 @pytest.mark.parametrize("name", SAMPLES)
+@pytest.mark.long
 def test_every_prefix_decodes_to_its_last_whole_layer(name: str) -> None:
     container, _ = contained(name)
     expected = told(states(container))

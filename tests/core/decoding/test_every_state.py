@@ -323,6 +323,7 @@ def unnamed(case: Case) -> bool:
 @example(case=unnamed_tile(), seed=1, level=5, bands=False)
 @example(case=unnamed_interface(), seed=1, level=3, bands=False)
 @given(case=cases(), seed=st.integers(0, 2**32), level=st.integers(0, 9), bands=st.booleans())
+@pytest.mark.long
 def test_every_state_shows_and_tells_what_the_page_says(case: Case, seed: int, level: int, bands: bool) -> None:
     region = window_of(case, seed)
     small = 0 if bands else pieces._ONE_CALL_VALUES

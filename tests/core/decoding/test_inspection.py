@@ -85,6 +85,7 @@ def test_nothing_follows_the_end(exact: bytes, rest: bytes | str) -> None:
         inspected(exact + more)
 
 
+@pytest.mark.long
 def test_every_flipped_bit_is_found(exact: bytes) -> None:
     for place in range(len(exact)):
         for bit in (0, 5) if place % 7 else range(8):

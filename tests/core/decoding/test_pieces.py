@@ -32,6 +32,7 @@ def _decoder(container: bytes, level: int | None = None) -> PiecewiseDecoder:
 @pytest.mark.sweep(16)
 @pytest.mark.parametrize("name", SURFACES)
 @pytest.mark.parametrize("memory", [1, 1 << 21])
+@pytest.mark.long
 def test_rows_make_the_surface(name: str, memory: int, tmp_path: Path) -> None:
     container = container_of(name)
     decoder, told = _decoder(container), [0.0]

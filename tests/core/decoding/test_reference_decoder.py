@@ -47,6 +47,7 @@ def test_the_files_have_chunks_of_every_rule() -> None:
 
 @pytest.mark.sweep(16)
 @small
+@pytest.mark.long
 def test_the_index_alone_gives_the_levels_one_after_another(name: str) -> None:
     index = index_of(name)
     entries = [entry for layer in index.segments for entry in layer]

@@ -56,6 +56,7 @@ def built(prepared: Prepared, points: int, core_points: int, threads: int = 1, f
 
 @pytest.mark.sweep(7)
 @pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.long
 def test_any_pieces_of_a_grid_give_the_container(name: str) -> None:
     surface, quality = SURFACES[name]
     with some_large():
@@ -229,6 +230,7 @@ sides = st.integers(4, 20) | st.integers(4, 60)
 @example("seam", (60, 63), 1, "float32", "", "1e-3d", None, 1, 1, 1, 5)
 @example("moebius", (24, 90), 3, "int32", "", None, (3, 5), 1, 9, 1, 6)
 @example("heights", (120, 40), 3, "int64", "holes", None, (4, 4), 1, 1, 1, 7)
+@pytest.mark.long
 def test_any_pieces_of_any_blocks(
     kind: str,
     shape: tuple[int, int],

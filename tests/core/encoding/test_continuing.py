@@ -148,6 +148,7 @@ def _expected(case: str) -> bytes:
 
 
 @pytest.mark.parametrize("case", CASES)
+@pytest.mark.long
 def test_a_damaged_file_never_reaches_a_container(case: str, tmp_path: Path) -> None:
     surface = CASES[case][0]()
     left = _left(surface, CASES[case][1], tmp_path / "cut")

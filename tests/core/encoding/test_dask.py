@@ -49,6 +49,7 @@ def _dying(task: Any, *arguments: Any) -> None:
 
 
 @pytest.mark.parametrize(("task", "kind"), [("second_step", "holes"), ("measure", "blocks")])
+@pytest.mark.long
 def test_a_worker_that_dies_costs_its_task(
     cluster: Any, task: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -80,6 +81,7 @@ def _hand_out_death(address: str) -> None:
         executor.submit(_kill_self).result()
 
 
+@pytest.mark.long
 def test_a_cluster_whose_workers_all_die_says_so(cluster: Any) -> None:
     with pytest.raises(ls.UnavailableError, match="expected a Dask cluster that lasts, lost it at"):
         _hand_out_death(cluster.scheduler.address)

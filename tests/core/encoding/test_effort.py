@@ -43,6 +43,7 @@ def test_every_effort_has_choices() -> None:
 
 @examples(40)
 @given(surfaces(), st.sampled_from(EFFORTS), st.integers(0, 99), st.integers(0, 99))
+@pytest.mark.long
 def test_values_are_the_same_and_another_decoder_shows_them_too(
     surface: ls.Surface, effort: Effort, layer: int, level: int
 ) -> None:
@@ -64,6 +65,7 @@ def test_values_are_the_same_and_another_decoder_shows_them_too(
     ],
     ids=["heights", "closed", "holes", "torus", "narrow"],
 )
+@pytest.mark.long
 def test_errors_are_measured_and_windows_are_exact(surface: ls.Surface, effort: Effort) -> None:
     container = ls.encode(surface, effort=effort)
     decoder = ls.Decoder()
@@ -118,6 +120,7 @@ def test_fast_has_small_units_where_large_ones_take_many_more_bytes() -> None:
 @pytest.mark.sweep(3)
 @every_effort
 @pytest.mark.parametrize("name", ["integers", "holes", "torus with attributes"])
+@pytest.mark.long
 def test_a_build_by_bands_has_the_same_bytes(name: str, effort: Effort, tmp_path: Path) -> None:
     surface = SURFACES[name][0]
     out = tmp_path / "out.lode"
@@ -135,6 +138,7 @@ def test_blocks_are_built_block_by_block(effort: Effort, tmp_path: Path) -> None
 
 
 @every_effort
+@pytest.mark.long
 def test_a_build_does_not_continue_one_of_another_effort(effort: Effort, tmp_path: Path) -> None:
     heights = rough((700, 600))
 

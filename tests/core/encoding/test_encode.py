@@ -91,6 +91,7 @@ def test_bytes_are_those_of_one_piece() -> None:
     assert ls.encode(surface, "1e-3d", memory=LITTLE) == ls.encode(surface, "1e-3d")
 
 
+@pytest.mark.long
 def test_noise_is_tried_on_coarser_lattices(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 2**32, (300, 310)).astype(np.uint32).view(np.float32)
     noise = np.where(np.isfinite(noise), noise, 0).astype(np.float32)

@@ -42,6 +42,7 @@ print(peak)
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell what memory is anonymous")
+@pytest.mark.long
 def test_what_is_promised_holds_for_holes(tmp_path: Path) -> None:
     rows, columns = np.indices(SHAPE, np.int32)
     heights = (rows // 7 + columns // 5 + rows * columns % 5).astype(np.int16)

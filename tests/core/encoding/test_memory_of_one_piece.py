@@ -50,6 +50,7 @@ print(peak - before)
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell what memory is anonymous")
 @pytest.mark.parametrize(("dtype", "rms"), [("float64", 0.0), ("float32", 0.01)])
+@pytest.mark.long
 def test_what_is_promised_holds_in_one_piece(tmp_path: Path, dtype: str, rms: float) -> None:
     heights = (terrain((1200, 1000)) + np.random.default_rng(3).normal(size=(1200, 1000)) / 100).astype(dtype)
     np.save(tmp_path / "heights.npy", heights)

@@ -68,6 +68,7 @@ def _container(more: str = "") -> bytes:
 
 @pytest.mark.parametrize("more", ["", "holes", "attributes"])
 @pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.long
 def test_wrong_errors_are_found(more: str, place: int) -> None:
     data = _container(more)
     with pytest.raises(ls.CorruptStreamError, match="RMS and maximum error of layer 0"):

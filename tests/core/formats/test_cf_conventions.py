@@ -207,6 +207,7 @@ def mapped(kind: str, said: str = "crs") -> xr.Dataset:
     ("kind", "said"),
     [*((kind, "crs") for kind in CONVENTIONS), ("lambert", "crs: x y"), ("geographic", "other: a b crs: x y")],
 )
+@pytest.mark.long
 def test_a_crs_comes_from_the_attributes_of_the_conventions(
     tmp_path: Path, opener: Opener, kind: str, said: str
 ) -> None:

@@ -32,6 +32,7 @@ except OSError as error:
 
 
 @pytest.mark.parametrize("limit", [1, 2_000, 20_000, 700_000, 900_000, 1_300_000])
+@pytest.mark.long
 def test_a_netcdf_that_does_not_fit_is_told_and_kills_nobody(tmp_path: Path, limit: int) -> None:
     # HDF5 ends a process whose writes fail.
     path = tmp_path / "a.nc"
@@ -59,6 +60,7 @@ for _ in range(5):
 
 
 @pytest.mark.parametrize("limit", [1, 3_000, 20_000, 300_000])
+@pytest.mark.long
 def test_a_store_that_does_not_fit_leaves_nothing(tmp_path: Path, limit: int) -> None:
     # Threads of zarr were still writing chunks while the folder was removed.
     pytest.importorskip("zarr")

@@ -170,6 +170,7 @@ def disk(units: str = "rad", factor: float = 1.0, kind: str = "projection") -> x
     [("rad", 1.0), ("radian", 1.0), ("radians", 1.0), ("microradian", 1e-6), ("degrees", np.pi / 180)],
 )
 @pytest.mark.parametrize("kind", ["coordinate", "angular_coordinate"])
+@pytest.mark.long
 def test_angles_of_a_satellite_become_lengths_of_its_crs(
     tmp_path: Path, opener: Callable[..., ls.Surface], units: str, factor: float, kind: str
 ) -> None:

@@ -35,6 +35,7 @@ def field(dtype: str = "f4", **attributes: Any) -> xr.Dataset:
 @every_opener
 @pytest.mark.parametrize("key", ["_FillValue", "missing_value"])
 @pytest.mark.parametrize(("dtype", "number"), [("i2", 7), ("i4", -99999), ("u1", 255), ("f4", 1e20), ("f8", -9999.0)])
+@pytest.mark.long
 def test_the_fill_value_of_the_file_is_that_of_what_is_written(
     tmp_path: Path, opener: Opener, key: str, dtype: str, number: float
 ) -> None:
@@ -106,6 +107,7 @@ def test_a_number_that_a_writer_chose_is_none_of_the_surface(tmp_path: Path) -> 
 @every_opener
 @pytest.mark.parametrize("dtype", ["f4", "f8", "i2", "i4", "i8"])
 @pytest.mark.parametrize("descending", [False, True])
+@pytest.mark.long
 def test_even_axes_keep_their_type(tmp_path: Path, opener: Opener, dtype: str, descending: bool) -> None:
     data = field()
     lat, lon = (4 * data[name].values for name in ("lat", "lon"))

@@ -81,6 +81,7 @@ def mark_of(surface: ls.Surface) -> Any:
     ],
     ids=str,
 )
+@pytest.mark.long
 def test_a_forged_mark_changes_no_place_and_no_unit(
     tmp_path: Path, opener: Callable[..., ls.Surface], curved: bool, forged: dict[str, Any]
 ) -> None:
@@ -120,6 +121,7 @@ def _replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
 @pytest.mark.parametrize(
     "new", [None, True, -1, 2.5, 2**70, "x", "row", "", [], [1, 2], ["a", "b"], {}, {"a": 1}, [[]]], ids=repr
 )
+@pytest.mark.long
 def test_any_part_of_a_mark_may_be_anything(new: Any) -> None:
     surface = ls.Surface(
         np.arange(60.0).reshape(6, 10),

@@ -82,6 +82,7 @@ def positions(surface: ls.Surface) -> tuple[NDArray[Any], NDArray[Any]]:
     ("opener", "units"),
     [*((_file, units) for units in METRES), (_decoded, "km"), (_decoded, "1000 m"), (_decoded, "ft")],
 )
+@pytest.mark.long
 def test_lengths_become_those_of_the_crs(tmp_path: Path, opener: Any, units: str) -> None:
     data = mapped(units)
     surface, notes = noted(lambda: opener(data, tmp_path))

@@ -331,6 +331,7 @@ def _raw(path: Path, order: str) -> None:
 @pytest.mark.parametrize("plane", ["i0", "j2,k-1", "k1"])
 @pytest.mark.parametrize("order", ["SetByteOrderToLittleEndian", "SetByteOrderToBigEndian"])
 @pytest.mark.filterwarnings("ignore::lodestream.FormatWarning")
+@pytest.mark.long
 def test_what_is_mapped_is_what_vtk_reads(
     tmp_path: Path, plane: str, order: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -538,6 +539,7 @@ def read_confined(path: Path, script: Path, landlock: str) -> str:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux confines")
 @pytest.mark.parametrize("landlock", ["with", "without"])
+@pytest.mark.long
 def test_who_reads_confined_needs_no_signal(tmp_path: Path, landlock: str) -> None:
     grid = grid_of((4, 3, 1), points_of((4, 3, 1)))
     path = tmp_path / "g.vtk"

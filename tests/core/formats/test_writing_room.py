@@ -48,6 +48,7 @@ print(peak - before)
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell what memory is anonymous")
 @pytest.mark.parametrize(("suffix", "dtype"), [("nc", "float32"), ("zarr", "int16")])
+@pytest.mark.long
 def test_memory_does_not_hold_the_surface(tmp_path: Path, suffix: str, dtype: str) -> None:
     pytest.importorskip("h5netcdf" if suffix == "nc" else "zarr")
     command = [sys.executable, "-c", SCRIPT, tmp_path, dtype, suffix, ROWS, COLUMNS]

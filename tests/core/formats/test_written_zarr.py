@@ -73,6 +73,7 @@ SURFACES: dict[str, Surface] = {
 @pytest.mark.sweep(19)
 @pytest.mark.parametrize("decoded", [{}, {"decode_cf": False}, {"decode_coords": "all"}])
 @pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.long
 def test_xarray_shows_what_it_shows_of_a_netcdf(tmp_path: Path, name: str, decoded: dict[str, Any]) -> None:
     for suffix in ("nc", "zarr"):
         formats.write(SURFACES[name], tmp_path / f"a.{suffix}")

@@ -218,6 +218,7 @@ def test_nobody_waits_for_a_pipe_in_place_of_the_head_of_a_store(tmp_path: Path)
     assert "expected a Zarr store of regular files, got 'zarr.json', which is none" in found.stderr
 
 
+@pytest.mark.long
 def test_few_chunks_of_many_values_may_all_be_missing(tmp_path: Path) -> None:
     zarr.create_array(str(tmp_path / "a.zarr"), shape=(300, 200), chunks=(2, 2), dtype="f4", fill_value=3.0)
     assert (ls.read(tmp_path / "a.zarr").points == 3.0).all()

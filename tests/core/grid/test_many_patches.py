@@ -45,6 +45,7 @@ def name_of(value: object) -> str | None:
 
 @pytest.mark.sweep(8)
 @pytest.mark.parametrize(("maker", "count"), many_patches.READ, ids=name_of)
+@pytest.mark.long
 def test_very_many_patches_are_read(maker: Maker, count: int, tmp_path: Path) -> None:
     """Whether in proportion to their number, `make bench ARGS=patches` measures with more of them."""
     with warnings.catch_warnings():
@@ -55,6 +56,7 @@ def test_very_many_patches_are_read(maker: Maker, count: int, tmp_path: Path) ->
 
 @pytest.mark.sweep(6)
 @pytest.mark.parametrize(("maker", "count", "error", "reason"), REFUSED, ids=name_of)
+@pytest.mark.long
 def test_a_limit_refuses_very_many_patches(
     maker: Maker, count: int, error: type[InputError], reason: str, tmp_path: Path
 ) -> None:

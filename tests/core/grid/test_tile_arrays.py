@@ -164,6 +164,7 @@ def test_tiles_of_several_grids_are_those_made_one_by_one(layout: Layout) -> Non
     assert sorted(numbers) == list(range(len(TileTable.of(layout).bands)))
 
 
+@pytest.mark.long
 def test_many_tiles_are_made_in_runs() -> None:
     layout = Layout([Grid((260, 270))], (1, 1))
     assert len(layout.tiles) > AT_ONCE

@@ -180,6 +180,7 @@ FILES: dict[str, dict[str, Any]] = {
 @pytest.mark.sweep(3)
 @pytest.mark.filterwarnings("ignore:materials .* left out:lodestream.errors.FormatWarning")
 @pytest.mark.parametrize("name", FILES)
+@pytest.mark.long
 def test_real_surfaces_stay_together_and_keep_their_faces(name: str) -> None:
     path = DATA / name
     if not path.exists():

@@ -116,6 +116,7 @@ LOST = {("xarray", "empty", "unit"), ("xarray", "empty", "crs")}
 @pytest.mark.sweep(88)
 @pytest.mark.parametrize("text", TEXTS)
 @pytest.mark.parametrize(("library", "place"), HANDED)
+@pytest.mark.long
 def test_any_text_reaches_every_library(library: str, text: str, place: str, tmp_path: Path) -> None:
     surface = surface_with(TEXTS[text], *(PLACES if place == "everywhere" else (place,)))
     with warnings.catch_warnings():
@@ -139,6 +140,7 @@ REFUSED = {(".zarr", "4 KB"), (".zarr", "4 KB, not ASCII")}
 @pytest.mark.parametrize("places", [METADATA, ("attribute",)], ids=["metadata", "attribute"])
 @pytest.mark.parametrize("text", TEXTS)
 @pytest.mark.parametrize("suffix", [*WRITTEN, *UNREAD])
+@pytest.mark.long
 def test_any_text_is_written_and_what_is_written_is_read(
     suffix: str, text: str, places: tuple[str, ...], tmp_path: Path
 ) -> None:

@@ -146,6 +146,7 @@ def test_a_file_says_what_the_dataset_says(name: str, suffix: str, tmp_path: Pat
 @pytest.mark.sweep(13)
 @both
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.long
 def test_a_file_says_what_the_dataset_says_of_every_convention(name: str, suffix: str, tmp_path: Path) -> None:
     make, options, attributes = CASES[name]
     with warnings.catch_warnings():

@@ -77,6 +77,7 @@ def by_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.sweep(6)
 @pytest.mark.parametrize("make", [_even, _uneven, _curvilinear, _rotated, _flags, _with_holes])
 @pytest.mark.parametrize("lazy", ["memory", "file", "dask"])
+@pytest.mark.long
 def test_the_bytes_are_those_of_from_xarray(
     make: Callable[[], Any], lazy: str, tmp_path: Path, by_windows: None
 ) -> None:

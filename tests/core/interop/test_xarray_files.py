@@ -321,6 +321,7 @@ DECODINGS: list[dict[str, Any]] = [{}, {"decode_times": False}, {"mask_and_scale
 
 @pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.long
 def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
     path, opened = written(make)
@@ -354,6 +355,7 @@ def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any
 
 @pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.long
 def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str, written: Any) -> None:
     make, options, _ = CASES[name]
     path, opened = written(make)
@@ -368,6 +370,7 @@ def test_without_a_choice_all_that_the_file_offers_becomes_attributes(name: str,
 
 @pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.long
 def test_containers_are_the_same(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
     path, opened = written(make)

@@ -247,6 +247,7 @@ CASES = (
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.long
 def test_the_height_at_a_place(case: Case) -> None:
     made = case.make()
     for level in case.levels:
@@ -266,6 +267,7 @@ def test_a_level_around_the_earth_as_a_surface_has_a_shorter_step_over_the_seam(
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.long
 def test_a_tile_has_the_height_too_and_the_bounds_have_the_place(case: Case) -> None:
     made = case.make()
     z = made.placement.web_zoom() + 1
@@ -290,6 +292,7 @@ def _latitude(row: int, z: int) -> float:
     return math.degrees(math.atan(math.sinh(math.pi * (1 - 2 * (row + 0.5) / (256 << z)))))
 
 
+@pytest.mark.long
 def test_whole_tiles_of_the_first_zooms_around_the_earth() -> None:
     for made in (_global(0), _global(20), _cells_at_the_poles()):
         for z in range(made.placement.web_zoom() + 2):

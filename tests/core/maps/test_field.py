@@ -121,6 +121,7 @@ def test_the_cache_is_bounded_and_forgets_what_was_used_least_recently() -> None
         BlockCache(-1)
 
 
+@pytest.mark.long
 def test_threads_share_a_field() -> None:
     container = ls.encode(terrain(600, 500, True, "float32"))
     metadata = degrees(10, 50, 0.01)

@@ -102,6 +102,7 @@ def test_faces_keep_their_order_and_triangles_and_quads_stay() -> None:
     assert (places[1:5, 3] == -1).all()
 
 
+@pytest.mark.long
 def test_what_would_take_long_is_refused() -> None:
     round_ = np.linspace(0, 2 * np.pi, 5000, endpoint=False)
     disc = np.stack([np.cos(round_), np.sin(round_)], axis=-1)

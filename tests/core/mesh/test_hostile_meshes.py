@@ -93,6 +93,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Refusal]:
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.long
 def test_meshes_that_cost_much(results: dict[str, Refusal], name: str) -> None:
     result = results[name]
     assert result.error == ("none" if name == "fan" else "FormatError"), result.message

@@ -86,6 +86,7 @@ def surface_of(kind: str, rows: int, columns: int) -> ls.Surface:
 @pytest.mark.sweep(12)
 @pytest.mark.parametrize("region", REGIONS)
 @pytest.mark.parametrize("kind", ["integers", "floats", "closed", "xyz", "holes", "plane", "attributes", "terraces"])
+@pytest.mark.long
 def test_a_window_is_what_cutting_the_whole_gives(kind: str, region: Any) -> None:
     surface, container = encoded(kind)
     decoder = received(container, ls.Target(region=region))

@@ -106,6 +106,7 @@ def plain_distances(
 
 @pytest.mark.sweep(5)
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.long
 def test_distances_are_summed_in_one_order(dtype: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for shape, geometric in itertools.product([(259, 1027), (1, 3), (2, 512)], (1, 3)):
         numbers = coordinates((geometric, *shape))

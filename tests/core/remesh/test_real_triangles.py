@@ -22,6 +22,7 @@ def mesh_of(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize(("name", "rms", "largest"), [("cow.obj", 6e-4, 1e-2), ("fertility.off", 6e-4, 1e-2)])
+@pytest.mark.long
 def test_thin_limbs_and_handles_are_covered(name: str, rms: float, largest: float) -> None:
     vertices, faces = mesh_of(name)
     result = remesh_triangles(vertices, faces, error=rms)

@@ -43,6 +43,7 @@ def remeshed(request: pytest.FixtureRequest) -> tuple[str, Remeshing]:
 
 
 @pytest.mark.sweep(4)
+@pytest.mark.long
 def test_a_closed_surface_stays_closed_and_no_edge_has_three_quads(remeshed: tuple[str, Remeshing]) -> None:
     name, result = remeshed
     _, count = edges_of(result)
@@ -157,6 +158,7 @@ def test_quads_that_are_folded_are_unfolded() -> None:
     assert result.mesh.closest(unfolded[moved])[0].max() < 1e-9
 
 
+@pytest.mark.long
 def test_sites_are_shared_out_by_area() -> None:
     result = remesh_triangles(*scenes.components(), blocks=60, error=1e-9, most_points=60 * 3 * 17**2)
     large = result.points[result.grids.numbers].reshape(len(result.grids.numbers), -1, 3)[:, :, 2].max(axis=1) < 3
@@ -280,6 +282,7 @@ def test_sizes_beyond_all_measure_are_refused(size: float) -> None:
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e30])
+@pytest.mark.long
 def test_the_unit_does_not_matter(size: float) -> None:
     points, faces = scenes.sphere()
     usual, other = (remesh_triangles(points * unit, faces, blocks=24, error=1e-2) for unit in (1, size))

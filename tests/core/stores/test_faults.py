@@ -96,6 +96,7 @@ def test_what_is_replaced_is_there_and_known(store: Bucket, proxy: FaultProxy, f
 @pytest.mark.sweep(9)
 @pytest.mark.parametrize("faults", ONCE)
 @pytest.mark.parametrize("size", [1000, 9 << 20], ids=["whole", "parts"])
+@pytest.mark.long
 def test_a_file_is_whole_or_not_there(
     store: Bucket, proxy: FaultProxy, faults: list[Fault], size: int, tmp_path: Path
 ) -> None:

@@ -132,6 +132,7 @@ def echo() -> Iterator[str]:
 @pytest.mark.parametrize("status", [400, 403, 404, 409, 200, 307, 503])
 @pytest.mark.parametrize(("address", "environment"), STORES)
 @pytest.mark.usefixtures("quiet")
+@pytest.mark.long
 def test_a_server_that_echoes_is_not_repeated(
     address: str,
     environment: dict[str, str],

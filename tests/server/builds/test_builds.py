@@ -491,6 +491,7 @@ def test_what_a_build_leaves_is_removed_though_it_is_cancelled(tmp_path: Path) -
     assert not folder.exists()
 
 
+@pytest.mark.long
 def test_what_builds_and_levels_import_is_there_before_they_begin(tmp_path: Path) -> None:
     program = """
 import sys

@@ -320,6 +320,7 @@ def test_a_server_starts_where_no_scheduler_is_and_says_so_of_what_it_cannot_bui
 # What is cut.
 
 
+@pytest.mark.long
 def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_killed_builds_again(
     tmp_path: Path,
 ) -> None:

@@ -106,6 +106,7 @@ def test_a_build_continues_after_its_server_has_ended(
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.long
 def test_what_is_kept_of_a_surface_that_waits_for_no_build_is_removed(
     tmp_path: Path, upload: tuple[str, bytes, bytes]
 ) -> None:
@@ -125,6 +126,7 @@ def test_what_is_kept_of_a_surface_that_waits_for_no_build_is_removed(
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.long
 def test_a_build_with_other_memory_begins_anew(tmp_path: Path, upload: tuple[str, bytes, bytes]) -> None:
     name, content, container = upload
     data = tmp_path / "data"
@@ -135,6 +137,7 @@ def test_a_build_with_other_memory_begins_anew(tmp_path: Path, upload: tuple[str
 
 @needs_landlock
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.long
 def test_a_process_of_the_server_before_is_waited_for(tmp_path: Path, upload: tuple[str, bytes, bytes]) -> None:
     name, content, container = upload
     data = tmp_path / "data"
@@ -153,6 +156,7 @@ def test_a_process_of_the_server_before_is_waited_for(tmp_path: Path, upload: tu
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.long
 def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, bytes]) -> None:
     name, content, container = upload
     data = tmp_path / "data"
@@ -166,6 +170,7 @@ def test_damaged_files_are_made_again(tmp_path: Path, upload: tuple[str, bytes, 
 
 @needs_landlock
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.long
 def test_a_build_that_fails_since_it_was_continued_is_tried_from_its_upload(
     tmp_path: Path, upload: tuple[str, bytes, bytes]
 ) -> None:
@@ -277,6 +282,7 @@ def test_a_start_keeps_only_what_queued_builds_continue_from(folder: Path, tmp_p
 
 
 @pytest.mark.parametrize("upload", ["npy"], indirect=True)
+@pytest.mark.long
 def test_nothing_is_kept_for_a_surface_whose_upload_is_damaged(
     tmp_path: Path, upload: tuple[str, bytes, bytes]
 ) -> None:

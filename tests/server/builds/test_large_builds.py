@@ -76,6 +76,7 @@ def _without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         ({}, "blocks.p3d"),
     ],
 )
+@pytest.mark.long
 def test_a_build_by_bands_has_the_same_bytes(
     options: dict[str, str], name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,6 +135,7 @@ def test_a_cluster_builds_what_is_large(cluster: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["heights.npy", "blocks.p3d"])
+@pytest.mark.long
 def test_a_surface_is_parsed_where_it_is_confined_and_built_elsewhere(
     cluster: Any, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -120,6 +120,7 @@ def line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 # What the server holds.
 
 
+@pytest.mark.long
 def test_the_server_keeps_no_memory_of_levels(tmp_path: Path) -> None:
     with server(tmp_path / "data") as running, running.client() as http:
         surface = push(http, npy(plain(900, 1000).astype(np.float64)))

@@ -68,6 +68,7 @@ def gone(process: int) -> bool:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the system does not count the memory of a process so")
+@pytest.mark.long
 def test_the_memory_of_a_call_is_beside_what_it_begins_with() -> None:
     """However much the fork server has loaded before."""
 
@@ -179,6 +180,7 @@ def test_a_process_has_its_pipe_and_nothing_else_of_the_server(tmp_path: Path, m
         server.close()
 
 
+@pytest.mark.long
 def test_nothing_is_left_open_or_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the name of the temporary folder is longer than that of a socket may be."""
     temporary = tmp_path / ("x" * 150)

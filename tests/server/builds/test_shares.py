@@ -157,6 +157,7 @@ def test_containers_count_too_and_builds_wait_for_their_owners_room(
 
 
 @pytest.mark.parametrize("town", [{"max_builds": 40}], indirect=True)
+@pytest.mark.long
 def test_builds_of_one_caller_do_not_delay_those_of_another(town: Town, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker, "build", slow.wait)
     with town.client("bad") as bad, town.client("good") as good:

@@ -492,6 +492,7 @@ def test_a_connection_too_many_is_told_to_come_back(tmp_path: Path) -> None:
         eventually(lambda: httpx.get(f"{url}/healthz", trust_env=False).status_code == 200, "room again")
 
 
+@pytest.mark.long
 def test_a_plan_that_takes_long_is_no_silence_of_the_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     receive = Sender.receive
 

@@ -167,6 +167,7 @@ def test_others_are_served_while_a_flood_goes_on(running: Running, name: str) ->
     assert "Traceback" not in running.server.log.read_text()
 
 
+@pytest.mark.long
 def test_nothing_remains_of_floods(running: Running) -> None:
     before = running.server.look()
     for flood in FLOODS.values():

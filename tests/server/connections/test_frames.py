@@ -129,6 +129,7 @@ def test_a_message_in_ever_more_fragments_is_cut(
     assert "connection cut: frames" in [record.getMessage() for record in caplog.records]
 
 
+@pytest.mark.long
 def test_an_honest_message_in_fragments_is_taken(server: str, surface: dict[str, Any]) -> None:
     message = serialize(Open(held=tuple((2 * n, 1) for n in range(1000)), container=surface["container"]))
     with raw_stream(server + surface["url"]) as stream:

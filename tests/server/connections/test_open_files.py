@@ -53,6 +53,7 @@ def serving(folder: Path, files: int, *arguments: str) -> Iterator[tuple[str, Pa
             process.wait(PATIENCE)
 
 
+@pytest.mark.long
 def test_more_connections_than_files_neither_stop_the_server_nor_fill_its_log(tmp_path: Path) -> None:
     with serving(tmp_path, 90) as (url, log), httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
         made = push(http, npy(hills()))

@@ -106,6 +106,7 @@ def test_a_netcdf_has_its_place_where_its_address_ends_like_one(authorised: str)
     np.testing.assert_array_equal(heights[valid], surface.points[surface.mask])
 
 
+@pytest.mark.long
 def test_the_finest_level_has_the_columns_of_the_source_and_what_has_no_cog_says_why(keys: Keys) -> None:
     lon = np.linspace(0, 360, 37)
     lat = np.linspace(80, -80, 17)

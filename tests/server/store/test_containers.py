@@ -178,6 +178,7 @@ def shapes() -> dict[str, bytes]:
     }
 
 
+@pytest.mark.long
 def test_what_is_counted_for_an_index_is_what_it_takes(tmp_path: Path) -> None:
     made_of = shapes()
     surfaces = stocked(tmp_path, {f"{number:064x}": data for number, data in enumerate(made_of.values())})

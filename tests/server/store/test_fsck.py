@@ -256,6 +256,7 @@ def test_a_container(data: Path, made: Made, how: str, id_: str) -> None:
 
 @pytest.mark.parametrize("how", DAMAGE)
 @pytest.mark.parametrize("id_", [ONE, TWO_FILES, LODE])
+@pytest.mark.long
 def test_an_upload(data: Path, made: Made, how: str, id_: str) -> None:
     DAMAGE[how](data / made.key("upload", id_))
     surfaces = {ONE, SAME} if id_ == ONE else {id_}
@@ -287,6 +288,7 @@ def test_the_upload_of_what_is_not_built(data: Path, made: Made, how: str, id_: 
 
 @pytest.mark.parametrize("how", CHANGED)
 @pytest.mark.parametrize("id_", [*READY, FAILED])
+@pytest.mark.long
 def test_an_object_built(data: Path, made: Made, how: str, id_: str) -> None:
     CHANGED[how](data / made.key("built", id_))
     damaged = contents(data)

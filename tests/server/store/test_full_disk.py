@@ -172,6 +172,7 @@ def test_what_nobody_needs_any_more_may_stay(tmp_path: Path, monkeypatch: pytest
 
 
 @pytest.mark.skipif(not can_fill(), reason="no disk that outlives a server can be had on this machine")
+@pytest.mark.long
 def test_a_server_starts_on_a_full_disk_and_deletes(tmp_path: Path) -> None:
     disk = Disk(tmp_path, "4m")
     try:
@@ -186,6 +187,7 @@ def test_a_server_starts_on_a_full_disk_and_deletes(tmp_path: Path) -> None:
         disk.close()
 
 
+@pytest.mark.long
 def test_a_disk_that_is_really_small(tmp_path: Path) -> None:
     done = small_disk.run(tmp_path, 20, size="700k")
     assert min(done.uploads, done.refused, done.deletes, done.kept) > 0

@@ -85,6 +85,7 @@ def scenario(surfaces: Surfaces, folder: Path, acked: dict[str, str], begun: dic
 
 
 @pytest.mark.parametrize("kind", PLACES)
+@pytest.mark.long
 def test_a_cut_at_every_step_leaves_each_name_where_it_was_or_where_it_was_to_go(
     kind: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
