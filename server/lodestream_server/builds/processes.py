@@ -574,7 +574,11 @@ class Keeper(Worker[Question]):
             # It may have died since its last answer.
             if isinstance(error, WrongAnswerError) or self._closed:
                 raise
-            return self._ask(call)
+        except MemoryError:
+            # What it kept of other questions may have been too much beside this one.
+            if self._asked == 1 or self._closed:
+                raise
+        return self._ask(call)
 
     def _ask(self, question: Question) -> Any:
         if self._process is None:

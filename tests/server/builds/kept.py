@@ -94,6 +94,7 @@ _DEEDS: dict[str, Callable[[int, int], Any]] = {
     "raise": lambda *_: 1 / 0,
     "exit": lambda *_: sys.exit(0),
     "hoard": _hoard,
+    "hoard beside others": lambda count, _: count if count == 1 else _hoard(count, _),
     "much": lambda *_: "x" * (1 << 20),
     "open": _open,
     "connect": _connect,

@@ -148,6 +148,14 @@ def test_one_that_has_died_meanwhile_is_replaced(server: ForkServer, file: Path)
     play(server, file, scene)
 
 
+def test_what_finds_no_memory_beside_what_is_kept_is_asked_of_another(server: ForkServer, file: Path) -> None:
+    async def scene(ask: Asked) -> None:
+        await ask("count")
+        assert await ask("hoard beside others") == 1
+
+    play(server, file, scene)
+
+
 def test_whoever_leaves_costs_nobody_the_process(server: ForkServer, file: Path) -> None:
     async def scene(ask: Asked) -> None:
         process, _ = await ask("count")
