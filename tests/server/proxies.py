@@ -88,7 +88,7 @@ def configuration(language: str, first: str) -> str:
 
 
 @contextlib.contextmanager
-def nginx(folder: Path, behind: str) -> Iterator[Front]:
+def nginx(folder: Path, behind: str, *, tls: bool = True) -> Iterator[Front]:
     """nginx with the configuration of the page, for https://localhost and a certificate of its own.
 
     Parameters
@@ -97,6 +97,8 @@ def nginx(folder: Path, behind: str) -> Iterator[Front]:
         Where its files go; it is made.
     behind : str
         The address of the server, ``http://127.0.0.1:PORT``.
+    tls : bool
+        Whether it speaks TLS, or is at http://127.0.0.1.
     """
     folder.mkdir()
     certificate, key = _certificate(folder)
@@ -104,7 +106,7 @@ def nginx(folder: Path, behind: str) -> Iterator[Front]:
     site = _with(
         configuration("nginx", "map "),
         {
-            "listen 443 ssl;": f"listen 127.0.0.1:{port} ssl;",
+            "listen 443 ssl;": f"listen 127.0.0.1:{port}{' ssl' * tls};",
             "maps.example.org;": "localhost;",
             "/etc/letsencrypt/live/maps.example.org/fullchain.pem": str(certificate),
             "/etc/letsencrypt/live/maps.example.org/privkey.pem": str(key),
@@ -114,7 +116,8 @@ def nginx(folder: Path, behind: str) -> Iterator[Front]:
     path = folder / "nginx.conf"
     path.write_text(_NGINX.format(work=folder, files=_FILES, site=site))
     with _running([str(_found("nginx")), "-p", str(folder), "-c", str(path)], folder):
-        yield _answering(Front(f"https://localhost:{port}", certificate), folder)
+        url = f"https://localhost:{port}" if tls else f"http://127.0.0.1:{port}"
+        yield _answering(Front(url, certificate), folder)
 
 
 @contextlib.contextmanager

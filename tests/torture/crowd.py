@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import random
 import socket
 import struct
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,27 +29,32 @@ from tests.server.programs import Server, Within, resident
 
 from .health import Health, watched
 
-__all__ = ["BEHAVIOURS", "Outcome", "settings", "visit"]
+__all__ = ["BARE", "WHOLE", "Outcome", "settings", "visit"]
 
 #: How long the server waits for anybody: a crowd is gone soon after.
 IDLE_SECONDS = 3.0
 
-_PATIENCE = 40.0
+_PATIENCE = 120.0
 _SAMPLE_SECONDS = 0.05
 
 # How many come in a second, of each kind: a system forgets connections that come faster than they are accepted, and
 # whoever was forgotten tries again seconds later, the honest ones too.
 _ARRIVALS = 100
 
+# Fewer than the documented proxy allows one address.
+_OF_AN_ADDRESS = 25
+
 
 def settings(count: int) -> dict[str, Any]:
-    """Settings of a server that is to stand a crowd with so many of each kind."""
+    """Settings of a server that is to stand a crowd with so many of each kind, bare or behind a proxy."""
     return {
         "idle_seconds": IDLE_SECONDS,
         "head_seconds": IDLE_SECONDS,
         "bye_seconds": IDLE_SECONDS,
-        "max_uploads": 2 * count + 64,
+        "max_uploads": 4 * count + 64,
+        "upload_bytes": 1 << 20,
         "max_connections": 20 * count + 500,
+        "max_streams": 20 * count + 500,
     }
 
 
@@ -95,8 +101,9 @@ class Outcome:
 class _Client:
     """A connection that is closed when the ``with`` block ends, whatever happens in it."""
 
-    def __init__(self, place: Place, random_: random.Random) -> None:
+    def __init__(self, place: Place, source: str, random_: random.Random) -> None:
         self.place = place
+        self.source = source
         self.random = random_
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self.socket.setblocking(False)
@@ -110,6 +117,7 @@ class _Client:
         if small:
             # Before connecting, so that the window that is offered is small too.
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        self.socket.bind((self.source, 0))
         await asyncio.get_running_loop().sock_connect(self.socket, (self.place.host, self.place.port))
 
     async def send(self, data: bytes) -> None:
@@ -230,7 +238,8 @@ async def _on_and_on(client: _Client, data: bytes, pause: float = 0.0) -> None:
         await asyncio.sleep(pause)
 
 
-BEHAVIOURS: tuple[Callable[[_Client], Awaitable[None]], ...] = (
+#: What a bare server withstands.
+BARE: tuple[Callable[[_Client], Awaitable[None]], ...] = (
     never_reads,
     one_byte_a_second,
     vanishes,
@@ -243,33 +252,51 @@ BEHAVIOURS: tuple[Callable[[_Client], Awaitable[None]], ...] = (
     refused_upload,
 )
 
+#: What a server behind the documented proxy withstands.
+WHOLE = (*BARE, one_byte_chunks)
 
-async def visit(server: Server, url: str, sha256: str, count: int, seed: int = 1) -> Outcome:
-    """Send ``count`` clients of each kind to a server, and as many honest ones that read a surface to its end.
+
+async def visit(
+    server: Server,
+    url: str,
+    sha256: str,
+    count: int,
+    honest: int,
+    kinds: Sequence[Callable[[_Client], Awaitable[None]]] = BARE,
+    seed: int = 1,
+) -> Outcome:
+    """Send ``count`` clients of each kind to a server, and honest ones that read a surface to its end.
+
+    They come from many addresses of this machine, as Linux has them.
 
     Parameters
     ----------
     server : Server
         Made with `settings`.
     url : str
-        A surface on it.
+        A surface on it, there or at a proxy in front.
     sha256 : str
         What the honest ones are to read: the hash of the container's parts in the order in which they are sent.
+    count, honest : int
+        How many of each kind, and how many honest ones in all.
+    kinds : sequence
+        Of `WHOLE`.
     """
     place, random_ = Place.of(url), random.Random(seed)
-    await _honest(place, sha256, count)  # what the server needs once for all
+    await _honest(place, sha256, honest)  # what the server needs once for all
     before = await _settled(server)
     most = [before.resident]
     watching = asyncio.create_task(_sample(server.pid, most))
-    async with watched(server.url, server.pid) as watching_health:
+    async with watched(server.url) as watching_health:
         hostile = [
-            asyncio.create_task(_behave(behave, place, random.Random(random_.random()), number / _ARRIVALS))
-            for number in range(count)
-            for behave in BEHAVIOURS
+            asyncio.create_task(
+                _behave(behave, _Client(place, _source(1, rank), random.Random(random_.random())), number / _ARRIVALS)
+            )
+            for rank, (number, behave) in enumerate(itertools.product(range(count), kinds))
         ]
         await asyncio.sleep(count / _ARRIVALS / 2)
         started = asyncio.get_running_loop().time()
-        wrong = await _honest(place, sha256, count)
+        wrong = await _honest(place, sha256, honest)
         seconds = asyncio.get_running_loop().time() - started
         # The server has had enough of each of them by itself, before they are gone.
         await asyncio.sleep(IDLE_SECONDS)
@@ -278,34 +305,37 @@ async def visit(server: Server, url: str, sha256: str, count: int, seed: int = 1
     for task in hostile:
         task.cancel()
     await asyncio.gather(*hostile, return_exceptions=True)
-    connections = count * (1 + len(BEHAVIOURS))
-    grown = (most[0] - before.resident) // connections
-    return Outcome(count, len(hostile), wrong, grown, before, after, seconds, watching_health.health)
+    grown = (most[0] - before.resident) // (honest + len(hostile))
+    return Outcome(honest, len(hostile), wrong, grown, before, after, seconds, watching_health.health)
 
 
-async def _behave(
-    behave: Callable[[_Client], Awaitable[None]], place: Place, random_: random.Random, seconds: float
-) -> None:
-    await asyncio.sleep(seconds)
-    async with _Client(place, random_) as client:
+async def _behave(behave: Callable[[_Client], Awaitable[None]], client: _Client, seconds: float) -> None:
+    async with client:
+        await asyncio.sleep(seconds)
         # What the server does with it is seen in the server.
         with contextlib.suppress(OSError):
             await behave(client)
 
 
+def _source(network: int, rank: int) -> str:
+    """Return an address of this machine, the same for a few clients."""
+    high, low = divmod(rank // _OF_AN_ADDRESS, 250)
+    return f"127.{network}.{high}.{low + 1}"
+
+
 async def _honest(place: Place, sha256: str, count: int) -> tuple[str, ...]:
-    async def read(window: int) -> str | None:
+    async def read(number: int) -> str | None:
+        window = (4096, 30_000, BASE_CREDIT)[number % 3]
         try:
             async with asyncio.timeout(_PATIENCE):
-                reader = await read_stream(place, Reader(window=window))
+                reader = await read_stream(place, Reader(window=window), _source(2, number))
         except (OSError, TimeoutError) as error:
             return f"{type(error).__name__}: {error}"
         if (reader.ended, reader.closed, reader.sha256) != ("complete", 1000, sha256):
             return f"expected the whole surface, got {reader.size} bytes, end {reader.ended}, close {reader.closed}"
         return None
 
-    windows = [(4096, 30_000, BASE_CREDIT)[number % 3] for number in range(count)]
-    return tuple(wrong for wrong in await asyncio.gather(*map(read, windows)) if wrong)
+    return tuple(wrong for wrong in await asyncio.gather(*map(read, range(count))) if wrong)
 
 
 async def _sample(process: int, most: list[int]) -> None:

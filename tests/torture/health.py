@@ -1,17 +1,15 @@
 """How long a server takes to answer ``/healthz`` while others keep it busy.
 
-``python -m tests.torture.health URL PID`` asks from a process of its own, which nothing else slows down, until its
-standard input ends; then it prints what it saw. On a machine that has other things to do, both the server and this
-process wait for a processor meanwhile, and Linux tells how long: what an answer took without the longer of these two
-waits is the server's own.
+``python -m tests.torture.health URL`` asks from a process of its own, which nothing else slows down, until its standard
+input ends; then it prints what it saw. On a machine that has other things to do, this process waits for a processor
+meanwhile, and Linux tells how long: what an answer took without that wait is the server's. The waits of the server, and
+of whatever is in front of it, count.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import os
 import sys
 import threading
 import time
@@ -35,7 +33,7 @@ class Health:
     median, late, last : float
         Seconds until the median answer, that of the 99th percentile, and the latest of all.
     own : float
-        Seconds that the answer of the 99th percentile took without the waits for a processor.
+        Seconds that the answer of the 99th percentile took without the asking process's waits for a processor.
     """
 
     answers: int
@@ -56,12 +54,11 @@ class watched:  # noqa: N801 - used like a function
 
     health: Health
 
-    def __init__(self, url: str, process: int) -> None:
+    def __init__(self, url: str) -> None:
         self._url = url
-        self._process_of_server = process
 
     async def __aenter__(self) -> watched:
-        command = (sys.executable, "-m", __name__, self._url, str(self._process_of_server))
+        command = (sys.executable, "-m", __name__, self._url)
         pipe = asyncio.subprocess.PIPE
         self._process = await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe)
         return self
@@ -71,37 +68,34 @@ class watched:  # noqa: N801 - used like a function
         self.health = Health(**json.loads(printed))
 
 
-def _waited(*processes: int) -> list[float]:
-    """Seconds for which the first threads of processes have been able to run, and had no processor."""
-    seconds = []
-    for process in processes:
-        found = "0 0"
-        with contextlib.suppress(OSError):  # a system that does not tell
-            found = Path(f"/proc/{process}/schedstat").read_text()
-        seconds.append(int(found.split()[1]) / 1e9)
-    return seconds
+def _waited() -> float:
+    """Seconds for which this thread has been able to run, and had no processor; 0 where the system does not tell."""
+    try:
+        return int(Path("/proc/self/schedstat").read_text().split()[1]) / 1e9
+    except OSError:
+        return 0.0
 
 
-async def _answered(host: str, port: int, server: int) -> tuple[float, float]:
-    """Seconds that an answer took, and those of them that the server had for it."""
-    before, started = _waited(server, os.getpid()), time.monotonic()
+async def _answered(host: str, port: int) -> tuple[float, float]:
+    """Seconds that an answer took, and those of them in which this process did not wait for a processor."""
+    before, started = _waited(), time.monotonic()
     incoming, outgoing = await asyncio.open_connection(host, port)
     outgoing.write(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
     answer = await incoming.read()
     seconds = time.monotonic() - started
-    waits = [now - then for now, then in zip(_waited(server, os.getpid()), before, strict=True)]
+    waited = _waited() - before
     outgoing.close()
     if not answer.startswith(b"HTTP/1.1 200"):
         raise ConnectionError(f"expected 200 from /healthz, got {answer[:200]!r}")
-    return seconds, max(seconds - max(waits), 0.0)
+    return seconds, max(seconds - waited, 0.0)
 
 
-async def _ask(url: str, server: int, over: threading.Event) -> list[tuple[float, float]]:
+async def _ask(url: str, over: threading.Event) -> list[tuple[float, float]]:
     place, seconds = urlsplit(url), []
     assert place.hostname is not None
     assert place.port is not None
     while not over.is_set():
-        seconds.append(await _answered(place.hostname, place.port, server))
+        seconds.append(await _answered(place.hostname, place.port))
         await asyncio.sleep(_PAUSE_SECONDS)
     return seconds
 
@@ -114,7 +108,7 @@ def _main() -> None:
         over.set()
 
     threading.Thread(target=wait, daemon=True).start()
-    answers = asyncio.run(_ask(sys.argv[1], int(sys.argv[2]), over))
+    answers = asyncio.run(_ask(sys.argv[1], over))
     number = len(answers)
     seen, own = (sorted(figures) for figures in zip(*answers, strict=True))
     late = number * 99 // 100

@@ -22,7 +22,7 @@ __all__ = ["STAGES", "Lanes", "Wish"]
 #: What measures runs first and alone. The others wait for links and processes most of the time, or compute all the
 #: time: these lanes run side by side, the parts of each one after another.
 STAGES = (
-    (("throughput", "crowds"),),
+    (("throughput", "crowds", "proxied"),),
     (
         ("streams",),
         ("kills", "disk", "history", "faults"),

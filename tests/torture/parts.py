@@ -33,6 +33,9 @@ __all__ = ["PARTS", "Part", "Result", "sent"]
 _SCHEDULES = 10_000
 _STREAM_SECONDS = 3600.0
 
+#: Hostile clients of each kind, and the honest ones beside them.
+_OF_EACH, _HONEST = 220, 300
+
 
 @dataclass(frozen=True)
 class Result:
@@ -118,31 +121,50 @@ def sent(container: bytes) -> str:
 
 
 def _crowds(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    return _crowd(folder, count, proxied=False)
+
+
+def _proxied(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    return _crowd(folder, count, proxied=True)
+
+
+def _crowd(folder: Path, count: int, *, proxied: bool) -> tuple[int, tuple[str, ...]]:
     from tests import data_folder
+    from tests.server import proxies
     from tests.server.helpers import hills, npy, push
     from tests.server.programs import server
 
     from . import crowd
 
-    data = folder / "data"
-    with server(data, **crowd.settings(count)) as running:
+    data, chosen = folder / "data", crowd.settings(count)
+    if proxied:
+        # As strangers whom the proxy tells of: they may do all that a caller of this machine may.
+        chosen |= {"trusted_proxies": ["127.0.0.1"], "insecure": True, "public_reads": True}
+    kinds, honest = crowd.WHOLE if proxied else crowd.BARE, max(1, count * _HONEST // _OF_EACH)
+    with server(data, **chosen) as running, ExitStack() as held:
         with running.client() as http:
             surface = push(http, npy(hills(420, 400)))
         container = data_folder.container(data, surface["container"]).read_bytes()
-        outcome = asyncio.run(crowd.visit(running, running.url + surface["url"], sent(container), count))
-    assert not outcome.wrong, outcome.wrong
-    assert not outcome.remains, outcome.remains
-    assert outcome.grown < 128 * 1024, outcome
-    assert outcome.health.own < 0.25, outcome
-    return count, (
-        f"{outcome.hostile} hostile connections of {len(crowd.BEHAVIOURS)} kinds and {outcome.honest} honest ones",
-        f"all {outcome.honest} honest streams right, the last after {outcome.seconds:.1f} s",
-        f"meanwhile {outcome.health.answers} answers of /healthz: median {1000 * outcome.health.median:.0f} ms, 99th "
-        f"percentile {1000 * outcome.health.late:.0f} ms ({1000 * outcome.health.own:.0f} without waits for a "
-        f"processor; allowed: 250), the latest {1000 * outcome.health.last:.0f} ms",
+        url = running.url
+        if proxied:
+            url = held.enter_context(proxies.nginx(folder / "nginx", url, tls=False)).url
+        visit = crowd.visit(running, url + surface["url"], sent(container), count, honest, kinds)
+        outcome = asyncio.run(visit)
+    health = outcome.health
+    facts = (
+        f"{outcome.hostile} hostile connections of {len(kinds)} kinds and {outcome.honest} honest ones",
+        f"{outcome.honest - len(outcome.wrong)} honest streams right, the last after {outcome.seconds:.1f} s",
+        f"meanwhile {health.answers} answers of /healthz: median {1000 * health.median:.0f} ms, 99th percentile "
+        f"{1000 * health.late:.0f} ms ({1000 * health.own:.0f} without the asking process's waits for a processor; "
+        f"allowed: 250), the latest {1000 * health.last:.0f} ms",
         f"the server's memory grew by {outcome.grown / 1024:.0f} KiB a connection (allowed: 128)",
-        "afterwards no task, socket or file more than before",
     )
+    told = "\n".join((*facts, *outcome.wrong[:5], *outcome.remains[:5]))
+    assert not outcome.wrong, told
+    assert not outcome.remains, told
+    assert outcome.grown < 128 * 1024, told
+    assert health.own < 0.25, told
+    return count, (*facts, "afterwards no task, socket or file more than before")
 
 
 def _streams(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
@@ -334,7 +356,8 @@ def _mutants(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
 PARTS = {
     part.name: part
     for part in (
-        Part("crowds", "Clients that do not behave, beside honest ones", "of each kind", 200, _crowds),
+        Part("crowds", "Clients that do not behave, beside honest ones", "of each kind", _OF_EACH, _crowds),
+        Part("proxied", "More such clients, with nginx in front", "of each kind", _OF_EACH, _proxied),
         Part("streams", "Streams over links that break, stall and lie", "schedules", _SCHEDULES, _streams),
         Part("throughput", "Many streams at once from one server", "streams at once", 500, _throughput),
         Part("kills", "Kill -9 under upload, build, stream and delete", "kills", 200, _kills),

@@ -126,10 +126,6 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
             super().data_received(data)
             self._follow_head()
 
-    def on_response_complete(self) -> None:
-        super().on_response_complete()
-        self._follow_head()
-
     def handle_websocket_upgrade(self, event: h11.Request) -> None:
         self._forget_head()
         self._answers.end()
@@ -198,7 +194,8 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
 
     def _follow_head(self) -> None:
         # The clock is not set back by a byte: a head that comes byte by byte is late like one that does not come. The
-        # rest of a body that was answered before it was whole is read, since a client may look only after it.
+        # rest of a body that was answered before it was whole is read, since a client may look only after it. Where
+        # nothing comes after an answer uvicorn has a clock of its own (`timeout_keep_alive`).
         answered = self.cycle is not None and self.cycle.response_complete
         waiting = self.conn.their_state is h11.IDLE or (answered and self.conn.their_state is h11.SEND_BODY)
         if self.is_closing() or not waiting:

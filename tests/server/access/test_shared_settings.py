@@ -182,7 +182,7 @@ def open_streams(folder: Path) -> None:
 
 def memory_of_streams(folder: Path) -> None:
     memory = 64 << 20
-    town = Town(folder, stream_memory=memory)
+    town = Town(folder, stream_memory=memory, max_streams=10_000)
     with ExitStack() as held:
 
         def credit(caller: Caller) -> int:
@@ -192,6 +192,10 @@ def memory_of_streams(folder: Path) -> None:
         assert memory // 4 < of_anna <= memory // 2
         assert credit(BERT) >= memory // 32
         assert credit(CARL) >= memory // 64
+        # Whoever has more than is left by now gets no more of it, and a stream all the same.
+        for _ in range(1000):
+            credit(BERT)
+        assert credit(ANNA) == 0
 
 
 def level_requests(folder: Path) -> None:

@@ -185,9 +185,10 @@ class Reader:
         return frame(serialize(Credit(granted)))
 
 
-async def read_stream(place: Place, reader: Reader) -> Reader:
-    """Read a surface to its end."""
-    incoming, outgoing = await asyncio.open_connection(place.host, place.port)
+async def read_stream(place: Place, reader: Reader, source: str | None = None) -> Reader:
+    """Read a surface to its end; from another address of this machine, if one is given."""
+    local = None if source is None else (source, 0)
+    incoming, outgoing = await asyncio.open_connection(place.host, place.port, local_addr=local)
     try:
         outgoing.write(handshake(place))
         while reader.closed is None:

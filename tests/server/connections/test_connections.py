@@ -133,6 +133,19 @@ def test_a_body_that_nobody_wants_any_more_is_not_waited_for(impatient: tuple[st
         assert status_of(all_of(connection)) == 401
 
 
+def test_the_rest_of_a_body_that_was_answered_is_not_waited_for_either(impatient: tuple[str, Any]) -> None:
+    with connected(impatient[0]) as connection:
+        connection.sendall(b"POST /nothing HTTP/1.1\r\nHost: localhost\r\nContent-Length: 60000\r\n\r\n")
+        assert status_of(one_of(connection)) == 404
+        try:
+            for _ in range(1000):
+                connection.sendall(b"x")
+                time.sleep(0.02)
+        except (ConnectionResetError, BrokenPipeError):
+            return
+        pytest.fail("the server waits and waits")
+
+
 def test_an_answer_that_nobody_takes_is_given_up(impatient: tuple[str, dict[str, Any]]) -> None:
     url, made = impatient
     address = f"/v1/containers/{made['container']}.lode"

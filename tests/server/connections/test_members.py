@@ -22,7 +22,6 @@ OVERRIDDEN: dict[type, dict[str, tuple[list[str], bool]]] = {
         "connection_made": (["transport"], False),
         "data_received": (["data"], False),
         "connection_lost": (["exc"], False),
-        "on_response_complete": ([], False),
         "handle_websocket_upgrade": (["event"], False),
         "send_400_response": (["msg"], False),
         "shutdown": ([], False),
@@ -72,6 +71,7 @@ RESTS_ON: dict[type, list[str]] = {
         "protocol.connection_made(self.transport)",
         "self.transport.set_protocol(protocol)",
         "if self.transport.is_closing():",
+        "self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)",
     ],
     RequestResponseCycle: [
         "self.transport.close()",
