@@ -314,7 +314,10 @@ class Process:
         """Return what has come of an answer, nothing at its end; None when it takes too long."""
         while ready := _ready([self.answer, self.status], call, until):
             if self.answer in ready:
-                return os.read(self.answer.fileno(), 1 << 16)
+                try:
+                    return os.read(self.answer.fileno(), 1 << 16)
+                except ConnectionResetError:  # it was killed before it had read what it was asked
+                    return b""
             self._end_group()  # the process has ended; what it has left behind keeps its pipe open
         return None
 

@@ -148,6 +148,18 @@ def test_one_that_has_died_meanwhile_is_replaced(server: ForkServer, file: Path)
     play(server, file, scene)
 
 
+def test_one_that_is_killed_before_it_reads_a_question_is_replaced(server: ForkServer, file: Path) -> None:
+    async def scene(ask: Asked) -> None:
+        process, _ = await ask("count")
+        os.kill(process, signal.SIGSTOP)
+        asked = asyncio.create_task(ask("count"))
+        await asyncio.sleep(0.1)
+        os.kill(process, signal.SIGKILL)
+        assert (await asked)[1] == 1
+
+    play(server, file, scene)
+
+
 def test_what_finds_no_memory_beside_what_is_kept_is_asked_of_another(server: ForkServer, file: Path) -> None:
     async def scene(ask: Asked) -> None:
         await ask("count")
