@@ -174,8 +174,9 @@ class Runner(Generic[_Key, _Call]):
         tasks = list(self._tasks)
         for task in tasks:
             _cut_short(task)
-        await asyncio.gather(*tasks, return_exceptions=True)
+        # Before their end: a process that is kept would finish first what was begun.
         await asyncio.to_thread(self._worker.close)
+        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def carried_out(change: Callable[[], None]) -> None:

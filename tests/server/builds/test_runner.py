@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack, suppress
 from typing import Any
 
 import pytest
 
-from lodestream_server.builds.processes import Call, ForkServer, Pool
+from lodestream_server.builds.processes import Call, ForkServer, Pool, Worker
 from lodestream_server.builds.runner import Runner
 from lodestream_server.problems import BusyError, RestartingError
 from tests.server.helpers import PATIENCE
@@ -226,6 +227,43 @@ def test_a_server_that_ends_waits_for_jobs_that_nobody_waits_for() -> None:
         assert ended == ["a"]
 
     bench(play)
+
+
+class Kept(Worker[Call]):
+    """A process that finishes what was begun, unless it is killed."""
+
+    def __init__(self) -> None:
+        super().__init__(1, ForkServer())
+        self.killed = threading.Event()
+
+    def close(self) -> None:
+        self.killed.set()
+        super().close()
+
+    def _run(self, call: Call) -> str:
+        return "killed" if self.killed.wait(PATIENCE) else "finished"
+
+
+@pytest.mark.parametrize("leaves", [False, True])
+def test_a_server_that_ends_waits_for_no_process_that_is_kept(leaves: bool) -> None:
+    async def end() -> None:
+        runner = Runner[str, Call]("test", 1, 60.0, Kept())
+
+        async def ask() -> None:
+            async with runner.job("a", "anna", lambda _: runner.call(Call(len))):
+                pass
+
+        asked = asyncio.create_task(ask())
+        await settle()
+        if leaves:
+            asked.cancel()
+            await settle()
+        async with asyncio.timeout(PATIENCE / 2):
+            await runner.close()
+            with pytest.raises(asyncio.CancelledError if leaves else RestartingError):
+                await asked
+
+    asyncio.run(end())
 
 
 def test_the_log_has_a_line_for_every_job_however_it_ended(caplog: pytest.LogCaptureFixture) -> None:
