@@ -532,14 +532,48 @@ def test_a_container_may_go_while_room_is_made(tmp_path: Path, monkeypatch: pyte
 
 
 class Stored:
-    """Containers that are there."""
+    """Containers that are there, at least at first."""
+
+    used = True
 
     @contextmanager
     def local(self, _: str) -> Iterator[Path]:
         yield Path("container")
 
     def is_used(self, _: str) -> bool:
-        return True
+        return self.used
+
+
+async def write(call: Call) -> MadeLevel:
+    """A process that makes the file of a level."""
+    await asyncio.sleep(0)
+    job: LevelJob = call.args[0]
+    job.path.write_bytes(bytes(1000))
+    await asyncio.sleep(0)
+    return MadeLevel(1000)
+
+
+@pytest.mark.parametrize("used", [True, False])
+def test_the_file_of_a_container_that_was_deleted_meanwhile_goes_with_its_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, used: bool
+) -> None:
+    stored: Any = Stored()
+    stored.used = used
+
+    async def read() -> int:
+        room = files(tmp_path / "levels", 1 << 20)
+        room.folder.mkdir()
+        there = limits(tmp_path)
+        queue = LevelMaker(there._settings, stored, room, ForkServer(), there)
+        monkeypatch.setattr(queue._runner, "call", write)
+        loan = await queue.take(Key("a" * 64, 0, "npy"), ANNA)
+        assert loan.path.stat().st_size == 1000
+        await asyncio.sleep(0)
+        loan.release()
+        assert len(list(room.folder.iterdir())) == used
+        return room.size
+
+    assert asyncio.run(read()) == 1000 * used
 
 
 def test_whoever_goes_at_any_moment_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -553,13 +587,6 @@ def test_whoever_goes_at_any_moment_leaves_nothing_behind(tmp_path: Path, monkey
         await asyncio.sleep(0)
         return result
 
-    async def make(call: Call) -> MadeLevel:
-        await asyncio.sleep(0)
-        job: LevelJob = call.args[0]
-        job.path.write_bytes(bytes(1000))
-        await asyncio.sleep(0)
-        return MadeLevel(1000)
-
     monkeypatch.setattr(asyncio, "to_thread", in_a_thread)
 
     async def go(step: int) -> bool:
@@ -570,7 +597,7 @@ def test_whoever_goes_at_any_moment_leaves_nothing_behind(tmp_path: Path, monkey
             put(room, number, most // 4).release()
         there = limits(folder, alone=False)
         queue = LevelMaker(there._settings, stored, room, ForkServer(), there)
-        monkeypatch.setattr(queue._runner, "call", make)
+        monkeypatch.setattr(queue._runner, "call", write)
         asked = asyncio.create_task(queue.take(Key("a" * 64, 0, "npy"), ANNA))
         for _ in range(step):
             await asyncio.sleep(0)
