@@ -201,3 +201,32 @@ def test_whoever_comes_and_goes_stands_in_line_once() -> None:
         assert (turns._free, turns._running, turns._waiting) == (1, {}, {})
 
     asyncio.run(come_and_go())
+
+
+def test_whoever_was_passed_over_while_away_stands_in_line_again() -> None:
+    async def come_back() -> bool:
+        turns = Turns(1, 600.0)
+        place, began = Place(turns), asyncio.Event()
+
+        async def work() -> None:
+            async with place.turn():
+                began.set()
+
+        async with turns.turn("zoe"):
+            another = asyncio.create_task(turns.turn("anna").__aenter__())
+            await asyncio.sleep(0)
+            for caller in ("anna", "bert"):
+                place.join(caller)
+            working = asyncio.create_task(work())
+            await asyncio.sleep(0)
+            place.leave("bert")
+        await another
+        place.join("bert")
+        place.leave("anna")
+        turns._leave("anna")  # the other one ends
+        for _ in range(5):
+            await asyncio.sleep(0)
+        working.cancel()
+        return began.is_set()
+
+    assert asyncio.run(come_back())
