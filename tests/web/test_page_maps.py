@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 import shutil
 from collections.abc import Iterator
@@ -13,55 +12,28 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from PIL import Image
 
-import lodestream as ls
 from lodestream.maps import HeightField, crs_wkt, terrain_rgb, terrarium
 from lodestream.maps.tile_grids import web_grid
 from lodestream_client.demo import site
 from tests.client.files import Ranged, ranged
-from tests.core.maps.fields import (
-    DATA,
-    PLANE_CODE,
-    PLANE_CORNER,
-    PLANE_STEP,
-    on_earth,
-    pixel_of,
-    plane_height,
-    utm,
-)
+from tests.core.maps.fields import pixel_of
 from tests.core.surfaces import terrain
 
 from .browser import WAIT, Tab
 from .conftest import WEB, Tabs
-
-MAPS = Path(__file__).parent / "maps"
-MAPLIBRE = MAPS / "node_modules" / "maplibre-gl" / "dist"
-
-_SIZE = (800, 600)
-_NODES = 200
-
-#: Zooms of the map beyond the one of the tiles that it then has as terrain.
-_CLOSER = 2
-
-#: Nodes from the middle of a field that the map shows: elsewhere it has coarser tiles.
-_AROUND = 18
+from .map_pages import MAPS, VIEW, greys, heights_at, maplibre, mountains, plane, write
 
 
 @pytest.fixture(scope="module")
 def host(tmp_path_factory: pytest.TempPathFactory, library: Path) -> Iterator[Ranged]:
-    """A host of files with pages, the packages, and a plane in UTM."""
-    assert MAPLIBRE.is_dir(), "expected MapLibre: npm install --no-save in tests/web/maps"
+    """A host of files with pages, the packages, and hills with a hole."""
     folder = tmp_path_factory.mktemp("maps")
     pages = (MAPS / "terrain.html", WEB / "examples" / "map.html")
     packages = (*library.glob("*.js"), WEB / "node_modules/proj4/dist/proj4.js")
     for path in (*pages, *packages, *maplibre()):
         shutil.copy(path, folder)
     (folder / "favicon.ico").write_bytes(b"")
-    rows, columns = np.mgrid[0:321, 0:598]
-    heights = plane_height(rows, columns).astype(np.float32)
-    write(folder / "plane.lode", heights, utm(PLANE_CODE, *PLANE_CORNER, PLANE_STEP))
     hills = terrain((481, 611), 4)
     hills[40:90, 200:300] = np.nan
     write(folder / "surface.lode", hills, {"crs": crs_wkt("EPSG:4326"), "geotransform": [8, 3e-4, 0, 47, 0, -3e-4]})
@@ -69,35 +41,13 @@ def host(tmp_path_factory: pytest.TempPathFactory, library: Path) -> Iterator[Ra
         yield server
 
 
-def maplibre() -> list[Path]:
-    """What a page loads of MapLibre."""
-    return [MAPLIBRE / f"maplibre-gl{end}" for end in (".mjs", "-worker.mjs", ".css")]
-
-
-def write(path: Path, heights: NDArray[Any], metadata: dict[str, Any]) -> None:
-    path.write_bytes(ls.encode(ls.Surface(heights, metadata=metadata)))
-
-
 def shown(tabs: Tabs, host: Ranged, dem: dict[str, Any], **camera: Any) -> Tab:
     """The page with terrain, once it has drawn all."""
     asked = quote(json.dumps({"dem": {"type": "raster-dem", **dem}, **camera}))
-    tab = tabs(f"{host.url}/terrain.html#{asked}", size=_SIZE)
+    tab = tabs(f"{host.url}/terrain.html#{asked}", size=VIEW)
     tab.page.wait_for_function("window.idle", timeout=WAIT)
     assert tab.page.evaluate("window.errors") == []
     return tab
-
-
-def heights_at(tab: Tab, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the map says of places, as longitudes and latitudes, shape (N, 2)."""
-    found = tab.page.evaluate("places => places.map((place) => map.queryTerrainElevation(place))", places.tolist())
-    return np.array(found, np.float64)
-
-
-def middle_nodes(shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of some nodes around the middle of a field."""
-    random = np.random.default_rng(1)
-    rows, columns = (length // 2 + random.integers(-_AROUND, _AROUND, _NODES) for length in shape)
-    return rows, columns
 
 
 def field_of(path: Path) -> HeightField:
@@ -106,35 +56,20 @@ def field_of(path: Path) -> HeightField:
 
 @pytest.mark.parametrize(("encoding", "within"), [("terrain-rgb", 0.06), ("terrarium", 0.01)])
 def test_a_plane_at_200_nodes(tabs: Tabs, host: Ranged, encoding: str, within: float) -> None:
-    rows, columns = middle_nodes((321, 598))
-    corner, step = PLANE_CORNER, PLANE_STEP
-    places = np.array(
-        [on_earth(PLANE_CODE, corner[0] + step * c, corner[1] - step * r) for r, c in zip(rows, columns, strict=True)]
-    )
-    zoom = field_of(host.folder / "plane.lode").placement.web_zoom() + _CLOSER
+    nodes = plane(host.folder / "plane.lode")
     dem = {"url": f"lode://{host.url}/plane.lode?encoding={encoding}"}
-    tab = shown(tabs, host, dem, center=places.mean(axis=0).tolist(), zoom=zoom)
-    assert np.abs(heights_at(tab, places) - plane_height(rows, columns)).max() <= within
+    tab = shown(tabs, host, dem, center=nodes.middle, zoom=nodes.zoom)
+    assert np.abs(heights_at(tab, nodes.places) - nodes.heights).max() <= within
 
 
 @pytest.mark.parametrize("encoding", ["terrain-rgb", "terrarium"])
 def test_mountains_at_200_nodes(tabs: Tabs, host: Ranged, encoding: str) -> None:
-    if not (DATA / "bigtujunga.tif").is_file():
-        pytest.skip("../shared/data/bigtujunga.tif is not there")
-    surface = ls.read(DATA / "bigtujunga.tif")
-    path = host.folder / "bigtujunga.lode"
-    path.write_bytes(ls.encode(surface))
-    rows, columns = middle_nodes(surface.points.shape)
-    x, step, _, y, _, down = surface.metadata["geotransform"]
-    places = np.array(
-        [on_earth("EPSG:32611", x + (c + 0.5) * step, y + (r + 0.5) * down) for r, c in zip(rows, columns, strict=True)]
-    )
-    zoom = field_of(path).placement.web_zoom() + _CLOSER
+    nodes = mountains(host.folder / "bigtujunga.lode")
     dem = {"url": f"lode://{host.url}/bigtujunga.lode?encoding={encoding}"}
-    tab = shown(tabs, host, dem, center=places.mean(axis=0).tolist(), zoom=zoom)
-    found = heights_at(tab, places)
+    tab = shown(tabs, host, dem, center=nodes.middle, zoom=nodes.zoom)
+    found = heights_at(tab, nodes.places)
     assert np.isfinite(found).all()
-    assert np.sqrt(((found - surface.points[rows, columns]) ** 2).mean()) <= 1.0
+    assert np.sqrt(((found - nodes.heights) ** 2).mean()) <= 1.0
 
 
 # As a page reads a picture, and as MapLibre's workers do.
@@ -174,19 +109,12 @@ def test_ten_lines_of_html_show_a_container_on_a_map(tabs: Tabs, host: Ranged) -
     assert len([line for line in example.splitlines() if line]) == 10
     assert f"```html\n{example}```" in (WEB.parents[1] / "docs" / "maps.md").read_text()
     host.requests.clear()
-    tab = tabs(f"{host.url}/map.html", size=_SIZE)
+    tab = tabs(f"{host.url}/map.html", size=VIEW)
     tab.until(lambda: len(greys(tab)) > 100)
     zoom, latitude, longitude = (float(number) for number in tab.page.url.partition("#")[2].split("/")[:3])
     assert zoom > 10
     assert (latitude, longitude) == pytest.approx((46.93, 8.09), abs=0.02)
     assert any(asked is not None for _, asked in host.requests)
-
-
-def greys(tab: Tab) -> NDArray[np.uint8]:
-    """The colours of the middle of the window, shape (N, 3)."""
-    with Image.open(io.BytesIO(tab.page.screenshot())) as picture:
-        pixels = np.asarray(picture.convert("RGB"))[100:400, 200:600]
-    return np.unique(pixels.reshape(-1, 3), axis=0)
 
 
 def test_the_public_demo_has_a_map(tabs: Tabs, library: Path, tmp_path: Path) -> None:
@@ -197,7 +125,7 @@ def test_the_public_demo_has_a_map(tabs: Tabs, library: Path, tmp_path: Path) ->
     assert site.main([str(tmp_path / "site"), str(pages)]) == 0
     (tmp_path / "site" / "favicon.ico").write_bytes(b"")
     with ranged(tmp_path / "site") as server:
-        tab = tabs(f"{server.url}/map/index.html", size=_SIZE)
+        tab = tabs(f"{server.url}/map/index.html", size=VIEW)
         tab.until(lambda: len(greys(tab)) > 100)
         assert float(tab.page.url.partition("#")[2].split("/")[0]) > 9
 
@@ -205,6 +133,6 @@ def test_the_public_demo_has_a_map(tabs: Tabs, library: Path, tmp_path: Path) ->
 def test_what_is_missing_is_an_error_of_the_map(tabs: Tabs, host: Ranged) -> None:
     write(host.folder / "nowhere.lode", terrain((40, 40), 4), {})
     asked = quote(json.dumps({"dem": {"type": "raster-dem", "url": f"lode://{host.url}/nowhere.lode"}}))
-    tab = tabs(f"{host.url}/terrain.html#{asked}", size=_SIZE)
+    tab = tabs(f"{host.url}/terrain.html#{asked}", size=VIEW)
     tab.page.wait_for_function("window.errors?.length", timeout=WAIT)
     assert "expected heights with a CRS" in tab.page.evaluate("window.errors")[0]

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 import pyproj
@@ -15,6 +16,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 from rasterio.io import MemoryFile
+from rasterio.windows import Window
 
 import lodestream as ls
 from lodestream.maps import HeightField, crs_wkt, web_tile
@@ -73,8 +75,7 @@ def plane_height(rows: NDArray[Any], columns: NDArray[Any]) -> NDArray[np.float6
 @functools.cache
 def plane() -> HeightField:
     """A tilted plane of 30 m in UTM: any shift shows. 642 rows cannot be halved evenly."""
-    rows, columns = np.mgrid[0:321, 0:598]
-    heights = plane_height(rows, columns).astype(np.float32)
+    heights = plane_height(*np.mgrid[0:321, 0:598]).astype(np.float32)
     return field_of(heights, utm(PLANE_CODE, *PLANE_CORNER, PLANE_STEP))
 
 
@@ -143,3 +144,45 @@ class Mosaic:
     def _pixel(self, row: int, column: int) -> float:
         tile = self._tile(column // self.size, row // self.size)
         return float(tile[row % self.size, column % self.size])
+
+
+def tiles_of_plane(z: int) -> list[tuple[int, int]]:
+    """The numbers x and y of the tiles that the plane meets."""
+    west, south, east, north = plane().bounds
+    corners = [pixel_of(x, y, z) for x, y in ((west, north), (east, south))]
+    (first, top), (last, bottom) = (tuple(int(place) // 256 for place in corner) for corner in corners)
+    return [(x, y) for x in range(first, last + 1) for y in range(top, bottom + 1)]
+
+
+def errors_by_gdal(address: str, z: int) -> NDArray[np.float64]:
+    """How far tiles of the plane, terrarium, are off at some pixels, in metres, read by GDAL's driver of tiles (TMS).
+
+    The address has {z}, {x} and {y}; shape (N,).
+    """
+    tiles = tiles_of_plane(z)
+    place = escape(address.replace("{", "${"))
+    description = f"""<GDAL_WMS>
+      <Service name="TMS"><ServerUrl>{place}</ServerUrl></Service>
+      <DataWindow>
+        <UpperLeftX>{-WORLD}</UpperLeftX><UpperLeftY>{WORLD}</UpperLeftY>
+        <LowerRightX>{WORLD}</LowerRightX><LowerRightY>{-WORLD}</LowerRightY>
+        <TileLevel>{z}</TileLevel><TileCountX>1</TileCountX><TileCountY>1</TileCountY>
+        <YOrigin>top</YOrigin>
+      </DataWindow>
+      <Projection>EPSG:3857</Projection><BlockSizeX>256</BlockSizeX><BlockSizeY>256</BlockSizeY>
+      <BandsCount>3</BandsCount><ZeroBlockHttpCodes>404</ZeroBlockHttpCodes>
+    </GDAL_WMS>"""
+    (first, top), (last, bottom) = tiles[0], tiles[-1]
+    window = Window(256 * first, 256 * top, 256 * (last + 1 - first), 256 * (bottom + 1 - top))
+    with rasterio.open(description) as dataset:
+        metres = METRES["terrarium"](*dataset.read(window=window).astype(np.float64))
+        transform = dataset.transform
+    known = np.argwhere(metres != 0)
+    assert len(known) > 200
+    rows, columns = known[np.random.default_rng(0).integers(0, len(known), 400)].T
+    x, y = transform @ (window.col_off + columns + 0.5, window.row_off + rows + 0.5)
+    x, y = pyproj.Transformer.from_crs("EPSG:3857", PLANE_CODE, always_xy=True).transform(x, y)
+    across, down = (x - PLANE_CORNER[0]) / PLANE_STEP, (PLANE_CORNER[1] - y) / PLANE_STEP
+    inside = (across >= 0) & (across <= 597) & (down >= 0) & (down <= 320)
+    errors: NDArray[np.float64] = (metres[rows, columns] - plane_height(down, across))[inside]
+    return errors

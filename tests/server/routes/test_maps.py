@@ -90,6 +90,18 @@ def test_options_reach_the_tiles(http: httpx.Client, hill: dict[str, Any], field
     assert lifted.content == maps.mesh_tile(field, 0, 1, 0, offset=40.0, normals=False)
 
 
+def test_gdal_reads_terrarium_by_its_driver_of_tiles(http: httpx.Client) -> None:
+    """At pixels of a tilted plane, in the zoom of its cells."""
+    fields = pytest.importorskip("tests.core.maps.fields")
+    heights = fields.plane_height(*np.mgrid[0:321, 0:598]).astype(np.float32)
+    placed = fields.utm(fields.PLANE_CODE, *fields.PLANE_CORNER, fields.PLANE_STEP)
+    surface = push(http, ls.encode(ls.Surface(heights, metadata=placed)), filename="plane.lode")
+    told = http.get(f"{surface['url']}/map.json", params={"encoding": "terrarium"}).raise_for_status().json()
+    errors = fields.errors_by_gdal(told["tiles"][0], told["maxzoom"])
+    assert len(errors) >= 200
+    assert np.abs(errors).max() <= 0.01
+
+
 def test_a_name_has_tiles_of_the_version_to_which_it_leads(http: httpx.Client, hill: dict[str, Any]) -> None:
     other = push(http, terrain(seed=3), filename="other.lode")
     seen = set[str]()
