@@ -99,7 +99,7 @@ $(PAGE)/index.html: $(WEB)/node_modules/.package-lock.json $(WEB_SOURCES) | $(WE
 	@cd $(WEB) && PYTHON=$(CURDIR)/$(BIN)/python npm run --silent kernels && npm run --silent build:page
 	@rm -rf $(PAGE) && cp -R $(WEB)/dist/page $(PAGE) && touch $@
 
-# MapLibre, which only tests and the public demo open.
+# MapLibre, which only tests and the public demo open, and CesiumJS, which only tests do.
 $(MAPS)/node_modules/.package-lock.json: $(MAPS)/package-lock.json
 	@cd $(MAPS) && npm install --no-save --silent --no-audit --no-fund && touch $(CURDIR)/$@
 
