@@ -270,7 +270,7 @@ class Settings(BaseSettings, Bounds):
         None,
         "limits",
         "memory that all running builds together may use; the process that makes levels as files may use half as much "
-        "in addition",
+        "in addition, and the one that makes tiles of maps 512 MiB",
         metavar=_SIZE,
         usual="half of the machine's memory",
         ge=256 << 20,

@@ -1,4 +1,4 @@
-"""Levels that GDAL opens by their address, as docs/gis.md says: tiles by ranges, place, CRS, holes, tokens."""
+"""What GDAL opens by an address, as docs/gis.md and docs/maps.md say: levels with ranges, place, CRS, holes; map tiles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from tests.server.programs import server
 
 rasterio = pytest.importorskip("rasterio")
 
-PAGE = (Path(__file__).parents[3] / "docs" / "gis.md").read_text()
+DOCS = Path(__file__).parents[3] / "docs"
+PAGE = (DOCS / "gis.md").read_text()
 ADDRESS = "https://maps.example.org/v1/surfaces/5f1c0a9b3d7e42a68c10/levels/7?format=cog"
 PLACE = [500000.0, 30.0, 0.0, 4100000.0, 0.0, -30.0]
 
@@ -170,3 +171,25 @@ def test_the_formats_of_the_page_are_written() -> None:
     assert named
     for name in named:
         assert ls.formats.written(name).write is not None
+
+
+def test_gdal_reads_tiles_of_a_map_by_the_file_of_the_page(authorised: str, tmp_path: Path) -> None:
+    maps, warp = pytest.importorskip("lodestream.maps"), pytest.importorskip("rasterio.warp")
+    container = ls.encode(terrain())
+    field = maps.HeightField(lambda offset, length: container[offset : offset + length], len(container))
+    (text,) = re.findall(r"^```xml\n(.*?)^```", (DOCS / "maps.md").read_text(), re.DOTALL | re.MULTILINE)
+    place, zoom = authorised.rpartition("/levels/")[0], field.placement.web_zoom()
+    file = tmp_path / "hill.xml"
+    text = text.replace("https://maps.example.org/v1/names/hill", place)
+    file.write_text(text.replace("<TileLevel>12<", f"<TileLevel>{zoom}<"))
+    west, south, east, north = field.bounds
+    with rasterio.open(file) as dataset:
+        ((x,), (y,)) = warp.transform("EPSG:4326", dataset.crs, [(west + east) / 2], [(south + north) / 2])
+        row, column = dataset.index(x, y)
+        red, green, blue = dataset.read(window=((row, row + 100), (column, column + 100))).astype(float)
+        xs, _ = dataset.xy(np.full(100, row), column + np.arange(100))
+        _, ys = dataset.xy(row + np.arange(100), np.full(100, column))
+        longitudes, _ = warp.transform(dataset.crs, "EPSG:4326", xs, np.full(100, y))
+        _, latitudes = warp.transform(dataset.crs, "EPSG:4326", np.full(100, x), ys)
+    expected = field.heights(np.array(longitudes), np.array(latitudes))
+    np.testing.assert_allclose(red * 256 + green + blue / 256 - 32768, expected, atol=0.01)
