@@ -1,4 +1,4 @@
-"""What GDAL opens by an address, as docs/gis.md and docs/maps.md say: levels with ranges, place, CRS, holes; map tiles."""
+"""What GDAL opens by an address, as docs/gis.md and docs/maps.md say: levels with ranges, place, holes; map tiles."""
 
 from __future__ import annotations
 
