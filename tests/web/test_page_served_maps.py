@@ -8,10 +8,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from playwright.sync_api import expect
 
 from lodestream_client.sync import upload
 from lodestream_server.access.tokens import TokenFile
@@ -21,6 +23,8 @@ from tests.server.programs import server
 from .browser import WAIT, Tab
 from .conftest import Tabs
 from .map_pages import MAPS, VIEW, Nodes, greys, heights_at, maplibre, mountains, plane
+from .shown import Shelf
+from .test_page_use import violations
 
 _CESIUM = MAPS / "node_modules" / "cesium" / "Build" / "Cesium"
 
@@ -38,6 +42,7 @@ class Served(NamedTuple):
 
     url: str
     pages: str
+    folder: Path
     nodes: Nodes
 
 
@@ -58,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str],
             if name not in kept:
                 path = folder / f"{name}.lode"
                 nodes = {"plane": plane, "bigtujunga": mountains}[name](path)
-                kept[name] = Served(upload(running.url, path, token=token).url, pages.url, nodes)
+                kept[name] = Served(upload(running.url, path, token=token).url, pages.url, folder, nodes)
             return kept[name]
 
         yield made
@@ -133,6 +138,53 @@ def test_mountains_are_seen(tabs: Tabs, served: Callable[[str], Served], tmp_pat
     ):
         _wait_for_relief(tab)
         tab.page.screenshot(path=tmp_path / f"{name}.png")
+
+
+def test_the_page_saves_what_opens_a_surface_elsewhere(
+    tabs: Tabs, served: Callable[[str], Served], tmp_path: Path
+) -> None:
+    """The pages load a library from where the user says, and show the surface."""
+    surface = served("bigtujunga")
+    server, id_ = surface.url.split("/v1/surfaces/")
+    tab = tabs(f"{server}/#s={id_}", size=(360, 600))
+    page = tab.page
+    page.get_by_role("button", name="Open in", exact=True).click()
+    dialog = page.get_by_role("dialog", name="Open in")
+    addresses = [dialog.locator("input[readonly]").nth(k).input_value() for k in range(4)]
+    tiles = f"{surface.url}/tiles/{{z}}/{{x}}/{{y}}.png?encoding="
+    expected = [f"{surface.url}/map.json", f"{surface.url}/terrain", f"{tiles}terrarium", f"{tiles}shade"]
+    assert addresses == expected
+    assert violations(tab) == []
+    page.screenshot(path=tmp_path / "narrow.png")
+    page.set_viewport_size({"width": 1000, "height": 800})
+    page.screenshot(path=tmp_path / "dialog.png")
+    dialog.get_by_label("Folder of MapLibre").fill("maplibre")  # no module has such an address
+    dialog.get_by_role("button", name="Save a MapLibre page").click()
+    assert dialog.locator("input:invalid").count() == 2
+    for label, folder, button in (("MapLibre GL JS", ".", "MapLibre"), ("CesiumJS", "./cesium/", "CesiumJS")):
+        dialog.get_by_label(f"Folder of {label}").fill(folder)
+        with page.expect_download() as saved:
+            dialog.get_by_role("button", name=f"Save a {button} page").click()
+        name = saved.value.suggested_filename
+        saved.value.save_as(surface.folder / name)
+        elsewhere = tabs(f"{surface.pages}/{name}", size=VIEW)
+        _wait_for_relief(elsewhere)
+        elsewhere.page.screenshot(path=tmp_path / f"{name}.png")
+    with page.expect_download() as saved:
+        dialog.get_by_role("button", name="Save a QGIS connection").click()
+    saved.value.save_as(tmp_path / "connection.xml")
+    (connection,) = ElementTree.parse(tmp_path / "connection.xml").getroot()
+    assert connection.get("url") == expected[2]
+    assert connection.get("interpretation") == "terrariumterrain"
+    dialog.get_by_role("button", name="Close").click()
+    expect(dialog).to_have_count(0)
+
+
+def test_what_has_no_place_on_the_earth_is_opened_nowhere_else(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.address("terrain"))
+    tab.everything_is_here()
+    expect(tab.page.get_by_role("button", name="Copy link")).to_be_visible()
+    expect(tab.page.get_by_role("button", name="Open in", exact=True)).to_be_hidden()
 
 
 def _wait_for_relief(tab: Tab) -> None:

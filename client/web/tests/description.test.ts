@@ -37,7 +37,7 @@ describe("what is read of the end of a container", () => {
     [{ geotransform: [0, 1, 0, 0, 0, 1], crs: 'PROJCS["x",GEOGCS["y",UNIT["degree",1]],UNIT["metre",1]]' }, "m"],
     [{ unit: "m" }, "cells"],
     [{ axes: 3 }, ""],
-  ])("tells the unit of x and y: %j", async (metadata, unit) => {
+  ])("tells the unit of x and y, and whether maps can show it: %j", async (metadata, unit) => {
     const closed = [false, true] as const;
     const heights = { ...(await header()), pointChannels: 1, plane: null, shape: [3, 4], closed } as unknown as Header;
     const info = infoOf({ ...heights, blocks: [{ shape: [3, 4], closed }] } as unknown as Header, {
@@ -45,6 +45,7 @@ describe("what is read of the end of a container", () => {
       metadata,
     });
     expect(info.planeUnit).toBe(unit);
+    expect(info.mapped).toBe("crs" in metadata && "geotransform" in metadata);
   });
 
   it("never calls exact what a mesh was resampled into", async () => {

@@ -100,6 +100,12 @@ export class Server {
     return (await this.json("GET", url)) as ListedSurface;
   }
 
+  /** Where the tiles of a surface, or of what a name leads to, lie: west, south, east, north in degrees; and to which zoom. */
+  async tiles(url: string): Promise<{ bounds: [number, number, number, number]; maxzoom: number }> {
+    const { bounds, maxzoom } = (await this.json("GET", `${url}/map.json`)) as Awaited<ReturnType<Server["tiles"]>>;
+    return { bounds, maxzoom };
+  }
+
   /** Deletes a surface. */
   async delete(url: string): Promise<void> {
     await this.json("DELETE", url);

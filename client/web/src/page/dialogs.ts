@@ -3,7 +3,7 @@
 import { html } from "../view/dom";
 
 /** Shows a dialog until it is answered. @returns what its buttons are called by, or "" if it was left. */
-function ask(dialog: HTMLDialogElement): Promise<string> {
+export function ask(dialog: HTMLDialogElement): Promise<string> {
   document.body.append(dialog);
   return new Promise((resolve) => {
     dialog.addEventListener("close", () => {

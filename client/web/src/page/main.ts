@@ -10,6 +10,7 @@ import { askToken } from "./dialogs";
 import icon from "./icon.svg?url";
 import { Listing } from "./listing";
 import { nameOf } from "./names";
+import { copyButton, openIn } from "./open-in";
 import { SeriesSlider, seriesOf } from "./series";
 
 const server = new Server(new URL(".", location.href).href);
@@ -41,18 +42,19 @@ function mark(link: boolean): HTMLElement {
   return link ? html("a", { class: "mark", href: "#" }, ...parts) : html("span", { class: "mark" }, ...parts);
 }
 
-/** Shows a surface in place of whatever is shown. */
-function open(src: string, name: string, back: boolean): void {
+/**
+ * Shows a surface in place of whatever is shown.
+ *
+ * @param path - Of the surface on the server, or of the name that led to it; null: it is on no server.
+ */
+function open(src: string, name: string, back: boolean, path: string | null): void {
   closeAll();
   const title = html("h1", {}, name);
   const facts = html("span", { class: "facts" });
-  const copy = html("button", { type: "button", class: "plain" }, "Copy link");
-  copy.addEventListener("click", async () => {
-    await navigator.clipboard.writeText(location.href).catch(() => {});
-    setText(copy, "Copied");
-    setTimeout(() => setText(copy, "Copy link"), 1500);
-  });
-  header.replaceChildren(mark(back), title, facts, html("span", { class: "grow" }), copy);
+  const copy = copyButton("Copy link", () => location.href);
+  const maps = html("button", { type: "button", class: "plain", hidden: true }, "Open in");
+  if (path !== null) maps.addEventListener("click", () => void openIn(server, path, name, allowed));
+  header.replaceChildren(mark(back), title, facts, html("span", { class: "grow" }), maps, copy);
   view = new LodestreamView();
   view.token = server.token;
   view.setAttribute("share", "");
@@ -60,6 +62,7 @@ function open(src: string, name: string, back: boolean): void {
   view.src = src;
   view.addEventListener("lodestream-info", (event) => {
     const info = (event as CustomEvent<SurfaceInfo>).detail;
+    maps.hidden = path === null || !info.mapped;
     if (name === "") setText(title, info.name || "Surface");
     document.title = `${name || info.name || "Surface"} – Lodestream`;
     const [first] = info.blocks;
@@ -69,7 +72,7 @@ function open(src: string, name: string, back: boolean): void {
   view.addEventListener("lodestream-progress", async (event) => {
     const { state, code, detail } = (event as CustomEvent<Progress>).detail;
     if (state !== "failed" || code === undefined || asking !== null) return;
-    if (await allowed(new ProblemError(401, code, detail, ""))) open(src, name, back);
+    if (await allowed(new ProblemError(401, code, detail, ""))) open(src, name, back, path);
   });
   document.body.replaceChildren(header, html("main", {}, view));
 }
@@ -113,7 +116,7 @@ async function route(): Promise<void> {
   try {
     const surface = await server.look(path);
     if (asked() !== path) return;
-    open(server.address(surface.url), nameOf(surface), true);
+    open(server.address(surface.url), nameOf(surface), true, path);
     await showSeries(surface);
   } catch (error) {
     shown = null;
@@ -169,7 +172,7 @@ async function showConfigured(surfaces: readonly ShownSurface[]): Promise<void> 
   const address = new URL(src, document.baseURI);
   if (address.origin !== location.origin)
     throw new Error(`expected a container of this host, got one of ${address.host}`);
-  open(address.href, title, surfaces.length > 1);
+  open(address.href, title, surfaces.length > 1, null);
 }
 
 function showChoice(surfaces: readonly ShownSurface[]): void {

@@ -217,15 +217,17 @@ export function infoOf(header: Header, { metadata, prices, size }: Omit<Descript
     return typeof value === "string" ? value : "";
   };
   const heights = header.pointChannels === 1 && header.blocks.length === 1;
+  const georeferenced =
+    heights && (header.plane !== null || metadata.axes !== undefined || (metadata.geotransform ?? null) !== null);
   return {
     name: text("name"),
     blocks: header.blocks.map(({ shape, closed }) => ({ shape, closed })),
     levels: header.levels,
     extent: header.extent,
     heights,
-    georeferenced:
-      heights && (header.plane !== null || metadata.axes !== undefined || (metadata.geotransform ?? null) !== null),
+    georeferenced,
     geographic: heights && GEOGRAPHIC.test(text("crs")),
+    mapped: georeferenced && text("crs") !== "",
     joined: header.arrangement !== null,
     unit: text("unit"),
     planeUnit: planeUnitOf(header, metadata),

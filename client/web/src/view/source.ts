@@ -56,6 +56,8 @@ export interface SurfaceInfo {
   readonly georeferenced: boolean;
   /** Whether x and y are degrees. */
   readonly geographic: boolean;
+  /** Whether it has a place on the Earth, so that servers make tiles for maps of it. */
+  readonly mapped: boolean;
   /** Whether sides of the blocks are joined, so that all of it has to be drawn at one level. */
   readonly joined: boolean;
   /** Of heights, and of all coordinates where x and y are no other: see `planeUnit`. */

@@ -170,6 +170,7 @@ const BASE = {
   exact: true,
   georeferenced: false,
   geographic: false,
+  mapped: false,
   joined: false,
   heights: false,
 };

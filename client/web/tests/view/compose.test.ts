@@ -79,6 +79,7 @@ describe("what is drawn of a large surface", () => {
     heights: true,
     georeferenced: false,
     geographic: false,
+    mapped: false,
     joined: false,
     unit: "",
     planeUnit: "",

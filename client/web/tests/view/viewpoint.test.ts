@@ -13,6 +13,7 @@ const INFO: SurfaceInfo = {
   heights: false,
   georeferenced: false,
   geographic: false,
+  mapped: false,
   joined: false,
   unit: "",
   planeUnit: "",
