@@ -22,6 +22,8 @@ from contextlib import ExitStack, asynccontextmanager
 from functools import partial
 from typing import Any, Generic, TypeVar, cast
 
+from lodestream.errors import LodestreamError
+
 from ..access.turns import Place, Turns
 from ..operation.logs import event
 from ..problems import RestartingError
@@ -75,7 +77,7 @@ class Runner(Generic[_Key, _Call]):
     worker : Worker
         Makes their calls; it is closed with the runner.
     level : int
-        Of the line in the log for a job that ends well.
+        Of the line in the log for a job that ends well, or is refused.
     """
 
     def __init__(self, kind: str, size: int, memory: float, worker: Worker[_Call], level: int = logging.INFO) -> None:
@@ -154,6 +156,9 @@ class Runner(Generic[_Key, _Call]):
                 made = await work(job.held)
             result = made if isinstance(made, str) else "done"
             return made
+        except LodestreamError as error:  # which is told to whoever asked
+            result = str(error)
+            raise
         except Exception as error:
             result, level = str(error) or type(error).__name__, logging.INFO
             raise

@@ -50,7 +50,7 @@ _MEMORY = 512 << 20
 # Questions to one process: what a file may have done to it does not last.
 _QUESTIONS = 2000
 
-_SECONDS = 30.0
+_SECONDS = 10.0
 
 # The longest image is one of 512 x 512 pixels of four bytes, which is not compressed; and its base64.
 _LONGEST = 2 << 20

@@ -73,6 +73,10 @@ class TileOrder(NamedTuple):
     normals: bool = False
     is_gzipped: bool = False
 
+    def __str__(self) -> str:
+        """Return what it is, for the log: strangers choose the rest."""
+        return f"{self.what} {self.z}/{self.x}/{self.y}"
+
 
 @dataclass(frozen=True)
 class MadeTile:

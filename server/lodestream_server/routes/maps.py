@@ -208,9 +208,18 @@ async def mesh(
         scale=scale,
         offset=offset,
         normals=_NORMALS in request.headers.get("accept", ""),
-        is_gzipped="gzip" in request.headers.get("accept-encoding", ""),
+        is_gzipped=_takes_gzip(request.headers.get("accept-encoding", "")),
     )
     return await _made(request, parts, caller, found, order, _MESH, version=v)
+
+
+def _takes_gzip(accepted: str) -> bool:
+    """Return whether an Accept-Encoding names gzip, and not with the weight 0."""
+    for each in accepted.split(","):
+        name, _, weight = each.partition(";")
+        if name.strip().lower() == "gzip":
+            return not weight.strip().lower().startswith("q=0") or weight.strip("qQ= 0.") != ""
+    return False
 
 
 async def _made(

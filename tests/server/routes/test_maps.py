@@ -78,6 +78,8 @@ def test_a_globe_finds_its_meshes_by_the_document(http: httpx.Client, hill: dict
             assert gzip.decompress(b"".join(packed.iter_raw())) == maps.mesh_tile(field, z, x, y)
         assert packed.headers["etag"] != plain.headers["etag"]
         assert packed.headers["vary"] == "accept, accept-encoding"
+        unwanted = http.get(place.format(z=z, x=x, y=y), headers={"accept-encoding": "br, gzip;q=0"})
+        assert "content-encoding" not in unwanted.headers
 
 
 def test_options_reach_the_tiles(http: httpx.Client, hill: dict[str, Any], field: Any) -> None:
