@@ -85,12 +85,8 @@ page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), wh
 
 # Both wait for links and clocks much of the time, so they run at the same time.
 test-web: page $(WEB_TOOLS) $(MAPS)/node_modules/.package-lock.json ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
-	@status=0; said=$$(mktemp); \
-	(cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent) > $$said 2>&1 & package=$$!; \
-	LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS) || status=1; \
-	wait $$package || status=1; \
-	cat $$said; rm -f $$said; \
-	exit $$status
+	@cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent
+	@LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
 
 bench-web: page $(WEB_TOOLS) ## speed of the browser's decoder, times to the first picture, and the size of the bundle
 	@$(BIN)/python -m benchmarks.web $(ARGS)

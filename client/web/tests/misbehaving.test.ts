@@ -158,9 +158,9 @@ describe("a server", () => {
       TruncatedStreamError,
       /bytes of the surface/,
     ],
-    ["falls silent, again and again", () => undefined, SilenceError, /has sent nothing for 0.15 seconds/],
+    ["falls silent, again and again", () => undefined, SilenceError, /has sent nothing for 0.8 seconds/],
   ])("that %s is left with an error", async (name, act, kind, text) => {
-    const silence = name.startsWith("falls") ? 0.15 : 2;
+    const silence = name.startsWith("falls") ? 0.8 : 2;
     // The first connection brings something; those after it do the same and bring nothing.
     const script: Script = (socket, sender, connection, pump) =>
       instead(connection === 0 ? 2 : 1, act)(socket, sender, connection, pump);
