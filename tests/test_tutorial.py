@@ -26,6 +26,7 @@ def outcome(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
     return page, tutorial.rendered(page, folder / "here", tutorial.installed(folder))
 
 
+@pytest.mark.long
 def test_every_command_prints_what_the_page_says(outcome: tuple[str, str]) -> None:
     page, rendered = outcome
     assert page.count("\n$ ") > 12

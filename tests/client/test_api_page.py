@@ -11,6 +11,7 @@ from ..test_doctests import EXAMPLE, modules
 from . import api_manual
 
 
+@pytest.mark.long
 def test_the_page_is_written_from_the_docstrings() -> None:
     assert api_manual.PATH.read_text() == api_manual.render(), "python -m tests.client.api_manual writes it anew"
 

@@ -63,6 +63,7 @@ def unique(points: NDArray[Any]) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize(("files", "options", "suffix", "warns"), CASES, ids=[case[0][0] for case in CASES])
+@pytest.mark.long
 def test_a_curvilinear_file_goes_through_a_server(
     server: str, run: Run, tmp_path: Path, files: tuple[str, ...], options: dict[str, str], suffix: str, warns: bool
 ) -> None:

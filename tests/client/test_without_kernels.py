@@ -57,6 +57,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Bare:
     return Bare(tmp_path_factory.mktemp("bare"))
 
 
+@pytest.mark.long
 def test_decoding_is_refused(bare: Bare, container_file: Path, surface: str, tmp_path: Path) -> None:
     out = tmp_path / "out.npy"
     for command in (

@@ -196,6 +196,7 @@ def test_a_level_of_few_points_is_read_once_and_large_ones_by_windows(
 
 @pytest.mark.parametrize("level", [5, 7])
 @pytest.mark.parametrize("key", [*KEYS[:3], (5, slice(0, 50)), (slice(None), -1)])
+@pytest.mark.long
 def test_whatever_is_indexed_of_a_level_is_the_levels_own(path: Path, level: int, key: Any) -> None:
     decoder = ls.Decoder()
     decoder.feed(path.read_bytes())

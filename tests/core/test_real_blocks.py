@@ -139,6 +139,7 @@ def written(surface: Surface, kind: str) -> bytes:
 
 @pytest.mark.sweep(8)
 @pytest.mark.parametrize("row", ROWS, ids=names)
+@pytest.mark.long
 def test_a_real_file_is_read_as_its_readme_says(row: Row) -> None:
     surface = read(row)
     assert tuple(block.shape for block in surface.blocks) == row.shapes

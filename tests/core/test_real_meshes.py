@@ -109,6 +109,7 @@ def shuffled(points: NDArray[np.float64], faces: list[list[int]]) -> str:
 
 @pytest.mark.sweep(2)
 @pytest.mark.parametrize("name", [name for name in READ if name != "torus_tri_blender.obj"])
+@pytest.mark.long
 def test_in_another_order(name: str, tmp_path: Path) -> None:
     points, faces = plain_mesh(path_of(name))
     path = tmp_path / "shuffled.obj"

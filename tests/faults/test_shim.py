@@ -132,6 +132,7 @@ def test_calls_are_counted_by_what_they_are_and_where(bench: Bench) -> None:
     ],
     ids=str,
 )
+@pytest.mark.long
 def test_one_call_fails_and_only_that_one(bench: Bench, fault: Fault, changes: Says) -> None:
     root = bench.new()
     with bench.shim.failing(fault):

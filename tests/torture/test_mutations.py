@@ -21,6 +21,7 @@ def test_every_mutant_names_a_golden_file_or_says_why_there_is_none() -> None:
 
 
 @pytest.mark.parametrize("mutant", MUTANTS[::16], ids=lambda mutant: mutant.rule)
+@pytest.mark.long
 def test_a_golden_file_notices_a_changed_rule(mutant: Mutant) -> None:
     assert outcome_of(mutant).file is not None
 

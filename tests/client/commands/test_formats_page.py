@@ -51,6 +51,7 @@ def test_the_command_has_a_row_for_each_format(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize("row", ROWS, ids=[row[0] for row in ROWS])
+@pytest.mark.long
 def test_the_commands_of_the_page(
     row: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -256,6 +256,7 @@ def test_too_little_memory_is_refused(run: Run, file: Path, tmp_path: Path, comm
     assert "argument --memory: expected 1 MiB of memory or more to work in, got '1KiB'" in stderr
 
 
+@pytest.mark.long
 def test_memory_that_will_be_exceeded_is_told(run: Run, file: Path, tmp_path: Path) -> None:
     code, _, stderr = run("encode", file, tmp_path / "a.lode", *LITTLE)
     assert code == 0

@@ -115,6 +115,7 @@ def _completions(line: str, folder: Path) -> list[str]:
     return (folder / "told").read_text().split("\n")
 
 
+@pytest.mark.long
 def test_shells_complete_commands_and_options(tmp_path: Path) -> None:
     pytest.importorskip("argcomplete")
     assert {"encode", "decode"} <= {word.strip() for word in _completions("lodestream ", tmp_path)}

@@ -168,6 +168,7 @@ def children() -> set[int]:
     return {process.pid for process in psutil.Process().children(recursive=True)}
 
 
+@pytest.mark.long
 def test_the_stream_does_not_wait_for_a_picture(
     run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,6 +251,7 @@ def test_an_interruption_leaves_no_process_that_draws(
     assert not (tmp_path / "out.png").exists()
 
 
+@pytest.mark.long
 def test_the_process_draws_what_is_drawn_here(tmp_path: Path, terrain: Terrain) -> None:
     decoder = ls.Decoder()
     views = decoder.feed(ls.encode(terrain))
@@ -298,6 +300,7 @@ def test_the_last_state_is_drawn_once(
     assert drawn.sizes == sorted(drawn.sizes)
 
 
+@pytest.mark.long
 def test_pictures_that_nobody_waits_for_take_half_of_the_time(
     tmp_path: Path, terrain: Terrain, monkeypatch: pytest.MonkeyPatch
 ) -> None:

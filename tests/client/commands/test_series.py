@@ -146,6 +146,7 @@ def test_steps_along_any_dimension_with_or_without_a_coordinate(run: Run, tmp_pa
         (["x" * 150 + "1", "x" * 150 + "2", "c"], None),
     ],
 )
+@pytest.mark.long
 def test_no_step_has_the_name_of_another(run: Run, tmp_path: Path, places: list[Any], names: list[str] | None) -> None:
     file, folder = tmp_path / "levels.nc", tmp_path / "levels"
     unit = {} if places[0] == "-" else {"units": "m"}

@@ -41,6 +41,7 @@ def surface(name: str, digit: str, levels: tuple[LevelFile, ...] = ()) -> Publis
 
 
 @given(st.lists(surfaces, max_size=6), st.lists(st.builds(Replaced, digests, st.floats(0, 1e10)), max_size=3))
+@pytest.mark.long
 def test_a_list_is_read_as_it_was_written(entries: list[PublishedSurface], replaced: list[Replaced]) -> None:
     written = PublishedList(tuple(entries), tuple(replaced))
     first, second = written.dump(), written.dump()

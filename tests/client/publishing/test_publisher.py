@@ -242,6 +242,7 @@ class _Late:
 
 @pytest.mark.parametrize("method", ["open", "put_file", "get", "create", "replace", "entries", "delete"])
 @pytest.mark.parametrize("case", ["stray", "replaced"])
+@pytest.mark.long
 def test_another_publisher_at_any_moment_takes_nothing_away(
     tmp_path: Path, pages: dict[str, page.Asset], method: str, case: str
 ) -> None:

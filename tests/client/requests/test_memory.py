@@ -77,6 +77,7 @@ def container_of(surface: Description) -> bytes:
 
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
 @pytest.mark.parametrize("kind", SURFACES)
+@pytest.mark.long
 def test_a_surface_in_memory_goes_whole(server: str, kind: str, asynchronous: bool) -> None:
     given = SURFACES[kind]()
     metadata = dict(given.metadata)

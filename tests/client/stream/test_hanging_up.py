@@ -98,6 +98,7 @@ class _LateSocket(socket.socket):
         return data
 
 
+@pytest.mark.long
 def test_none_of_300_streams_to_their_end_logs_anything(
     large: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

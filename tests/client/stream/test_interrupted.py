@@ -536,6 +536,7 @@ def test_encode_and_decode_leave_no_half_of_a_file(
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.long
 def test_the_demo_leaves_no_server(tmp_path: Path, number: signal.Signals, code: int) -> None:
     with command("demo", "--out", tmp_path / "demo") as process:
         until(lambda: descendants(process.pid), process)

@@ -87,6 +87,7 @@ def test_every_prefix_shows_the_last_whole_layer(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.long
 def test_a_flipped_bit_leaves_the_layers_before_it_and_a_clear_error(name: str) -> None:
     container, layers = container_of(name), EXPECTED[name]["layers"]
     shuffle = random.Random(name)

@@ -101,6 +101,7 @@ def refused(reader: str, data: bytes, words: str = "") -> None:
 @pytest.mark.sweep(5)
 @pytest.mark.parametrize("reader", READERS)
 @pytest.mark.parametrize("count", [limits.LAYERS + 1, 20_000, 100_000])
+@pytest.mark.long
 def test_too_many_layers_are_refused_at_the_header(reader: str, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     data = with_layers(count)
     monkeypatch.setattr(sections, "parse_layer", None)  # no reader gets as far
@@ -268,6 +269,7 @@ def test_many_channels_have_fewer_layers(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("options", [{}, {"memory": 1 << 20}])
+@pytest.mark.long
 def test_layers_of_many_channels_are_merged_evenly(monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]) -> None:
     """Every reader takes what the encoder makes, and its first layers stay small."""
     attributes = terrain((60, 70))[..., None] * np.linspace(0.5, 1.5, 7) + np.arange(60.0)[:, None, None]

@@ -82,6 +82,7 @@ def check_kept(case: Case, data: bytes, seed: int) -> None:
 
 @examples(10)
 @given(case=cases(), seed=st.integers(0, 2**32), rule=st.sampled_from([None, 0, 1, 2, 3, 255]))
+@pytest.mark.long
 def test_what_came_before_a_wrong_chunk_is_kept(case: Case, seed: int, rule: int | None) -> None:
     assume(any(chunk.range.length for chunk in index_of(case.data).chunks))
     check_kept(case, with_chunk(case.data, random.Random(seed), rule), seed)

@@ -37,6 +37,7 @@ def test_sound_containers_pass(name: str) -> None:
 @pytest.mark.parametrize("name", ["integers", "holes", "attributes", "torus"])
 @pytest.mark.parametrize("part", [0.0, 0.2])
 @pytest.mark.parametrize("place", [0, 1])
+@pytest.mark.long
 def test_wrong_errors_are_found(name: str, part: float, place: int) -> None:
     data = container_of(name)
     number = round(part * (len(index_of(data).layers) - 1))

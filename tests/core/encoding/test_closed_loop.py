@@ -126,6 +126,7 @@ def test_of_special_surfaces_too(name: str, base: int) -> None:
 
 
 @pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.long
 def test_streams_of_special_surfaces_keep_the_error(name: str) -> None:
     surface = SURFACES[name]
     for wanted in (1e-2, 1e-4):

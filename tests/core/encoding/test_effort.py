@@ -130,6 +130,7 @@ def test_a_build_by_bands_has_the_same_bytes(name: str, effort: Effort, tmp_path
 
 
 @every_effort
+@pytest.mark.long
 def test_blocks_are_built_block_by_block(effort: Effort, tmp_path: Path) -> None:
     surface = block_surface("plates", (150, 130), 2, "float32", "attributes", np.random.default_rng(1))
     out = tmp_path / "out.lode"

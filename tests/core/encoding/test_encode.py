@@ -110,6 +110,7 @@ def test_processes_share_the_work(tmp_path: Path) -> None:
 @pytest.mark.sweep(6)
 @pytest.mark.parametrize("shape", [(1, 2), (2, 3), (40, 50), (150, 150)])
 @pytest.mark.parametrize("kind", ["heights", "holes", "closed columns", "closed rows", "closed both"])
+@pytest.mark.long
 def test_small_surfaces_are_built_by_an_executor_too(shape: tuple[int, int], kind: str) -> None:
     heights = np.rint(300 * terrain(shape)).astype(np.int16)
     mask = np.hypot(*np.mgrid[-1 : 1 : shape[0] * 1j, -1 : 1 : shape[1] * 1j]) < 1.2 if kind == "holes" else None
@@ -381,6 +382,7 @@ def test_text_says_how_much_memory_there_is() -> None:
     assert ls.encode(surface, memory="1MiB") == _container()
 
 
+@pytest.mark.long
 def test_copies_of_one_source_are_all_in_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     xarray = pytest.importorskip("xarray")
     heights = _heights().points.astype(np.float32)

@@ -76,6 +76,7 @@ def test_every_type_shape_and_closure_comes_back_bit_for_bit(dtype: str) -> None
 
 
 @pytest.mark.parametrize("closed", CLOSURES)
+@pytest.mark.long
 def test_every_pair_of_small_sizes_comes_back(closed: tuple[bool, bool]) -> None:
     for rows, columns in itertools.product(range(1, 8), repeat=2):
         if rows * columns > 1:

@@ -165,6 +165,7 @@ def test_damage_is_found_where_it_is_decoded() -> None:
         _decoder(bytes(container)).surface(IN_MEMORY, 1, lambda fraction: None)
 
 
+@pytest.mark.long
 def test_coefficients_that_are_too_large_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     surface = _plates()
     monkeypatch.setattr(transform_phases, "COEFFICIENT_BITS", 0)  # so that coefficients of fitted predictors do not fit

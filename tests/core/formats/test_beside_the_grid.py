@@ -142,6 +142,7 @@ def many(count: int, **attributes: str) -> dict[str, Any]:
 
 
 @every_opener
+@pytest.mark.long
 def test_single_numbers_give_way_to_coordinates(tmp_path: Path, opener: Opener) -> None:
     lon = np.linspace(0, 13, 6080) ** 2
     place = {"lat": ("lat", [0.0, 1.0, 3.0], NORTH), "lon": ("lon", lon, EAST)}
@@ -157,6 +158,7 @@ def test_single_numbers_give_way_to_coordinates(tmp_path: Path, opener: Opener) 
 
 
 @every_opener
+@pytest.mark.long
 def test_a_dataset_of_very_many_numbers_keeps_the_first_and_its_crs(tmp_path: Path, opener: Opener) -> None:
     crs = {"grid_mapping_name": "latitude_longitude", "semi_major_axis": 6371229.0, "inverse_flattening": 0.0}
     data = field(crs=((), 0, crs), **many(100, long_name="a constant of a model, with a name", units="m s-1"))

@@ -545,6 +545,7 @@ def test_values_outside_the_valid_range_are_missing(
         {"scale_factor": 2, "add_offset": 1},
     ],
 )
+@pytest.mark.long
 def test_packed_values_are_those_of_xarray(tmp_path: Path, dtype: str, fill: bool, scale: dict[str, Any]) -> None:
     stored = (np.arange(24 * 32) * 7 % 101).reshape(24, 32).astype(dtype)
     said = scale | ({"_FillValue": stored.dtype.type(5)} if fill else {})

@@ -38,6 +38,7 @@ except KeyboardInterrupt:
 @pytest.mark.usefixtures("interrupts")
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are others")
 @pytest.mark.parametrize("call", [1, 2, 5, 12])
+@pytest.mark.long
 def test_an_interruption_is_told_and_kills_nobody(tmp_path: Path, call: int) -> None:
     command = [sys.executable, "-c", _WRITE, str(tmp_path / "a.nc"), str(call)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)

@@ -369,6 +369,7 @@ def test_coordinates_are_found_by_their_names(tmp_path: Path, x: str, y: str) ->
         ("xc", "yc", {"units": "m s-1"}),
     ],
 )
+@pytest.mark.long
 def test_names_that_say_no_place_are_candidates(tmp_path: Path, x: str, y: str, attributes: dict[str, str]) -> None:
     grid = {name: (("j", "i"), hills(), attributes) for name in (x, y, *(f"flow{number}" for number in range(30)))}
     with pytest.raises(FormatError) as refused:

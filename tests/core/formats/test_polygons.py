@@ -78,6 +78,7 @@ FILES["binary.ply"] = lambda path: ply(path, binary=True)
 
 
 @pytest.mark.parametrize("kind", FILES)
+@pytest.mark.long
 def test_a_file_of_pentagons_is_refused_with_the_option_and_resampled_with_it(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"a.{kind}"
     FILES[kind](path)

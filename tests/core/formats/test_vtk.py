@@ -78,6 +78,7 @@ ENCODINGS: list[dict[str, Any]] = [
 
 
 @pytest.mark.parametrize("encoding", range(0, len(ENCODINGS), 3))
+@pytest.mark.long
 def test_xml_in_every_encoding(tmp_path: Path, encoding: int) -> None:
     points = points_of((5, 4, 1), "f4" if encoding % 2 else "f8")
     arrays = {"speed": np.arange(20, dtype=np.int16), "flow": np.arange(60.0).reshape(20, 3)}
@@ -92,6 +93,7 @@ def test_xml_in_every_encoding(tmp_path: Path, encoding: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["SetFileTypeToASCII", "SetFileTypeToBinary"])
+@pytest.mark.long
 def test_legacy_structured_grid_with_named_roles(tmp_path: Path, kind: str) -> None:
     points = points_of((3, 2, 4))
     grid = grid_of((3, 2, 4), points, {"heat": np.arange(24, dtype=np.float32)})
@@ -420,6 +422,7 @@ LEGACY = (
         (LEGACY.replace("0 1 2", "nan nan nan"), InputError, "at least one valid point|that VTK reads"),
     ],
 )
+@pytest.mark.long
 def test_a_legacy_file_that_lies_is_refused(tmp_path: Path, text: str, error: type[InputError], message: str) -> None:
     (tmp_path / "g.vtk").write_text(text)
     with pytest.raises(error, match=message):

@@ -38,6 +38,7 @@ def utm() -> str:
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "int16", "int32", "int64", "float32", "float64"])
+@pytest.mark.long
 def test_a_cog_is_a_geotiff_with_overviews(tmp_path: Path, dtype: str) -> None:
     surface = with_hole(dtype, (700, 600), crs=utm(), unit="m", tags={"": {"SURVEY": "1996"}})
     surface.blocks[0].attributes["depth"] = hills(dtype, (700, 600)) // 2

@@ -207,6 +207,7 @@ def test_hostile_stores(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+@pytest.mark.long
 def test_nobody_waits_for_a_pipe_in_place_of_the_head_of_a_store(tmp_path: Path) -> None:
     store = tmp_path / "a.zarr"
     sea().isel(time=0).drop_vars(["speed", "time"]).to_zarr(store, zarr_format=2, consolidated=False)

@@ -132,6 +132,7 @@ def check_table(
 
 
 @pytest.mark.parametrize("closed", CLOSED)
+@pytest.mark.long
 def test_tiles_of_every_small_size_are_those_made_one_by_one(closed: tuple[bool, bool]) -> None:
     for rows, columns in itertools.product(range(1, 14), repeat=2):
         layout = Layout([Grid((rows, columns), closed)], ((0, 0), (1, 2), (3, 1))[(rows + columns) % 3])

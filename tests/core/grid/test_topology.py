@@ -206,6 +206,7 @@ SURFACES: dict[str, Callable[[], ls.Surface]] = {
 
 @pytest.mark.sweep(4)
 @pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.long
 def test_faces_are_the_same_after_every_layer(name: str) -> None:
     surface = SURFACES[name]()
     expected = topologies(surface)
@@ -218,6 +219,7 @@ def test_faces_are_the_same_after_every_layer(name: str) -> None:
 
 @pytest.mark.sweep(4)
 @pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.long
 def test_faces_of_a_level_are_the_same_after_every_layer(name: str) -> None:
     decoder = decoded(SURFACES[name]())
     assert decoder.header is not None

@@ -205,6 +205,7 @@ def test_a_file_of_lodestream_is_the_surface_again(name: str, suffix: str, tmp_p
 @both
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"])
 @pytest.mark.parametrize("channels", [0, 2, 3])
+@pytest.mark.long
 def test_integers_with_holes_keep_their_type(dtype: str, channels: int, suffix: str, tmp_path: Path) -> None:
     limits = np.iinfo(dtype)
     values = np.random.default_rng(3).integers(max(limits.min, -(2**53)), min(limits.max, 2**53), (*SHAPE, 3))

@@ -336,6 +336,7 @@ def test_a_dataset_is_the_surface_of_its_file(name: str, written: Any) -> None:
 
 @pytest.mark.sweep(13)
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.long
 def test_every_variable_along_the_grid_is_taken_or_named(name: str, written: Any) -> None:
     make, options, attributes = CASES[name]
     data = make()

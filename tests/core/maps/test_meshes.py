@@ -84,6 +84,7 @@ def test_a_plane_at_200_nodes() -> None:
     assert np.abs(found - plane_height(rows, columns)).max() <= 0.01
 
 
+@pytest.mark.long
 def test_mountains_at_200_nodes_and_their_bytes() -> None:
     field, heights = bigtujunga()
     rows, columns = nodes_of(field, 200)

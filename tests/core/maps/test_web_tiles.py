@@ -77,6 +77,7 @@ def test_mountains_at_200_nodes(encoding: Encoding) -> None:
 
 
 @pytest.mark.parametrize("driver_zoom", [10, 12])
+@pytest.mark.long
 def test_gdal_reads_terrarium_by_its_driver_of_tiles(driver_zoom: int, tmp_path: Path) -> None:
     """With numbers of rows and columns of its own, from files, as its WMS driver for TMS does from servers."""
     field = plane()

@@ -104,6 +104,7 @@ def check_window(view: View, region: Region, level: int, inside: Places) -> None
     ),
     data=st.data(),
 )
+@pytest.mark.long
 def test_the_window_of_a_level_is_cut_out_of_it_in_every_state(surface: ls.Surface, data: st.DataObject) -> None:
     container = encoded(surface, data.draw(st.sampled_from([None, (4, 4), (3, 5)])))
     decoder = ls.Decoder()
@@ -124,6 +125,7 @@ def test_the_window_of_a_level_is_cut_out_of_it_in_every_state(surface: ls.Surfa
 
 @examples(20)
 @given(surface=surfaces(), data=st.data())
+@pytest.mark.long
 def test_what_is_sent_for_the_window_of_a_level_is_enough(surface: ls.Surface, data: st.DataObject) -> None:
     container = encoded(surface, data.draw(st.sampled_from([None, (4, 4), (3, 5)])))
     index = index_of(container)

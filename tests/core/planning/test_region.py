@@ -115,6 +115,7 @@ SIZES = [((4, 4), (4, 4)), ((1, 7), (9, 7)), ((3, 6), (7, 1)), ((8, 8), (5, 3))]
 @pytest.mark.sweep(6)
 @pytest.mark.parametrize(("tile", "chunk"), SIZES, ids=repr)
 @pytest.mark.parametrize("kind", ["integers", "floats", "holes"])
+@pytest.mark.long
 def test_tiles_and_chunks_of_any_size_are_read(
     kind: str, tile: tuple[int, int], chunk: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

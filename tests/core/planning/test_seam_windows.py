@@ -69,6 +69,7 @@ def windows(draw: st.DrawFn, shape: tuple[int, int], closed: tuple[bool, bool]) 
 
 @examples(25)
 @given(st.data())
+@pytest.mark.long
 def test_every_prefix_shows_the_window_as_numpy_takes_it(data: st.DataObject) -> None:
     kind, shape = data.draw(st.sampled_from(KINDS)), data.draw(st.sampled_from(SHAPES))
     closed = data.draw(st.sampled_from([(False, True), (True, True), (True, False)]))
@@ -116,6 +117,7 @@ def test_every_prefix_shows_the_window_as_numpy_takes_it(data: st.DataObject) ->
 
 
 @pytest.mark.parametrize("kind", ["integers", "floats", "holes", "attributes"])
+@pytest.mark.long
 def test_windows_across_the_seam_are_sent_alone_and_their_errors_hold(kind: str) -> None:
     shape, closed = (130, 1024), (False, True)
     surface, container = encoded(kind, shape, closed)

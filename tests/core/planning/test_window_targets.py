@@ -73,6 +73,7 @@ def views_of(container: bytes, index: Index, target: ls.Target, windows: WindowE
     st.sampled_from(["quality", "quality", "level"]),
     st.booleans(),
 )
+@pytest.mark.long
 def test_what_is_told_holds_and_no_stop_comes_too_early(
     kind: tuple[str, int, bool], corners: tuple[float, ...], limit: str, share: float, order: Any, with_own: bool
 ) -> None:

@@ -84,6 +84,7 @@ def test_random_cells_are_paired_without_exception(seed: int, name: str, count: 
     check_pairs(cut(*ALL[name](), count, seed), name in scenes.CLOSED)
 
 
+@pytest.mark.long
 def test_cells_are_discs_and_no_triangle_is_turned_over_in_their_maps() -> None:
     for scene in ALL.values():
         cells = cut(*scene(), 30)
@@ -187,6 +188,7 @@ def test_samples_that_are_far_from_the_error_are_not_measured_in_full(monkeypatc
     assert set(sizes) == {16}
 
 
+@pytest.mark.long
 def test_the_same_mesh_gives_the_same_blocks() -> None:
     first, second = (remesh_triangles(*scenes.torus(), blocks=24, error=1e-2) for _ in range(2))
     np.testing.assert_array_equal(first.points, second.points)
@@ -241,6 +243,7 @@ def test_a_component_without_area_is_dropped() -> None:
 
 
 @pytest.mark.parametrize("height", [1e-3, 1e-9])
+@pytest.mark.long
 def test_a_narrow_component_is_cut_into_so_many_triangles_only(height: float) -> None:
     result = remesh_triangles(*beside(scenes.cube(), sliver(height)), blocks=12, error=1e-2)
     mesh = Triangulation(*sliver(height))
@@ -347,6 +350,7 @@ class TestSurfaces:
         np.testing.assert_array_equal(first[place.reshape(-1)], after)
 
     @pytest.mark.parametrize("scene", [scenes.torus, scenes.disc])
+    @pytest.mark.long
     def test_any_layer_and_level_is_one_watertight_mesh(self, scene: scenes.Scene) -> None:
         surface = ls.Surface.from_mesh(*scene(), remesh=True, blocks=24, remesh_error=1e-2)
         container = ls.encode(surface)

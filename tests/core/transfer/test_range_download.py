@@ -132,6 +132,7 @@ def test_slices_that_are_near_are_asked_for_together(large: bytes) -> None:
 
 
 @pytest.mark.parametrize("target", TARGETS, ids=repr)
+@pytest.mark.long
 def test_whatever_is_held_is_not_asked_for(large: bytes, target: ls.Target) -> None:
     random = Random(3)
     for _ in range(20):

@@ -43,6 +43,11 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/v1/names/{name}"): "read",
     ("GET", "/v1/names/{name}/container"): "read",
     ("DELETE", "/v1/names/{name}"): "write",
+    **{
+        ("GET", f"/v1/{kind}/{{surface}}/{path}"): "read"
+        for kind in ("surfaces", "names")
+        for path in ("map.json", "tiles/{z}/{x}/{y}.{image}", "terrain/layer.json", "terrain/{z}/{x}/{y}.terrain")
+    },
 }
 GUARDED = [(method, path) for (method, path), scope in ROUTES.items() if scope is not None]
 WRITING = [(method, path) for method, path in GUARDED if method != "GET"]

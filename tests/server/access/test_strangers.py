@@ -45,6 +45,7 @@ def test_an_axis_that_is_too_long_is_refused_as_documented() -> None:
 
 
 @pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.long
 def test_any_change_is_taken_or_refused(name: str) -> None:
     target = TARGETS[name]
     corpus = target.corpus()

@@ -269,6 +269,7 @@ def test_an_option_that_does_not_fit_is_not_laid_on_the_cluster(
         (UnforeseenError("OSError", errno.ENOSPC, "| secret"), "queued", "waits for space on the server's disk"),
     ],
 )
+@pytest.mark.long
 def test_how_a_build_by_a_cluster_ends_is_told_and_logged(
     result: Any,
     state: str,
@@ -303,6 +304,7 @@ def test_how_a_build_by_a_cluster_ends_is_told_and_logged(
     assert any(line.startswith(f"the build of {surface['id']} came back from Dask after ") for line in logged)
 
 
+@pytest.mark.long
 def test_a_server_starts_where_no_scheduler_is_and_says_so_of_what_it_cannot_build(tmp_path: Path) -> None:
     with (
         running_server(tmp_path, dask="tcp://127.0.0.1:1", **BEYOND) as url,

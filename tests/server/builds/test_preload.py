@@ -22,6 +22,7 @@ for number in sorted(set(os.listdir("/proc/self/fd")) - before, key=int):
 """
 
 
+@pytest.mark.long
 def test_no_file_is_open() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert done.stdout == ""

@@ -87,6 +87,7 @@ def test_the_memory_of_a_call_is_beside_what_it_begins_with() -> None:
             server.close()
 
 
+@pytest.mark.long
 def test_a_fork_server_killed_while_it_idles_harms_nobody() -> None:
     server = ForkServer(slow.nothing)
 
@@ -250,6 +251,7 @@ def test_where_there_is_no_room_for_a_process_the_system_says_so() -> None:
         server.close()
 
 
+@pytest.mark.long
 def test_a_fork_server_that_ends_while_it_loads_is_told() -> None:
     server = ForkServer(slow.vanish)
     try:
@@ -355,6 +357,7 @@ def test_closing_kills_what_runs(server: ForkServer, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["cancel", "close", "fork server"])
+@pytest.mark.long
 def test_what_a_call_has_started_ends_with_it(tmp_path: Path, ending: str) -> None:
     server = ForkServer()
     begun, other = tmp_path / "begun", tmp_path / "begun.other"
@@ -411,6 +414,7 @@ def _parent(folder: Path, program: list[str], function: str) -> Iterator[subproc
 
 
 @pytest.mark.parametrize("way", ["a script", "-c"])
+@pytest.mark.long
 def test_a_process_does_not_outlive_its_parent(tmp_path: Path, way: str) -> None:
     """Nor does it run the program of its parent again, which says nowhere that it would mind."""
     script = tmp_path / "parent.py"

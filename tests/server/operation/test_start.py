@@ -179,6 +179,7 @@ def test_a_token_file_that_cannot_be_read(tmp_path: Path, refused: Refused) -> N
         assert str(path) in refused(*command, "--data", tmp_path)
 
 
+@pytest.mark.long
 def test_an_address_that_is_taken_or_not_ours(tmp_path: Path, refused: Refused) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -228,6 +228,7 @@ def test_data_in_order_are_not_changed(data: Path, made: Made) -> None:
 
 @pytest.mark.parametrize("how", DAMAGE)
 @pytest.mark.parametrize("id_", [ONE, TWO_FILES, LODE])
+@pytest.mark.long
 def test_a_container(data: Path, made: Made, how: str, id_: str) -> None:
     before = files(data)
     path = data / made.key("container", id_)

@@ -905,6 +905,7 @@ class Model(RuleBasedStateMachine):
         self.surfaces.close()
 
 
+@pytest.mark.long
 def test_surfaces_are_those_that_a_dict_would_hold(tmp_path: Path) -> None:
     Model.folder = tmp_path
     run_state_machine_as_test(Model, settings=settings(max_examples=30, stateful_step_count=25, deadline=None))
