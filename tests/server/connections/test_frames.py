@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosed
 import lodestream as ls
 from lodestream.protocol.messages import Credit, End, Error, Open
 from lodestream.protocol.wire import serialize
-from lodestream_server import running_server
+from lodestream_server import running, running_server
 from lodestream_server.connections import connections
 from tests.server.connections.sockets import CONTINUATION, PING, PONG, Frames, Place, frame, handshake
 from tests.server.helpers import PATIENCE, Keys, hills, npy, push, raw_stream
@@ -32,9 +32,8 @@ def surface(http: httpx.Client) -> dict[str, Any]:
 
 def streams() -> list[Any]:
     """The streams of servers of this process that are open."""
-    found = [
-        item for item in gc.get_objects() if issubclass(type(item), connections._Stream)
-    ]  # not by `isinstance`, which asks weak proxies
+    # Not by `isinstance`, which asks weak proxies.
+    found = [item for item in gc.get_objects() if issubclass(type(item), connections._Stream)]
     return [stream for stream in found if not stream.disconnected]
 
 
@@ -67,11 +66,12 @@ def test_of_pongs_that_nobody_takes_the_last_one_waits(
 ) -> None:
     monkeypatch.setattr(connections, "_FRAMES", 1e9)
     # Somebody without a token, whose open is waited for.
-    settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json"}
+    monkeypatch.setattr(running, "_PING_INTERVAL", PATIENCE)  # of no ping that the server itself sends
+    settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json", "head_seconds": PATIENCE}
     with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}", 4096) as connection:
         transport = streams()[0].transport
         number, most = 0, 0
-        while number < 200_000:
+        while number < 100_000:
             connection.sendall(b"".join(frame(b"%0125d" % each, PING) for each in range(number, number + 500)))
             number += 500
             most = max(most, transport.get_write_buffer_size())
