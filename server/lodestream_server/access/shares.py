@@ -82,11 +82,6 @@ class Share:
         self._taken: Counter[str] = Counter()
         self._total = 0
 
-    @property
-    def total(self) -> int:
-        """What all callers have taken."""
-        return self._total
-
     def of(self, key: str) -> int:
         """Return what the caller with this key has taken."""
         return self._taken[key]

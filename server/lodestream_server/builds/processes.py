@@ -22,6 +22,7 @@ import sys
 import tempfile
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -449,7 +450,7 @@ class Question:
 _Call = TypeVar("_Call", Call, Question)
 
 
-class Worker(Generic[_Call]):
+class Worker(ABC, Generic[_Call]):
     """Makes up to ``size`` calls at a time, each in a thread that waits for the process.
 
     Parameters
@@ -504,8 +505,9 @@ class Worker(Generic[_Call]):
             call.ended = True
         self._threads.shutdown(wait=True, cancel_futures=True)
 
+    @abstractmethod
     def _run(self, call: _Call) -> Any:
-        raise NotImplementedError
+        """Make a call, in a thread; return and raise as `run` does."""
 
     def _fork(self, call: Call, *, is_kept: bool = False) -> Process:
         """Fork a process as soon as the fork server is ready."""

@@ -7,7 +7,8 @@ ever. So a name (``/v1/names/``) may lead to another surface later, and its tile
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import Response
@@ -26,6 +27,8 @@ from .sending import ready, still_there, while_there
 __all__ = ["router"]
 
 router = APIRouter(prefix="/v1", tags=["maps"])
+
+_Route = TypeVar("_Route", bound=Callable[..., Any])
 
 _JSON, _MESH = "application/json", "application/vnd.quantized-mesh"
 _NORMALS = "octvertexnormals"
@@ -59,20 +62,24 @@ async def _found(request: Request, parts: Parts, surface: str) -> Surface:
 _Found = Annotated[Surface, Depends(_found)]
 
 
-@readable(
-    router,
-    "/names/{surface}/map.json",
-    summary="Describe the tiles of what a name leads to",
-    response_class=Response,
-    responses={200: {"description": "TileJSON 3.0.0", "content": {_JSON: {}}}, **_ERRORS},
-)
-@readable(
-    router,
-    "/surfaces/{surface}/map.json",
-    summary="Describe the tiles of a surface",
-    response_class=Response,
-    responses={200: {"description": "TileJSON 3.0.0", "content": {_JSON: {}}}, **_ERRORS},
-)
+def _mapped(path: str, summary: str, description: str, content: dict[str, Any]) -> Callable[[_Route], _Route]:
+    """Decorator for routes that surfaces have, and names of the surfaces to which they lead."""
+
+    def register(route: _Route) -> _Route:
+        for place, whose in (("/surfaces", "a surface"), ("/names", "what a name leads to")):
+            readable(
+                router,
+                f"{place}/{{surface}}{path}",
+                summary=f"{summary} of {whose}",
+                response_class=Response,
+                responses={200: {"description": description, "content": content}, **_ERRORS},
+            )(route)
+        return route
+
+    return register
+
+
+@_mapped("/map.json", "Describe the tiles", "TileJSON 3.0.0", {_JSON: {}})
 async def map_json(
     caller: Reader,
     request: Request,
@@ -97,20 +104,7 @@ async def map_json(
     return await _made(request, parts, caller, found, order, _JSON, version=None)
 
 
-@readable(
-    router,
-    "/names/{surface}/tiles/{z}/{x}/{y}.{image}",
-    summary="Fetch a tile of what a name leads to",
-    response_class=Response,
-    responses={200: {"description": "An image", "content": {"image/png": {}, "image/webp": {}}}, **_ERRORS},
-)
-@readable(
-    router,
-    "/surfaces/{surface}/tiles/{z}/{x}/{y}.{image}",
-    summary="Fetch a tile of a surface",
-    response_class=Response,
-    responses={200: {"description": "An image", "content": {"image/png": {}, "image/webp": {}}}, **_ERRORS},
-)
+@_mapped("/tiles/{z}/{x}/{y}.{image}", "Fetch a tile", "An image", {"image/png": {}, "image/webp": {}})
 async def tile(
     caller: Reader,
     request: Request,
@@ -134,20 +128,7 @@ async def tile(
     return await _made(request, parts, caller, found, order, f"image/{image}", version=v)
 
 
-@readable(
-    router,
-    "/names/{surface}/terrain/layer.json",
-    summary="Describe the meshes of what a name leads to",
-    response_class=Response,
-    responses={200: {"description": "A layer.json", "content": {_JSON: {}}}, **_ERRORS},
-)
-@readable(
-    router,
-    "/surfaces/{surface}/terrain/layer.json",
-    summary="Describe the meshes of a surface",
-    response_class=Response,
-    responses={200: {"description": "A layer.json", "content": {_JSON: {}}}, **_ERRORS},
-)
+@_mapped("/terrain/layer.json", "Describe the meshes", "A layer.json", {_JSON: {}})
 async def layer_json(
     caller: Reader,
     request: Request,
@@ -168,20 +149,7 @@ async def layer_json(
     return await _made(request, parts, caller, found, order, _JSON, version=None)
 
 
-@readable(
-    router,
-    "/names/{surface}/terrain/{z}/{x}/{y}.terrain",
-    summary="Fetch a mesh of what a name leads to",
-    response_class=Response,
-    responses={200: {"description": "quantized-mesh-1.0", "content": {_MESH: {}}}, **_ERRORS},
-)
-@readable(
-    router,
-    "/surfaces/{surface}/terrain/{z}/{x}/{y}.terrain",
-    summary="Fetch a mesh of a surface",
-    response_class=Response,
-    responses={200: {"description": "quantized-mesh-1.0", "content": {_MESH: {}}}, **_ERRORS},
-)
+@_mapped("/terrain/{z}/{x}/{y}.terrain", "Fetch a mesh", "quantized-mesh-1.0", {_MESH: {}})
 async def mesh(
     caller: Reader,
     request: Request,

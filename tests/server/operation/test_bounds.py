@@ -57,7 +57,7 @@ def test_of_uploads_each_caller_leaves_some_to_the_next(tmp_path: Path, most: in
                     with pytest.raises(kind, match=f"of {caller.name}" if left else f"at most {most} uploads"):
                         await take(caller)
                 done.set()
-        assert (made._uploads.total, made._clocks) == (0, {})
+        assert (made._uploads._total, made._clocks) == (0, {})
         assert not made._promised
         assert not made._taken
 
