@@ -279,7 +279,7 @@ def test_who_has_more_than_its_share_of_credit_gets_the_least(tmp_path: Path) ->
                 held.enter_context(made.stream(caller))
         # Half of it when nobody else was there.
         assert held.enter_context(made.stream(ANNA)) == BASE_CREDIT
-    assert (made._credit.total, made.streams.total) == (0, 0)
+    assert (made._credit._total, made.streams._total) == (0, 0)
     assert (made._credit._taken, made.streams._taken) == ({}, {})  # of those who are gone nothing is kept
 
 

@@ -608,7 +608,7 @@ def test_whoever_goes_at_any_moment_leaves_nothing_behind(tmp_path: Path, monkey
             await asyncio.sleep(0)
         if not asked.cancelled():
             asked.result().release()
-        assert (room.lent, there.lent.total, there.levels.total) == (0, 0, 0)
+        assert (room.lent, there.lent._total, there.levels._total) == (0, 0, 0)
         assert (queue._runner._jobs, queue._runner._turns._free) == ({}, 1)
         assert {path.stat().st_size for path in room.folder.iterdir()} <= {1000, most // 4}
         assert sum(path.stat().st_size for path in room.folder.iterdir()) == room.size
