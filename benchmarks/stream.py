@@ -50,7 +50,7 @@ class Served:
     def file(self) -> str:
         """The container as a plain file."""
         details = sync.describe(self.url).details
-        return f"{self.url.partition('/v1/')[0]}/v1/containers/{details['container']}.lode"
+        return f"{self.url.partition('/v1/')[0]}/v1/containers/{details['container_sha256']}.lode"
 
 
 def main() -> None:

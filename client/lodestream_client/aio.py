@@ -188,7 +188,7 @@ async def identify(url: str, *, token: str | None = None) -> Identity:
     --------
     >>> import asyncio, lodestream_client
     >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
-    >>> len(asyncio.run(lodestream_client.identify(url)).container)
+    >>> len(asyncio.run(lodestream_client.identify(url)).container_sha256)
     64
     """
     return await _run(api.identify(url), url, token)

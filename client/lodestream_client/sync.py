@@ -358,7 +358,7 @@ def identify(url: str, *, token: str | None = None) -> Identity:
     --------
     >>> from lodestream_client import sync
     >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
-    >>> len(sync.identify(url).container)
+    >>> len(sync.identify(url).container_sha256)
     64
     """
     return _run(api.identify(url), url, token)

@@ -123,13 +123,13 @@ def test_info_tells_blocks(run: Run, addresses: dict[str, str], files: Path, tmp
         code, out, _ = run("info", place)
         assert code == 0
         assert "3: 2 of 9 x 13, 17 x 9" in out
-        assert "sha256" in out
+        assert "values sha256" in out
         assert "grid" not in out
         details = json.loads(run("info", place, "--json")[1])
         assert [tuple(block["shape"]) for block in details["blocks"]] == BLOCK_SHAPES
         assert (details["shape"], details["closed"], details["holes"], details["attributes"]) == (None, None, 0, [])
         assert all(level["shape"] is None for level in details["levels"])
-        assert len(details["sha256"]) == 64
+        assert len(details["values_sha256"]) == 64
 
 
 def test_info_tells_holes_attributes_and_what_was_recognised(run: Run, addresses: dict[str, str]) -> None:

@@ -85,7 +85,7 @@ def _plain(programs: Programs, data: Path) -> Folder:
             surface = _push(talk, hills(12, 11, seed=seed))
             entry = talk.ready(surface)
             assert entry is not None, talk.problems
-            folder.ledger.kept[surface].container = entry["container"]
+            folder.ledger.kept[surface].container = entry["container_sha256"]
     return folder
 
 

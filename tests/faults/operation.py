@@ -184,7 +184,7 @@ class Operation:
         entry = self.talk.ready(surface)
         if entry is None or entry["state"] != "ready":
             raise UnusableError(f"{surface} does not become ready, and no call fails: {entry}")
-        self.ledger.kept[surface].container = entry["container"]
+        self.ledger.kept[surface].container = entry["container_sha256"]
         return entry
 
     def delete(self, surface: str, good: tuple[int, ...] = (204,)) -> None:

@@ -22,7 +22,7 @@ from .programs import PATIENCE
 __all__ = ["Kept", "Ledger", "Problem", "Talk"]
 
 #: What an answer may say while a call fails: the server's fault, or not now.
-_EXCUSES = (409, 424)
+_EXCUSES = (409,)
 
 # Where a token is needed and the file of tokens cannot be read, nobody may do anything.
 _NO_TOKENS = (401, 403)
@@ -251,8 +251,8 @@ class Talk:
         if entry["state"] != "ready":
             self.say("lost", f"{surface} is {entry['state']} for good: {entry['reason']}")
             return
-        kept.container = kept.container or entry["container"]
-        if kept.container != entry["container"]:
+        kept.container = kept.container or entry["container_sha256"]
+        if kept.container != entry["container_sha256"]:
             self.say("wrong", f"{surface} has another container than before")
         self.container(surface, kept)
 

@@ -167,7 +167,7 @@ def _delete_shared(work: Operation) -> None:
     # The same bytes under another option are another surface with the same container.
     body, points = work.fresh()
     pair = work.sent(body, points), work.sent(body, points, {"closed": "none"})
-    if work.settle(pair[0])["container"] != work.settle(pair[1])["container"]:
+    if work.settle(pair[0])["container_sha256"] != work.settle(pair[1])["container_sha256"]:
         raise UnusableError("the same surface has another container")
     with work.armed():
         work.delete(pair[0])

@@ -18,16 +18,16 @@ __all__ = ["check"]
 
 # From a server that has too much to do, makes its index again, or ends.
 _BUSY = {429, 503}
-_FILES = {200, 404, 409, 424} | _BUSY
+_FILES = {200, 404, 409} | _BUSY
 _ALLOWED = {
     "upload": {200, 202, 507} | _BUSY,
     "delete": {204, 404} | _BUSY,
-    "retry": {200, 202, 404, 409, 424, 507} | _BUSY,
+    "retry": {200, 202, 404, 409, 507} | _BUSY,
     "look": {200, 404} | _BUSY,
     "list": {200} | _BUSY,
     "fetch": _FILES,
     "values": _FILES | {507},  # there has to be room for the file of a level
-    "point": {200, 201, 404, 409, 424, 507} | _BUSY,  # it leads to nothing that is not ready
+    "point": {200, 201, 404, 409, 507} | _BUSY,  # it leads to nothing that is not ready
     "unpoint": {204, 404} | _BUSY,
     "follow": {200, 404} | _BUSY,
     "names": {200} | _BUSY,
@@ -39,7 +39,7 @@ _UNKNOWN = {500, 502, 503, 504}
 _OF_NAMES = ("point", "unpoint", "follow", "names")
 
 # The states of a surface whose bytes are answered so.
-_BYTES = {200: {"ready"}, 404: {ABSENT}, 409: {"queued", "building", "waiting"}, 424: {"failed", "waiting"}}
+_BYTES = {200: {"ready"}, 404: {ABSENT}, 409: {"queued", "building", "failed", "waiting"}}
 
 _SHOWN = 12
 
@@ -241,7 +241,7 @@ def _steps(operation: Operation, history: History) -> Iterator[Step]:
             yield _write(operation, operation.ended, None)
         elif status is None or status in _UNKNOWN:
             yield _write(operation, None, history.ends.get(operation.server))
-        elif kind != "upload" and status in (403, 404, 409, 424):
+        elif kind != "upload" and status in (403, 404, 409):
             yield _read(operation, {ABSENT} if status == 404 else PRESENT)
     elif kind in ("fetch", "values") and answer is not None:
         if answer.status in _BYTES and not answer.seen:

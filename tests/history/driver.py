@@ -284,7 +284,7 @@ def _as_form(body: bytes) -> dict[str, Any]:
 
 
 def _seen(entry: dict[str, Any]) -> Seen:
-    return Seen(entry["id"], entry["state"], entry["name"], entry["container"])
+    return Seen(entry["id"], entry["state"], entry["name"], entry["container_sha256"])
 
 
 def _entry(answer: httpx.Response, *, entries: bool = True) -> Answer:

@@ -67,7 +67,7 @@ class _Simple:
             "url": f"/v1/surfaces/{surface.id}",
             "state": "ready" if ready else "building",
             "name": None if self.wrong("no name") else surface.name,
-            "container": hashlib.sha256(surface.container).hexdigest() if ready else None,
+            "container_sha256": hashlib.sha256(surface.container).hexdigest() if ready else None,
             **({"levels": [{"level": 0}]} if ready else {}),
         }
 

@@ -98,7 +98,7 @@ def test_while_an_index_cannot_be_made_again_everything_about_surfaces_is_busy(
 
         monkeypatch.setattr(Folder, "entries", unreadable)
         (tmp_path / "scratch" / "index.sqlite").unlink()
-        container = f"/v1/containers/{made['container']}.lode"
+        container = f"/v1/containers/{made['container_sha256']}.lode"
         for answer in (
             http.get("/v1/surfaces"),
             http.get(made["url"]),

@@ -170,16 +170,16 @@ class _Torment:
             if entry["state"] == "waiting":  # its processes were killed too often
                 http.post(f"{entry['url']}/retry").raise_for_status()
             if surface in ledger.containers:
-                assert (entry["state"], entry["container"]) == ("ready", ledger.containers[surface])
+                assert (entry["state"], entry["container_sha256"]) == ("ready", ledger.containers[surface])
             if entry["state"] == "ready":
                 self._whole(http, entry)
 
     def _whole(self, http: httpx.Client, entry: dict[str, Any]) -> None:
         container = http.get(f"{entry['url']}/container", follow_redirects=True).raise_for_status().content
-        assert hashlib.sha256(container).hexdigest() == entry["container"]
-        if entry["container"] not in self.checked:
+        assert hashlib.sha256(container).hexdigest() == entry["container_sha256"]
+        if entry["container_sha256"] not in self.checked:
             assert np.array_equal(ls.decode(container).points, self.points[self.ids[entry["id"]]])
-            self.checked.add(entry["container"])
+            self.checked.add(entry["container_sha256"])
 
     def _busy(
         self,
@@ -278,7 +278,7 @@ class _Torment:
                 if surface in self.ledger.doubtful or self.ledger.stored.get(surface) != number:
                     continue
                 if answer.status_code == 200 and answer.json()["state"] == "ready":
-                    self.ledger.containers[surface] = answer.json()["container"]
+                    self.ledger.containers[surface] = answer.json()["container_sha256"]
                     self.kills.builds += 1
 
     def _number(self) -> int:

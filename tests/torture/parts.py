@@ -144,7 +144,7 @@ def _crowd(folder: Path, count: int, *, proxied: bool) -> tuple[int, tuple[str, 
     with server(data, **chosen) as running, ExitStack() as held:
         with running.client() as http:
             surface = push(http, npy(hills(420, 400)))
-        container = data_folder.container(data, surface["container"]).read_bytes()
+        container = data_folder.container(data, surface["container_sha256"]).read_bytes()
         url = running.url
         if proxied:
             url = held.enter_context(proxies.nginx(folder / "nginx", url, tls=False)).url

@@ -154,8 +154,8 @@ def _facts(details: Mapping[str, Any]) -> list[tuple[str, str]]:
         facts.append((last, words if details[last] else "no, within the error that was asked for"))
     if errors := _ERRORS.get(str(details.get("errors"))):
         facts.append(("errors", errors))
-    if details.get("sha256"):
-        facts.append(("sha256", str(details["sha256"])))
+    if details.get("values_sha256"):
+        facts.append(("values sha256", str(details["values_sha256"])))
     return facts + [(str(name), _short(value)) for name, value in metadata.items()]
 
 

@@ -356,7 +356,7 @@ def _levels(file: str, container: Path, finest: int, folder: Path, options: Publ
 
 
 def _report(surface: PublishedSurface, page: str) -> dict[str, Any]:
-    return {**surface.document(), "container": surface.container, "page": f"{page}#{_fragment(surface.name)}"}
+    return {**surface.document(), "container_sha256": surface.container, "page": f"{page}#{_fragment(surface.name)}"}
 
 
 def _fragment(name: str) -> str:

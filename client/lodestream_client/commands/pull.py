@@ -308,7 +308,7 @@ def _receive(
             silence=min(options.retry, _SILENCE) or _SILENCE,
             limit_rate=options.limit_rate,
             store=kept.store,
-            container=identity.container if identity is not None else None,
+            container=identity.container_sha256 if identity is not None else None,
             size=identity.size if identity is not None else None,
             progress=bar.received,
             sink=take,

@@ -80,7 +80,7 @@ class Identity:
     ----------
     name : str or None
         A name in hexadecimal digits; None if the server does not distinguish versions of the file.
-    container : str or None
+    container_sha256 : str or None
         SHA-256 of the container, if the server gives it.
     size : int or None
         Bytes of the container.
@@ -90,12 +90,12 @@ class Identity:
     >>> from lodestream_client import sync
     >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
     >>> identity = sync.identify(url)
-    >>> identity.name == identity.container, identity.size > 6000
+    >>> identity.name == identity.container_sha256, identity.size > 6000
     (True, True)
     """
 
     name: str | None
-    container: str | None
+    container_sha256: str | None
     size: int | None
 
 
@@ -320,7 +320,7 @@ def identify(url: str) -> Flow[Identity]:
     url = yield from locate(url)
     if addresses.is_surface(url):
         surface = yield from describe(url)
-        container, size = surface.details.get("container"), surface.details.get("bytes")
+        container, size = surface.details.get("container_sha256"), surface.details.get("bytes")
         if not surface.ready or not isinstance(container, str) or not isinstance(size, int):
             raise RemoteError("not-ready", f"expected {url} to be ready, got {surface.state}")
         if not _CONTAINER.fullmatch(container) or size is True or not 0 < size <= _LARGEST_FILE:
@@ -433,10 +433,10 @@ def _is_of(answer: Answer, url: str, identity: Identity) -> bool:
         return False
     if version is None:
         return True
-    if identity.container is None:
+    if identity.container_sha256 is None:
         return identity_of_file(url, version, identity.size) == identity
     tag = _TAG.fullmatch(version)  # a proxy may have put its own in the place of the server's
-    return tag is None or tag[1] == identity.container
+    return tag is None or tag[1] == identity.container_sha256
 
 
 def _refuse(answer: Answer | None, url: str) -> Answer:

@@ -155,6 +155,6 @@ def describe(index: Index, *, channels: bool = False) -> dict[str, Any]:
         "layers": [{"bytes": r.end, "level": r.level, **errors(r)} for r in index.layers],
         "bytes": index.size,
         "complete" if is_remeshed(index.metadata_values) else "exact": header.exact,
-        "sha256": index.digest,
+        "values_sha256": index.digest,
         "metadata": dict(index.metadata_values),
     }

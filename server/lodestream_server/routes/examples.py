@@ -33,7 +33,7 @@ QUEUED: dict[str, Any] = {
     "filenames": ["jacksboro.npy"],
     "upload_bytes": 277328,
     "options": {"precision": "0.5"},
-    "container": None,
+    "container_sha256": None,
 }
 
 
@@ -47,7 +47,7 @@ READY: dict[str, Any] = {
     **QUEUED,
     "state": "ready",
     "progress": 1.0,
-    "container": "9c56cc51b374c3ba189210d5b6d4bf57790d351c96c47c02190ecf1e430635ab",
+    "container_sha256": "9c56cc51b374c3ba189210d5b6d4bf57790d351c96c47c02190ecf1e430635ab",
     **_FIGURES,
     "blocks": [{"shape": [344, 403], "closed": [False, False]}],
     "levels": [{"level": 0, "shape": [2, 2], "bytes": 120, "rms": 181.2, "max": 651.0}],

@@ -30,7 +30,7 @@ router = APIRouter(prefix="/v1", tags=["files"])
     status_code=307,
     summary="Find a surface's container",
     response_class=Response,
-    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 424, 503)},
+    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 503)},
 )
 async def find(request: Request, parts: Parts, surface: str) -> Response:
     """Redirect to the container; 409 with Retry-After while it is being built."""

@@ -36,7 +36,7 @@ router = APIRouter(prefix="/v1", tags=["files"])
         200: examples.LEVEL,
         206: {"description": "The range asked for"},
         304: {"description": "The client has it"},
-        **responses(404, 409, 413, 416, 422, 424, 429, 501, 503, 507),
+        **responses(404, 409, 413, 416, 422, 429, 501, 503, 507),
     },
 )
 async def level(

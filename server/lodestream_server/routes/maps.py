@@ -34,7 +34,7 @@ _JSON, _MESH = "application/json", "application/vnd.quantized-mesh"
 _NORMALS = "octvertexnormals"
 _VERSION = 12
 
-_ERRORS = responses(404, 409, 413, 422, 424, 429, 501, 503)
+_ERRORS = responses(404, 409, 413, 422, 429, 501, 503)
 
 _Zoom = Annotated[int, Path(ge=0, le=30)]
 _Place = Annotated[int, Path(ge=0, lt=1 << 31, description="of the tile")]

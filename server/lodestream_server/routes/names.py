@@ -45,7 +45,7 @@ class _Pointing(BaseModel):
         200: examples.answer("It leads to this surface", examples.READY),
         201: examples.answer("There was no such name", examples.READY),
         204: {"description": "`surface` is null, and the caller may change the name"},
-        **responses(403, 404, 408, 409, 413, 422, 424, 503, 507),
+        **responses(403, 404, 408, 409, 413, 422, 503, 507),
     },
 )
 async def point(caller: Writer, request: Request, parts: Parts, name: _Name) -> Response:
@@ -116,7 +116,7 @@ async def look(caller: Reader, request: Request, parts: Parts, name: _Name) -> R
     status_code=307,
     summary="Find the container to which a name leads",
     response_class=Response,
-    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 422, 424, 503)},
+    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 422, 503)},
 )
 async def find(request: Request, parts: Parts, name: _Name) -> Response:
     """Redirect to the container of the surface to which a name leads now."""

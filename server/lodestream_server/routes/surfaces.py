@@ -305,7 +305,7 @@ def _told(surface: Surface, caller: Caller, parts: State, request: Request) -> d
         "reason": surface.reason,
         "created": datetime.fromtimestamp(it.created, UTC).isoformat(timespec="milliseconds"),
         "upload_bytes": it.upload_bytes,
-        "container": surface.container if ready else None,
+        "container_sha256": surface.container if ready else None,
         # What is built again has the figures of the container that was lost.
         **(surface.summary.shown if ready else {}),
     }

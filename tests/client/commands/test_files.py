@@ -98,7 +98,7 @@ def test_the_surface_of_a_server_by_range(surface: str, terrain: Terrain) -> Non
         views = list(stream)
     assert np.array_equal(views[-1].points, terrain)
     assert stream.transport == "http"
-    assert stream._reception.container == sync.describe(surface).details["container"]
+    assert stream._reception.container == sync.describe(surface).details["container_sha256"]
 
 
 def test_stop_and_seconds_and_leaving(url: str) -> None:

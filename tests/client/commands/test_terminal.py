@@ -76,7 +76,7 @@ def test_what_a_server_says(as_json: bool, run: Run) -> None:
         "name": EVIL,
         "dtype": EVIL,
         "attributes": [EVIL],
-        "sha256": EVIL,
+        "values_sha256": EVIL,
         "bytes": 7,
         "metadata": {EVIL: [EVIL], "notes": [EVIL]},
     }

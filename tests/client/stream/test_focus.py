@@ -137,14 +137,14 @@ def test_what_is_kept_on_disk_is_not_sent_again(surface: str, heights: Heights) 
 
     store, known = Kept(), sync.identify(surface)
     assert known.size is not None
-    with sync.connect(surface, window=4096, store=store, container=known.container, size=known.size) as first:
+    with sync.connect(surface, window=4096, store=store, container=known.container_sha256, size=known.size) as first:
         for view in first:
             first.focus(FAR)
             if view.number > 9:
                 break
     held = store.ranges.total
     assert 0 < held < known.size / 2
-    with sync.connect(surface, window=4096, store=store, container=known.container, size=known.size) as second:
+    with sync.connect(surface, window=4096, store=store, container=known.container_sha256, size=known.size) as second:
         second.focus(NEAR)
         for _ in second:
             pass

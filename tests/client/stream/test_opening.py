@@ -166,7 +166,7 @@ def test_what_is_too_long_for_an_address_goes_as_a_message(
     surface: str, terrain: Terrain, asynchronous: bool, dialled: list[Dialled]
 ) -> None:
     details = sync.describe(surface).details
-    stored, known = sync.fetch_range(surface, 0, int(details["bytes"])), str(details["container"])
+    stored, known = sync.fetch_range(surface, 0, int(details["bytes"])), str(details["container_sha256"])
     store = MemoryStore()
     for offset in range(0, 12_000, 20):
         store.write(offset, stored[offset : offset + 10])

@@ -100,7 +100,7 @@ def test_another_address_goes_on_with_what_is_held(surface: str, terrain: Terrai
     with linked(surface, breaks_after(5000)) as one, pytest.raises(ls.TruncatedStreamError):
         follow(one.url, asynchronous, window=2000, store=store, deadline=0, transport="ws")
     details = sync.describe(surface).details
-    container, size = str(details["container"]), int(details["bytes"])
+    container, size = str(details["container_sha256"]), int(details["bytes"])
     with linked(surface, Fault()) as other:
         views, stream = follow(other.url, asynchronous, store=store, container=container, size=size)
     assert np.array_equal(views[-1].points, terrain)
@@ -402,7 +402,7 @@ def test_a_container_that_no_server_of_ours_names_is_refused(
 ) -> None:
     victim = tmp_path / "victim.part"
     victim.write_bytes(b"of somebody else")
-    told = {"id": "ab", "state": "ready", "container": container, "bytes": 5000}
+    told = {"id": "ab", "state": "ready", "container_sha256": container, "bytes": 5000}
     with scripted(lambda _: document(told)) as server:
         code, _, stderr = run("pull", f"{server.url}/v1/surfaces/ab", tmp_path / "o.npy", "--resume")
     assert code == 1
@@ -414,7 +414,7 @@ def test_a_container_that_no_server_of_ours_names_is_refused(
 
 @pytest.mark.parametrize("size", [0, -1, 1 << 80, 10**400, True])
 def test_nor_one_of_a_size_that_none_has(run: Run, folder: Path, tmp_path: Path, size: int) -> None:
-    told = {"id": "ab", "state": "ready", "container": "ab" * 32, "bytes": size}
+    told = {"id": "ab", "state": "ready", "container_sha256": "ab" * 32, "bytes": size}
     with scripted(lambda _: document(told)) as server:
         code, _, stderr = run("pull", f"{server.url}/v1/surfaces/ab", tmp_path / "o.npy", "--resume")
     assert code == 1

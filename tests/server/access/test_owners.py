@@ -65,7 +65,7 @@ def test_each_name_and_each_owner_has_a_surface_and_the_bytes_are_there_once(off
         assert "owner" not in httpx.get(f"{office.url}{mine[0]}", trust_env=False).json()
         assert push(anna, name="hills") == mine[1]
         # The same bytes under the same name are one container.
-        assert anna.get(mine[1]).json()["container"] == bert.get(theirs[1]).json()["container"]
+        assert anna.get(mine[1]).json()["container_sha256"] == bert.get(theirs[1]).json()["container_sha256"]
         assert problem(bert.delete(mine[1])) == (403, "not-owner")
         assert bert.delete(theirs[1]).status_code == 204
         assert anna.get(f"{mine[1]}/container", follow_redirects=True).status_code == 200
@@ -87,7 +87,7 @@ def test_the_second_owner_of_the_same_bytes_has_a_build_of_its_own(office: Offic
         answer = bert.post("/v1/surfaces", content=BODY, params={"name": "hills"})
         assert (answer.status_code, answer.json()["owner"]) == (202, "bert")
         theirs = settled(bert, answer.headers["location"])
-        assert (theirs["state"], theirs["container"]) == ("ready", anna.get(mine).json()["container"])
+        assert (theirs["state"], theirs["container_sha256"]) == ("ready", anna.get(mine).json()["container_sha256"])
         assert len(kept(office.data, "containers")) == 1
 
 

@@ -312,7 +312,7 @@ def test_a_start_removes_what_a_dead_server_left_in_its_scratch_and_nothing_else
             *stray,
             ".lodestream/lock",
             f"built/{surface['id']}.json",
-            f"containers/{surface['container']}.lode",
+            f"containers/{surface['container_sha256']}.lode",
             "lock",
             "lodestream.json",
             "scratch/index.sqlite",
@@ -334,13 +334,13 @@ def test_a_lost_container_is_built_again_when_somebody_opens_it(tmp_path: Path, 
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, npy(hills()))
-        container = data / "containers" / f"{surface['container']}.lode"
+        container = data / "containers" / f"{surface['container_sha256']}.lode"
         whole = container.read_bytes()
         container.unlink()
         lost = http.get(path.format(**surface), follow_redirects=True)
         # Levels are asked for by surface, which is not ready now.
         assert problem(lost) == (409, "not-ready") if "levels" in path else busy(lost)
-        again = eventually(lambda: (it := settled(http, surface["url"]))["container"] and it, "another build")
+        again = eventually(lambda: (it := settled(http, surface["url"]))["container_sha256"] and it, "another build")
         assert again == surface
         assert container.read_bytes() == whole
         assert http.get(path.format(**surface), follow_redirects=True).status_code == 200
@@ -350,7 +350,7 @@ def test_without_its_upload_a_lost_container_is_waited_for(tmp_path: Path) -> No
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, npy(hills()))
-    container = data / "containers" / f"{surface['container']}.lode"
+    container = data / "containers" / f"{surface['container_sha256']}.lode"
     upload = upload_of(data, surface)
     upload.rename(data / "away")
     before = {path: path.read_bytes() for name in ("surfaces", "built") for path in (data / name).iterdir()}
@@ -360,10 +360,10 @@ def test_without_its_upload_a_lost_container_is_waited_for(tmp_path: Path) -> No
         container.rename(data / "lost")
         assert busy(http.get(f"{surface['url']}/container", follow_redirects=True))
         waiting = settled(http, surface["url"])
-        assert (waiting["state"], waiting["container"]) == ("waiting", None)
+        assert (waiting["state"], waiting["container_sha256"]) == ("waiting", None)
         assert waiting["reason"] == "its upload is not in the server's store"
-        assert http.get(f"{surface['url']}/container").status_code == 424
-        assert busy(http.get(f"/v1/containers/{surface['container']}.lode"))
+        assert http.get(f"{surface['url']}/container").status_code == 409
+        assert busy(http.get(f"/v1/containers/{surface['container_sha256']}.lode"))
         assert {path: path.read_bytes() for path in before} == before
         # Once either is there again it is enough to ask.
         (data / "lost").rename(container)
@@ -383,7 +383,7 @@ def test_a_manifest_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: P
     with running(data) as http:
         surface, other = push(http, npy(hills())), push(http, npy(hills()), name="of the same bytes")
     path = data / "surfaces" / f"{surface['id']}.json"
-    files = (upload_of(data, surface) / "0", data / "containers" / f"{surface['container']}.lode")
+    files = (upload_of(data, surface) / "0", data / "containers" / f"{surface['container_sha256']}.lode")
     path.write_text("{not json")
     (data / "scratch" / "index.sqlite").unlink()
     with running(data) as http:
@@ -394,7 +394,11 @@ def test_a_manifest_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: P
         assert all(file.is_file() for file in files)
         # The same upload again takes its place, and is built again.
         again = push(http, npy(hills()))
-        assert (again["id"], again["state"], again["container"]) == (surface["id"], "ready", surface["container"])
+        assert (again["id"], again["state"], again["container_sha256"]) == (
+            surface["id"],
+            "ready",
+            surface["container_sha256"],
+        )
     with running(data) as http:
         assert http.get(surface["url"]).json() == again
 

@@ -146,7 +146,7 @@ def test_no_word_of_it_is_believed(
     assert made["state"] == "waiting"
     assert "gave an invalid answer" in made["reason"]
     assert made["reason"].endswith(": 3 builds began and did not end")
-    assert made["container"] is None
+    assert made["container_sha256"] is None
     assert kept(data, "containers") == containers
     # The same bytes are built once nothing has taken the reader over.
     assert http.post(f"{made['url']}/retry").status_code == 202

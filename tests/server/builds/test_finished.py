@@ -71,7 +71,7 @@ def test_a_container_is_kept_as_it_is(http: httpx.Client, data: Path) -> None:
     assert made["state"] == "ready", made["reason"]
     assert made["errors"] == "checked"
     assert made["options"] == {}
-    assert made["container"] == hashlib.sha256(container).hexdigest()
+    assert made["container_sha256"] == hashlib.sha256(container).hexdigest()
     assert fetched(http, made) == container
     told = plain(describe(index_of(container), channels=True))
     assert {key: made[key] for key in told} == told
@@ -95,7 +95,7 @@ def test_a_file_and_its_container_have_one_container(http: httpx.Client, exact: 
     built = push(http, npy(hills(seed=73)))
     sent = push(http, fetched(http, built))
     assert sent["id"] != built["id"]
-    assert sent["container"] == built["container"]
+    assert sent["container_sha256"] == built["container_sha256"]
     assert "errors" not in built
     assert sent["errors"] == "checked"
 
@@ -182,12 +182,12 @@ def test_nothing_of_a_wrong_container_is_kept(http: httpx.Client, data: Path, ex
     change, words = WRONG[what]
     made = push(http, change(exact))
     assert made["state"] == "failed"
-    assert made["container"] is None
+    assert made["container_sha256"] is None
     assert re.search(words, made["reason"]), made["reason"]
     assert "\n" not in made["reason"]
     new = [path for path in stored(data) if path not in before]
     assert {path.partition("/")[0] for path in new} == {"built", "surfaces", "uploads"}  # until somebody deletes it
-    assert http.get(f"{made['url']}/container").status_code == 424
+    assert http.get(f"{made['url']}/container").status_code == 409
     assert kept(data, "scratch/work") == []
     http.delete(made["url"]).raise_for_status()
     assert stored(data) == before
@@ -285,7 +285,7 @@ def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Pa
     ):
         made = push(http, exact)
         assert made["state"] == "ready"
-    lost = data / "containers" / f"{made['container']}.lode"
+    lost = data / "containers" / f"{made['container_sha256']}.lode"
     lost.unlink()
     with (
         running_server(data, workers=1) as url,
@@ -293,7 +293,11 @@ def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Pa
     ):
         assert problem(http.get(f"{made['url']}/container", follow_redirects=True)) == (503, "busy")
         again = push(http, exact)
-        assert (again["state"], again["container"], again["errors"]) == ("ready", made["container"], "checked")
+        assert (again["state"], again["container_sha256"], again["errors"]) == (
+            "ready",
+            made["container_sha256"],
+            "checked",
+        )
     assert lost.read_bytes() == exact
 
 

@@ -57,7 +57,7 @@ def _post(http: httpx.Client, name: str, data: bytes) -> str:
 def _container(http: httpx.Client, location: str) -> bytes:
     surface = settled(http, location)
     assert surface["state"] == "ready", surface
-    return http.get(f"/v1/containers/{surface['container']}.lode").raise_for_status().content
+    return http.get(f"/v1/containers/{surface['container_sha256']}.lode").raise_for_status().content
 
 
 def _made(folder: Path) -> Inodes:

@@ -177,11 +177,11 @@ def test_nothing_is_left_of_levels(tmp_path: Path) -> None:
         surface = push(http, npy(hills()))
         assert http.get(finest(surface)).status_code == 200
         (path,) = (tmp_path / "data" / "scratch" / "levels").iterdir()
-        assert path.name.startswith(f"{surface['container']}-{len(surface['levels']) - 1}-npy")
+        assert path.name.startswith(f"{surface['container_sha256']}-{len(surface['levels']) - 1}-npy")
         twin = push(http, npy(hills()), name="twin")
-        assert twin["container"] != surface["container"] or twin["id"] != surface["id"]
+        assert twin["container_sha256"] != surface["container_sha256"] or twin["id"] != surface["id"]
         http.delete(surface["url"]).raise_for_status()
-        if twin["container"] == surface["container"]:
+        if twin["container_sha256"] == surface["container_sha256"]:
             assert path.exists()
             http.delete(twin["url"]).raise_for_status()
         # Whoever has read it to its end may not have given it back yet.
@@ -392,7 +392,7 @@ def test_a_container_may_be_built_again_while_a_level_is_made(tmp_path: Path, mo
 
     with running_server(tmp_path, workers=1) as url, client(url) as http, ThreadPoolExecutor(1) as other:
         surface = push(http, npy(hills()))
-        container = tmp_path / "containers" / f"{surface['container']}.lode"
+        container = tmp_path / "containers" / f"{surface['container_sha256']}.lode"
         answer = other.submit(http.get, finest(surface))
         begun = begin()
         # The same bytes in another file: the process may read only the one that there was.
@@ -660,7 +660,7 @@ def test_a_request_that_is_cancelled_loses_no_loan(again: int) -> None:
 def test_the_process_makes_no_file_that_is_longer(tmp_path: Path) -> None:
     with running_server(tmp_path / "data", workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
-        container = tmp_path / "data" / "containers" / f"{surface['container']}.lode"
+        container = tmp_path / "data" / "containers" / f"{surface['container_sha256']}.lode"
         level = len(surface["levels"]) - 1
         refused = make_level(LevelJob(container, level, "npy", _new(tmp_path / "a"), 1000, 1 << 28))
         assert isinstance(refused, Refusal)
@@ -714,7 +714,7 @@ def test_a_level_of_several_blocks_is_made_block_by_block_to_the_same_file(
 def test_values_in_files_count_for_the_room_of_a_level(tmp_path: Path) -> None:
     with running_server(tmp_path / "data", workers=1) as url, client(url) as http:
         surface = push(http, npy(hills()))
-    container = tmp_path / "data" / "containers" / f"{surface['container']}.lode"
+    container = tmp_path / "data" / "containers" / f"{surface['container_sha256']}.lode"
     level, size = len(surface["levels"]) - 1, len(npy(hills()))
     for name, most in (("a", 40 * 30 * 4), ("b", 40 * 30 * 4 + size - 1)):
         refused = make_level(LevelJob(container, level, "npy", _new(tmp_path / name), most, 1 << 10))

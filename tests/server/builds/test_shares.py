@@ -290,7 +290,7 @@ def test_a_plan_that_takes_long_stops_nobody(town: Town, monkeypatch: pytest.Mon
         surface = push(good, npy(hills(100, 90)))
         crumbs: dict[str, Any] = {
             "held": held_all_over(surface["bytes"]),
-            "container": surface["container"],
+            "container": surface["container_sha256"],
             "credit": 4,
         }
         fewer = {**crumbs, "held": crumbs["held"][:3000]}
@@ -350,7 +350,7 @@ def test_a_plan_is_not_left_alone_with_the_sender(town: Town, monkeypatch: pytes
     with ExitStack() as stack, town.client("good") as good:
         surface = push(good, npy(hills(100, 90)))
         stream = opened(
-            stack, town, "bad", surface, held=held_all_over(surface["bytes"]), container=surface["container"]
+            stack, town, "bad", surface, held=held_all_over(surface["bytes"]), container=surface["container_sha256"]
         )
         assert begun.wait(PATIENCE)
         stream.socket.close()

@@ -115,7 +115,7 @@ def test_it_waits_over_a_restart_and_is_built_when_asked(tmp_path: Path, monkeyp
         assert surface["state"] == "waiting"
         assert "process ended" in surface["reason"]
         for path in (f"{surface['url']}/container", f"{surface['url']}/levels/0"):
-            assert problem(http.get(path)) == (424, "waiting")
+            assert problem(http.get(path)) == (409, "waiting")
     monkeypatch.undo()
     with running(data) as http:
         # Nobody asked: it is not built at every start, which it may have ended.
@@ -162,7 +162,7 @@ def test_a_rebuild_that_fails_costs_nothing(tmp_path: Path, monkeypatch: pytest.
     data = tmp_path / "data"
     with running(data) as http:
         surface = push(http, BODY)
-    container = data / "containers" / f"{surface['container']}.lode"
+    container = data / "containers" / f"{surface['container_sha256']}.lode"
     whole = container.read_bytes()
     container.write_bytes(whole[:-1])
     report = check(Folder(data), repair=True)

@@ -148,7 +148,7 @@ def test_the_rest_of_a_body_that_was_answered_is_not_waited_for_either(impatient
 
 def test_an_answer_that_nobody_takes_is_given_up(impatient: tuple[str, dict[str, Any]]) -> None:
     url, made = impatient
-    address = f"/v1/containers/{made['container']}.lode"
+    address = f"/v1/containers/{made['container_sha256']}.lode"
     with connected(url, buffer=4096) as connection:
         # Several times over, so that no system's buffers hold it all.
         connection.sendall(f"GET {address} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode() * 8)
@@ -161,7 +161,7 @@ def test_an_answer_that_nobody_takes_is_given_up(impatient: tuple[str, dict[str,
             return False
 
         eventually(given_up, "the connection to be closed")
-    eventually(lambda: not opened(made["container"]), "the file to be closed")
+    eventually(lambda: not opened(made["container_sha256"]), "the file to be closed")
 
 
 def opened(name: str) -> bool:
@@ -179,7 +179,7 @@ def opened(name: str) -> bool:
 
 def test_an_answer_that_is_taken_slowly_comes_whole(impatient: tuple[str, dict[str, Any]]) -> None:
     url, made = impatient
-    address = f"/v1/containers/{made['container']}.lode"
+    address = f"/v1/containers/{made['container_sha256']}.lode"
     with connected(url, buffer=16384) as connection:
         connection.sendall(f"GET {address} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
         data = bytearray()
@@ -199,7 +199,7 @@ def test_an_answer_that_is_taken_too_slowly_is_cut(tmp_path: Path) -> None:
         running_server(tmp_path, workers=1, idle_seconds=0.2, least_rate=10**15) as url,
         httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
-        request = f"GET /v1/containers/{made['container']}.lode HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+        request = f"GET /v1/containers/{made['container_sha256']}.lode HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
         with connected(url, buffer=4096) as connection:
             connection.sendall(request * 8)
             came = 0
@@ -440,7 +440,7 @@ def test_a_body_whose_length_is_told_in_two_ways_is_refused(
 )
 def test_ten_thousand_ranges_cost_no_more_than_the_file(impatient: tuple[str, dict[str, Any]], header: str) -> None:
     url, made = impatient
-    address = f"/v1/containers/{made['container']}.lode"
+    address = f"/v1/containers/{made['container_sha256']}.lode"
     with connected(url) as connection:
         connection.sendall(
             f"GET {address} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nRange: {header}\r\n\r\n".encode()

@@ -17,7 +17,7 @@ def test_honest_clients_are_served_and_nothing_remains_of_the_others(tmp_path: P
     data = tmp_path / "data"
     with server(data, **crowd.settings(COUNT)) as running, running.client() as http:
         surface = push(http, npy(hills(420, 400)))
-        container = (data / "containers" / f"{surface['container']}.lode").read_bytes()
+        container = (data / "containers" / f"{surface['container_sha256']}.lode").read_bytes()
         http.close()
         outcome = asyncio.run(crowd.visit(running, running.url + surface["url"], sent(container), COUNT, COUNT))
         assert outcome.wrong == ()

@@ -141,7 +141,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     with server(data, upload_bytes=4 << 20) as program:
         with program.client() as http:
             surface = push(http, npy(hills(420, 400)))
-        container = (data / "containers" / f"{surface['container']}.lode").read_bytes()
+        container = (data / "containers" / f"{surface['container_sha256']}.lode").read_bytes()
         yield Running(program, Place.of(program.url + surface["url"]), hash_of_stream(container))
 
 

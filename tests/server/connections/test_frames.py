@@ -132,7 +132,7 @@ def test_a_message_in_ever_more_fragments_is_cut(
 
 @pytest.mark.long
 def test_an_honest_message_in_fragments_is_taken(server: str, surface: dict[str, Any]) -> None:
-    message = serialize(Open(held=tuple((2 * n, 1) for n in range(1000)), container=surface["container"]))
+    message = serialize(Open(held=tuple((2 * n, 1) for n in range(1000)), container=surface["container_sha256"]))
     with raw_stream(server + surface["url"]) as stream:
         stream.socket.send([message[start : start + 100] for start in range(0, len(message), 100)])
         stream.send(Credit(1000))

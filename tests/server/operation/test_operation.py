@@ -128,7 +128,7 @@ def test_what_was_sent_before_another_open_is_counted_once(
 def test_what_the_client_held_is_not_saved(http: httpx.Client, server: str, made: dict[str, Any]) -> None:
     before = figures(http)
     with raw_stream(server + made["url"]) as stream:
-        stream.send(Open(ls.Target(max_bytes=5000), held=((0, 3000),), container=made["container"]))
+        stream.send(Open(ls.Target(max_bytes=5000), held=((0, 3000),), container=made["container_sha256"]))
         sent = data_of(stream.until_end())
     eventually(lambda: grown(http, before, "lodestream_streams_total", "bytes") == 1, "the stream to be counted")
     assert sent < 5000

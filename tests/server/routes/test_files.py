@@ -34,7 +34,7 @@ def surface(http: httpx.Client) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def address(surface: dict[str, Any]) -> str:
-    return f"/v1/containers/{surface['container']}.lode"
+    return f"/v1/containers/{surface['container_sha256']}.lode"
 
 
 def test_the_surface_leads_to_its_immutable_container(
@@ -45,7 +45,7 @@ def test_the_surface_leads_to_its_immutable_container(
     assert answer.headers["cache-control"] == "no-cache"
     container = http.get(address)
     assert container.status_code == 200
-    assert container.headers["etag"] == f'"{surface["container"]}"'
+    assert container.headers["etag"] == f'"{surface["container_sha256"]}"'
     assert container.headers["accept-ranges"] == "bytes"
     assert "immutable" in container.headers["cache-control"]
     assert container.headers["content-length"] == str(surface["bytes"])
@@ -64,7 +64,7 @@ def test_ranges_are_slices_of_the_file(http: httpx.Client, surface: dict[str, An
         assert (answer.status_code, answer.content) == (206, expected)
         start = whole.index(expected)
         assert answer.headers["content-range"] == f"bytes {start}-{start + len(expected) - 1}/{size}"
-        assert answer.headers["etag"] == f'"{surface["container"]}"'
+        assert answer.headers["etag"] == f'"{surface["container_sha256"]}"'
     several = http.get(address, headers={"range": "bytes=0-9,100-109"})
     assert several.status_code == 206
     assert several.headers["content-type"].startswith("multipart/byteranges")

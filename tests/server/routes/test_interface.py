@@ -60,9 +60,9 @@ class Server:
         surface = self.stays
         if method == "delete":
             answer = self.http.post("/v1/surfaces", content=npy(hills(3, 4, seed=next(self._seeds))))
-            surface = {**answer.json(), "container": ""}
+            surface = {**answer.json(), "container_sha256": ""}
         name = self._name(f"name-{next(self._seeds)}") if method == "delete" else "stays"
-        return {"surface": surface["id"], "sha256": surface["container"], "name": name}
+        return {"surface": surface["id"], "sha256": surface["container_sha256"], "name": name}
 
     def _name(self, name: str) -> str:
         assert self.http.put(f"/v1/names/{name}", json={"surface": self.stays["id"]}).status_code == 201

@@ -57,7 +57,7 @@ def test_a_name_leads_to_the_newest_surface(http: httpx.Client, pushed: list[dic
     assert http.get("/v1/names/dem").json()["url"] == second["url"]
     redirect = http.get("/v1/names/dem/container")
     assert (redirect.status_code, redirect.headers["cache-control"]) == (307, "no-cache")
-    assert redirect.headers["location"] == f"/v1/containers/{second['container']}.lode"
+    assert redirect.headers["location"] == f"/v1/containers/{second['container_sha256']}.lode"
     assert http.get(first["url"]).json().pop("replaced_until") > datetime.now(UTC).isoformat(), "it stays for its time"
     assert "replaced_until" not in http.get(second["url"]).json()
     assert http.delete("/v1/names/dem").status_code == 204
@@ -124,7 +124,7 @@ def test_a_name_leads_to_what_is_ready(http: httpx.Client, pushed: list[dict[str
     broken = http.post("/v1/surfaces", content=b"no surface", params={"filename": "a.npy"})
     if broken.status_code == 202:  # otherwise nothing was stored
         eventually(lambda: http.get(broken.headers["location"]).json()["state"] == "failed", "the build to fail")
-        assert problem(put(http, "dem", broken.json()["id"])) == (424, "failed")
+        assert problem(put(http, "dem", broken.json()["id"])) == (409, "failed")
     extra = push(http, npy(hills(seed=4)))
     assert put(http, "dem", extra["id"]).status_code == 201
     assert http.delete(extra["url"]).status_code == 204
@@ -335,7 +335,7 @@ def test_the_commands_follow_a_name(
         assert source.read(1, 4) == b"LODE"
     finally:
         source.close()
-    assert sync.identify(dem).container == told["container"]
+    assert sync.identify(dem).container_sha256 == told["container_sha256"]
     assert sync.fetch_range(dem, 1, 4) == b"LODE"
     assert main(["rm", dem]) == 0
     with pytest.raises(NotFoundError, match="a name on this server"):

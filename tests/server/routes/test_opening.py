@@ -126,7 +126,7 @@ def test_credit_and_stop_hold_as_ever(url: str) -> None:
 
 
 def test_what_is_held_is_not_sent_again(url: str, surface: dict[str, Any]) -> None:
-    held, container = ((0, 400), (900, 250)), str(surface["container"])
+    held, container = ((0, 400), (900, 250)), str(surface["container_sha256"])
     with opened(url, to_address(serialize(Open(held=held, container=container)))) as stream:
         events = events_of(stream)
     sent = [(event.offset, event.offset + len(event.data)) for event in events if isinstance(event, Segments)]

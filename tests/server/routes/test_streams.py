@@ -106,7 +106,7 @@ def test_the_messages_come_in_their_order(url: str, surface: dict[str, Any]) -> 
         assert closed(stream, 1000) == "bytes"
     header = events[0]
     assert isinstance(header, Opened)
-    assert (header.container, header.size) == (surface["container"], surface["bytes"])
+    assert (header.container, header.size) == (surface["container_sha256"], surface["bytes"])
     layers = [event for event in events if isinstance(event, Layer)]
     assert [(layer.bytes, layer.level, layer.rms, layer.max) for layer in layers] == [
         (layer["bytes"], layer["level"], layer["rms"], layer["max"])
@@ -285,7 +285,7 @@ def test_a_surface_deleted_under_a_stream_goes_on_to_its_end(server: str, http: 
 
 def test_a_damaged_container_is_reported_after_what_is_whole(server: str, http: httpx.Client, data: Path) -> None:
     made = push(http, npy(hills(90, 80, seed=6)))
-    path = data / "containers" / f"{made['container']}.lode"
+    path = data / "containers" / f"{made['container_sha256']}.lode"
     with raw_stream(server + made["url"]) as stream:
         stream.send(Open(credit=1000))
         received = 0
@@ -351,7 +351,7 @@ def test_what_a_client_holds_is_not_sent_again(url: str, surface: dict[str, Any]
     container = http.get(f"{surface['url']}/container", follow_redirects=True).content
     held = ((0, 1000), (1500, 20_000), (len(container) - 40, 40), (500, 700))
     with raw_stream(url) as stream:
-        stream.send(Open(held=held, container=surface["container"]))
+        stream.send(Open(held=held, container=surface["container_sha256"]))
         events: list[Event] = []
         while not events or not isinstance(events[-1], End):
             events.append(stream.receive())
@@ -390,7 +390,7 @@ def test_what_cannot_be_held_is_refused(
 ) -> None:
     fields = {"type": "open", "version": 1, "credit": 1000, **changes}
     if fields.get("container") is True:
-        fields["container"] = surface["container"]
+        fields["container"] = surface["container_sha256"]
     with raw_stream(url) as stream:
         stream.socket.send(msgpack.packb(fields))
         event = stream.receive()

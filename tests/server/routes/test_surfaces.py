@@ -42,11 +42,11 @@ def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
     assert surface["layers"][-1]["bytes"] <= surface["bytes"]
     container = http.get(f"{location}/container", follow_redirects=True).content
     assert len(container) == surface["bytes"]
-    assert hashlib.sha256(container).hexdigest() == surface["container"]
+    assert hashlib.sha256(container).hexdigest() == surface["container_sha256"]
     assert np.array_equal(ls.decode(container).points, hills())
     small = (data / "built" / f"{surface['id']}.json").read_bytes()
     built = layout.parse(layout.Built, layout.built_key(surface["id"]), small)
-    assert (built.container, built.container_bytes) == (surface["container"], surface["bytes"])
+    assert (built.container, built.container_bytes) == (surface["container_sha256"], surface["bytes"])
     # The description is sent as it is stored, behind what the server says of the surface, and nothing is said twice.
     answer = http.get(location)
     assert answer.content.endswith(b", " + built.info[1:])
@@ -141,7 +141,7 @@ def test_a_bad_file_fails_with_its_reason_and_keeps_its_upload(http: httpx.Clien
     assert kept(data, f"uploads/{upload_of(data, surface).name}") == ["0"], "a retry needs it"
     for path in ("/container", "/levels/0"):
         answer = http.get(surface["url"] + path)
-        assert (answer.status_code, answer.json()["code"]) == (424, "failed")
+        assert (answer.status_code, answer.json()["code"]) == (409, "failed")
         assert "cut short" in answer.json()["detail"]
     again = http.post("/v1/surfaces", content=npy(hills(seed=8))[:-100], params={"filename": "cut.npy"})
     assert again.status_code == 202
@@ -165,18 +165,18 @@ def test_a_deleted_surface_is_gone_with_all_its_bytes(http: httpx.Client, data: 
         f"surfaces/{surface['id']}.json",
         f"built/{surface['id']}.json",
         f"uploads/{upload.name}",
-        f"containers/{surface['container']}.lode",
+        f"containers/{surface['container_sha256']}.lode",
     ):
         assert not (data / path).exists()
-    assert http.get(f"/v1/containers/{surface['container']}.lode").status_code == 404
+    assert http.get(f"/v1/containers/{surface['container_sha256']}.lode").status_code == 404
 
 
 def test_a_container_that_two_surfaces_share_stays_until_both_are_gone(http: httpx.Client) -> None:
     body = npy(hills(seed=11))
     one, two = push(http, body, name="same"), push(http, body, name="same", closed="none")
     assert one["id"] != two["id"]
-    assert one["container"] == two["container"]
-    address = f"/v1/containers/{one['container']}.lode"
+    assert one["container_sha256"] == two["container_sha256"]
+    address = f"/v1/containers/{one['container_sha256']}.lode"
     http.delete(one["url"])
     assert http.get(address).status_code == 200
     http.delete(two["url"])
@@ -248,7 +248,7 @@ def test_every_get_has_its_head(http: httpx.Client) -> None:
         surface["url"],
         f"{surface['url']}/container",
         f"{surface['url']}/levels/2",
-        f"/v1/containers/{surface['container']}.lode",
+        f"/v1/containers/{surface['container_sha256']}.lode",
     ):
         got, head = http.get(path), http.head(path)
         assert head.status_code == got.status_code
@@ -328,7 +328,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
     example = post["responses"]["202"]["content"]["application/json"]["example"]
     real = http.post("/v1/surfaces", content=npy(hills(seed=13))).json()
     # The framework leaves nulls out of examples.
-    assert set(example) == set(real) - {"reason", "container"}
+    assert set(example) == set(real) - {"reason", "container_sha256"}
     ready = schema["paths"]["/v1/surfaces/{surface}"]["get"]["responses"]["200"]["content"]["application/json"][
         "example"
     ]

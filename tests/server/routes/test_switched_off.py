@@ -174,7 +174,7 @@ def test_what_is_to_be_built_after_its_format_was_switched_off_waits(
         waiting = settled(http, surface["url"])
         assert waiting["state"] == "waiting"
         assert "got text, which is switched off on this server" in waiting["reason"]
-        assert problem(http.get(f"{surface['url']}/container")) == (424, "waiting")
+        assert problem(http.get(f"{surface['url']}/container")) == (409, "waiting")
     with running(data, formats="all") as http:
         assert http.get(surface["url"]).json()["state"] == "waiting"
         assert http.post(f"{surface['url']}/retry").status_code == 202

@@ -55,7 +55,7 @@ def test_a_damaged_container_is_told_once_with_what_to_do(
     http: httpx.Client, tmp_path: Path, caplog: pytest.LogCaptureFixture, way: str
 ) -> None:
     made = push(http, npy(hills(60, 50)))
-    path = tmp_path / "data" / "containers" / f"{made['container']}.lode"
+    path = tmp_path / "data" / "containers" / f"{made['container_sha256']}.lode"
 
     def cut() -> None:
         os.truncate(path, made["bytes"] // 2)
@@ -65,7 +65,7 @@ def test_a_damaged_container_is_told_once_with_what_to_do(
             file.seek(made["bytes"] - 40)  # in the index, or the footer that leads to it
             file.write(bytes(20))
 
-    level, fetch = f"{made['url']}/levels/2?format=npy", f"/v1/containers/{made['container']}.lode"
+    level, fetch = f"{made['url']}/levels/2?format=npy", f"/v1/containers/{made['container_sha256']}.lode"
     for attempt in range(3):
         if way == "opened":
             assert error_of(http, made, flip, before=True) == "damaged"

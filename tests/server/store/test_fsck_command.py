@@ -81,7 +81,7 @@ def flip(path: Path, place: int) -> None:
 
 
 def container(data: Path, surface: Surface) -> Path:
-    return data / "containers" / f"{surface['container']}.lode"
+    return data / "containers" / f"{surface['container_sha256']}.lode"
 
 
 def test_a_folder_in_order(fsck: Fsck, data: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_lost_manifest_comes_back_with_its_file(fsck: Fsck, data: Path, surfac
     shutil.rmtree(data / "scratch")
     with serving(data) as http:
         assert http.get(two["url"]).status_code == 404
-        assert push(http, npy(hills(seed=2)), filename="two.npy")["container"] == two["container"]
+        assert push(http, npy(hills(seed=2)), filename="two.npy")["container_sha256"] == two["container_sha256"]
     assert fsck()[1]["findings"] == []
 
 

@@ -48,7 +48,7 @@ def test_a_container_may_go_before_it_is_opened(
             return await opens(*args, **kwargs)
 
         monkeypatch.setattr(anyio, "open_file", late)
-        answer = http.get(f"/v1/containers/{surface['container']}.lode", headers=header)
+        answer = http.get(f"/v1/containers/{surface['container_sha256']}.lode", headers=header)
         assert problem(answer) == expected
 
 
@@ -96,7 +96,7 @@ def test_a_level_whose_container_was_deleted_and_made_again_for_another(
         assert ann.delete(mine["url"]).status_code == 204
         eventually((data / "missed").exists, "the process to look for the container")
         theirs = push(ben, BODY)
-        assert theirs["container"] == mine["container"]
+        assert theirs["container_sha256"] == mine["container_sha256"]
         second = threads.submit(ben.get, finest(theirs))
         eventually(lambda: len(waiting) == 2, "both to wait for the same level")
         (data / "go").touch()
@@ -127,12 +127,12 @@ def _client(url: str, token: str | None = None) -> Iterator[httpx.Client]:
 def test_a_container_that_is_gone_is_built_again(tmp_path: Path) -> None:
     with running_server(tmp_path, workers=1) as url, _client(url) as http:
         surface = push(http, BODY)
-        path = tmp_path / "containers" / f"{surface['container']}.lode"
+        path = tmp_path / "containers" / f"{surface['container_sha256']}.lode"
         for look in (f"/v1/containers/{path.name}", finest(surface)):
             path.unlink()
             assert problem(http.get(look))[1] in ("busy", "not-ready")
             again = settled(http, surface["url"])
-            assert (again["state"], again["container"]) == ("ready", surface["container"])
+            assert (again["state"], again["container_sha256"]) == ("ready", surface["container_sha256"])
             assert http.get(look).status_code == 200
         path.unlink()
         with raw_stream(url + surface["url"]) as stream:
@@ -148,8 +148,12 @@ def test_a_container_and_an_upload_that_are_gone(tmp_path: Path) -> None:
         surface = push(http, BODY)
         for path in (*(tmp_path / "containers").iterdir(), *(tmp_path / "uploads").glob("*/0")):
             path.unlink()
-        assert http.get(f"/v1/containers/{surface['container']}.lode").status_code == 503
+        assert http.get(f"/v1/containers/{surface['container_sha256']}.lode").status_code == 503
         waiting = settled(http, surface["url"])
         assert (waiting["state"], waiting["reason"]) == ("waiting", "its upload is not in the server's store")
         again = push(http, BODY)  # which brings it back
-        assert (again["id"], again["state"], again["container"]) == (surface["id"], "ready", surface["container"])
+        assert (again["id"], again["state"], again["container_sha256"]) == (
+            surface["id"],
+            "ready",
+            surface["container_sha256"],
+        )
