@@ -89,10 +89,19 @@ class Bucket:
 
     def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
         """Read a small object and its tag."""
-        data, tag = self._ask(key, partial(self._read, self._at(key), most))
+        found = self.get_if(key, None, most)
+        assert found is not None, "without a tag it is read in any case"
+        return found
+
+    def get_if(self, key: str, tag: Tag | None, most: int = SMALL) -> tuple[bytes, Tag] | None:
+        """Read a small object and its tag; return None if it is still the one with this tag."""
+        found = self._ask(key, partial(self._read, self._at(key), most, tag))
+        if found is None:
+            return None
+        data, its_tag = found
         if data is None:
             raise StoreError(f"{self._named(key)}: expected at most {most:,} bytes")
-        return data, self._tag(tag)
+        return data, self._tag(its_tag)
 
     def create(self, key: str, data: bytes) -> Tag:
         """Write a small object if there is none, and return its tag."""
@@ -233,9 +242,14 @@ class Bucket:
             raise AbsentError(f"{self.describe()}: there is no {key}") from None
         raise StoreError(f"{self._named(key)}: {failure.words}") from None
 
-    def _read(self, at: str, most: int) -> tuple[bytes | None, str | None]:
-        """Return the bytes of an object, or None if they are too many, and its tag."""
-        answer = self._library.get(self._store, at)
+    def _read(self, at: str, most: int, tag: str | None = None) -> tuple[bytes | None, str | None] | None:
+        """Return the bytes of an object, or None if they are too many, and its tag; None if it still has a tag."""
+        from obstore.exceptions import NotModifiedError
+
+        try:
+            answer = self._library.get(self._store, at, options={"if_none_match": tag} if tag else None)
+        except NotModifiedError:
+            return None
         return bytes(answer.bytes()) if answer.meta["size"] <= most else None, answer.meta["e_tag"]
 
     def _tag(self, tag: str | None) -> Tag:
@@ -268,7 +282,7 @@ class Bucket:
             # Of a lost answer, a time-out, a conflict with a write on its way (409 of S3), and a lost race (412, and
             # 409 of Azure), the latter two may also be those of this write, which was made before in this very call.
             try:
-                there, its_tag = ask(partial(self._read, at, SMALL))
+                there, its_tag = ask(partial(self._read, at, SMALL)) or (None, None)
             except RequestError as failure:
                 if failure.kind != "absent":
                     break

@@ -86,6 +86,11 @@ class Folder:
             raise StoreError(f"{self.describe()}: {key}: expected at most {most:,} bytes")
         return data, _tag(data)
 
+    def get_if(self, key: str, tag: Tag | None, most: int = SMALL) -> tuple[bytes, Tag] | None:
+        """Read a small object and its tag; return None if it is still the one with this tag."""
+        data, there = self.get(key, most)
+        return None if there == tag else (data, there)
+
     def create(self, key: str, data: bytes) -> Tag:
         """Write a small object if there is none, and return its tag."""
         path = self._path(key)

@@ -120,6 +120,28 @@ class Store(Protocol):
         """
         ...
 
+    def get_if(self, key: str, tag: Tag | None, most: int = SMALL) -> tuple[bytes, Tag] | None:
+        """Read a small object and its tag, unless it is still the one that was read with a tag: then return None.
+
+        It costs a bucket one request, and no bytes where nothing has changed: for whoever looks again and again.
+
+        Parameters
+        ----------
+        key : str
+        tag : Tag or None
+            Of `get`, `create` or `replace`; None: it is read in any case.
+        most : int
+            Bytes that it may have.
+
+        Raises
+        ------
+        AbsentError
+            If there is none.
+        StoreError
+            If it is larger, or the store cannot be read.
+        """
+        ...
+
     def create(self, key: str, data: bytes) -> Tag:
         """Write a small object if there is none, and return its tag.
 

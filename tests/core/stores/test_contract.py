@@ -53,6 +53,21 @@ def test_what_was_created_is_read_with_its_tag(store: Store) -> None:
     assert store.get("surfaces/a.json") == (data, tag)
 
 
+def test_an_object_is_read_again_only_if_it_has_changed(store: Store) -> None:
+    first, second = body(), body()
+    tag = store.create("a/b.json", first)
+    assert store.get_if("a/b.json", None) == (first, tag)
+    assert store.get_if("a/b.json", tag) is None
+    new = store.replace("a/b.json", second, tag)
+    assert store.get_if("a/b.json", tag) == (second, new)
+    assert store.get_if("a/b.json", new) is None
+    with pytest.raises(StoreError, match="at most 3 bytes"):
+        store.get_if("a/b.json", tag, most=3)
+    store.delete(["a/b.json"])
+    with pytest.raises(AbsentError):
+        store.get_if("a/b.json", new)
+
+
 def test_nothing_is_created_twice(store: Store) -> None:
     first = body()
     tag = store.create("a", first)
@@ -231,6 +246,7 @@ def test_what_cannot_be_a_key_is_refused_everywhere(store: Store, key: str, tmp_
     tag = store.create("good", body())
     for call in (
         lambda: store.get(key),
+        lambda: store.get_if(key, None),
         lambda: store.create(key, b""),
         lambda: store.replace(key, b"", tag),
         lambda: store.put_file(key, path),

@@ -149,7 +149,7 @@ def test_a_conflict_may_hide_a_write_that_took_place(
     states: list[bytes] = []
     read = store._read
 
-    def overtaken(at: str, most: int) -> tuple[bytes | None, str | None]:
+    def overtaken(at: str, most: int) -> tuple[bytes | None, str | None] | None:
         states.append(other.get("a")[0])
         other.replace("a", body(), other.get("a")[1])
         return read(at, most)
