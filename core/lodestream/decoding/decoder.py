@@ -471,9 +471,7 @@ class Decoder:
                 self._queue.add_chunk(self._slices.number(item), payload, place)
                 state = self._slices.hold_chunk(item)
             else:
-                known = bool(self._progress.top[item.tile, item.channel])
-                top = 0 if known else item.top
-                first = self._progress.advance(item.tile, item.channel, top, item.passes, place)
+                first = self._progress.follow(item)
                 self._queue.add([Coded(item.tile, item.channel, first, item.passes, payload, place)])
                 state = self._slices.hold(item)
             if state is not None:

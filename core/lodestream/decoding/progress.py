@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..container.model import Header
+from ..container.model import Header, Index, Segment
 from ..container.sections import Entry
 from ..entropy.bitplanes import pass_count
 from ..entropy.dequantize import UNANNOUNCED
@@ -17,7 +17,7 @@ from ..grid.layout import Layout
 from ..transform.predictors import COEFFICIENT_BITS
 from .batches import Coded
 
-__all__ = ["Progress", "initial_state", "known_levels"]
+__all__ = ["Progress", "initial_state", "known_levels", "state_after"]
 
 #: Bytes of a segment from which on a window of those that arrived takes less memory than a copy.
 _WINDOW = 256
@@ -65,6 +65,12 @@ class Progress:
         self.state[tile, channel] = below - passes
         return below - 1
 
+    def follow(self, segment: Segment) -> int:
+        """Record a segment as an index tells it, with the planes of its tile each time; see `advance`."""
+        known = self.top[segment.tile, segment.channel]
+        top = 0 if known else segment.top
+        return self.advance(segment.tile, segment.channel, top, segment.passes, segment.range.offset)
+
     def advance_all(self, entries: Sequence[Entry], payload: memoryview, start: int, offset: int) -> list[Coded]:
         """Record the segments of a layer, whose bytes stand in its payload one after another from ``start`` on.
 
@@ -90,6 +96,21 @@ class Progress:
         Once ``whole``, a tile that no layer has announced is known to have nothing but zeros.
         """
         return np.where(self._state == UNANNOUNCED, np.int8(0), self._state) if whole else self._state.copy()
+
+
+def state_after(index: Index, layers: int) -> NDArray[np.int8]:
+    """Return the state after the first ``layers`` layers of a container, int8, shape (tile, channel).
+
+    Raises
+    ------
+    CorruptStreamError
+        If the index names a tile whose level has zeros only, or more passes than a tile has.
+    """
+    progress = Progress(index.header)
+    for segment in index.segments:
+        if segment.layer < layers:
+            progress.follow(segment)
+    return progress.snapshot(layers == index.header.layer_count)
 
 
 def initial_state(header: Header) -> NDArray[np.int8]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from threading import Lock
 
 import numpy as np
@@ -18,6 +19,7 @@ from ..entropy.tiles import Reading, Tiles, TileTable
 from ..errors import CorruptStreamError
 from ..parallel import aside, spread
 from .batches import Coded, batch_length, rounds_of
+from .progress import state_after
 from .region import Region
 from .values import Values, mark_holes, restore, values_of
 
@@ -27,6 +29,8 @@ __all__ = ["SegmentQueue", "StoredSegments"]
 _WORTH_PREPARING_BYTES = 1 << 13
 #: Bytes of segments that are decoded in advance at a time: a caller, or a fork, waits for so much.
 _PREPARED_AT_ONCE_BYTES = 1 << 18
+#: States after some layers that are kept: each is as long as a table of the tiles, and takes a walk over the index.
+_KEPT_STATES = 4
 
 
 class SegmentQueue:
@@ -197,6 +201,8 @@ class SegmentQueue:
 class StoredSegments:
     """Decodes any region of a complete container, whose segments and chunks are read from its file.
 
+    Methods take ``layers``: the first so many, and no residual, as a `Decoder` has it after these; None: everything.
+
     Parameters
     ----------
     read : callable (offset, length) -> bytes
@@ -217,18 +223,19 @@ class StoredSegments:
             if chosen is None or chosen[segment.channel]:
                 self._segments[segment.tile].append(segment)
         self._complete = np.zeros((len(self.header.layout.tiles), self.header.channels), np.int8)
+        self._state_after = lru_cache(_KEPT_STATES)(lambda layers: state_after(index, layers))
 
-    def values(self, region: Region) -> dict[int, Values]:
-        """Return the values of a region by block, exact where the container is.
+    def values(self, region: Region, layers: int | None = None) -> dict[int, Values]:
+        """Return the values of a region by block, exact where the container and ``layers`` are.
 
         Raises
         ------
         CorruptStreamError
             If a segment or a chunk is damaged.
         """
-        return self.values_from(region, self.channels(region))
+        return self.values_from(region, self.channels(region, layers), layers)
 
-    def values_from(self, region: Region, channels: Sequence[Tiles]) -> dict[int, Values]:
+    def values_from(self, region: Region, channels: Sequence[Tiles], layers: int | None = None) -> dict[int, Values]:
         """Return `values` from the ``channels`` of the region.
 
         Raises
@@ -236,15 +243,16 @@ class StoredSegments:
         CorruptStreamError
             If a chunk is damaged.
         """
-        corrected = region.level == self.header.levels
-        blocks = values_of(self.header, region, channels, self._complete, self._chosen)
+        corrected = region.level == self.header.levels and layers is None
+        state = self._complete if layers is None else self._state_after(layers)
+        blocks = values_of(self.header, region, channels, state, self._chosen)
         if corrected and self._index.chunks:
             restore(self.header, region, blocks, self._chunk, self._chosen)
         mark_holes(self.header, region, blocks, corrected)
         return blocks
 
-    def channels(self, region: Region) -> list[Tiles]:
-        """Decode all segments of the tiles of a region, and return the tiles of each channel.
+    def channels(self, region: Region, layers: int | None = None) -> list[Tiles]:
+        """Decode the segments of the tiles of a region, and return the tiles of each channel.
 
         Raises
         ------
@@ -257,6 +265,8 @@ class StoredSegments:
         for tile in numbers.tolist():
             remaining: dict[int, int] = {}
             for segment in self._segments[tile]:
+                if layers is not None and segment.layer >= layers:
+                    continue
                 first = remaining.get(segment.channel, pass_count(segment.top))
                 remaining[segment.channel] = first - segment.passes
                 data = self._checked(segment, "segment")
