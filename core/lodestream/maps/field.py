@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import mmap
 from collections.abc import Callable
@@ -55,6 +56,10 @@ class HeightField:
     scale : float, optional
         Metres upwards of one unit of the heights: -1 for depths in metres. None: as a compound CRS says, downward axes
         included; without one, as the unit in the metadata says; without that, 1.
+    error : float, optional
+        Metres that heights may be off: they are made from the fewest layers whose told maximum error is no larger, so
+        that fewer bytes are read. At the finest level none is further off. Heights of coarser levels are weighted means
+        of finer ones, whose errors are not told: they were at most 1.13 times as far off. 0: from everything.
     cache : BlockCache, optional
         For decoded blocks; by default one of 64 MiB of its own.
     max_vertices : int, optional
@@ -72,7 +77,7 @@ class HeightField:
     InputError
         If it is no single block of heights, has no CRS or no position, or its unit is none of length.
     OptionError
-        If the scale is 0 or not finite.
+        If the scale is 0 or not finite, or the error is not 0 or more.
     UnavailableError
         If pyproj is not installed.
     StreamError, TooLargeError
@@ -99,6 +104,7 @@ class HeightField:
         size: int,
         *,
         scale: float | None = None,
+        error: float = 0.0,
         cache: BlockCache | None = None,
         max_vertices: int | None = None,
     ) -> None:
@@ -106,12 +112,14 @@ class HeightField:
         header, metadata = self._windows.header, self._windows.metadata
         self.placement = Placement.of(metadata, header.shape, header.blocks[0][1])
         self.name = str(metadata.get("name", ""))
-        self._metres = _metres_of(metadata, self.placement.projection.vertical, scale)
         self._cache = BlockCache() if cache is None else cache
         self._key = object()  # other fields may share the cache
+        self._choose(scale, error)
 
     @classmethod
-    def open(cls, path: str | Path, *, scale: float | None = None, cache: BlockCache | None = None) -> HeightField:
+    def open(
+        cls, path: str | Path, *, scale: float | None = None, error: float = 0.0, cache: BlockCache | None = None
+    ) -> HeightField:
         """Open a container in a file, which must not change; parameters and errors as of the class.
 
         Raises
@@ -125,7 +133,34 @@ class HeightField:
             if not Path(path).stat().st_size:
                 raise InputError(f"expected a container, got the empty file {path}")
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        return cls(lambda offset, length: mapped[offset : offset + length], len(mapped), scale=scale, cache=cache)
+        return cls(
+            lambda offset, length: mapped[offset : offset + length],
+            len(mapped),
+            scale=scale,
+            error=error,
+            cache=cache,
+        )
+
+    def with_options(self, *, scale: float | None = None, error: float = 0.0) -> HeightField:
+        """Return the field of the same container with another scale and error; nothing is read again.
+
+        Raises
+        ------
+        InputError
+            If no scale is given and the unit is none of length.
+        OptionError
+            If the scale is 0 or not finite, or the error is not 0 or more.
+        """
+        field = copy.copy(self)
+        field._choose(scale, error)
+        return field
+
+    def _choose(self, scale: float | None, error: float) -> None:
+        """Set the scale and the error."""
+        if not (math.isfinite(error) and error >= 0):
+            raise OptionError(f"expected an error of 0 metres or more, got {error}")
+        self._error = error
+        self._metres = _metres_of(self._windows.metadata, self.placement.projection.vertical, scale)
 
     @property
     def bounds(self) -> Box:
@@ -226,18 +261,22 @@ class HeightField:
 
     def _block(self, level: int, i: int, j: int) -> NDArray[np.float32]:
         """Return a block of a level in metres, shape (row, column); NaN in holes."""
+        rows, columns = (
+            (at * _BLOCK, min((at + 1) * _BLOCK, len(nodes)))
+            for at, nodes in zip((i, j), self._windows.nodes(level), strict=True)
+        )
+        scale, offset = self._metres
+        layers = None
+        if self._error:
+            error = self._error / abs(scale) if scale else math.inf
+            layers = self._windows.layers_within(error, level, (rows, columns))
 
         def decoded() -> NDArray[np.float32]:
-            rows, columns = (
-                (at * _BLOCK, min((at + 1) * _BLOCK, len(nodes)))
-                for at, nodes in zip((i, j), self._windows.nodes(level), strict=True)
-            )
-            scale, offset = self._metres
-            heights = self._windows.heights(level, (rows, columns)) * scale + offset
+            heights = self._windows.heights(level, (rows, columns), layers) * scale + offset
             heights[~np.isfinite(heights)] = np.nan
             return heights.astype(np.float32)
 
-        return self._cache.get((self._key, level, i, j), decoded)
+        return self._cache.get((self._key, self._metres, layers, level, i, j), decoded)
 
 
 def _metres_of(metadata: dict[str, object], vertical: float | None, scale: float | None) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from ..errors import InputError
 from ..grid.window import spanning, within
 from ..joints import Nodes
 from ..planning.selection import Selection
+from ..planning.window_errors import WindowErrors, read_window_errors
 from ..target import Region
 
 __all__ = ["HeightWindows"]
@@ -55,7 +57,9 @@ class HeightWindows:
             raise InputError(f"expected one block of heights for a map, got {got}")
         if header.point_channels != 1:
             raise InputError("expected one block of heights for a map, got points with an x and a y of their own")
+        self._read, self._index = read, index
         self._segments = StoredSegments(read, index, Selection(attributes=()).channels(header))
+        self._told = np.array([layer.max_error for layer in index.layers])
         self.metadata = dict(index.metadata_values)
         if header.plane is not None:
             self.metadata["grid"] = header.plane["grid"]
@@ -68,7 +72,42 @@ class HeightWindows:
             self._nodes[level] = level_nodes(self.header, level)[0]
         return self._nodes[level]
 
-    def heights(self, level: int, window: Region) -> NDArray[np.float64]:
+    @cached_property
+    def _window_errors(self) -> WindowErrors | None:
+        return read_window_errors(self._index, self._read)
+
+    def layers_within(self, error: float, level: int, window: Region) -> int | None:
+        """Return after how few layers a window of a level is told to be no further off than an error.
+
+        For the finest level the errors of windows count, if the container has them; for others, whose heights are
+        means of finer ones, those of the whole surface.
+
+        Parameters
+        ----------
+        error : float
+            In the unit of the container.
+        level : int
+        window : ((int, int), (int, int))
+            Rows and columns of the level, half-open.
+
+        Returns
+        -------
+        int or None
+            For `heights`; None if only everything is.
+
+        Raises
+        ------
+        CorruptStreamError
+            If the errors of windows are damaged.
+        """
+        told = self._told
+        if level == self.header.levels and self._window_errors is not None:
+            _, fractions = self._window_errors.cells(window, slice(None))
+            told = np.minimum(told, fractions[..., 1].max(axis=(0, 1)) * self.header.extent)
+        enough = np.flatnonzero(told <= error)
+        return int(enough[0]) + 1 if enough.size else None
+
+    def heights(self, level: int, window: Region, layers: int | None = None) -> NDArray[np.float64]:
         """Return a window of a level as the container has it, shape (row, column); NaN in holes.
 
         Parameters
@@ -76,6 +115,8 @@ class HeightWindows:
         level : int
         window : ((int, int), (int, int))
             Rows and columns of the level, half-open.
+        layers : int, optional
+            From the first so many layers, of which alone bytes are read; None: from everything.
 
         Raises
         ------
@@ -88,7 +129,7 @@ class HeightWindows:
         nodes = self.nodes(level)
         shape = len(nodes[0]), len(nodes[1])
         made = region_of_window(self.header, level, spanning(window, self.header.shape, nodes))
-        (values,) = self._segments.values(made).values()
+        (values,) = self._segments.values(made, layers).values()
         heights = within(values.arrays[0], made.spans_in(shape), window, shape)[..., 0].astype(np.float64)
         if valid is not None:
             heights[~valid] = np.nan

@@ -104,15 +104,15 @@ class WindowErrors:
         return min(rms, worst) * self.header.extent, worst * self.header.extent
 
     def cells(
-        self, region: Region, layer: int, mask: NDArray[np.bool_] | None = None
+        self, region: Region, layer: int | slice, mask: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray[np.int64], Floats]:
-        """Return the cells that a window of the only block touches, after a layer.
+        """Return the cells that a window of the only block touches, after a layer or after each of several.
 
         Returns
         -------
         int64, shape (row of cells, column of cells)
             Points of each, or those that ``mask`` (bool, shape (row, column)) has.
-        float64, shape (row of cells, column of cells, 2)
+        float64, shape (row of cells, column of cells, 2), or (row of cells, column of cells, layer, 2)
             Bounds of RMS and maximum, over the surface's extent.
         """
         touched = []
@@ -121,7 +121,8 @@ class WindowErrors:
             touched.append(np.unique(np.concatenate(parts)))  # a cell at both ends of the window counts once
         window = np.ix_(*touched)
         counts = _cell_counts(self.header.shape, self.cell, mask)
-        return counts[window], _FRACTIONS[self.codes[:, layer].reshape(*counts.shape, 2)[window]]
+        codes = self.codes[:, layer]
+        return counts[window], _FRACTIONS[codes.reshape(*counts.shape, *codes.shape[1:])[window]]
 
 
 class WindowFigures:

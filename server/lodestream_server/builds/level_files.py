@@ -13,7 +13,10 @@ from typing import NamedTuple
 from ..store.durable import discard
 from .runner import carried_out
 
-__all__ = ["Key", "Lease", "LevelFiles"]
+__all__ = ["REMOVED", "Key", "Lease", "LevelFiles"]
+
+#: Why a level file is not where it was made, or cannot be made.
+REMOVED = "the server's scratch folder was removed meanwhile; ask again"
 
 
 class Key(NamedTuple):

@@ -38,7 +38,7 @@ from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
 from .answers import FileTooLongError, ProcessDiedError, Refusal, UnforeseenError, WrongAnswerError
 from .fork_server import Allowed
-from .level_files import Key, Lease, LevelFiles
+from .level_files import REMOVED, Key, Lease, LevelFiles
 from .levels import LevelJob, MadeLevel, make_level
 from .processes import Call, ForkServer, Pool
 from .runner import Runner, carried_out
@@ -181,7 +181,7 @@ class LevelMaker:
         except (FileNotFoundError, WrongAnswerError) as error:
             if folder.exists():
                 raise
-            raise BusyError("the server's scratch folder was removed meanwhile; ask again") from error
+            raise BusyError(REMOVED) from error
         finally:
             await carried_out(partial(discard, folder))
 

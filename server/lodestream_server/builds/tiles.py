@@ -50,8 +50,8 @@ class TileOrder(NamedTuple):
         Of tiles, in a document.
     encoding, image, size, nodata
         Of an image, see `lodestream.maps.web_tile`.
-    scale : float or None
-        Metres upwards of one unit, see `lodestream.maps.HeightField`.
+    scale, error
+        Of the heights, see `lodestream.maps.HeightField`.
     offset : float
         Added to the heights of a mesh, in metres.
     normals : bool
@@ -69,6 +69,7 @@ class TileOrder(NamedTuple):
     size: int = 256
     nodata: float = 0.0
     scale: float | None = None
+    error: float = 0.0
     offset: float = 0.0
     normals: bool = False
     is_gzipped: bool = False
@@ -115,7 +116,8 @@ def answer(fields: _Fields, container: str, order: list[Any], descriptor: int) -
     # Errors come back as values: not every exception survives the way between processes.
     try:
         wanted = TileOrder(*order)
-        data = _made(fields.get(container, wanted.scale, descriptor), wanted)
+        field = fields.get(container, descriptor, scale=wanted.scale, error=wanted.error)
+        data = _made(field, wanted)
     except LodestreamError as error:
         return Refusal.of(error)
     if data and wanted.is_gzipped:
@@ -131,29 +133,29 @@ class _Fields:
 
         self._cache = BlockCache(cache_bytes)
         self._max_vertices = max_vertices
-        self._open: OrderedDict[tuple[str, float | None], tuple[HeightField, int]] = OrderedDict()
+        self._open: OrderedDict[str, tuple[HeightField, int]] = OrderedDict()
 
-    def get(self, container: str, scale: float | None, descriptor: int) -> HeightField:
-        """Return a container as heights; it stays open for later requests."""
+    def get(self, container: str, descriptor: int, *, scale: float | None, error: float) -> HeightField:
+        """Return a container as heights; it stays open for later requests, whatever their options."""
         from lodestream.maps import HeightField
 
-        key = container, scale
-        if key in self._open:
-            self._open.move_to_end(key)
-            return self._open[key][0]
+        if container in self._open:
+            self._open.move_to_end(container)
+            return self._open[container][0].with_options(scale=scale, error=error)
         file = os.dup(descriptor)
         try:
             field = HeightField(
                 lambda offset, length: os.pread(file, length, offset),
                 os.fstat(file).st_size,
                 scale=scale,
+                error=error,
                 cache=self._cache,
                 max_vertices=self._max_vertices,
             )
         except BaseException:
             os.close(file)
             raise
-        self._open[key] = field, file
+        self._open[container] = field, file
         while len(self._open) > _OPEN:
             os.close(self._open.popitem(last=False)[1][1])
         return field

@@ -12,7 +12,7 @@ from lodestream.errors import OptionError
 from lodestream.formats import written
 
 from ..access.scopes import Reader
-from ..builds.level_files import Key
+from ..builds.level_files import REMOVED, Key
 from ..builds.level_maker import Loan
 from ..builds.levels import MEDIA_TYPES, written_by
 from ..problems import BusyError, responses
@@ -71,7 +71,7 @@ async def level(
     except FileNotFoundError as error:
         loan.release()
         parts.levels.forget(key.container)  # or it would be lent again
-        raise BusyError("the server's scratch folder was removed meanwhile; ask again") from error
+        raise BusyError(REMOVED) from error
     except BaseException:
         loan.release()
         raise

@@ -48,6 +48,10 @@ _Scale = Annotated[
     float | None,
     Query(allow_inf_nan=False, description="metres upwards of one unit of the heights; by default as the surface says"),
 ]
+_Error = Annotated[
+    float,
+    Query(ge=0, le=20_000, description="metres that heights may be off: so fewer bytes of the surface are decoded"),
+]
 _Version = Annotated[str | None, Query(max_length=64, description="as a document names it; tiles with it never change")]
 
 
@@ -89,6 +93,7 @@ async def map_json(
     size: _Size = "256",
     scale: _Scale = None,
     nodata: _Height = 0.0,
+    error: _Error = 0.0,
 ) -> Response:
     """Return the TileJSON of a surface with a CRS: its bounds, its zooms and the address of its tiles.
 
@@ -97,7 +102,7 @@ async def map_json(
     place = f"{request.url.scheme}://{request.url.netloc}{request.url.path.removesuffix('/map.json')}"
     options: dict[str, Any] = {"encoding": encoding, "size": size}
     options |= {} if scale is None else {"scale": scale}
-    options |= {"nodata": nodata} if nodata else {}
+    options |= {name: value for name, value in (("nodata", nodata), ("error", error)) if value}
     query = "&".join(f"{name}={value}" for name, value in options.items())
     address = f"{place}/tiles/{{z}}/{{x}}/{{y}}.png?{query}&v={_version(found)}"
     order = TileOrder("map", address=address, encoding=encoding, size=int(size), scale=scale)
@@ -118,13 +123,14 @@ async def tile(
     size: _Size = "256",
     nodata: _Height = 0.0,
     scale: _Scale = None,
+    error: _Error = 0.0,
     v: _Version = None,
 ) -> Response:
     """Return a tile in Web Mercator, y from the north; 404 where the surface does not reach.
 
     Heights are never drawn higher than they are: maps do that themselves.
     """
-    order = TileOrder("tile", z, x, y, "", encoding, image, int(size), nodata, scale)
+    order = TileOrder("tile", z, x, y, "", encoding, image, int(size), nodata, scale, error)
     return await _made(request, parts, caller, found, order, f"image/{image}", version=v)
 
 
@@ -137,12 +143,13 @@ async def layer_json(
     offset: _Height = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,
+    error: _Error = 0.0,
 ) -> Response:
     """Return the layer.json of a surface with a CRS; CesiumJS takes the address of its folder, ``.../terrain``.
 
     `offset` lifts heights above the geoid to those above the ellipsoid, which globes draw: -100 to 85 m.
     """
-    options = {name: value for name, value in (("offset", offset), ("nodata", nodata)) if value}
+    options = {name: value for name, value in (("offset", offset), ("nodata", nodata), ("error", error)) if value}
     options |= {} if scale is None else {"scale": scale}
     query = "".join(f"&{name}={value}" for name, value in options.items())
     order = TileOrder("layers", address=f"{{z}}/{{x}}/{{y}}.terrain?v={_version(found)}{query}", scale=scale)
@@ -161,6 +168,7 @@ async def mesh(
     offset: _Height = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,
+    error: _Error = 0.0,
     v: _Version = None,
 ) -> Response:
     """Return a quantized mesh in the geographic scheme TMS, y from the south; 404 where the surface does not reach.
@@ -174,6 +182,7 @@ async def mesh(
         y,
         nodata=nodata,
         scale=scale,
+        error=error,
         offset=offset,
         normals=_NORMALS in request.headers.get("accept", ""),
         is_gzipped=_takes_gzip(request.headers.get("accept-encoding", "")),

@@ -92,6 +92,26 @@ def test_options_reach_the_tiles(http: httpx.Client, hill: dict[str, Any], field
     assert lifted.content == maps.mesh_tile(field, 0, 1, 0, offset=40.0, normals=False)
 
 
+@pytest.mark.parametrize("of", ["surfaces", "names"])
+def test_tiles_may_be_off_by_an_error(http: httpx.Client, hill: dict[str, Any], field: Any, of: str) -> None:
+    http.put("/v1/names/hilly", json={"surface": hill["id"]}).raise_for_status()
+    place = hill["url"] if of == "surfaces" else "/v1/names/hilly"
+    off = field.with_options(error=20.0)
+    (address,) = http.get(f"{place}/map.json", params={"error": 20}).raise_for_status().json()["tiles"]
+    assert "&error=20.0&v=" in address
+    tile = http.get(address.format(z=7, x=66, y=45)).raise_for_status()
+    assert "immutable" in tile.headers["cache-control"]
+    assert tile.content == maps.web_tile(off, 7, 66, 45) != maps.web_tile(field, 7, 66, 45)
+    exact = http.get(f"{place}/tiles/7/66/45.png").raise_for_status()
+    assert exact.content == maps.web_tile(field, 7, 66, 45)
+    assert exact.headers["etag"] != tile.headers["etag"]
+    (address,) = http.get(f"{place}/terrain/layer.json", params={"error": 20}).raise_for_status().json()["tiles"]
+    assert address.endswith("&error=20.0")
+    mesh = http.get(f"{place}/terrain/{address.format(z=6, x=66, y=48)}").raise_for_status()
+    assert mesh.content == maps.mesh_tile(off, 6, 66, 48, normals=False)
+    assert mesh.content != maps.mesh_tile(field, 6, 66, 48, normals=False)
+
+
 def test_gdal_reads_terrarium_by_its_driver_of_tiles(http: httpx.Client) -> None:
     """At pixels of a tilted plane, in the zoom of its cells."""
     fields = pytest.importorskip("tests.core.maps.fields")
@@ -134,6 +154,9 @@ def test_a_name_has_tiles_of_the_version_to_which_it_leads(http: httpx.Client, h
         ("tiles/7/66/45.png?nodata=nan", (422, "bad-option")),
         ("tiles/7/66/45.png?scale=0", (422, "bad-option")),
         ("tiles/7/66/45.png?scale=inf", (422, "bad-option")),
+        ("tiles/7/66/45.png?error=-1", (422, "bad-option")),
+        ("tiles/7/66/45.png?error=nan", (422, "bad-option")),
+        ("terrain/6/66/48.terrain?error=1e9", (422, "bad-option")),
         ("map.json?encoding=jpeg", (422, "bad-option")),
         ("terrain/6/0/0.terrain", (404, "not-found")),
         ("terrain/40/0/0.terrain", (422, "bad-option")),
