@@ -26,6 +26,7 @@ PAGES = [
 #: Where the blocks of a page run, by page and language. An entry is a test, or "not run: " and the reason.
 RUN = {
     ("README.md", "console"): "tests/client/test_readme.py",
+    ("README.md", "js"): "tests/client/test_readme.py",
     ("README.md", "python"): "tests/client/test_readme.py",
     ("client/web/README.md", "indented"): "not run: tasks of package.json that install, build and test the package; "
     "`make page` and `make test-web` run the same",
