@@ -142,7 +142,7 @@ class HeightField:
         )
 
     def with_options(self, *, scale: float | None = None, error: float = 0.0) -> HeightField:
-        """Return the field of the same container with another scale and error; nothing is read again.
+        """Return the field of the same container with this scale and error instead of its own; nothing is read again.
 
         Raises
         ------
