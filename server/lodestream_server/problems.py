@@ -1,4 +1,4 @@
-"""What errors are called: from classes to codes, from codes to statuses and titles; problem documents (RFC 9457)."""
+"""What errors are called: from classes to codes; problem documents (RFC 9457)."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ from lodestream.errors import (
     UnavailableError,
     UnsupportedVersionError,
 )
-from lodestream.protocol.messages import CODES, MessageError
+from lodestream.protocol.messages import MessageError
+
+from .codes import MEANINGS, address
 
 __all__ = [
-    "MEANINGS",
     "MEDIA_TYPE",
     "PROBLEM_EXAMPLE",
     "BadTokenError",
@@ -41,6 +42,7 @@ __all__ = [
     "ForeignOriginError",
     "FullError",
     "NoTokenError",
+    "NoWebSocketError",
     "NotOwnerError",
     "NotReadyError",
     "PostponedError",
@@ -114,6 +116,10 @@ class ForeignOriginError(LodestreamError):
     """A page of another site made the request."""
 
 
+class NoWebSocketError(LodestreamError):
+    """A stream was asked for in an ordinary request."""
+
+
 class TooManyError(LodestreamError):
     """One client has as much in progress as allowed."""
 
@@ -137,35 +143,6 @@ class FullError(LodestreamError):
 
     headers: ClassVar = {"retry-after": "60"}
 
-
-class Meaning(NamedTuple):
-    """What a code says: the status of the answer over HTTP, and the title of the problem."""
-
-    status: int
-    title: str
-
-
-# Codes of streams whose close code is not 4000 plus the status.
-_STATUSES = {"message-too-large": 413, "internal": 500, "restarting": 503}
-
-#: Every code of a problem document or of a stream's ``error``; those of `CODES` have a close code there.
-MEANINGS: Mapping[str, Meaning] = {
-    **{word: Meaning(_STATUSES.get(word, code.close - 4000), code.title) for word, code in CODES.items()},
-    "bad-request": Meaning(400, "Not a valid request"),
-    "gone": Meaning(400, "The client disconnected"),
-    "foreign-origin": Meaning(403, "Pages of other sites may not do this"),
-    "not-owner": Meaning(403, "Only its owner and an admin may do this"),
-    "bad-method": Meaning(405, "There is no such method here"),
-    "too-large": Meaning(413, "The request, or what it asks for, is too large"),
-    "requested-range-not-satisfiable": Meaning(416, "The file has no such bytes"),
-    "bad-file": Meaning(422, "The file cannot be read, or the level not be written, in this format"),
-    "bad-input": Meaning(422, "The input cannot be used"),
-    "bad-option": Meaning(422, "An option does not exist, or its value is not valid"),
-    "unavailable": Meaning(501, "This server lacks a library that this needs"),
-    "damaged-name": Meaning(503, "It cannot be read where the name leads"),
-    "disk-full": Meaning(507, "The disk is full"),
-    "full": Meaning(507, "There is no space for more"),
-}
 
 _SEE_LOG = "the server's log says more"
 
@@ -192,6 +169,7 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     SmallScopeError: _Kind("small-scope"),
     NotOwnerError: _Kind("not-owner"),
     ForeignOriginError: _Kind("foreign-origin"),
+    NoWebSocketError: _Kind("no-websocket"),
     TooManyError: _Kind("too-many"),
     BusyError: _Kind("busy"),
     RestartingError: _Kind("restarting"),
@@ -202,23 +180,30 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     DamagedNameError: _Kind("damaged-name"),
     StreamError: _Kind("damaged"),
     UnsupportedVersionError: _Kind("unsupported-version"),
-    stores.FullError: _Kind("disk-full", "nothing was stored; delete surfaces or enlarge the disk"),
-    stores.UnacknowledgedError: _Kind("busy", f"it is not known whether that was done; {_SEE_LOG}"),
-    stores.StoreError: _Kind("busy", f"the server's store cannot be used now; {_SEE_LOG}"),
-    ClientDisconnect: _Kind("gone", "the body ended before it was complete"),
+    stores.FullError: _Kind("disk-full", "Nothing was stored; delete surfaces or enlarge the disk"),
+    stores.UnacknowledgedError: _Kind("busy", f"It is not known whether that was done; {_SEE_LOG}"),
+    stores.StoreError: _Kind("busy", f"The server's store cannot be used now; {_SEE_LOG}"),
+    ClientDisconnect: _Kind("gone", "The body ended before it was complete"),
     # An unexpected error reveals nothing about the server.
     Exception: _Kind("internal", _SEE_LOG),
+}
+
+# Headers of answers to errors that have none of their own.
+_USUAL: Mapping[int, Mapping[str, str]] = {
+    426: {"connection": "upgrade", "upgrade": "websocket"},
+    503: BusyError.headers,
+    507: FullError.headers,
 }
 
 #: Codes of what the framework refuses by itself.
 _OF_THE_FRAMEWORK = {404: "not-found", 405: "bad-method", 416: "requested-range-not-satisfiable"}
 
 PROBLEM_EXAMPLE = {
-    "type": "urn:lodestream:not-found",
+    "type": address("not-found", ""),
     "title": MEANINGS["not-found"].title,
     "status": MEANINGS["not-found"].status,
     "code": "not-found",
-    "detail": "expected the id of a surface on this server, got '0123'",
+    "detail": "No surface '0123' on this server",
     "instance": "/v1/surfaces/0123",
 }
 
@@ -269,8 +254,7 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
     status = MEANINGS[code].status
     if status >= 500 and code != "damaged":  # whoever found the damage has told of it
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
-    usual = {503: BusyError.headers, 507: FullError.headers}
-    return _document(request, code, detail, getattr(error, "headers", usual.get(status, {})))
+    return _document(request, code, detail, getattr(error, "headers", _USUAL.get(status, {})))
 
 
 async def refused(request: Request, error: Exception) -> Response:
@@ -278,11 +262,11 @@ async def refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     detail, headers = error.detail, dict(error.headers or {})
     if error.status_code == 404:
-        detail = f"expected a path that /docs lists, got {request.url.path[:100]!r}"
+        detail = f"No such address on this server: {request.url.path[:100]!r}; /docs lists what there is"
     if error.status_code == 405:
         # The framework names the methods of the first route of this path only.
         headers = {"allow": ", ".join(_methods(request))}
-        detail = f"expected one of {headers['allow']}, got {request.method}"
+        detail = f"Nothing takes {request.method} here, only {headers['allow']}"
     return _document(request, _OF_THE_FRAMEWORK[error.status_code], detail, headers)
 
 
@@ -304,17 +288,28 @@ async def _invalid(request: Request, error: Exception) -> Response:
 
 def _document(request: HTTPConnection, code: str, detail: str, headers: Mapping[str, str]) -> JSONResponse:
     request.app.state.metrics.failed(code)
-    content = document(code, detail, request.url.path)
+    content = document(code, detail, request.scope.get("root_path", ""), request.url.path)
     return JSONResponse(content, content["status"], headers, media_type=MEDIA_TYPE)
 
 
-def document(code: str, detail: str, path: str | None) -> dict[str, Any]:
-    """Return the problem document of a code; `path` is that of the request, if it was read so far."""
-    status, title = MEANINGS[code]
+def document(code: str, detail: str, root: str, path: str | None) -> dict[str, Any]:
+    """Return the problem document of a code.
+
+    Parameters
+    ----------
+    code : str
+        Key of `MEANINGS`.
+    detail : str
+    root : str
+        Path at which the application is.
+    path : str or None
+        Of the request, if it was read so far.
+    """
+    meaning = MEANINGS[code]
     return {
-        "type": f"urn:lodestream:{code}",
-        "title": title,
-        "status": status,
+        "type": address(code, root),
+        "title": meaning.title,
+        "status": meaning.status,
         "code": code,
         "detail": detail,
         "instance": path,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 from lodestream.protocol.messages import CODES
+from lodestream_server.codes import MEANINGS
 from lodestream_server.operation.bounds import Bounds
 from lodestream_server.operation.settings import GROUPS, Choice, choices
-from lodestream_server.problems import MEANINGS
 
 _DOCS = Path(__file__).parents[2] / "docs"
 PATH, ERRORS_PATH = _DOCS / "settings.md", _DOCS / "errors.md"
@@ -70,12 +71,20 @@ def render() -> str:
 _ERRORS = """\
 # Codes of errors
 
-What the server answers when it refuses or fails. Over HTTP each answer is a problem document (RFC 9457) with the code
-in `code`, and in `detail` what was expected. A stream ends with an `error` message that has the same code, and with a
-close code ([protocol.md](protocol.md#errors-and-close-codes)). In Python the code is `RemoteError.code`, where there is
-no class of its own. `lodestream_errors_total` counts each ([operating.md](operating.md)).
+What the server answers when it refuses or fails. Over HTTP each answer is a problem document (RFC 9457):
 
-This page is written by `python -m tests.server.manual` from `lodestream_server.problems` and
+    {"type": "/errors#not-found", "title": "There is no such thing", "status": 404, "code": "not-found",
+     "detail": "No surface '5f1c' on this server", "instance": "/v1/surfaces/5f1c"}
+
+Programs decide by `code`; people read `detail`, which may be worded otherwise tomorrow. `type` is the address of what
+this page says about the code, on the server itself: it is right whichever version answers, and needs no other host.
+It is a path, which belongs to the address of the request, because a server behind a proxy does not know its own name.
+
+A stream ends with an `error` message that has the same code, and with a close code
+([protocol.md](protocol.md#errors-and-close-codes)). In Python the code is `RemoteError.code`, where there is no class
+of its own. `lodestream_errors_total` counts each ([operating.md](operating.md)).
+
+This page is written by `python -m tests.server.manual` from `lodestream_server.codes` and
 `lodestream.protocol.messages`; a test checks it.
 
 | code | status | close code of a stream | title |
@@ -84,12 +93,13 @@ This page is written by `python -m tests.server.manual` from `lodestream_server.
 
 
 def render_errors() -> str:
-    """The page of codes, by their statuses."""
-    rows = []
-    for code, (status, title) in sorted(MEANINGS.items(), key=lambda item: (item[1].status, item[0])):
+    """The page of codes: a table by their statuses, and a paragraph for each."""
+    rows, paragraphs = [], []
+    for code, (status, title, advice) in sorted(MEANINGS.items(), key=lambda item: (item[1].status, item[0])):
         close = f"{CODES[code].close} " if code in CODES else ""
-        rows.append(f"| `{code}` | {status} | {close}| {title} |\n")
-    return _ERRORS + "".join(rows)
+        rows.append(f"| [`{code}`](#{code}) | {status} | {close}| {title} |\n")
+        paragraphs.append(f"\n### {code}\n\n{textwrap.fill(advice, 120, break_on_hyphens=False)}\n")
+    return _ERRORS + "".join(rows) + "\n## What each means, and what to do\n" + "".join(paragraphs)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,10 @@ from starlette.requests import ClientDisconnect
 
 from lodestream import errors, stores
 from lodestream.protocol.messages import CODES, MessageError
-from lodestream_server import problems
+from lodestream_server import codes, problems
+from lodestream_server.codes import MEANINGS
 from lodestream_server.operation.metrics import Metrics
-from lodestream_server.problems import MEANINGS, problem
+from lodestream_server.problems import problem
 from tests.server import manual
 
 EXPECTED = [
@@ -33,6 +34,7 @@ EXPECTED = [
     (problems.SmallScopeError("x"), 403, "small-scope"),
     (problems.NotOwnerError("x"), 403, "not-owner"),
     (problems.ForeignOriginError("x"), 403, "foreign-origin"),
+    (problems.NoWebSocketError("x"), 426, "no-websocket"),
     (problems.TooManyError("x"), 429, "too-many"),
     (problems.BusyError("x"), 503, "busy"),
     (problems.RestartingError("x"), 503, "restarting"),
@@ -84,7 +86,7 @@ def test_every_code_is_somebodys_and_close_codes_follow_from_statuses() -> None:
     used = {kind.code for kind in problems._KINDS.values()} | set(problems._OF_THE_FRAMEWORK.values())
     used.add("bad-request")  # of the connections, which answer without the framework
     assert used | set(CODES) == set(MEANINGS)
-    assert {code for code, meaning in CODES.items() if meaning.close < 4000} == set(problems._STATUSES)
+    assert {code for code, meaning in CODES.items() if meaning.close < 4000} == set(codes._STATUSES)
     for code, meaning in CODES.items():
         assert meaning.close in (4000 + MEANINGS[code].status, 1009, 1011, 1012)
 

@@ -69,7 +69,7 @@ def test_the_element_follows_a_name(tabs: Tabs, shelf: Shelf, tmp_path: Path) ->
 def test_a_name_that_leads_nowhere_is_told(tabs: Tabs, shelf: Shelf, heard: Heard) -> None:
     heard.allow("status of 404")
     tab = tabs(f"{shelf.server}/#n=nowhere")
-    expect(tab.page.get_by_role("alert")).to_contain_text("expected a name on this server, got nowhere")
+    expect(tab.page.get_by_role("alert")).to_contain_text("No name 'nowhere' on this server")
 
 
 def drop(tab: Tab, name: str, data: bytes, place: str = ".drop") -> None:

@@ -108,7 +108,7 @@ def blocks_sockets(error: LodestreamError, *, met: bool) -> bool:
     cause = error.__cause__
     if isinstance(cause, ws.InvalidStatus):
         # A server that is asked for a stream by a plain GET, since something between took the rest of the handshake
-        # away, knows no such path. What else it says in its own words it would say by the other transport too.
+        # away, answers 426. What else it says in its own words it would say by the other transport too.
         code = _document(bytes(cause.response.body or b"")).get("code")
         is_ours = isinstance(code, str) and code in CODES
         return not is_ours or cause.response.status_code in _NO_HANDSHAKE

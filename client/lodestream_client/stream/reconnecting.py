@@ -90,8 +90,7 @@ class Transports:
             self.transport, self._blocked = "http", error
             return 0.0
         # What is wrong over either transport in the same way, such as the address, is said once.
-        both_missing = isinstance(error, NotFoundError) and isinstance(self._blocked, NotFoundError)
-        twice = both_missing or str(error) == str(self._blocked)
+        twice = isinstance(error, NotFoundError) or str(error) == str(self._blocked)
         if self.transport == "http" and self._blocked is not None and not self.met and not twice:
             error.args = (f"{error} (and by WebSocket: {self._blocked})", *error.args[1:])
         if not problems.passes(error):

@@ -110,7 +110,7 @@ class Access:
             named = self._settings.origins
             if origin not in named and "*" not in named and not _is_own(origin, connection):
                 raise ForeignOriginError(
-                    f"expected the origin of this server or one of its setting origins, got {origin[:80]!a}"
+                    f"Pages of {origin[:80]!a} may not use this server; its setting origins says whose may"
                 )
 
     def authorize(self, connection: HTTPConnection, scope: str) -> Caller:
@@ -129,7 +129,7 @@ class Access:
             return self._holder(text, scope)
         hindrance = self._hindrance(connection, scope)
         if hindrance is not None:
-            raise NoTokenError(f"expected a token (Authorization: Bearer ...), got none; {hindrance}")
+            raise NoTokenError(f"This needs a token (Authorization: Bearer ...): {hindrance}")
         return replace(anybody(connection), admin=self._hindrance(connection, "admin") is None)
 
     def reader(self, connection: HTTPConnection) -> Caller | None:
@@ -154,7 +154,7 @@ class Access:
             If there is no token, it is not known, or it does not allow reading.
         """
         if text is None or not self._tokens.used:
-            raise NoTokenError("expected a token in the handshake or in open as the first message, got neither")
+            raise NoTokenError("This needs a token, in the handshake or in open as the first message")
         return self._holder(text, "read")
 
     def check(self, caller: Caller) -> None:
@@ -166,14 +166,14 @@ class Access:
             If its token was revoked or has expired.
         """
         if caller.token is not None and self._tokens.known(caller.token) is None:
-            raise BadTokenError("expected a token that is still valid, got one that was revoked or has expired")
+            raise BadTokenError("The token was revoked or has expired")
 
     def _holder(self, text: str, scope: str) -> Caller:
         token = self._tokens.find(text)
         if token is None:
-            raise BadTokenError("expected a valid token, got one that is unknown, expired or revoked")
+            raise BadTokenError("The token is unknown, expired or revoked")
         if not token.allows(scope):
-            raise SmallScopeError(f"expected a token with the scope {scope}, got one with {', '.join(token.scopes)}")
+            raise SmallScopeError(f"This needs a token with the scope {scope}; this one has {', '.join(token.scopes)}")
         return Caller(key_of(token.name), token.name, token.name, token.allows("admin"), token.sha256)
 
     def _hindrance(self, connection: HTTPConnection, scope: str) -> str | None:

@@ -46,6 +46,6 @@ def _check_path(scope: Scope) -> None:
     # A proxy that cuts paths apart in another way than we do would guard another path than the one that is answered.
     raw: bytes = scope.get("raw_path") or b""
     if b"%2f" in raw.partition(b"?")[0].lower():
-        raise NotFoundError("expected a path that /docs lists, got one with an encoded slash")
+        raise NotFoundError("No such address on this server: no path here has an encoded slash")
     if any(unicodedata.category(character) == "Cc" for character in scope["path"]):
-        raise NotFoundError("expected a path that /docs lists, got one with a control character")
+        raise NotFoundError("No such address on this server: no path here has a control character")

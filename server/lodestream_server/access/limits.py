@@ -167,7 +167,7 @@ class Limits:
                 yield
         except TimeoutError:
             if clock.expired():
-                raise RestartingError("expected the whole upload before the server ended; send it again") from None
+                raise RestartingError("The server ends, and the upload was not complete; send it again") from None
             raise
         finally:
             del self._clocks[clock]
@@ -199,8 +199,8 @@ class Limits:
         promised = self._promised[caller.key]
         if free < promised:
             raise FullError(
-                f"expected disk space for the upload beside the {kept} bytes that the server keeps free, got "
-                f"{max(free, 0)} bytes for all uploads of {caller.name}; delete surfaces or enlarge the disk"
+                f"There is no room for the upload: all uploads of {caller.name} may take {max(free, 0)} bytes, beside "
+                f"the {kept} that the server keeps free; delete surfaces or enlarge the disk"
             )
         if new:
             await self._check_bytes(caller.owner, free, promised)
@@ -316,8 +316,8 @@ def _watched(request: Request, room: _Room, settings: Settings) -> Receive:
         slow = rate.shortfall(came)
         if slow is not None and message.get("more_body", False):
             raise SlowUploadError(
-                f"expected at least {settings.least_rate} bytes a second of an upload, got {slow[0]} bytes in "
-                f"{slow[1]:.0f} s"
+                f"The upload is too slow: {slow[0]} bytes came in {slow[1]:.0f} s, and at least {settings.least_rate} "
+                "a second must"
             )
         return message
 

@@ -111,20 +111,20 @@ class Share:
             Of the class ``full`` if there is no more of it, or of the class ``beyond`` if the caller has its share.
         """
         most, taken, own = found = self.held(caller.key) if held is None else held
-        more = f" and {amount} more" if amount != 1 else ""
+        more = f" and {amount} more" if amount > 1 else ""
         if self._each is not None:
             if own + amount > self._each:
                 raise self._beyond(
-                    f"expected at most {self._each} {self._what} of {caller.name}, got {own}{more}; {self._advice}"
+                    f"{caller.name} may have at most {self._each} {self._what}, and has {own}{more}; {self._advice}"
                 )
             return
         if taken + amount > most:
             raise self._full(
-                f"expected at most {most} {self._what} on this server, got {taken} and {amount} more; {self._advice}"
+                f"This server has at most {most} {self._what}, and there are {taken} and {amount} more; {self._advice}"
             )
         if amount > found.left and not self._alone():
             raise self._beyond(
-                f"expected no more {self._what} of {caller.name} than are left for others, got {own}{more}, and "
+                f"{caller.name} may have no more {self._what} than are left for others: it has {own}{more}, and "
                 f"{most - taken} of {most} are left; {self._advice}"
             )
 

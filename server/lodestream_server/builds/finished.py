@@ -74,9 +74,9 @@ def check_upload(files: Sequence[Path], options: Collection[str]) -> Format:
     from lodestream.formats import Format
 
     if len(files) > 1:
-        raise FormatError(f"expected a container as the only file, got one of {len(files)} files")
+        raise FormatError(f"A container is uploaded alone, and here are {len(files)} files")
     for option in options:
-        raise OptionError(f"expected no option other than name and filename for a container, got {option[:80]!a}")
+        raise OptionError(f"A container has no option {option[:80]!a}, only name and filename: it is kept as it is")
     _check_sections(files[0])
     return Format(name="lode", suffixes=(".lode",), sniff=lambda head, suffix: False)
 
@@ -92,9 +92,9 @@ def _check_sections(path: Path) -> None:
         size = os.fstat(file.fileno()).st_size
         for number, (kind, length) in enumerate(section_lengths(partial(_read, file), size)):
             if number == MOST_SECTIONS:
-                raise TooLargeError(f"expected at most {MOST_SECTIONS:,} sections in a container, got more")
+                raise TooLargeError(f"The container has more than {MOST_SECTIONS:,} sections")
             if kind == METADATA and length > MAX_BYTES:
-                raise TooLargeError(f"expected at most {MAX_BYTES} bytes of metadata in a container, got {length}")
+                raise TooLargeError(f"The container has {length} bytes of metadata, and at most {MAX_BYTES} are read")
 
 
 def _read(file: BinaryIO, offset: int, length: int) -> bytes:

@@ -16,7 +16,7 @@ from .runner import carried_out
 __all__ = ["REMOVED", "Key", "Lease", "LevelFiles"]
 
 #: Why a level file is not where it was made, or cannot be made.
-REMOVED = "the server's scratch folder was removed meanwhile; ask again"
+REMOVED = "The server's scratch folder was removed meanwhile; ask again"
 
 
 class Key(NamedTuple):

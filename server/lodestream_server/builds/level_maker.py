@@ -192,7 +192,7 @@ class LevelMaker:
             except (ProcessDiedError, _ReplacedError) as error:
                 _log.warning("level %d of %s: %s", key.level, key.container, error)
                 await carried_out(partial(_empty, wanted.folder))
-        raise BusyError("the process that made the level was killed, or its container was replaced; try again soon")
+        raise BusyError("The process that made the level was killed, or its container was replaced; try again soon")
 
     async def _run(self, wanted: LevelJob, key: Key) -> int:
         advice = "ask for a coarser level, or stream the surface"
@@ -202,10 +202,10 @@ class LevelMaker:
             result: MadeLevel | Refusal = await self._runner.call(call)
         except TimeoutError:
             raise TooLargeError(
-                f"expected a level that is made within {seconds:g} s (level_seconds); {advice}"
+                f"The level takes longer to make than the {seconds:g} s that it may (level_seconds); {advice}"
             ) from None
         except MemoryError:
-            raise TooLargeError(f"expected a level that needs at most {self._memory}; {advice}") from None
+            raise TooLargeError(f"The level needs more than {self._memory}; {advice}") from None
         except UnforeseenError as error:
             if error.errno in _NO_ROOM:
                 raise self._no_room(0) from None
@@ -218,7 +218,7 @@ class LevelMaker:
             raise
         except OSError as error:
             # No process could be started.
-            raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
+            raise BusyError(f"The server's system could not start a process: {error.strerror}") from error
         if isinstance(result, MadeLevel):
             return await asyncio.to_thread(_checked_size, wanted, result)
         refused = result.error()
@@ -226,12 +226,12 @@ class LevelMaker:
             if wanted.most_bytes < self._files.longest:
                 raise self._no_room(wanted.most_bytes)
             raise TooLargeError(
-                f"expected a level whose file has less than {wanted.most_bytes} bytes, a quarter of the disk space for "
-                f"levels (level_disk); {advice}"
+                f"The file of the level has more than {wanted.most_bytes} bytes, a quarter of what all levels "
+                f"may take (level_disk); {advice}"
             )
         if isinstance(refused, TooLargeError):  # what the decoder advises is for those who call it
             limit, _, _ = str(refused).partition("; max_vertices=")
-            raise TooLargeError(f"expected a level that needs at most {self._memory}: {limit}; {advice}")
+            raise TooLargeError(f"The level needs more than {self._memory}: {limit}; {advice}")
         if isinstance(refused, InputError) and not isinstance(refused, OptionError):
             raise FormatError(str(refused))
         if isinstance(refused, StreamError):
@@ -249,10 +249,9 @@ class LevelMaker:
         # What readers hold will be free again; what else is on the disk will not by itself.
         if 2 * most + self._files.size + _LEAST_ROOM >= self._files.most:
             return BusyError(
-                f"expected disk space for a level, got {most} bytes beside files that others are reading; try again "
-                "soon"
+                f"There is no room for the level: {most} bytes beside files that others are reading; try again soon"
             )
-        return FullError(f"expected disk space for a level, got {most} bytes; delete surfaces or enlarge the disk")
+        return FullError(f"There is no room for the level: {most} bytes; delete surfaces or enlarge the disk")
 
 
 def _allowed(wanted: LevelJob, settings: Settings) -> Allowed:

@@ -58,7 +58,7 @@ class SurfaceOptions:
         precisions = []
         for key, value in query:
             if "=" in key:
-                raise OptionError(f"expected the name of an option, got {key[:80]!a}")
+                raise OptionError(f"There is no option {key[:80]!a}: no name of one has an equals sign")
             if key == "precision":
                 precisions.append(value)
                 continue
@@ -66,13 +66,13 @@ class SurfaceOptions:
                 values[key] += f",{value}"  # a list, as of the text with commas
                 continue
             if key in values:
-                raise OptionError(f"expected {key[:80]!a} once, got it twice")
+                raise OptionError(f"The option {key[:80]!a} is given twice")
             values[key] = value
         values |= stored(Quality.parse(precisions, values.pop("rms", None), values.pop("effort", Quality.effort)))
         name, filename = plain_name(values.pop("name", "")), plain_name(values.pop("filename", ""))
         closed = values.pop("closed", "auto")
         if closed not in CLOSED:
-            raise OptionError(f"expected closed to be one of {', '.join(CLOSED)}, got {closed[:80]!a}")
+            raise OptionError(f"The option closed is one of {', '.join(CLOSED)}, and not {closed[:80]!a}")
         if closed != "auto":
             values["closed"] = closed
         if "nodata" in values:
@@ -119,7 +119,7 @@ def check(
     for key in options.chosen:
         if key not in (*ours, *sniffed[0].options) and not key.startswith(ATTRIBUTE):
             known = ", ".join((*ours, "name", "filename", *sniffed[0].options))
-            raise OptionError(f"expected one of {known} for format {sniffed[0].name}, got {key[:80]!a}")
+            raise OptionError(f"The format {sniffed[0].name} has no option {key[:80]!a}, only {known}")
     if options.chosen.get("remesh") is not None:
         _check_allowed(("remesh",), names[0], allowed)
     return sniffed[0]

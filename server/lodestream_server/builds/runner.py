@@ -213,4 +213,4 @@ def _name(key: Hashable) -> str:
 
 
 def _restarting() -> RestartingError:
-    return RestartingError("the server ended before that was done; ask again")
+    return RestartingError("The server ended before that was done; ask again")

@@ -102,7 +102,9 @@ class TileMaker:
             If the server ends.
         """
         if len(order.address) > _LONGEST_ADDRESS:
-            raise TooLargeError(f"expected addresses of at most {_LONGEST_ADDRESS} letters, got {len(order.address)}")
+            raise TooLargeError(
+                f"The address of the tiles has {len(order.address)} letters, and may have {_LONGEST_ADDRESS}"
+            )
         with self._limits.tiles.take(caller):
             async with self._runner.job((container, order), caller.key, partial(self._make, container, order)) as made:
                 return made
@@ -121,19 +123,19 @@ class TileMaker:
         try:
             made: MadeTile | Refusal = await self._runner.call(question)
         except TimeoutError:
-            raise TooLargeError(f"expected a tile that is made within {_SECONDS:g} s") from None
+            raise TooLargeError(f"The tile takes longer to make than the {_SECONDS:g} s that it may") from None
         except MemoryError:
-            raise TooLargeError(f"expected a tile that needs at most {_MEMORY >> 20} MiB of memory") from None
+            raise TooLargeError(f"The tile needs more than {_MEMORY >> 20} MiB of memory") from None
         except ProcessDiedError as error:
             _log.warning("a tile of %s: %s", container, error)
-            raise BusyError("the process that makes tiles was killed; try again soon") from None
+            raise BusyError("The process that makes tiles was killed; try again soon") from None
         except UnforeseenError as error:
             _log.error("making a tile failed unexpectedly: %s", error.traceback)
             raise
         except FileNotFoundError:
-            raise BusyError(f"the container {container} was deleted or stored again meanwhile; try again") from None
+            raise BusyError(f"The container {container} was deleted or stored again meanwhile; try again") from None
         except OSError as error:
-            raise BusyError(f"the server's system could not start a process: {error.strerror}") from error
+            raise BusyError(f"The server's system could not start a process: {error.strerror}") from error
         if isinstance(made, Refusal):
             refusal = made.error()
             if isinstance(refusal, StreamError):
@@ -142,4 +144,4 @@ class TileMaker:
         try:
             return b64decode(made.data, validate=True)
         except (Error, ValueError):
-            raise BusyError("the process that makes tiles gave an invalid answer; try again") from None
+            raise BusyError("The process that makes tiles gave an invalid answer; try again") from None

@@ -109,7 +109,9 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
         super().connection_made(cast(asyncio.Transport, self._answers))
         self._follow_head()
         if len(self.connections) > self.most:
-            self._refuse("busy", f"expected at most {self.most} connections; try again in a few seconds")
+            self._refuse(
+                "busy", f"The server has {self.most} connections, as many as it takes; try again in a few seconds"
+            )
 
     def get_buffer(self, sizehint: int) -> memoryview:
         return self.buffer if self.conn.remaining > _PIECE else self.buffer[:_PIECE]
@@ -212,14 +214,14 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
         self._head_timer = None
         if self.conn.our_state is h11.IDLE:
             seconds = self.settings.head_seconds
-            self._refuse("idle", f"expected the complete head of a request within {seconds:g} s")
+            self._refuse("idle", f"The head of the request was not complete within {seconds:g} s")
         else:
             self.cuts.note("refused-body", self.client)
             self._socket.abort()
 
     def _refuse(self, code: str, detail: str) -> None:
         self._leave_request()
-        problem = document(code, detail, None)
+        problem = document(code, detail, self.settings.root_path, None)
         status, body = problem["status"], json.dumps(problem).encode()
         headers = [
             ("content-type", MEDIA_TYPE),

@@ -28,7 +28,7 @@ class Requests(h11.Connection):
 
     def __init__(self) -> None:
         super().__init__(h11.SERVER, MOST_HEAD)
-        self.wrong = "expected a valid HTTP/1.1 request"
+        self.wrong = "This is no valid HTTP/1.1 request"
         self.only_head = False
         self._whole = False
         self._to_come = 0
@@ -74,9 +74,9 @@ class Requests(h11.Connection):
         # RFC 9112, 6.1 and 6.3: a proxy in front may take the other of the two lengths, and what it takes for a body
         # is the next request here, or the other way round.
         if not self._whole and b"content-length" in headers:
-            self._refuse("expected Content-Length or Transfer-Encoding in a request, got both")
+            self._refuse("The request has both Content-Length and Transfer-Encoding")
         if not self._whole and request.http_version < b"1.1":
-            self._refuse("expected Transfer-Encoding in HTTP/1.1 only, got it in HTTP/1.0")
+            self._refuse("The request has Transfer-Encoding, which HTTP/1.0 does not know")
 
     def _refuse(self, wrong: str) -> None:
         self.wrong = wrong

@@ -38,7 +38,9 @@ def sort_out(request: Request, size: int, etag: str) -> None:
     for requested in ranges:
         if requested is not None and (int(requested[1]) >= size if requested[1] else int(requested[3]) == 0):
             raise HTTPException(
-                416, f"expected bytes of a file of {size}, got {requested[0]}", {"content-range": f"bytes */{size}"}
+                416,
+                f"The file has {size} bytes, and not the range {requested[0].strip()}",
+                {"content-range": f"bytes */{size}"},
             )
 
 

@@ -1,4 +1,4 @@
-"""The page ``/docs``: the OpenAPI document as HTML, without scripts and without resources of other hosts."""
+"""The pages ``/docs`` and ``/errors`` as HTML: the OpenAPI document, and what each code of an error means."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
-__all__ = ["render"]
+from ..codes import MEANINGS
+
+__all__ = ["render", "render_codes"]
 
 _CODE = re.compile(r"(`{1,2})([^`]+)\1")
 
@@ -31,6 +33,15 @@ def render(document: Mapping[str, Any], address: str) -> str:
             *_sections(document["paths"]),
         )
     )
+
+
+def render_codes() -> str:
+    """Return the body of the page of codes; the address of a paragraph is the ``type`` of problem documents."""
+    shown = (
+        f'<h2 id="{code}"><code>{code}</code> {status} {escape(title)}</h2>\n{_text(advice)}'
+        for code, (status, title, advice) in sorted(MEANINGS.items())
+    )
+    return f"<h1>Codes of errors</h1>\n{''.join(shown)}"
 
 
 def _sections(paths: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:

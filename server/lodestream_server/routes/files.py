@@ -74,7 +74,7 @@ def _file(containers: Containers, sha256: str) -> tuple[Path, os.stat_result]:
         try:
             return blob.path, blob.path.stat()
         except FileNotFoundError:
-            raise BusyError(f"the container {sha256} was deleted and stored again meanwhile; try again") from None
+            raise BusyError(f"The container {sha256} was deleted and stored again meanwhile; try again") from None
 
 
 class _Container(SentFile):
@@ -92,4 +92,4 @@ class _Container(SentFile):
             await super().__call__(scope, receive, send)
         except FileNotFoundError:
             await asyncio.to_thread(_file, self._containers, self._sha256)  # which says why
-            raise BusyError(f"the container {self._sha256} was deleted and stored again; try again") from None
+            raise BusyError(f"The container {self._sha256} was deleted and stored again; try again") from None

@@ -94,4 +94,4 @@ class _Borrowed(SentFile):
 def _check(surface: Surface, level: int) -> None:
     finest = surface.summary.levels - 1
     if not 0 <= level <= finest:
-        raise OptionError(f"expected a level of 0 to {finest}, got {level}")
+        raise OptionError(f"No level {level} of this surface: it has levels 0 to {finest}")

@@ -227,7 +227,7 @@ async def _made(
     with still_there(parts, found.id):
         data = await while_there(request, parts.tiles.make(container, order, caller), lambda _: None)
     if not data:
-        raise NotFoundError(f"expected a tile that the surface reaches, got {order.z}/{order.x}/{order.y}")
+        raise NotFoundError(f"The surface does not reach the tile {order.z}/{order.x}/{order.y}")
     return Response(data, media_type=media_type, headers=headers)
 
 

@@ -141,13 +141,13 @@ async def _asked(request: Request, parts: State) -> str | None:
             async for chunk in request.stream():
                 body += chunk
                 if len(body) > _LONGEST_BODY:
-                    raise TooLargeError(f"expected at most {_LONGEST_BODY} bytes of JSON, got more")
+                    raise TooLargeError(f"The body is longer than the {_LONGEST_BODY} bytes that it may be")
     except TimeoutError:
-        raise SlowUploadError(f"expected the whole request within {seconds:g} s") from None
+        raise SlowUploadError(f"The body was not complete within {seconds:g} s") from None
     try:
         surface = _Pointing.model_validate_json(bytes(body)).surface
     except ValidationError:
-        raise InputError(f'expected {{"surface": ID}} in JSON, got {bytes(body[:80])!r}') from None
+        raise InputError(f'The body must be {{"surface": ID}} in JSON, and is {bytes(body[:80])!r}') from None
     return None if surface is None else surface.removeprefix(f"{base(request)}/")
 
 
@@ -164,7 +164,7 @@ def leads_to(parts: State, name: str) -> Surface:
     leads = parts.surfaces.names.get(name).surface
     found = None if leads is None else parts.surfaces.index.find(leads)
     if found is None:
-        raise NotFoundError(f"the name {name} led to the surface {leads}, which was deleted")
+        raise NotFoundError(f"The name {name} led to the surface {leads}, which was deleted")
     return found
 
 

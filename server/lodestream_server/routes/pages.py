@@ -10,8 +10,9 @@ from lodestream import page
 from lodestream.errors import NotFoundError
 
 from ..access.scopes import ADMIN, WRITE
+from ..codes import PAGE
 from . import examples
-from .documentation import render
+from .documentation import render, render_codes
 from .html_page import html_page
 from .routing import Parts, matches, readable
 from .sending import SentFile
@@ -46,7 +47,7 @@ async def asset(request: Request, name: str) -> Response:
     """Return a script, style or kernel of the page."""
     answer = _sent(request, f"assets/{name}")
     if answer is None:
-        raise NotFoundError(f"there is no {name[:80]!a} among the files of the page")
+        raise NotFoundError(f"No {name[:80]!a} among the files of the page")
     return answer
 
 
@@ -63,6 +64,12 @@ async def configuration() -> Response:
 async def docs(request: Request) -> Response:
     """Return the HTTP interface, for people."""
     return html_page("Lodestream: the HTTP interface", render(request.app.openapi(), f"{_root(request)}/openapi.json"))
+
+
+@readable(router, PAGE, include_in_schema=False)
+async def errors() -> Response:
+    """Return what each code of an error means, for people."""
+    return html_page("Lodestream: codes of errors", render_codes())
 
 
 @readable(router, "/openapi.json", include_in_schema=False)

@@ -94,7 +94,7 @@ def still_there(parts: State, surface: str) -> Iterator[None]:
         yield
     except NotFoundError:
         ready(parts, surface)
-        raise BusyError(f"the container of {surface} was deleted and stored again meanwhile; try again") from None
+        raise BusyError(f"The container of {surface} was deleted and stored again meanwhile; try again") from None
     except BusyError:
         ready(parts, surface)
         raise

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from fastapi import APIRouter, WebSocket
+from fastapi.responses import Response
 from starlette.websockets import WebSocketDisconnect
 
 from lodestream.container import ByteRange
@@ -27,18 +28,19 @@ from lodestream.stores import StoreError
 from lodestream.transfer.sender import Sender
 
 from ..access.access import Caller, anybody
-from ..access.scopes import StreamReader
+from ..access.scopes import READ, StreamReader
+from ..codes import MEANINGS
 from ..operation.logs import event
-from ..problems import MEANINGS, SilentError, answer, problem
+from ..problems import NoWebSocketError, SilentError, answer, problem, responses
 from ..store.containers import OpenContainer
-from .routing import Parts
+from .routing import Parts, readable
 from .sending import ready, still_there
 
 __all__ = ["router"]
 
 _log = logging.getLogger(__name__)
 
-router = APIRouter()
+router = APIRouter(tags=["streams"])
 
 # A close frame carries 125 bytes, two of them the code.
 _LONGEST_REASON = 123
@@ -59,8 +61,27 @@ _TOKEN_SECONDS = 3.0
 # Long enough for a close frame to leave through a full buffer, short enough not to keep a dead peer.
 _CLOSE_SECONDS = 5.0
 
+_PATH = "/v1/surfaces/{surface}/stream"
 
-@router.websocket("/v1/surfaces/{surface}/stream")
+
+@readable(
+    router,
+    _PATH,
+    dependencies=[READ],
+    status_code=101,
+    summary="Stream a surface over a WebSocket",
+    response_class=Response,
+    responses={101: {"description": "The subprotocol lodestream.v1"}, **responses(404, 426)},
+)
+async def plain(parts: Parts) -> Response:
+    """Open a stream: messages in MessagePack, see `docs/protocol.md`. A request that opens no WebSocket is 426.
+
+    A token is in the handshake, or in `open` as the first message. Other refusals are messages in the stream.
+    """
+    raise NoWebSocketError("A stream is opened as a WebSocket, and this is an ordinary request")
+
+
+@router.websocket(_PATH)
 async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface: str) -> None:
     """Send a surface under the client's credit."""
     try:
@@ -75,7 +96,7 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface:
     try:
         first = None if opening is None else from_address(opening)
         if first is not None and _token(first) is not None:
-            raise MessageError("bad-message", "expected no token in an address, because logs keep addresses")
+            raise MessageError("bad-message", "A token does not belong into an address, because logs keep addresses")
         if caller is None:
             # Nothing is told of the surface, not even whether it exists, before the token was seen; and nobody takes a
             # stream from those who have one by showing none.
@@ -130,7 +151,7 @@ async def _first_message(socket: WebSocket, patience: float) -> bytes:
         async with asyncio.timeout(patience):
             return await _message(socket)
     except TimeoutError:
-        raise SilentError(f"expected open within {patience:g} s") from None
+        raise SilentError(f"No open came within {patience:g} s") from None
 
 
 async def _message(socket: WebSocket) -> bytes:
@@ -139,14 +160,14 @@ async def _message(socket: WebSocket) -> bytes:
         raise WebSocketDisconnect(message.get("code", 1006), message.get("reason"))
     data: bytes | None = message.get("bytes")
     if data is None:
-        raise MessageError("bad-message", "expected a binary message, got text")
+        raise MessageError("bad-message", "The message is text, and all messages are binary")
     return data
 
 
 def _token(message: bytes) -> str | None:
     first = parse(message)
     if not isinstance(first, Open):
-        raise MessageError("out-of-turn", f"expected open, got {first.type}")
+        raise MessageError("out-of-turn", f"The first message must be open, and is {first.type}")
     return first.token
 
 
@@ -292,7 +313,7 @@ class _Session:
             message, wanted = await self._next()
             if message is not None:
                 sending = self._socket.send_bytes(message)
-                await _within(self._settings.idle_seconds, sending, "the client to read what was sent")
+                await _within(self._settings.idle_seconds, sending, "The client has not read what was sent")
                 self._progress = time.monotonic()
                 if self._sender.layers and self.first_surface is None:
                     self.first_surface = time.monotonic() - self._opened
@@ -311,11 +332,11 @@ class _Session:
 
     async def _hear(self) -> None:
         if self._sender.state is State.ENDED:
-            patience, what = self._settings.bye_seconds, "bye or another open"
+            patience, what = self._settings.bye_seconds, "Neither bye nor another open came"
         else:
             patience, what = (
                 self._settings.idle_seconds,
-                "open" if self._sender.state is State.IDLE else "credit or stop",
+                "No open came" if self._sender.state is State.IDLE else "Neither credit nor stop came",
             )
         # Messages that change nothing, such as a credit of nothing new, do not set the clock back.
         waited = time.monotonic() - self._progress
@@ -350,7 +371,7 @@ async def _within(seconds: float, work: Coroutine[Any, Any, object], what: str, 
         async with asyncio.timeout(max(seconds - waited, 0.0)):
             await work
     except TimeoutError:
-        raise SilentError(f"expected {what} within {seconds:g} s") from None
+        raise SilentError(f"{what} within {seconds:g} s") from None
 
 
 def _problem(error: Exception) -> tuple[str, str]:
@@ -380,5 +401,7 @@ async def _close(socket: WebSocket, code: int, reason: str) -> None:
 
 async def _refuse_handshake(socket: WebSocket) -> None:
     offered = ", ".join(socket.scope["subprotocols"]) or "none"
-    refusal = UnsupportedVersionError(f"expected the WebSocket subprotocol {SUBPROTOCOL}, got {offered[:80]!a}")
+    refusal = UnsupportedVersionError(
+        f"This server speaks the WebSocket subprotocol {SUBPROTOCOL}, and was offered {offered[:80]!a}"
+    )
     await socket.send_denial_response(answer(socket, refusal))

@@ -173,7 +173,9 @@ def _changeable(caller: Caller, parts: State, surface: str) -> Surface:
     owner = found.manifest.owner
     if not caller.may_change(owner):
         whose = "nobody" if owner is None else "another owner"
-        raise NotOwnerError(f"expected the owner of {surface} or an admin, got {caller.name}: it belongs to {whose}")
+        raise NotOwnerError(
+            f"Only its owner and an admin may change {surface}: it belongs to {whose}, and you are {caller.name}"
+        )
     return found
 
 
@@ -190,7 +192,7 @@ async def _keep(
             raise
         return received, await parts.builder.accept(manifest, received.paths, folder, caller.key)
     except FileNotFoundError as error:
-        raise BusyError("the server's scratch folder was removed meanwhile; send the upload again") from error
+        raise BusyError("The server's scratch folder was removed meanwhile; send the upload again") from error
 
 
 def _perhaps_known(request: Request, parts: State) -> bool:

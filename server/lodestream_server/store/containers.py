@@ -178,19 +178,19 @@ class Containers:
         """Return the bytes of a container that some surface has; raise an error if none has it."""
         size = self._surfaces.index.served_bytes(sha256)
         if size is None and not self._surfaces.index.uses_container(sha256):
-            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+            raise NotFoundError(f"No container {sha256[:80]!a} on this server")
         if size is None:
-            raise BusyError(f"the container {sha256} was not there, and is built again; try again later")
+            raise BusyError(f"The container {sha256} was not there, and is built again; try again later")
         return size
 
     def _gone(self, sha256: str) -> NoReturn:
         lost = self._surfaces.lose(sha256)
         if not lost and not self._surfaces.index.uses_container(sha256):
-            raise NotFoundError(f"expected the SHA-256 of a container on this server, got {sha256[:80]!a}")
+            raise NotFoundError(f"No container {sha256[:80]!a} on this server")
         if lost:
             _log.error("the container %s is not in the store, and is built again", sha256)
             self._lost(lost)
-        raise BusyError(f"the container {sha256} was not there a moment ago; try again soon")
+        raise BusyError(f"The container {sha256} was not there a moment ago; try again soon")
 
     def open(self, sha256: str, caller: str = "", share: Share = _nothing) -> OpenContainer:
         """Open a container.
@@ -289,8 +289,8 @@ class Containers:
             taken = self._taken()
             if taken + size > self._most:
                 raise BusyError(
-                    f"expected at most {self._most >> 20} MiB of memory for the indexes of all surfaces that are "
-                    f"streamed, got {taken >> 20} MiB and {size >> 20} MiB more; try again soon"
+                    f"The indexes of streamed surfaces may take {self._most >> 20} MiB of memory: {taken >> 20} MiB is "
+                    f"taken, and this one needs {size >> 20} MiB more; try again soon"
                 )
             # Those that nobody has open make room. Who has nothing yet finds a place.
             everybody = self._coming.total() + self._bytes_of(set().union(*self._open.values()))

@@ -621,11 +621,11 @@ class Index:
             if code in _PASSING or (code == sqlite3.SQLITE_IOERR and extended not in _UNREADABLE):
                 raise StoreError(f"{self._path}: {error}: try again") from error
             if self._closed:
-                raise IndexLostError("the server has closed the index of its surfaces") from error
+                raise IndexLostError("The server has closed the index of its surfaces") from error
             lost, self._lost = self._lost, None
             if lost is not None:
                 lost()
-            raise IndexLostError(f"the index of the surfaces cannot be used, and is made again: {error}") from error
+            raise IndexLostError(f"The index of the surfaces cannot be used, and is made again: {error}") from error
 
 
 def _identity_of(path: Path) -> tuple[int, int] | None:

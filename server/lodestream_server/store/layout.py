@@ -143,8 +143,8 @@ class Manifest:
         length = len(json.dumps([self.name, self.filenames, self.options], ensure_ascii=False).encode())
         if length > MOST_TEXT:
             raise InputError(
-                f"expected at most {MOST_TEXT} bytes of names and options for a surface, got {length}: shorter names "
-                "of files, or fewer files, will do"
+                f"Names and options of a surface may have {MOST_TEXT} bytes, and these have {length}: shorter names of "
+                "files, or fewer files, will do"
             )
 
 
@@ -266,8 +266,8 @@ def name_key(name: str) -> str:
     key = f"{NAMES}{name}.json"
     if not re.fullmatch(NAME, name) or not is_key(key):
         raise InputError(
-            "expected a name of at most 100 letters, digits and ._- that begins with a letter or a digit, and none "
-            f"that Windows keeps for itself, such as con, got {name[:100]!a}"
+            f"{name[:100]!a} cannot be a name: one has at most 100 letters, digits and ._-, begins with a letter or a "
+            "digit, and is none that Windows keeps for itself, such as con"
         )
     return key
 

@@ -121,8 +121,8 @@ class Names:
             before, tag = self._changeable(name, may_change, fits)
             if len(self._surfaces.index.names_of(surface) - {key}) >= MOST_NAMES:
                 raise InputError(
-                    f"expected at most {MOST_NAMES} names that lead to {surface}, or have replaced it of late, got one "
-                    "more: delete one of them"
+                    f"{MOST_NAMES} names lead to {surface}, or have replaced it of late, which is as many as may: "
+                    "delete one of them"
                 )
             new = Name(name, owner, surface, now, (), layout.new_write())
             if before is not None and before.surface == surface:
@@ -155,7 +155,7 @@ class Names:
         key = layout.name_key(name)
         other = self._surfaces.index.name_like(name)
         if other is not None:
-            raise InputError(f"expected a name that differs from {other} in more than case, got {name}")
+            raise InputError(f"There is the name {other} already, which differs from {name} in nothing but case")
         before, tag = self._before(key, may_change)
         if tag is None:
             fits()
@@ -321,15 +321,15 @@ class Names:
 
 def _damaged(name: str) -> DamagedNameError:
     return DamagedNameError(
-        f"the name {name} cannot be read on this server: an admin can make it lead to a surface again, or delete it"
+        f"The name {name} cannot be read on this server: an admin can make it lead to a surface again, or delete it"
     )
 
 
 def _absent(name: str) -> NotFoundError:
-    return NotFoundError(f"expected a name on this server, got {name}")
+    return NotFoundError(f"No name {name!r} on this server")
 
 
 def _check_owner(what: str, owner: str | None, may_change: Callable[[str | None], bool]) -> None:
     if not may_change(owner):
         whose = "nobody" if owner is None else "another owner"
-        raise NotOwnerError(f"expected the owner of {what} or an admin, got another caller: it belongs to {whose}")
+        raise NotOwnerError(f"Only its owner and an admin may change {what}: it belongs to {whose}")

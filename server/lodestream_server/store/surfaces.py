@@ -164,7 +164,7 @@ class Surfaces:
         """
         found = self.index.find(surface)
         if found is None:
-            raise NotFoundError(f"expected the id of a surface on this server, got {surface[:80]!a}")
+            raise NotFoundError(f"No surface {surface[:80]!a} on this server")
         return found
 
     def info(self, surface: Surface) -> bytes:
@@ -719,7 +719,7 @@ def _surface(manifest: Manifest, built: Built | None, tag: Tag | None) -> Surfac
 def _check_same(known: Manifest, manifest: Manifest) -> None:
     """Refuse an upload that has the id of a surface of other bytes: ids are short hashes."""
     if (known.upload, known.owner) != (manifest.upload, manifest.owner):
-        raise InputError(f"expected an upload with a new id, got one with the id of {known.id}; give it another name")
+        raise InputError(f"Another upload has the id {known.id}, which this one would get; give it another name")
 
 
 def _bounded(reason: str | None) -> str | None:

@@ -76,7 +76,7 @@ class Upload:
             If the upload has as many files as it may have.
         """
         if len(self.names) == self._most_files:
-            raise TooLargeError(f"expected at most {self._most_files} files in an upload")
+            raise TooLargeError(f"The upload has more files than the {self._most_files} that it may have")
         if self._folder is None:
             self._file = _Nowhere()
         else:
@@ -102,7 +102,7 @@ class Upload:
         # The length keeps files apart: two files are not the same upload as both in one.
         self.digest.update(self._file.size.to_bytes(8, "big"))
         if not self._file.size:
-            raise FormatError("expected a file, got 0 bytes")
+            raise FormatError("The file is empty")
         self._file = None
         self._stack.close()
 
@@ -204,13 +204,13 @@ class _Multipart:
         try:
             self._parser.write(data)
         except FormParserError as error:
-            raise FormatError(f"expected a multipart body, got one that cannot be read: {error}") from None
+            raise FormatError(f"The form cannot be read: {error}") from None
 
     def finish(self) -> None:
         if not self._ended:
-            raise FormatError("expected a multipart body with a last boundary, got one that is cut short")
+            raise FormatError("The form is cut short: it has no last boundary")
         if not self._upload.names:
-            raise FormatError(f"expected a part called {_FIELD}, got none")
+            raise FormatError(f"The form has no part called {_FIELD}")
 
     def _part_begin(self) -> None:
         self._headers = {}
@@ -227,13 +227,15 @@ class _Multipart:
     def _header_end(self) -> None:
         self._headers[self._name.lower()] = self._value
         if len(self._headers) > 16:
-            raise FormatError("expected at most 16 headers in a part")
+            raise FormatError("A part of the form has more than 16 headers")
 
     def _headers_finished(self) -> None:
         _, options = parse_options_header(self._headers.get(b"content-disposition"))
         field = options.get(b"name", b"").decode("utf-8", "replace")
         if field != _FIELD:
-            raise OptionError(f"expected parts called {_FIELD} (options go into the query), got {field[:80]!a}")
+            raise OptionError(
+                f"The form has a part called {field[:80]!a}; files are called {_FIELD}, and options go into the query"
+            )
         name = options.get(b"filename")
         self._upload.begin(None if name is None else name.decode("utf-8", "replace"))
 
@@ -246,7 +248,7 @@ class _Multipart:
     @staticmethod
     def _bounded(header: bytes) -> bytes:
         if len(header) > _MOST_PART_HEADERS:
-            raise FormatError(f"expected a header of at most {_MOST_PART_HEADERS} bytes in a part")
+            raise FormatError(f"A part of the form has a header of more than {_MOST_PART_HEADERS} bytes")
         return header
 
 
@@ -287,17 +289,17 @@ def take_apart(upload: Upload, content_type: str | None, name: str | None = None
         return _Raw(upload, name)
     boundary = options.get(b"boundary")
     if not boundary:
-        raise FormatError("expected a boundary in the content type multipart/form-data, got none")
+        raise FormatError("The content type multipart/form-data has no boundary")
     try:
         return _Multipart(upload, boundary)
     except FormParserError as error:
-        raise FormatError(f"expected a usable boundary: {error}") from None
+        raise FormatError(f"The boundary of the form cannot be used: {error}") from None
 
 
 def _check_promised(request: Request, most: int) -> None:
     promised = request.headers.get("content-length", "")
     if promised.isdecimal() and int(promised) > most:
-        raise TooLargeError(f"expected an upload of at most {most} bytes, got one of {promised}")
+        raise TooLargeError(f"The upload has {promised} bytes, and may have {most}")
 
 
 async def _blocks(request: Request, settings: Settings) -> AsyncIterator[bytes]:
@@ -309,12 +311,12 @@ async def _blocks(request: Request, settings: Settings) -> AsyncIterator[bytes]:
             async with asyncio.timeout(settings.idle_seconds):
                 chunk = await anext(chunks, None)
         except TimeoutError:
-            raise SlowUploadError(f"expected more of the upload within {settings.idle_seconds:g} s") from None
+            raise SlowUploadError(f"Nothing more of the upload came within {settings.idle_seconds:g} s") from None
         if chunk is None:
             break
         size += len(chunk)
         if size > settings.upload_bytes:
-            raise TooLargeError(f"expected an upload of at most {settings.upload_bytes} bytes, got more")
+            raise TooLargeError(f"The upload has more than the {settings.upload_bytes} bytes that it may have")
         pending += chunk
         if len(pending) >= _BUFFER:
             yield bytes(pending)

@@ -328,7 +328,7 @@ def test_push_of_a_damaged_container(run: Run, server: str, container_file: Path
     assert caught.value.code == "failed"
     code, _, err = run("push", container_file, tmp_path / "cut.lode", server)
     assert code == 1
-    assert "a container as the only file" in err
+    assert "A container is uploaded alone" in err
 
 
 def test_what_was_pulled_can_be_uploaded_again(server: str) -> None:

@@ -47,7 +47,7 @@ def test_a_proxy_that_knows_no_upgrade(
 
 
 def test_whoever_wants_a_websocket_is_told(surface: str, asynchronous: bool) -> None:
-    with plain_proxy(surface) as proxy, pytest.raises(ls.NotFoundError):
+    with plain_proxy(surface) as proxy, pytest.raises(ls.RemoteError, match="opened as a WebSocket"):
         follow(proxy.url, asynchronous, deadline=0, transport="ws")
     with plain_proxy(surface, Answer(501)) as proxy, pytest.raises(ls.RemoteError, match="501"):
         follow(proxy.url, asynchronous, deadline=0, transport="ws")

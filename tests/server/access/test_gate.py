@@ -23,6 +23,7 @@ from tests.server.helpers import Keys, problem
 ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/"): None,
     ("GET", "/docs"): None,
+    ("GET", "/errors"): None,
     ("GET", "/assets/{name}"): None,
     ("GET", "/view.json"): None,
     ("GET", "/openapi.json"): None,
@@ -36,6 +37,7 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("DELETE", "/v1/surfaces/{surface}"): "write",
     ("POST", "/v1/surfaces/{surface}/retry"): "write",
     ("GET", "/v1/surfaces/{surface}/container"): "read",
+    ("GET", "/v1/surfaces/{surface}/stream"): "read",
     ("GET", "/v1/surfaces/{surface}/levels/{level}"): "read",
     ("GET", "/v1/containers/{sha256}.lode"): "read",
     ("GET", "/v1/names"): "read",

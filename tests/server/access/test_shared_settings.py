@@ -138,7 +138,7 @@ def surfaces(folder: Path) -> None:
         async with town.limits.upload(request(b""), ANNA):
             await upload(ANNA)
 
-    with pytest.raises(FullError, match="surfaces of anna than are left for others"):
+    with pytest.raises(FullError, match="anna may have no more surfaces than are left for others"):
         asyncio.run(two())
 
 

@@ -331,7 +331,7 @@ def test_a_file_that_would_be_too_long_is_not_made(tmp_path: Path) -> None:
         for name in ("npy", "obj", "ply"):
             answer = http.get(finest(surface), params={"format": name})
             assert problem(answer) == (413, "too-large")
-            assert f"less than {1 << 19} bytes, a quarter of" in answer.json()["detail"]
+            assert f"more than {1 << 19} bytes, a quarter of" in answer.json()["detail"]
             assert "(level_disk)" in answer.json()["detail"]
             assert http.get(f"{surface['url']}/levels/2", params={"format": name}).status_code == 200
             assert on_disk(tmp_path) < 1 << 19
@@ -377,7 +377,7 @@ def test_a_level_that_memory_is_too_little_for_names_the_limit_and_its_setting(
                 else "1024 MiB of memory (half of LODESTREAM_MEMORY, but at least 1024 MiB)"
             )
             detail = answer.json()["detail"]
-            assert detail.startswith(f"expected a level that needs at most {words}")
+            assert detail.startswith(f"The level needs more than {words}")
             assert "ask for a coarser level" in detail
             assert "max_vertices" not in detail
             assert "bytes" not in detail

@@ -318,9 +318,9 @@ def test_time_in_which_the_server_is_held_up_does_not_count() -> None:
 def test_a_silent_client_is_closed_with_a_reason(impatient: tuple[str, dict[str, Any]]) -> None:
     url, made = impatient
     silent: list[tuple[list[Event], str]] = [
-        ([], "expected open"),
-        ([Open(credit=100)], "expected credit or stop"),
-        ([Open(ls.Target(level=0))], "expected bye"),
+        ([], "No open came"),
+        ([Open(credit=100)], "Neither credit nor stop"),
+        ([Open(ls.Target(level=0))], "Neither bye nor another open came"),
     ]
     with ExitStack() as held:
         streams = [held.enter_context(raw_stream(url + made["url"])) for _ in silent]

@@ -54,7 +54,9 @@ def test_of_uploads_each_caller_leaves_some_to_the_next(tmp_path: Path, most: in
                         await take(caller)
                     left -= share
                     kind = TooManyError if left else BusyError
-                    with pytest.raises(kind, match=f"of {caller.name}" if left else f"at most {most} uploads"):
+                    with pytest.raises(
+                        kind, match=f"{caller.name} may have no more uploads" if left else f"at most {most} uploads"
+                    ):
                         await take(caller)
                 done.set()
         assert (made._uploads._total, made._clocks) == (0, {})
@@ -69,11 +71,11 @@ def test_builds_of_one_caller_leave_some_to_the_others(tmp_path: Path) -> None:
         return limits(tmp_path, builds=builds, own=own, alone=alone, max_builds=10)
 
     asyncio.run(read(made(4, 4), request(b"x")))
-    with pytest.raises(TooManyError, match="pending builds of anna"):
+    with pytest.raises(TooManyError, match="anna may have no more pending builds"):
         asyncio.run(read(made(5, 5), request(b"x")))
     asyncio.run(read(made(5, 5), request(b"x"), BERT))
     asyncio.run(read(made(9, 9, alone=True), request(b"x")))
-    with pytest.raises(BusyError, match="at most 10 pending builds on this server"):
+    with pytest.raises(BusyError, match="This server has at most 10 pending builds"):
         asyncio.run(read(made(10, 0), request(b"x")))
 
 
@@ -126,7 +128,7 @@ def test_an_owner_keeps_as_much_as_stays_free(
     if fits:
         asyncio.run(read(made, request(b"x", length=length)))
         return
-    with pytest.raises(FullError, match="bytes of surfaces of anna than are left for others"):
+    with pytest.raises(FullError, match="anna may have no more bytes of surfaces than are left for others"):
         asyncio.run(read(made, request(b"x", length=length)))
     asyncio.run(read(made, request(b"x", length=500), BERT))
     asyncio.run(read(limits(tmp_path, kept=kept, alone=True, keep_free=0), request(b"x", length=length)))
@@ -136,7 +138,7 @@ def test_the_share_of_an_owner_may_be_chosen(tmp_path: Path, disk: dict[str, int
     for alone in (False, True):
         made = limits(tmp_path, kept=90, alone=alone, keep_free=0, owner_bytes=100)
         asyncio.run(read(made, request(b"x", length=10)))
-        with pytest.raises(FullError, match="at most 100 bytes of surfaces of anna, got 90 and 11 more"):
+        with pytest.raises(FullError, match="anna may have at most 100 bytes of surfaces, and has 90 and 11 more"):
             asyncio.run(read(made, request(b"x", length=11)))
         asyncio.run(read(made, request(b"x", length=100), BERT))
 
@@ -144,7 +146,7 @@ def test_the_share_of_an_owner_may_be_chosen(tmp_path: Path, disk: dict[str, int
 def test_an_upload_that_does_not_say_its_size_stops_at_its_owners_share(tmp_path: Path, disk: dict[str, int]) -> None:
     disk["free"] = 1 << 40
     made = limits(tmp_path, keep_free=0, owner_bytes=20 << 20)
-    with pytest.raises(FullError, match="of anna"):
+    with pytest.raises(FullError, match="anna may have at most"):
         asyncio.run(read(made, request(*[bytes(1 << 24)] * 3)))
     # What was promised and taken for good stays good, whatever comes beside it.
     assert len(asyncio.run(read(made, request(bytes(1 << 24), b"x", length=(1 << 24) + 1), BERT))) == (1 << 24) + 1

@@ -552,4 +552,5 @@ def test_links_and_clients_behind_a_proxy(tmp_path: Path) -> None:
         assert answer.status_code == 200
         assert http.get("/docs").status_code == 200
         assert "/maps/openapi.json" in http.get("/docs").text
-        assert http.post("/v1/surfaces", content=b"x").status_code == 401
+        refused = http.post("/v1/surfaces", content=b"x")
+        assert (refused.status_code, refused.json()["type"]) == (401, "/maps/errors#no-token")

@@ -338,7 +338,7 @@ def test_the_commands_follow_a_name(
     assert sync.identify(dem).container_sha256 == told["container_sha256"]
     assert sync.fetch_range(dem, 1, 4) == b"LODE"
     assert main(["rm", dem]) == 0
-    with pytest.raises(NotFoundError, match="a name on this server"):
+    with pytest.raises(NotFoundError, match="No name 'dem' on this server"):
         sync.describe(dem)
     assert sync.describe(told["url"]).ready
 

@@ -160,13 +160,13 @@ def packed(**fields: Any) -> str:
         ("open=gr%C3%BCn", "bad-message", "base64url"),
         ("open=wcHB", "bad-message", "MessagePack"),
         ("open=" + "A" * (MAX_OPENING + 4), "message-too-large", "2048 characters"),
-        (to_address(serialize(Stop())), "out-of-turn", "got stop"),
+        (to_address(serialize(Stop())), "out-of-turn", "must be open, and is stop"),
         (packed(version=9), "unsupported-version", "version 1"),
         (packed(credit="much"), "bad-message", "open.credit"),
         (packed(target={"level": 50}), "bad-target", "got 50"),
         (packed(held=[[0, 10]]), "bad-held", "open.container"),
         (packed(container="0" * 64), "other-container", "expected container"),
-        (packed(token="secret"), "bad-message", "no token in an address"),
+        (packed(token="secret"), "bad-message", "A token does not belong into an address"),
     ],
 )
 def test_what_is_wrong_is_told_as_of_a_message(url: str, query: str, code: str, words: str) -> None:

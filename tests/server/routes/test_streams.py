@@ -46,7 +46,7 @@ from lodestream_server import running_server
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.routes import streams
 from tests.core.planning.test_cost import crowded
-from tests.server.helpers import PATIENCE, closed, data_of, eventually, hills, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, closed, data_of, eventually, hills, npy, problem, push, raw_stream
 
 
 @pytest.fixture(scope="module")
@@ -265,6 +265,13 @@ def test_many_clients_at_once_get_the_same(url: str, points: Any) -> None:
         drivers = list(pool.map(lambda window: download(url, window=window), [3000, 20_000, 100_000, BASE_CREDIT] * 2))
     assert all(driver.ended == "complete" for driver in drivers)
     assert all(np.array_equal(driver.decoder.surface().points, points) for driver in drivers[:2])
+
+
+def test_a_request_that_opens_no_websocket_is_told_so(url: str, http: httpx.Client) -> None:
+    for answer in (http.get(f"{url}/stream"), http.head(f"{url}/stream"), http.get("/v1/surfaces/none/stream")):
+        assert answer.status_code == 426
+        assert (answer.headers["upgrade"], answer.headers["connection"]) == ("websocket", "upgrade")
+    assert problem(http.get(f"{url}/stream")) == (426, "no-websocket")
 
 
 def test_a_surface_deleted_under_a_stream_goes_on_to_its_end(server: str, http: httpx.Client) -> None:

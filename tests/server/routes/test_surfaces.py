@@ -267,15 +267,15 @@ def test_what_the_server_says_of_itself(http: httpx.Client) -> None:
 
 def test_problems_have_one_shape(http: httpx.Client) -> None:
     for answer, status, words in (
-        (http.get("/nowhere"), 404, "expected a path that /docs lists, got '/nowhere'"),
+        (http.get("/nowhere"), 404, "No such address on this server: '/nowhere'"),
         (http.get("/v1/surfaces/0123"), 404, "'0123'"),
-        (http.get("/v1/surfaces/" + "x" * 500), 404, "id"),
-        (http.get("/v1/surfaces/..%2f..%2fetc"), 404, "expected"),
-        (http.get(f"/v1/containers/{'0' * 64}.lode"), 404, "SHA-256"),
-        (http.get("/v1/containers/..%2f..%2fsurfaces.lode"), 404, "expected"),
+        (http.get("/v1/surfaces/" + "x" * 500), 404, "No surface 'xxx"),
+        (http.get("/v1/surfaces/..%2f..%2fetc"), 404, "encoded slash"),
+        (http.get(f"/v1/containers/{'0' * 64}.lode"), 404, "No container '000"),
+        (http.get("/v1/containers/..%2f..%2fsurfaces.lode"), 404, "encoded slash"),
         (http.put("/v1/surfaces"), 405, "GET, HEAD, POST"),
         (http.post("/healthz"), 405, "GET, HEAD"),
-        (http.get("/v1/surfaces/"), 404, "expected"),
+        (http.get("/v1/surfaces/"), 404, "No such address"),
     ):
         assert answer.status_code == status, answer.url
         assert answer.headers["content-type"] == "application/problem+json"
@@ -283,7 +283,9 @@ def test_problems_have_one_shape(http: httpx.Client) -> None:
         assert set(document) == {"type", "title", "status", "code", "detail", "instance"}
         assert document["status"] == status
         assert words in document["detail"]
-        assert document["type"] == f"urn:lodestream:{document['code']}"
+        page, _, place = document["type"].partition("#")
+        assert (place, http.get(page).status_code) == (document["code"], 200)
+        assert f'<h2 id="{place}">' in http.get(page).text
     assert http.put("/v1/surfaces").headers["allow"] == "GET, HEAD, POST"
 
 
@@ -298,6 +300,7 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/v1/surfaces/{surface}",
         "/v1/surfaces/{surface}/retry",
         "/v1/surfaces/{surface}/container",
+        "/v1/surfaces/{surface}/stream",
         "/v1/surfaces/{surface}/levels/{level}",
         "/v1/containers/{sha256}.lode",
         "/v1/names",
