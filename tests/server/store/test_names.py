@@ -317,9 +317,9 @@ def test_owners(surfaces: Surfaces, tmp_path: Path) -> None:
     assert [it.id for it in surfaces.names.expire(LATER)] == [anns]
     assert there(surfaces) == {1, 2}
     surfaces.names.delete("dem", only("ann"))
-    with pytest.raises(NotFoundError, match="a name on this server"):
+    with pytest.raises(NotFoundError, match="No name 'dem' on this server"):
         surfaces.names.delete("dem", only("ann"))
-    with pytest.raises(NotFoundError, match="a name on this server"):
+    with pytest.raises(NotFoundError, match="No name 'dem' on this server"):
         surfaces.names.get("dem")
     assert there(surfaces) == {1, 2}, "a name takes no surface with it"
 
