@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         UnsupportedVersionError,
     )
     from .formats import read, write
+    from .opening.container import Container, open
     from .planning.selection import Selection
     from .quality import Quality
     from .sources import Source
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Block": "surface",
+    "Container": "opening.container",
     "Decoder": "decoding.decoder",
     "View": "decoding.view",
     "decode": "decoding.decoder",
@@ -63,6 +65,7 @@ _HOMES = {
     "UnavailableError": "errors",
     "UnsupportedVersionError": "errors",
     "Quality": "quality",
+    "open": "opening.container",
     "read": "formats",
     "write": "formats",
     "coarsen": "transform.least_squares",
@@ -76,6 +79,7 @@ _HOMES = {
 
 __all__ = [
     "Block",
+    "Container",
     "CorruptStreamError",
     "Decoder",
     "FormatError",
@@ -103,6 +107,7 @@ __all__ = [
     "decode",
     "encode",
     "hierarchy",
+    "open",
     "paper",
     "read",
     "write",

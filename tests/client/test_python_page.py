@@ -16,7 +16,7 @@ def programs(page: str) -> list[str]:
 
 def test_they_run(server: str, installed: dict[str, str], tmp_path: Path) -> None:
     found = programs("docs/python.md")
-    assert len(found) == 10
+    assert len(found) == 11
     script = "\n".join(found).replace("http://127.0.0.1:8000", server)
     result = subprocess.run(
         [sys.executable, "-c", script],

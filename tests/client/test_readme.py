@@ -100,6 +100,7 @@ def test_its_programs_run(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lodestream-demo").mkdir()
     np.save(tmp_path / "lodestream-demo" / "terrain.npy", terrain((256, 480)))
+    (tmp_path / "terrain.lode").write_bytes(ls.encode(terrain((256, 480))))
     programs = blocks("python")
     assert len(programs) == 3
     programs.pop()  # its lines stand in docs/python.md, where they run: see test_python_page.py

@@ -12,8 +12,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client import sync, xarray_engine
-from lodestream_client.xarray_engine import Container, LodeBackend
+from lodestream.interop import lazy_xarray
+from lodestream_client import sync
+from lodestream_client.xarray_engine import LodeBackend
 from tests.client import files
 from tests.core.surfaces import terrain, torus
 
@@ -166,14 +167,14 @@ def test_a_level_of_few_points_is_read_once_and_large_ones_by_windows(
     decoder.feed((tmp_path / "a.lode").read_bytes())
     assert decoder.header is not None
     level, decodings = decoder.header.levels - 3, 0
-    decoded = Container._decoded
+    decoded = ls.Container._end
 
-    def counted(*args: Any) -> Any:
+    def counted(*args: Any, **options: Any) -> Any:
         nonlocal decodings
         decodings += 1
-        return decoded(*args)
+        return decoded(*args, **options)
 
-    monkeypatch.setattr(Container, "_decoded", counted)
+    monkeypatch.setattr(ls.Container, "_end", counted)
     for region in (None, ((40, 200), (300, 420))):  # which goes on across the seam
         wanted = decoder.surface(level) if region is None else decoder.view().window(region, level)
         decodings = 0
@@ -186,7 +187,7 @@ def test_a_level_of_few_points_is_read_once_and_large_ones_by_windows(
         assert decodings == 2, "once for the heights, once for the attribute"
     with opened(tmp_path / "a.lode", level=level, region=((40, 41), (0, 1))) as found:
         assert found.z.values == decoder.points_at(level)[5, 0], "an array may have one point"
-    monkeypatch.setattr(xarray_engine, "_WHOLE_POINTS", 100)
+    monkeypatch.setattr(lazy_xarray, "_WHOLE_POINTS", 100)
     decodings = 0
     with opened(tmp_path / "a.lode", level=level) as found:
         for row in range(5):
@@ -234,7 +235,7 @@ def test_dask_computes_windows_in_threads_and_copies_go_to_other_processes(path:
     assert float(lines.z.max()) == valid.max()
     copy = pickle.loads(pickle.dumps(found))
     xr.testing.assert_equal(copy.z[:40, :50], original.to_xarray().z[:40, :50])
-    again = pickle.loads(pickle.dumps(Container(str(path))))
+    again = pickle.loads(pickle.dumps(ls.open(path)))
     assert again.header.shape == (ROWS, COLUMNS)
 
 

@@ -78,18 +78,11 @@ def _of_url(options: InfoOptions) -> Mapping[str, Any]:
 
 
 def _of_file(options: InfoOptions) -> Mapping[str, Any]:
-    from lodestream.container import describe, read_index
-    from lodestream.container.capacity import Capacity
+    from lodestream.opening import container
 
     with input_files([options.what]) as files, files.paths[0].open("rb") as file:
-        size = file.seek(0, 2)
-
-        def read(offset: int, length: int) -> bytes:
-            file.seek(offset)
-            return file.read(length)
-
         try:
-            return describe(read_index(read, size, Capacity(options.max_vertices)), channels=True)
+            return container.open(files.paths[0], max_vertices=options.max_vertices).info
         except (StreamError, TooLargeError) as error:
             advice = no_container(file)
             if isinstance(error, TruncatedStreamError):

@@ -315,19 +315,12 @@ def _container(file: str, folder: Path, options: PublishOptions) -> Path:
 
 def _described(container: Path, file: str) -> tuple[str | None, int]:
     """Return the title of a container and the number of its finest level."""
-    from lodestream.container import read_index
+    import lodestream as ls
 
-    with container.open("rb") as opened:
-        size = opened.seek(0, 2)
-
-        def read(offset: int, length: int) -> bytes:
-            opened.seek(offset)
-            return opened.read(length)
-
-        try:
-            index = read_index(read, size)
-        except (StreamError, TooLargeError) as error:
-            raise named(error, file) from None
+    try:
+        index = ls.open(container).index
+    except (StreamError, TooLargeError) as error:
+        raise named(error, file) from None
     title: Any = index.metadata_values.get("name")
     return (title if isinstance(title, str) and title else None), index.header.levels
 

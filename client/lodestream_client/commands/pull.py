@@ -222,13 +222,12 @@ def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:
 
     layers = None
     if options.until_done:
-        from contextlib import closing
+        from lodestream.opening import container
 
         from ..viewer.pictures import layers_of
-        from ..viewer.sources import RemoteSource
 
-        with closing(RemoteSource(options.url, options.token)) as source:
-            layers = layers_of(source, options.max_vertices)
+        with container.open(options.url, token=options.token, max_vertices=options.max_vertices) as opened:
+            layers = layers_of(opened)
     return Drawing(options.picture, options.url, window=options.target.region is not None, layers=layers)
 
 

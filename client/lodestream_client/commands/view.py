@@ -7,12 +7,13 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lodestream.errors import OptionError, UnavailableError
+from lodestream.opening.open_source import is_address, open_source
 from lodestream.page import HOW_TO_BUILD, assets
 from lodestream.quality import Quality
 
@@ -26,10 +27,9 @@ from .surface_options import SurfaceOptions, add_surface_options, surface_option
 from .values import parse_pictures, parse_port, parse_region
 
 if TYPE_CHECKING:
+    from lodestream.opening.byte_sources import ByteSource
     from lodestream.surface import Surface
     from lodestream.target import Region
-
-    from ..viewer.sources import Source
 
 __all__ = ["ViewOptions", "register", "run"]
 
@@ -139,7 +139,7 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         args.parser.error("argument --roi: needs --png; the page loads the visible part first")
     if args.png is not None and args.png.suffix.lower() != ".png":
         args.parser.error(f"argument --png: expected OUT.png, got {args.png}")
-    if len(args.files) > 1 and any(map(is_url, args.files)):
+    if len(args.files) > 1 and any(map(is_address, args.files)):
         args.parser.error("expected one URL, or files of one surface")
     return ViewOptions(
         standard_input_once(args, args.files),
@@ -151,7 +151,7 @@ def _options(args: argparse.Namespace) -> ViewOptions:
         args.until_done,
         args.roi,
         args.max_vertices,
-        token_of(args),
+        token_of(args) if is_url(args.files[0]) else None,
     )
 
 
@@ -202,19 +202,21 @@ def _wait() -> None:
 
 
 def _draw(options: ViewOptions, out: Path) -> None:
+    from lodestream.opening.container import Container
+
     from ..viewer.picture_change import done_text
     from ..viewer.pictures import Picture, least_size, view_after, view_when_done, write_png
 
     require_folder(out)
-    with _source(options) as source:
+    with _source(options) as source, Container(source, options.max_vertices) as container:
         if options.until_done:
-            view, picture, share = view_when_done(source, source.name, options.max_vertices)
+            view, picture, share = view_when_done(container, source.name)
             write_png(picture.png(), out)
             words = "complete" if view.complete else done_text(view.bytes, source.size, share)
             note(f"{out}: {words}")
             return
         sizes = options.at or (("", None),)
-        least = least_size(source, options.max_vertices, options.region)
+        least = least_size(container, options.region)
         if all(most is not None and most < least for _, most in sizes):
             words = ", ".join(label for label, _ in sizes)
             raise OptionError(f"--at {words}: expected {least} bytes or more, which the first picture takes")
@@ -223,25 +225,21 @@ def _draw(options: ViewOptions, out: Path) -> None:
                 note(f"--at {label}: no picture, since the first one takes {least} bytes")
                 continue
             path = out.with_name(f"{out.stem}-{label}{out.suffix}") if label else out
-            view, layout = view_after(source, most, options.max_vertices, options.region)
+            view, layout = view_after(container, most, options.region)
             write_png(Picture.of(view, layout, source.name).png(), path)
             note(f"{path}: {view.bytes} bytes, RMS error {view.rms:.6g}, maximum {view.max_error:.6g}")
 
 
 @contextmanager
-def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]], Source]]:
+def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]], ByteSource]]:
     """Yield a function that makes the container, with a progress callback, once the source can be read."""
     from lodestream.library import require
+    from lodestream.opening.byte_sources import FileSource
 
-    from ..viewer.sources import FileSource, RemoteSource
-
-    if is_url(options.files[0]):
+    if is_address(options.files[0]):
         _refuse_options(options.surface, "an address")
-        remote = RemoteSource(options.files[0], options.token)
-        try:
+        with closing(open_source(options.files[0], options.token)) as remote:
             yield lambda _: remote
-        finally:
-            remote.close()
         return
     with ExitStack() as stack:
         files = stack.enter_context(input_files(options.files))
@@ -255,7 +253,7 @@ def _opened(options: ViewOptions) -> Iterator[Callable[[Callable[[float], None]]
         surface = read_surface(tuple(map(str, files.paths)), options.surface)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lodestream-view-")))
 
-        def encoded(progress: Callable[[float], None]) -> Source:
+        def encoded(progress: Callable[[float], None]) -> ByteSource:
             container = folder / "surface.lode"
             container.write_bytes(_encoded(surface, options.surface, progress))
             return FileSource(container, options.name)
@@ -273,7 +271,7 @@ def _refuse_options(options: SurfaceOptions, what: str) -> None:
 
 
 @contextmanager
-def _source(options: ViewOptions) -> Iterator[Source]:
+def _source(options: ViewOptions) -> Iterator[ByteSource]:
     """Yield the container to show; a file of another format is encoded here."""
     with _opened(options) as make:
         yield make(lambda _: None)

@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from lodestream.errors import LodestreamError, RemoteError
-
-from ..viewer.sources import Source
+from lodestream.opening.byte_sources import ByteSource
 
 __all__ = ["LONGEST", "Answers", "Message"]
 
@@ -41,7 +40,7 @@ class Answers:
 
     Parameters
     ----------
-    source : Source
+    source : ByteSource
     program : Path
         The module of the viewer's element.
 
@@ -51,7 +50,7 @@ class Answers:
         Bytes of the container in all answers so far.
     """
 
-    def __init__(self, source: Source, program: Path) -> None:
+    def __init__(self, source: ByteSource, program: Path) -> None:
         self.sent = 0
         self._source = source
         self._program = program

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import functools
 import os
-from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import lodestream as ls
-from lodestream.container import Header, read_index
-from lodestream.container.capacity import Capacity
+from lodestream.container import Header
 from lodestream.container.sections import MAGIC
 from lodestream.errors import InputError, OptionError
+from lodestream.opening.byte_sources import ByteSource, MemorySource
+from lodestream.opening.container import Container
+from lodestream.opening.open_source import is_address, open_source
 from lodestream.quality import Quality
 from lodestream.surface import Surface
 from lodestream.target import Target
 
-from ..requests.addresses import is_url
-from ..viewer.sources import FileSource, MemorySource, RemoteSource, Source, read_fully
-
-__all__ = ["Opened", "field_names", "limit_of", "opened"]
+__all__ = ["field_names", "limit_of", "opened"]
 
 #: What is called by one name each in the viewer, beside attributes.
 _FIELDS = ("height", "slope", "change", "none")
@@ -32,28 +28,9 @@ _FIELDS = ("height", "slope", "change", "none")
 _MOST_COMPONENTS = 16
 
 
-@dataclass(frozen=True)
-class Opened:
-    """A container that can be shown.
-
-    Attributes
-    ----------
-    source : Source
-        Its bytes.
-    header : Header
-    remote : bool
-        Whether reading waits for another machine.
-    resources : ExitStack
-        Closes what was opened for it.
-    """
-
-    source: Source
-    header: Header
-    remote: bool
-    resources: ExitStack
-
-
-def opened(source: Any, *, token: str | None = None, quality: Quality | None = None, name: str | None = None) -> Opened:
+def opened(
+    source: Any, *, token: str | None = None, quality: Quality | None = None, name: str | None = None
+) -> Container:
     """Open the source of a widget, and read its header and index.
 
     Parameters
@@ -76,30 +53,21 @@ def opened(source: Any, *, token: str | None = None, quality: Quality | None = N
     StreamError, TooLargeError, NotFoundError, RemoteError, UnreachableError
         If the container is damaged or too large, or cannot be had.
     """
-    remote = isinstance(source, str) and is_url(source)
+    remote = is_address(source)
     if token is not None and not remote:
         raise OptionError(f"expected a URL, to whose server the token belongs, got {_kind(source)}")
-    with ExitStack() as stack:
-        chosen = _remote(source, token, stack) if remote else _local(source, quality)
-        if quality is not None and not (isinstance(chosen, MemorySource) and not isinstance(source, bytes | bytearray)):
-            raise OptionError(
-                "expected a surface to encode with this quality, got a container, which is shown as it is"
-            )
-        if name is not None:
-            chosen.name = name
-        index = read_index(functools.partial(read_fully, chosen), chosen.size, Capacity())
-        return Opened(chosen, index.header, remote, stack.pop_all())
+    chosen = open_source(source, token) if remote else _local(source, quality)
+    if quality is not None and not (isinstance(chosen, MemorySource) and not isinstance(source, bytes | bytearray)):
+        chosen.close()
+        raise OptionError("expected a surface to encode with this quality, got a container, which is shown as it is")
+    if name is not None:
+        chosen.name = name
+    return Container(chosen)
 
 
-def _remote(url: str, token: str | None, stack: ExitStack) -> Source:
-    source = RemoteSource(url, token)
-    stack.callback(source.close)
-    return source
-
-
-def _local(source: Any, quality: Quality | None) -> Source:
+def _local(source: Any, quality: Quality | None) -> ByteSource:
     if isinstance(source, bytes | bytearray | memoryview):
-        return MemorySource(bytes(source), "")
+        return open_source(source)
     if isinstance(source, Surface | np.ndarray):
         return _encoded(source, quality, "")
     if isinstance(source, str | os.PathLike):
@@ -107,7 +75,7 @@ def _local(source: Any, quality: Quality | None) -> Source:
         if not path.is_dir():  # as a Zarr store is
             with path.open("rb") as file:
                 if file.read(len(MAGIC)) == MAGIC:
-                    return FileSource(path)
+                    return open_source(path)
         return _encoded(ls.read(path), quality, path.stem)
     hint = "; a view has surface()" if isinstance(source, ls.View) else ""
     raise InputError(
@@ -116,7 +84,7 @@ def _local(source: Any, quality: Quality | None) -> Source:
     )
 
 
-def _encoded(surface: Surface | np.ndarray[Any, Any], quality: Quality | None, name: str) -> Source:
+def _encoded(surface: Surface | np.ndarray[Any, Any], quality: Quality | None, name: str) -> ByteSource:
     data = ls.encode(surface, quality=quality)
     surface_name = surface.metadata.get("name") if isinstance(surface, Surface) else None
     return MemorySource(data, surface_name if isinstance(surface_name, str) and surface_name else name)

@@ -9,11 +9,13 @@ import traitlets
 
 from lodestream import page
 from lodestream.errors import OptionError, UnavailableError
+from lodestream.opening.container import Container
+from lodestream.opening.open_source import is_address
 from lodestream.quality import Quality
 from lodestream.target import Target
 
 from .messages import Answers, Message
-from .opening import Opened, field_names, limit_of, opened
+from .opening import field_names, limit_of, opened
 
 try:
     from anywidget import AnyWidget
@@ -113,7 +115,7 @@ class Widget(AnyWidget):
     """
 
     # A widget that was refused is closed too.
-    _shown: Opened | None = None
+    _shown: Container | None = None
     _later: frozenset[asyncio.Task[None]] = frozenset()
 
     _esm = traitlets.Unicode().tag(sync=True)
@@ -165,7 +167,7 @@ class Widget(AnyWidget):
             esm = widget.read_text(encoding="utf-8")
             super().__init__(_esm=esm, _program=element.name, _target=limit, name=shown.source.name, **look)
         except BaseException:
-            shown.resources.close()
+            shown.close()
             raise
         self.on_msg(self._hear)
 
@@ -202,12 +204,12 @@ class Widget(AnyWidget):
             task.cancel()
         super().close()
         if self._shown is not None:
-            self._shown.resources.close()
+            self._shown.close()
 
     def _hear(self, _widget: Any, question: Any, _buffers: Any) -> None:
         """Answer a question: at once, or beside the kernel's other work if another machine must be waited for."""
         loop = None
-        if self._shown is not None and self._shown.remote:
+        if self._shown is not None and is_address(self._shown.source.place):
             try:
                 loop = asyncio.get_running_loop()
             except RuntimeError:

@@ -20,9 +20,8 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from lodestream.errors import LodestreamError
+from lodestream.opening.byte_sources import ByteSource
 from lodestream.page import HEADERS, INDEX, Asset
-
-from .sources import Source
 
 __all__ = ["MOST_CONNECTIONS", "PageServer", "byte_range", "serving"]
 
@@ -73,7 +72,7 @@ class PageServer(ThreadingHTTPServer):
     ----------
     url : str
         Of the page.
-    source : Source or None
+    source : ByteSource or None
         The container; None while it is not ready.
     progress : float
         Share of the encoding that is done, until there is a source.
@@ -94,7 +93,7 @@ class PageServer(ThreadingHTTPServer):
         self.url = f"http://127.0.0.1:{self.server_port}/{self.word}/"
         self.pages = pages
         self.name = name
-        self.source: Source | None = None
+        self.source: ByteSource | None = None
         self.progress = 0.0
         self.asked = threading.Event()
         self._places = threading.Semaphore(MOST_CONNECTIONS)
@@ -258,7 +257,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._head(HTTPStatus.OK, {**asset.headers, "content-type": asset.media_type}, len(data))
         send(iter((data,)))
 
-    def _container(self, source: Source, send: Callable[[Iterator[bytes]], None]) -> None:
+    def _container(self, source: ByteSource, send: Callable[[Iterator[bytes]], None]) -> None:
         etag = f'"{source.tag}"'
         headers = {"accept-ranges": "bytes", "etag": etag, "cache-control": "no-cache"}
         wanted = self.headers.get("range")
@@ -303,7 +302,7 @@ def _turn_away(connection: socket.socket) -> None:
         connection.send(f"HTTP/1.1 {status.value} {status.phrase}\r\n{head}\r\n{body}".encode())
 
 
-def _bytes(source: Source, first: int, stop: int) -> Iterator[bytes]:
+def _bytes(source: ByteSource, first: int, stop: int) -> Iterator[bytes]:
     while first < stop:
         data = source.read(first, stop - first)
         first += len(data)

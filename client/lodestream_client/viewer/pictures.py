@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lodestream.container import Index, read_index
-from lodestream.container.capacity import Capacity
-from lodestream.decoding.decoder import Decoder
 from lodestream.errors import UnavailableError
 from lodestream.interop.pictures import DPI, draw_surface, is_height_field, pixels_of
-from lodestream.planning.plan import Mark, Plan
+from lodestream.planning.plan import Mark
 from lodestream.planning.planner import plan
 from lodestream.surface import Block, Surface
 from lodestream.target import Region, Target
@@ -21,7 +17,6 @@ from lodestream.text import is_remeshed, printable
 
 from ..terminal.output import human_size, replacing
 from .picture_change import DONE, Judge, Stage
-from .sources import Source, read_fully
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,6 +24,7 @@ if TYPE_CHECKING:
 
     from lodestream.decoding.view import View
     from lodestream.grid.layout import Layout
+    from lodestream.opening.container import Container
 
 __all__ = [
     "Picture",
@@ -45,18 +41,14 @@ _THINNED = 2  # levels by which a surface in space is drawn coarser, since it ha
 _LONGEST = 100  # characters of a name
 
 
-def view_after(
-    source: Source, most: int | None, max_vertices: int | None = None, region: Region | None = None
-) -> tuple[View, Layout | None]:
+def view_after(container: Container, most: int | None, region: Region | None = None) -> tuple[View, Layout | None]:
     """Return the view of a container, or of a window of it, after at most so many bytes of its stream.
 
     Parameters
     ----------
-    source : Source
+    container : Container
     most : int or None
         Bytes; None: all.
-    max_vertices : int or None
-        Limit on the memory of the surface, see `lodestream.Decoder`.
     region : ((int, int), (int, int)), optional
         The window.
 
@@ -72,37 +64,27 @@ def view_after(
     StreamError, TooLargeError
         If the container is damaged or too large.
     """
-    read = partial(read_fully, source)
-    decoder, index, chosen = _begun(source, Target(max_bytes=most, region=region), max_vertices)
-    for place in chosen.ranges:
-        decoder.feed_at(place.offset, read(place.offset, place.length))
-    return decoder.view(), index.header.layout if region is None else None
+    view = container.view_at(Target(max_bytes=most, region=region))
+    return view, container.header.layout if region is None else None
 
 
-def view_when_done(source: Source, name: str, max_vertices: int | None = None) -> tuple[View, Picture, float]:
+def view_when_done(container: Container, name: str) -> tuple[View, Picture, float]:
     """Read a container layer by layer until its picture looks done.
 
     Parameters
     ----------
-    source : Source
+    container : Container
     name : str
         Of the surface.
-    max_vertices : optional
-        As in `view_after`.
 
     Returns
     -------
     (View, Picture, float)
         The state, its picture, and the share of its pixels that is expected to change visibly after it; 0 at the end.
     """
-    read = partial(read_fully, source)
-    decoder, index, chosen = _begun(source, Target(), max_vertices)
-    layout = index.header.layout
-    judge = Judge(chosen.marks)
-    for _, places in chosen.steps():
-        for place in places:
-            decoder.feed_at(place.offset, read(place.offset, place.length))
-        view = decoder.view()
+    layout = container.header.layout
+    judge = Judge(layers_of(container))
+    for view in container:
         if view.complete:
             break
         picture = Picture.of(view, layout, name)
@@ -112,27 +94,14 @@ def view_when_done(source: Source, name: str, max_vertices: int | None = None) -
     return view, Picture.of(view, layout, name), 0.0
 
 
-def _begun(source: Source, target: Target, max_vertices: int | None) -> tuple[Decoder, Index, Plan]:
-    """Return a decoder that has what comes before the slices of a plan."""
-    decoder = Decoder(target, max_vertices=max_vertices)
-    index = read_index(partial(read_fully, source), source.size, Capacity(decoder.capacity.max_vertices))
-    chosen = plan(index, target)
-    for place in (*chosen.before, index.metadata):
-        decoder.feed_at(place.offset, read_fully(source, place.offset, place.length))
-    return decoder, index, chosen
-
-
-def layers_of(source: Source, max_vertices: int | None = None) -> tuple[Mark, ...]:
+def layers_of(container: Container) -> tuple[Mark, ...]:
     """Return the states of a whole container in order: its layers, and the exact end if it has one."""
-    capacity = Decoder(max_vertices=max_vertices).capacity
-    return plan(read_index(partial(read_fully, source), source.size, Capacity(capacity.max_vertices)), Target()).marks
+    return plan(container.index).marks
 
 
-def least_size(source: Source, max_vertices: int | None = None, region: Region | None = None) -> int:
-    """Return the bytes that the first picture of a container takes; the parameters are those of `view_after`."""
-    capacity = Decoder(max_vertices=max_vertices).capacity
-    index = read_index(partial(read_fully, source), source.size, Capacity(capacity.max_vertices))
-    return plan(index, Target(region=region)).marks[0].bytes
+def least_size(container: Container, region: Region | None = None) -> int:
+    """Return the bytes that the first picture of a container, or of a window of it, takes."""
+    return plan(container.index, Target(region=region)).marks[0].bytes
 
 
 def require_matplotlib() -> None:

@@ -309,16 +309,13 @@ class View:
 
     def _repr_html_(self) -> str:
         """Return the HTML for a notebook: a small picture, sizes and errors."""
-        from ..interop.html import SMALL, view_html
+        from ..interop.html import small_level, view_html
 
         header, region = self._queue.header, self._selection.region
         if region is not None:
             window = self.surface()
             return view_html(self, window, [window.blocks[0].shape])
-        layout = header.layout
-        widest = [max(max(layout.shape(g, level)) for g in range(len(layout.grids))) for level in range(layout.levels)]
-        level = next((level for level, width in enumerate(widest) if width >= SMALL), None)
-        return view_html(self, self.surface(level), [shape for shape, _ in header.blocks])
+        return view_html(self, self.surface(small_level(header)), [shape for shape, _ in header.blocks])
 
     def _blocks(self, level: int) -> list[Block]:
         """Return all blocks at a level, or the window of the only one; without the x and y of height fields."""

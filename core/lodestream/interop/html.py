@@ -11,10 +11,11 @@ from ..text import is_remeshed, printable
 from .pictures import SMALL, small_png
 
 if TYPE_CHECKING:
+    from ..container.model import Header
     from ..decoding.view import View
     from ..surface import Surface
 
-__all__ = ["SMALL", "errors", "surface_html", "table", "view_html"]
+__all__ = ["errors", "small_level", "surface_html", "table", "view_html"]
 
 #: Rows of one table: blocks, attributes.
 _MOST = 8
@@ -24,6 +25,14 @@ def surface_html(surface: Surface) -> str:
     """Return a surface as HTML: picture, blocks, attributes, name and unit."""
     shapes = [block.shape for block in surface.blocks]
     return table("Surface", _of_surface(surface, shapes), small_png(surface))
+
+
+def small_level(header: Header) -> int | None:
+    """Return the coarsest level that is enough for a small picture; None: full resolution."""
+    layout = header.layout
+    grids = range(len(layout.grids))
+    widest = (max(max(layout.shape(grid, level)) for grid in grids) for level in range(layout.levels))
+    return next((level for level, width in enumerate(widest) if width >= SMALL), None)
 
 
 def view_html(view: View, surface: Surface, shapes: Sequence[tuple[int, int]]) -> str:

@@ -9,11 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..container import read_index
-from ..container.capacity import Capacity
 from ..coordinates.seams import merge
-from ..decoding.decoder import Decoder
-from ..errors import FormatError, InputError, named
+from ..errors import FormatError, InputError
 from ..formats.attributes import NORMAL, TEXTURE
 from ..formats.meshes import check_corners, polygons_allowed
 from ..formats.netcdf.mark import MARK
@@ -23,9 +20,8 @@ from ..formats.vtk.grids import without_hidden
 from ..mesh import Mesh
 from ..mesh.ears import cut_faces
 from ..mesh.model import names_of_parts
-from ..planning.planner import plan
+from ..opening import container
 from ..surface import Block, Surface
-from ..target import Target
 from .meshes import surface_of_mesh
 from .optional import require_library
 from .pyvista_layout import GHOSTS, as_it_was, grid_of_block, marks_of
@@ -56,19 +52,8 @@ def read(path: str | os.PathLike[str], *, level: int | None = None) -> pyvista.S
     StreamError, TooLargeError
         If the container is damaged or too large. A note of the error names the file.
     """
-    with named(os.fspath(path)), open(path, "rb") as file:
-
-        def take(offset: int, length: int) -> bytes:
-            file.seek(offset)
-            return file.read(length)
-
-        target = Target(level=level)
-        decoder = Decoder(target)
-        index = read_index(take, os.fstat(file.fileno()).st_size, Capacity(decoder.capacity.max_vertices))
-        chosen = plan(index, target)
-        for place in (*chosen.before, *chosen.ranges, *chosen.after):
-            decoder.feed_at(place.offset, take(place.offset, place.length))
-    return to_pyvista(decoder.view().surface(level))
+    with container.open(path) as opened:
+        return to_pyvista(opened.view(level=level).surface(level))
 
 
 def to_pyvista(surface: Surface) -> pyvista.StructuredGrid | pyvista.MultiBlock:

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.errors import LodestreamError, RemoteError
+from lodestream.opening.byte_sources import FileSource, MemorySource
 from lodestream_client.notebook.messages import LONGEST, Answers
-from lodestream_client.viewer.sources import FileSource, MemorySource
 
 DATA = bytes(range(256)) * 8192  # 2 MiB
 

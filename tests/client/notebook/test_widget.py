@@ -12,7 +12,7 @@ import pytest
 import lodestream as ls
 from lodestream import page
 from lodestream.errors import InputError, NotFoundError, OptionError, StreamError, UnavailableError
-from lodestream_client.viewer.sources import FileSource
+from lodestream.opening.byte_sources import FileSource
 from tests.core.remesh import scenes
 
 from .conftest import Page
@@ -250,7 +250,7 @@ def test_what_is_refused_is_closed_again(
     container: bytes, monkeypatch: pytest.MonkeyPatch, server: str, terrain: ls.Surface
 ) -> None:
     from lodestream_client import sync
-    from lodestream_client.viewer.sources import RemoteSource
+    from lodestream_client.remote_source import RemoteSource
 
     closed: list[RemoteSource] = []
     close = RemoteSource.close

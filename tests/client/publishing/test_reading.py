@@ -22,7 +22,6 @@ from lodestream_client import sync
 from lodestream_client.errors import SilenceError
 from lodestream_client.program import main
 from lodestream_client.requests.addresses import published_name
-from lodestream_client.viewer.sources import RemoteSource
 from tests.client.files import Ranged, ranged, running
 
 HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
@@ -94,12 +93,9 @@ def test_the_asyncio_client_reads_names_too(host: Ranged) -> None:
 def test_info_and_pictures(tmp_path: Path, host: Ranged, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", f"{host.url}/#plain", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["shape"] == [9, 9]
-    source = RemoteSource(f"{host.url}/#plain", None)
-    try:
-        assert source.url == sync.locate(f"{host.url}/#plain")
-        assert source.read(1, 4) == b"LODE"
-    finally:
-        source.close()
+    with ls.open(f"{host.url}/#plain") as opened:
+        assert opened.source.place == sync.locate(f"{host.url}/#plain")
+        assert np.array_equal(opened.window((2, 5), (3, 9)).points, HILLS[2:5, 3:9])
 
 
 def test_xarray_opens_a_name_and_stays_with_its_container(tmp_path: Path, host: Ranged) -> None:

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from lodestream import page
 from lodestream.errors import RemoteProtocolError
+from lodestream.opening.byte_sources import FileSource
 from lodestream_client.viewer import page_server
 from lodestream_client.viewer.page_server import PageServer, byte_range, serving
-from lodestream_client.viewer.sources import FileSource
 from tests.patience import PATIENCE
 
 DATA = bytes(range(256)) * 9
@@ -111,7 +111,7 @@ def test_a_name_that_leads_here_is_not_ours(server: PageServer) -> None:
 class _Failing:
     """Has so many bytes, and no more."""
 
-    name, size, tag = "failing", 100, "a"
+    place, name, size, tag, gap = "memory", "failing", 100, "a", 0
 
     def __init__(self, has: int) -> None:
         self._has = has
@@ -120,6 +120,9 @@ class _Failing:
         if offset >= self._has:
             raise RemoteProtocolError("expected more, got nothing")
         return b"x" * min(length, self._has - offset)
+
+    def close(self) -> None:
+        pass
 
 
 def test_a_source_that_fails_is_an_error_or_a_connection_cut_short(server: PageServer) -> None:

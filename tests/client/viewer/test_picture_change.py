@@ -21,7 +21,6 @@ from lodestream_client.viewer.picture_change import (
     share_above,
 )
 from lodestream_client.viewer.pictures import view_after, view_when_done
-from lodestream_client.viewer.sources import MemorySource
 
 PICTURES = arrays.arrays(np.uint8, (3, 4, 4))
 LAYERS = [Mark(k, k, min(k, 4), k, rms, rms) for k, rms in enumerate((16.0, 8.0, 4.0, 2.0, 1.0, 0.0))]
@@ -102,7 +101,7 @@ def test_little_of_a_picture_changes_after_it_looks_done(kind: str) -> None:
         "rough": lambda: ls.Surface(np.cumsum(np.cumsum(random.normal(0, 1, (160, 200)), 0), 1).astype(np.float32)),
         "torus": lambda: ls.Surface(_torus(64, 96), (True, True)),
     }[kind]()
-    source = MemorySource(ls.encode(surface), kind)
+    source = ls.open(ls.encode(surface))
     view, picture, share = view_when_done(source, kind)
     # What is not drawn does not count.
     drawn = np.mean(picture.pixels()[..., 3] > 0)
@@ -111,7 +110,7 @@ def test_little_of_a_picture_changes_after_it_looks_done(kind: str) -> None:
     changed = picture_change(picture.pixels(), pixels_of(exact, 1000))
     assert share < DONE
     assert share_above(changed, VISIBLE) <= 0.03
-    assert view.bytes < 0.6 * source.size
+    assert view.bytes < 0.6 * source.source.size
 
 
 def _torus(rows: int, columns: int) -> np.ndarray:

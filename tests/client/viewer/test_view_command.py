@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.opening.byte_sources import FileSource
 from lodestream_client.program import main
+from lodestream_client.remote_source import RemoteSource
 from lodestream_client.viewer.picture_change import DONE, VISIBLE, picture_change, share_above
 from lodestream_client.viewer.pictures import Picture, view_after, view_when_done
-from lodestream_client.viewer.sources import FileSource, RemoteSource, read_fully
 from tests.client.files import ranged
 from tests.patience import PATIENCE
 
@@ -79,12 +80,12 @@ def test_a_picture_is_drawn_as_soon_as_it_looks_done(
     assert 0 < received < 0.5 * container.stat().st_size
     assert float(told[3]) < 1
     # The same state by its bytes: its picture is the same, and hardly differs from the exact one.
-    source = FileSource(container)
-    view, picture, share = view_when_done(source, source.name)
+    source = ls.open(container)
+    view, picture, share = view_when_done(source, source.source.name)
     assert share < DONE
     assert (tmp_path / "a.png").read_bytes() == picture.png()
     last, layout = view_after(source, None)
-    exact = Picture.of(last, layout, source.name).pixels()
+    exact = Picture.of(last, layout, source.source.name).pixels()
     assert share_above(picture_change(picture.pixels(), exact), VISIBLE) < 0.03
     assert view.bytes < last.bytes
 
@@ -209,7 +210,7 @@ def test_a_container_of_another_host_is_passed_on(tmp_path: Path, container: Pat
         try:
             assert (source.name, source.size) == ("hills", container.stat().st_size)
             assert source.read(10, 30) == container.read_bytes()[10:40]
-            assert read_fully(source, 0, source.size) == container.read_bytes()
+            assert source.read(0, source.size) == container.read_bytes()
         finally:
             source.close()
 

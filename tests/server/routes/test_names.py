@@ -21,7 +21,7 @@ import lodestream_client
 from lodestream.errors import NotFoundError
 from lodestream_client import sync
 from lodestream_client.program import main
-from lodestream_client.viewer.sources import RemoteSource
+from lodestream_client.remote_source import RemoteSource
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.store.index import Surface
@@ -331,7 +331,7 @@ def test_the_commands_follow_a_name(
     assert (told["name"], told["url"]) == ("dem", f"{server}/v1/surfaces/{told['id']}")
     source = RemoteSource(dem, None)
     try:
-        assert source.url == told["url"]
+        assert source.place == told["url"]
         assert source.read(1, 4) == b"LODE"
     finally:
         source.close()
