@@ -28,21 +28,23 @@ site: page kernels docs $(MAPS)/node_modules/.package-lock.json ## write build/s
 	@$(BIN)/python -m lodestream_client.demo.site build/site/demo build/map
 
 # The tests start many processes: none is to compile every module again, whatever the shell's environment says. Four
-# of pytest's share two processors, since some of the tests wait for a clock.
+# of pytest's share two processors, since some of the tests wait for a clock. Threads of OpenBLAS would wait for each
+# other there, and keep a processor busy meanwhile.
+TESTED := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1
 PYTEST := -m pytest -q -n 4 --dist loadfile
 COVERAGE := build/coverage
 
 test: kernels ## run the tests; ARGS="-k name" for some of them; COVER=1 as cover does
 ifdef COVER
 	@rm -rf $(COVERAGE) && mkdir -p $(COVERAGE)
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/coverage run $(PYTEST) $(ARGS)
+	@$(TESTED) $(BIN)/coverage run $(PYTEST) $(ARGS)
 	@$(BIN)/coverage combine --quiet && $(BIN)/coverage report
 else
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(ARGS)
+	@$(TESTED) $(BIN)/python $(PYTEST) $(ARGS)
 endif
 
 test-rest: kernels ## run the tests that `make test` leaves out because they are long, and the other cases of its sweeps
-	@HYPOTHESIS_PROFILE=rest PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(ARGS)
+	@HYPOTHESIS_PROFILE=rest $(TESTED) $(BIN)/python $(PYTEST) $(ARGS)
 
 cover: ## run the tests and say which lines of Python none of them runs, in whatever process
 	@$(MAKE) --no-print-directory test COVER=1
@@ -55,7 +57,7 @@ CHECKED := tests/test_doctests.py $(wildcard tests/core/test_*_docs.py) tests/co
 	tests/core/grid/test_axis.py tests/client/stream/test_core.py tests/client/commands/test_arguments.py
 
 check: lint kernels ## lint and a subset of the tests: about a minute
-	@PYTHONDONTWRITEBYTECODE= $(BIN)/python $(PYTEST) $(CHECKED)
+	@$(TESTED) $(BIN)/python $(PYTEST) $(CHECKED)
 
 test-lowest: ## run the tests with the oldest versions that pyproject.toml allows
 	@$(PYTHON) .ci/lowest.py build/lowest $(ARGS)
@@ -86,7 +88,7 @@ page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), wh
 # Both wait for links and clocks much of the time, so they run at the same time.
 test-web: page $(WEB_TOOLS) $(MAPS)/node_modules/.package-lock.json ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter
 	@cd $(WEB) && npm run --silent check && PYTHON=$(CURDIR)/$(BIN)/python npm test --silent
-	@LODESTREAM_WEB=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
+	@LODESTREAM_WEB=1 $(TESTED) $(BIN)/python -m pytest -q -n 2 --dist loadfile tests/web $(ARGS)
 
 bench-web: page $(WEB_TOOLS) ## speed of the browser's decoder, times to the first picture, and the size of the bundle
 	@$(BIN)/python -m benchmarks.web $(ARGS)

@@ -46,25 +46,41 @@ if sys.platform != "linux":
     collect_ignore = list(OF_LINUX)
 
 
-#: Files that take longest, though they have few tests: what begins last is not to be what takes longest.
+#: Files that take longest, in `make test` or in `make test-rest`: what begins last is not to be what takes longest.
 LONGEST = (
     "tests/server/builds/test_interrupted_builds.py",
     "tests/core/formats/test_cf_conventions.py",
     "tests/history/test_runs.py",
     "tests/server/builds/test_cluster_builds.py",
     "tests/core/decoding/test_reference_decoder.py",
-    "tests/core/grid/test_many_patches.py",
-    "tests/core/grid/test_watertight.py",
     "tests/client/stream/test_interrupted.py",
+    "tests/core/encoding/test_encode.py",
+    "tests/server/builds/test_levels.py",
+    "tests/core/grid/test_many_patches.py",
+    "tests/server/store/test_surfaces.py",
+    "tests/core/grid/test_watertight.py",
+    "tests/faults/test_sample.py",
+    "tests/core/remesh/test_remeshing.py",
+    "tests/server/test_proxies.py",
     "tests/core/decoding/test_decoder.py",
     "tests/core/stores/test_faults.py",
     "tests/core/grid/test_topology.py",
-    "tests/core/encoding/test_any_pieces.py",
-    "tests/core/encoding/test_dask.py",
-    "tests/server/connections/test_floods.py",
-    "tests/server/builds/test_levels.py",
-    "tests/faults/test_sample.py",
     "tests/server/connections/test_crowds.py",
+    "tests/core/encoding/test_any_pieces.py",
+    "tests/server/connections/test_connections.py",
+    "tests/core/encoding/test_dask.py",
+    "tests/server/builds/test_confinement.py",
+    "tests/core/encoding/test_in_memory.py",
+    "tests/server/connections/test_frames.py",
+    "tests/core/transform/test_paper.py",
+    "tests/server/builds/test_builds.py",
+    "tests/client/stream/test_resume.py",
+    "tests/server/operation/test_operation.py",
+    "tests/core/container/test_golden.py",
+    "tests/server/store/test_fsck.py",
+    "tests/client/commands/test_command_line.py",
+    "tests/server/connections/test_floods.py",
+    "tests/core/transfer/test_range_download.py",
     "tests/server/store/test_kills.py",
     "tests/server/access/test_strangers.py",
 )
@@ -95,8 +111,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             others = set(items) - others
         config.hook.pytest_deselected(items=[item for item in items if item in others])
         items[:] = [item for item in items if item not in others]
-    places = {name: place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(LONGEST)))
+    places = _places(list(dict.fromkeys(map(_file, items))))
+    items.sort(key=lambda item: places[_file(item)])
+
+
+def _file(item: pytest.Item) -> str:
+    return item.nodeid.partition("::")[0]
+
+
+def _places(files: list[str]) -> dict[str, tuple[int, float]]:
+    """Return what sorts files: those that take longest come first, then those of all folders in turn.
+
+    The files of each folder are spread over the whole run, since tests of servers and clients wait for much of their
+    time, and those of the core keep a processor busy.
+    """
+    folders: dict[str, list[str]] = {}
+    for file in files:
+        folders.setdefault("/".join(file.split("/")[:2]), []).append(file)
+    spread = {file: (at + 0.5) / len(folder) for folder in folders.values() for at, file in enumerate(folder)}
+    return {file: (LONGEST.index(file) if file in LONGEST else len(LONGEST), spread[file]) for file in files}
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -33,6 +33,7 @@ def test_every_command_prints_what_the_page_says(outcome: tuple[str, str]) -> No
     assert rendered == page
 
 
+@pytest.mark.long
 def test_the_last_section_was_run_too(outcome: tuple[str, str]) -> None:
     if not viewer.assets():
         pytest.skip(viewer.HOW_TO_BUILD)

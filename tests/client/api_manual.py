@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ def public_names(module: griffe.Module) -> Iterator[tuple[str, griffe.Object]]:
         yield name, member
 
 
+@cache
 def load() -> griffe.ModulesCollection:
     """Both packages, as their sources say."""
     loader = griffe.GriffeLoader(

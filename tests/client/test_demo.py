@@ -20,7 +20,7 @@ from .commands.test_program import environment
 SHAPE = (128, 160)
 
 
-@pytest.mark.parametrize("plot", [True, False])
+@pytest.mark.parametrize("plot", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_the_demo(tmp_path: Path, plot: bool) -> None:
     if plot:
         pytest.importorskip("matplotlib", reason="the demo draws with matplotlib")

@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -117,6 +118,33 @@ def test_a_folder_of_scripts_around_it_is_not_opened(tmp_path: Path, monkeypatch
     monkeypatch.syspath_prepend(tmp_path)
     told = confined([f"open({str(path)!r}).read()" for path in (mine, other)], read=[str(mine)])
     assert told["found"] == ["'x'", "PermissionError 13"]
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or landlock.version(_LIBC) < landlock.SCOPES, reason="this kernel's Landlock has no scopes"
+)
+def test_landlock_alone_keeps_signals_and_sockets_without_a_file_from_others() -> None:
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind("")  # the kernel chooses a name that no file has
+        listening.listen()
+        program = f"""
+import ctypes, os, socket
+from lodestream.confinement import landlock
+libc = ctypes.CDLL(None)
+libc.prctl(38, 1, 0, 0, 0)  # PR_SET_NO_NEW_PRIVS
+assert landlock.restrict(libc, (), (), ())
+os.kill(os.getpid(), 0)
+client = socket.socket(socket.AF_UNIX)
+for attempt in (lambda: os.kill(os.getppid(), 0), lambda: client.connect({listening.getsockname()!r})):
+    try:
+        attempt()
+    except PermissionError as error:
+        print(error.errno)
+"""
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert (done.stdout, done.stderr) == ("1\n1\n", "")
 
 
 @has_seccomp
@@ -310,6 +338,14 @@ def test_what_the_filter_does_call_by_call(machine: str) -> None:
     for name in {*seccomp._DENIED.split()} & calls.keys():
         assert verdict(name) == verdict(name, processes=True) == "error 1", name
         assert verdict(name, descriptors=True) == ("allow" if name == "recvmsg" else "error 1"), name
+    some = {"clone", "fcntl", "mmap", "open", "openat", "prctl", "seccomp", *seccomp._SIGNALS, *seccomp._LIMITS}
+    assert {name for name in calls if verdict(name) == "allow"} <= some, "of all others no call is allowed"
+    assert {
+        "ptrace",
+        "process_vm_writev",
+        "chmod" if machine == "x86_64" else "fchmodat",
+        "keyctl",
+    } <= calls.keys() - some
     known = {*calls.values()}
     assert all(verdict(number) == "allow" for number in range(424) if number not in known)
 

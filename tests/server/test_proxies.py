@@ -69,7 +69,9 @@ def pulled(front: Front, token: str, url: str, *options: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("proxy", [proxies.nginx, proxies.caddy, proxies.caddy_of_image])
+@pytest.mark.parametrize(
+    "proxy", [proxies.nginx, proxies.caddy, pytest.param(proxies.caddy_of_image, marks=pytest.mark.long)]
+)
 def test_a_surface_through_a_proxy(proxy: Proxy, tmp_path: Path) -> None:
     heights = hills(120, 90)
     with running(proxy, tmp_path) as (front, token), front.client(token) as http:

@@ -199,6 +199,7 @@ GONE: dict[str, Callable[[Path], object]] = {"gone": Path.unlink, "link": _link,
 DAMAGE = CHANGED | GONE
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize("kind", PLACES)
 def test_data_in_order_in_any_store(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     place: Place = request.getfixturevalue(kind)

@@ -108,6 +108,7 @@ def check(store: Store, index: Path, acked: dict[str, bytes], deleted: set[str],
     return collected
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize("kind", PLACES)
 def test_a_cut_at_every_step_loses_nothing_and_brings_nothing_back(
     kind: str, request: pytest.FixtureRequest, tmp_path: Path
