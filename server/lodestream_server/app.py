@@ -145,7 +145,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             allow_origins=chosen.origins,
             allow_methods=["DELETE", "GET", "HEAD", "POST", "PUT"],
             allow_headers=["authorization", "if-none-match", "if-range", "range"],
-            expose_headers=["content-range", "etag", "location", "retry-after", "x-request-id"],
+            expose_headers=["content-location", "content-range", "etag", "location", "retry-after", "x-request-id"],
         )
     app.add_middleware(Paced, pace=pace)
     app.add_middleware(Observation, metrics=metrics, log_reads=chosen.log_reads)

@@ -29,6 +29,8 @@ class Proxy(ThreadingHTTPServer):
         The address given, by way of this proxy.
     handshakes, passed : int
         Requests that asked for a WebSocket, and others.
+    connections : int
+        Connections of clients.
     """
 
     daemon_threads = True
@@ -39,7 +41,12 @@ class Proxy(ThreadingHTTPServer):
         self.behind = parts.netloc
         self.refusal = refusal
         self.url = urlunsplit(parts._replace(netloc=f"127.0.0.1:{self.server_port}"))
-        self.handshakes = self.passed = 0
+        self.handshakes = self.passed = self.connections = 0
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection, which is counted."""
+        self.connections += 1
+        super().process_request(request, client_address)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A client may hang up in the middle of an answer."""

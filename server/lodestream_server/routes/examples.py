@@ -7,6 +7,7 @@ from typing import Any
 from lodestream.quality import EFFORTS
 
 __all__ = [
+    "BINARY",
     "CONTAINER_TYPE",
     "LEVEL",
     "NAMES",
@@ -20,6 +21,9 @@ __all__ = [
 ]
 
 CONTAINER_TYPE = "application/vnd.lodestream.container"
+
+#: The schema of bytes.
+BINARY = {"type": "string", "format": "binary"}
 
 QUEUED: dict[str, Any] = {
     "id": "5f1c0a9b3d7e42a68c10",
@@ -105,8 +109,6 @@ LEVEL: dict[str, Any] = {
     "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
 }
 
-_BINARY = {"type": "string", "format": "binary"}
-
 #: The query and body of an upload. Further parameters are options of the file's format.
 UPLOAD: dict[str, Any] = {
     "parameters": [
@@ -145,12 +147,12 @@ UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
-            "application/octet-stream": {"schema": _BINARY},
+            "application/octet-stream": {"schema": BINARY},
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
                     "required": ["file"],
-                    "properties": {"file": {"type": "array", "items": _BINARY}},
+                    "properties": {"file": {"type": "array", "items": BINARY}},
                 }
             },
         },

@@ -5,38 +5,56 @@ from __future__ import annotations
 import asyncio
 import os
 from pathlib import Path
+from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from ..access.scopes import READ
 from ..problems import BusyError, responses
 from ..store.containers import Containers
+from ..store.index import Surface
 from . import examples
 from .byte_ranges import sort_out
-from .routing import Parts, matches, readable
-from .sending import SentFile, ready
+from .routing import Parts, State, caching, matches, readable
+from .sending import SentFile, ready, still_there
 
-__all__ = ["router"]
+__all__ = ["CONTAINER", "container_of", "router"]
 
 router = APIRouter(prefix="/v1", tags=["files"])
+
+
+#: What OpenAPI says of answers with a container.
+CONTAINER: dict[int | str, dict[str, Any]] = {
+    200: {"description": "The whole container", "content": {examples.CONTAINER_TYPE: {"schema": examples.BINARY}}},
+    206: {"description": "The range asked for"},
+    304: {"description": "The client has it"},
+}
 
 
 @readable(
     router,
     "/surfaces/{surface}/container",
     dependencies=[READ],
-    status_code=307,
-    summary="Find a surface's container",
-    response_class=Response,
-    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 503)},
+    summary="Fetch the container of a surface, or ranges of it",
+    response_class=FileResponse,
+    responses={**CONTAINER, **responses(404, 409, 416, 503)},
 )
-async def find(request: Request, parts: Parts, surface: str) -> Response:
-    """Redirect to the container; 409 with Retry-After while it is being built."""
-    found = ready(parts, surface)
-    address = f"{request.scope.get('root_path', '')}{router.prefix}/containers/{found.container}.lode"
-    return RedirectResponse(address, headers={"cache-control": "no-cache"})
+async def get_surface_container(request: Request, parts: Parts, surface: str) -> Response:
+    """Return the container of a surface; 409 with Retry-After while it is being built.
+
+    Its strong ETag is the SHA-256 of its contents. Content-Location is its own address, where it may be kept for ever.
+    """
+    return await container_of(request, parts, ready(parts, surface))
+
+
+async def container_of(request: Request, parts: State, surface: Surface) -> Response:
+    """Return an answer with the container of a surface that is ready, as the request asks for it."""
+    sha256 = surface.container or ""
+    place = f"{request.scope.get('root_path', '')}{router.prefix}/containers/{sha256}.lode"
+    with still_there(parts, surface.id):
+        return await _sent(request, parts, sha256, {"cache-control": caching(parts), "content-location": place})
 
 
 @readable(
@@ -45,20 +63,17 @@ async def find(request: Request, parts: Parts, surface: str) -> Response:
     dependencies=[READ],
     summary="Fetch a container, or ranges of it",
     response_class=FileResponse,
-    responses={
-        200: {"description": "The whole container", "content": {examples.CONTAINER_TYPE: {}}},
-        206: {"description": "The range asked for"},
-        304: {"description": "The client has it"},
-        **responses(404, 416, 503),
-    },
+    responses={**CONTAINER, **responses(404, 416, 503)},
 )
-async def fetch(request: Request, parts: Parts, sha256: str) -> Response:
+async def get_container(request: Request, parts: Parts, sha256: str) -> Response:
     """Return a container. It never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
+    return await _sent(request, parts, sha256, {"cache-control": caching(parts, forever=True)})
+
+
+async def _sent(request: Request, parts: State, sha256: str, headers: dict[str, str]) -> Response:
     path, status = await asyncio.to_thread(_file, parts.containers, sha256)
     etag = f'"{sha256}"'
-    # What needs a token must not come out of a shared cache for those who have none.
-    shared = "public" if parts.settings.public_reads else "private"
-    headers = {"etag": etag, "cache-control": f"{shared}, max-age=31536000, immutable"}
+    headers = {**headers, "etag": etag}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         unchanged.headers.update(headers)

@@ -19,7 +19,7 @@ from ..problems import BusyError, responses
 from ..store.index import Surface
 from . import examples
 from .byte_ranges import sort_out
-from .routing import Parts, matches, readable
+from .routing import Parts, caching, matches, readable
 from .sending import SentFile, ready, still_there, while_there
 
 __all__ = ["router"]
@@ -57,7 +57,7 @@ async def level(
     _check(found, level)
     format_ = written(wanted)
     etag = f'"{found.container}-{level}-{format_.name}-{written_by()}"'
-    headers = {"etag": etag, "cache-control": "no-cache"}
+    headers = {"etag": etag, "cache-control": caching(parts)}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         return unchanged

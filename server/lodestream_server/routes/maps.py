@@ -21,7 +21,7 @@ from ..builds.tiles import REVISION, TileOrder
 from ..problems import responses
 from ..store.index import Surface
 from .names import leads_to
-from .routing import Parts, State, matches, readable
+from .routing import Parts, State, caching, matches, readable
 from .sending import ready, still_there, while_there
 
 __all__ = ["router"]
@@ -211,11 +211,7 @@ async def _made(
     container = found.container or ""
     named = hashlib.sha256(repr((REVISION, container, order)).encode()).hexdigest()[:32]
     etag = f'"{named}"'
-    headers = {"etag": etag, "cache-control": "no-cache"}
-    if version == _version(found):
-        # What needs a token must not come out of a shared cache for those who have none.
-        shared = "public" if parts.settings.public_reads else "private"
-        headers["cache-control"] = f"{shared}, max-age=31536000, immutable"
+    headers = {"etag": etag, "cache-control": caching(parts, forever=version == _version(found))}
     if order.what == "mesh":
         headers["vary"] = "accept, accept-encoding"
     if order.is_gzipped:

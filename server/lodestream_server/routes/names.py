@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
-from fastapi.responses import JSONResponse, Response
+from fastapi.responses import FileResponse, JSONResponse, Response
 from pydantic import BaseModel, ValidationError
 
 from lodestream.errors import InputError, NotFoundError, TooLargeError
@@ -113,14 +113,13 @@ async def look(caller: Reader, request: Request, parts: Parts, name: _Name) -> R
     router,
     "/{name}/container",
     dependencies=[READ],
-    status_code=307,
-    summary="Find the container to which a name leads",
-    response_class=Response,
-    responses={307: {"description": "Location is the immutable container"}, **responses(404, 409, 422, 503)},
+    summary="Fetch the container to which a name leads, or ranges of it",
+    response_class=FileResponse,
+    responses={**files.CONTAINER, **responses(404, 409, 416, 422, 503)},
 )
-async def find(request: Request, parts: Parts, name: _Name) -> Response:
-    """Redirect to the container of the surface to which a name leads now."""
-    return await files.find(request, parts, leads_to(parts, name).id)
+async def get_name_container(request: Request, parts: Parts, name: _Name) -> Response:
+    """Return the container of the surface to which a name leads now; another one, with another ETag, later."""
+    return await files.container_of(request, parts, ready(parts, leads_to(parts, name).id))
 
 
 @router.delete("/{name}", status_code=204, summary="Delete a name", responses=responses(403, 404, 422, 503))

@@ -23,7 +23,7 @@ from ..store.data_folder import DataFolder
 from ..store.surfaces import Surfaces
 from ..upkeep import Upkeep
 
-__all__ = ["Parts", "State", "matches", "readable"]
+__all__ = ["Parts", "State", "caching", "matches", "readable"]
 
 _Route = TypeVar("_Route", bound=Callable[..., Any])
 
@@ -66,6 +66,14 @@ def readable(
         return router.get(path, dependencies=dependencies, **options)(route)
 
     return register
+
+
+def caching(parts: State, *, forever: bool = False) -> str:
+    """Return the Cache-Control of an answer; what is not for ever is asked for again each time."""
+    # What needs a token must not come out of a shared cache for those who have none.
+    if forever:
+        return f"{'public' if parts.settings.public_reads else 'private'}, max-age=31536000, immutable"
+    return "no-cache" if parts.settings.public_reads else "private, no-cache"
 
 
 def matches(header: str | None, etag: str) -> Response | None:

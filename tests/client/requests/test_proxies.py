@@ -53,6 +53,12 @@ def test_whoever_wants_a_websocket_is_told(surface: str, asynchronous: bool) -> 
         follow(proxy.url, asynchronous, deadline=0, transport="ws")
 
 
+def test_a_surface_comes_by_one_request_of_one_connection(surface: str, asynchronous: bool) -> None:
+    with plain_proxy(surface) as proxy:
+        follow(proxy.url, asynchronous, transport="http")
+    assert (proxy.connections, proxy.handshakes, proxy.passed) == (1, 0, 1)
+
+
 def test_a_surface_that_is_none_is_none_behind_a_proxy(server: str, asynchronous: bool) -> None:
     with (
         plain_proxy(f"{server}/v1/surfaces/0123456789abcdef0123") as proxy,
@@ -74,4 +80,6 @@ def test_pull_behind_a_proxy(surface: str, terrain: Terrain, run: Run, tmp_path:
     with plain_proxy(surface) as proxy:
         code, _, stderr = run("pull", proxy.url, tmp_path / "o.npy")
     assert code == 0, stderr
+    # The container is at the address of the surface: the first request without a handshake has it.
+    assert (proxy.handshakes, proxy.passed) == (1, 1)
     assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)

@@ -37,18 +37,20 @@ def address(surface: dict[str, Any]) -> str:
     return f"/v1/containers/{surface['container_sha256']}.lode"
 
 
-def test_the_surface_leads_to_its_immutable_container(
-    http: httpx.Client, surface: dict[str, Any], address: str
-) -> None:
-    answer = http.get(surface["url"] + "/container")
-    assert (answer.status_code, answer.headers["location"]) == (307, address)
-    assert answer.headers["cache-control"] == "no-cache"
-    container = http.get(address)
-    assert container.status_code == 200
-    assert container.headers["etag"] == f'"{surface["container_sha256"]}"'
-    assert container.headers["accept-ranges"] == "bytes"
-    assert "immutable" in container.headers["cache-control"]
-    assert container.headers["content-length"] == str(surface["bytes"])
+def test_a_container_has_two_addresses(http: httpx.Client, surface: dict[str, Any], address: str) -> None:
+    of_surface, itself = http.get(surface["url"] + "/container"), http.get(address)
+    assert of_surface.headers["content-location"] == address
+    assert of_surface.content == itself.content
+    for container, lasting in ((of_surface, "private, no-cache"), (itself, "private, max-age=31536000, immutable")):
+        assert container.status_code == 200
+        assert container.headers["etag"] == f'"{surface["container_sha256"]}"'
+        assert container.headers["accept-ranges"] == "bytes"
+        assert container.headers["cache-control"] == lasting
+        assert container.headers["content-length"] == str(surface["bytes"])
+    part = http.get(surface["url"] + "/container", headers={"range": "bytes=4-9", "if-range": itself.headers["etag"]})
+    assert (part.status_code, part.content) == (206, itself.content[4:10])
+    again = http.get(surface["url"] + "/container", headers={"if-none-match": itself.headers["etag"]})
+    assert (again.status_code, again.content, again.headers["content-location"]) == (304, b"", address)
 
 
 def test_ranges_are_slices_of_the_file(http: httpx.Client, surface: dict[str, Any], address: str) -> None:

@@ -50,7 +50,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Any:
 def test_a_map_finds_its_tiles_by_the_document(http: httpx.Client, hill: dict[str, Any], field: Any) -> None:
     for encoding in ("terrain-rgb", "terrarium", "shade"):
         described = http.get(f"{hill['url']}/map.json", params={"encoding": encoding}).raise_for_status()
-        assert described.headers["cache-control"] == "no-cache"
+        assert described.headers["cache-control"] == "private, no-cache"
         told = described.json()
         assert told["bounds"] == pytest.approx([7, 45, 8.2, 46], abs=0.01)
         z = told["maxzoom"]
@@ -136,7 +136,7 @@ def test_a_name_has_tiles_of_the_version_to_which_it_leads(http: httpx.Client, h
         seen.add(address)
     # What was told of the surface before is not kept as if it were that.
     kept = sorted(http.get(each.format(z=7, x=66, y=45)).headers["cache-control"] for each in seen)
-    assert kept == ["no-cache", "private, max-age=31536000, immutable"]
+    assert kept == ["private, max-age=31536000, immutable", "private, no-cache"]
 
 
 @pytest.mark.parametrize(

@@ -55,9 +55,10 @@ def test_a_name_leads_to_the_newest_surface(http: httpx.Client, pushed: list[dic
     assert http.head("/v1/names/dem").status_code == 200
     assert put(http, "dem", second["url"]).status_code == 200, "an address does as well"
     assert http.get("/v1/names/dem").json()["url"] == second["url"]
-    redirect = http.get("/v1/names/dem/container")
-    assert (redirect.status_code, redirect.headers["cache-control"]) == (307, "no-cache")
-    assert redirect.headers["location"] == f"/v1/containers/{second['container_sha256']}.lode"
+    container = http.get("/v1/names/dem/container")
+    assert (container.status_code, container.headers["cache-control"]) == (200, "private, no-cache")
+    assert container.headers["etag"] == f'"{second["container_sha256"]}"'
+    assert http.get(container.headers["content-location"]).content == container.content
     assert http.get(first["url"]).json().pop("replaced_until") > datetime.now(UTC).isoformat(), "it stays for its time"
     assert "replaced_until" not in http.get(second["url"]).json()
     assert http.delete("/v1/names/dem").status_code == 204
