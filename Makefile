@@ -83,7 +83,7 @@ WEB_TOOLS := $(VENV)/.web
 WEB_SOURCES := $(shell find $(WEB)/src $(WEB)/kernels $(WEB)/scripts -type f -not -name module.ts 2>/dev/null) \
 	$(wildcard $(WEB)/*.json $(WEB)/*.ts core/kernels/*.[ch])
 
-page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream view` show
+page: $(PAGE)/index.html ## build the page of the browser (Node 20 or newer), which servers and `lodestream open` show
 
 # Both wait for links and clocks much of the time, so they run at the same time.
 test-web: page $(WEB_TOOLS) $(MAPS)/node_modules/.package-lock.json ## test the npm package in Node, and the page in Chromium; ARGS="-k name" for some of the latter

@@ -1,4 +1,4 @@
-"""The browser's side: its decoder beside Python's, first pictures over a slow link, `lodestream view`, the bundle.
+"""The browser's side: its decoder beside Python's, first pictures over a slow link, `lodestream open`, the bundle.
 
 Times of decoding are processor times of Node's process, with one worker in it, and of this one: the least of several
 decodings in turns, since a busy machine only ever adds to them. First pictures are seen in Chromium, which draws with
@@ -253,14 +253,14 @@ def view_table(folder: Path) -> None:
                 shown.until(lambda shown=shown: shown.page.evaluate("window.firstDrawn"), 300)  # type: ignore[misc]
                 drawn = time.perf_counter() - began
             rows.append([name, f"{path.stat().st_size:,}", f"{served:.2f}", f"{drawn:.2f}"])
-    table("lodestream view", ["file", "bytes", "page is served, s", "first picture, s"], rows)
+    table("lodestream open", ["file", "bytes", "page is served, s", "first picture, s"], rows)
     note("Aim: the page is served within a second of the command: " + verdict(all(float(row[2]) <= 1 for row in rows)))
 
 
 @contextmanager
 def viewing(path: Path) -> Iterator[str]:
-    """`lodestream view`, and its address."""
-    command = [sys.executable, "-m", "lodestream_client", "view", "--no-browser", str(path)]
+    """`lodestream open`, and its address."""
+    command = [sys.executable, "-m", "lodestream_client", "open", "--no-browser", str(path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment)
     try:

@@ -19,6 +19,7 @@ from .commands import (
     encode,
     formats,
     info,
+    open,
     publish,
     pull,
     push,
@@ -29,14 +30,23 @@ from .commands import (
 from .commands.arguments import Subparsers, add_command
 from .starting import EndingAtOnce
 from .terminal.interrupts import exit_code, unwrapping
-from .terminal.output import Parser, clean_warnings, note
+from .terminal.output import GroupingParser, Parser, clean_warnings, note
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 __all__ = ["build_parser", "main"]
 
-_MODULES = (demo, encode, decode, convert, info, push, retry, pull, view, publish, surfaces, formats, completion)
+_MODULES = (demo, encode, decode, convert, info, open, view, formats, push, pull, surfaces, retry, publish, completion)
+
+#: How the help groups commands; others of other packages are under its last heading.
+_GROUPS = {
+    "files": ("encode", "decode", "convert", "info", "open", "view", "formats"),
+    "surfaces of a server": ("push", "pull", "list", "rm", "retry"),
+    "pages in a bucket or a folder": ("publish", "published", "unpublish"),
+    "a server of your own": ("serve", "token", "fsck"),
+    "others": ("demo", "completion"),
+}
 
 
 def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
@@ -45,7 +55,8 @@ def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     Other packages are searched only if ``argv`` does not begin with one of the client's own commands: the search takes
     a third of the time of a short command.
     """
-    parser: argparse.ArgumentParser = Parser(
+    parser: argparse.ArgumentParser = GroupingParser(
+        _GROUPS,
         prog="lodestream",
         description="Stream structured surfaces progressively: coarse data first, then finer data, with a known error "
         "at each step.",
@@ -53,7 +64,7 @@ def build_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument("--version", action="version", version=f"lodestream {lodestream.__version__}")
-    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    subparsers: Subparsers = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for module in _MODULES:
         module.register(subparsers)
     if argv and argv[0] in subparsers.choices:

@@ -4,7 +4,7 @@ import { defineConfig } from "vite";
 const own = (path: string): string => resolve(import.meta.dirname ?? ".", path);
 
 /**
- * The page that servers and `lodestream view` show: everything bundled, addresses relative to the page itself. The
+ * The page that servers and `lodestream open` show: everything bundled, addresses relative to the page itself. The
  * element is a module of its own, `assets/view-*.js`, which imports nothing: widgets in notebooks load it too.
  */
 export default defineConfig({

@@ -19,6 +19,6 @@ def require_linux() -> None:
     """
     if sys.platform != "linux":
         raise UnavailableError(
-            "the server needs Linux, which forks and confines the processes that read uploads; here `lodestream view` "
+            "the server needs Linux, which forks and confines the processes that read uploads; here `lodestream open` "
             "shows files, and the other commands use servers elsewhere"
         )

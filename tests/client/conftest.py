@@ -40,7 +40,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / page.INDEX).write_text("<!doctype html><title>page</title>")
     (folder / "assets" / "main-1.js").write_text("export {}")
     made = page.assets(folder)
-    for module in ("lodestream.page", "lodestream_client.commands.view", "lodestream_client.demo.site"):
+    for module in ("lodestream.page", "lodestream_client.commands.open", "lodestream_client.demo.site"):
         monkeypatch.setattr(f"{module}.assets", lambda: made)
     return folder
 

@@ -22,6 +22,7 @@ COMMANDS = (
     "push",
     "retry",
     "pull",
+    "open",
     "view",
     "publish",
     "published",

@@ -1,4 +1,4 @@
-"""Containers without a server: a host of files, ten lines of HTML, `lodestream view`, and damaged files."""
+"""Containers without a server: a host of files, ten lines of HTML, `lodestream open`, and damaged files."""
 
 from __future__ import annotations
 
@@ -200,8 +200,8 @@ def allow(bucket: str, command: str) -> None:
 
 @contextmanager
 def viewing(*arguments: object, **environment: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """`lodestream view`, and the address that it prints."""
-    command = [sys.executable, "-m", "lodestream_client", "view", "--no-browser", *map(str, arguments)]
+    """`lodestream open`, and the address that it prints."""
+    command = [sys.executable, "-m", "lodestream_client", "open", "--no-browser", *map(str, arguments)]
     paths = os.pathsep.join(filter(None, sys.path))
     process = subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": paths, **environment}

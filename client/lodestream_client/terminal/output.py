@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LONG",
+    "GroupingParser",
     "Parser",
     "Progress",
     "cell",
@@ -102,6 +103,41 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print usage and message, and end the program with 2."""
         super().error(printable(message))
+
+
+class GroupingParser(Parser):
+    """A parser whose help has its sub-commands in groups.
+
+    Parameters
+    ----------
+    groups : mapping of str to sequence of str
+        Names of sub-commands by heading; those that none of them has are in the last group.
+    **options
+        Of `argparse.ArgumentParser`.
+    """
+
+    def __init__(self, groups: Mapping[str, Sequence[str]], **options: Any) -> None:
+        super().__init__(**options)
+        self._groups = groups
+
+    def format_help(self) -> str:
+        """Return the help: usage, description, a list of commands for each heading, options, epilog."""
+        formatter = self._get_formatter()
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        (commands,) = (action for action in self._actions if isinstance(action, argparse._SubParsersAction))
+        summaries = {choice.dest: choice for choice in commands._choices_actions}
+        groups = [[summaries.pop(name) for name in names if name in summaries] for names in self._groups.values()]
+        groups[-1] += summaries.values()
+        for heading, group in zip(self._groups, groups, strict=True):
+            formatter.start_section(heading)
+            formatter.add_arguments(group)
+            formatter.end_section()
+        formatter.start_section("options")
+        formatter.add_arguments(action for action in self._actions if action is not commands)
+        formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
 
 
 @contextmanager

@@ -1,1 +1,1 @@
-"""``lodestream view``: the page of a browser, served on this machine, and pictures of what it would show."""
+"""``lodestream open``: a page for a browser on this machine; ``lodestream view``: pictures of what it shows."""

@@ -1,6 +1,6 @@
 """A small file server for one browser: the page, and a container with Range, on a free port of this machine.
 
-It belongs to ``lodestream view`` and ends with it. Its addresses begin with a random word, so that other users of the
+It belongs to ``lodestream open`` and ends with it. Its addresses begin with a random word, so that other users of the
 machine and other pages of the browser, which do not know it, get nothing. A browser is given the address as an
 argument, which other users may see in the list of processes; with ``--no-browser`` only who runs the command sees it.
 """

@@ -96,7 +96,7 @@ def test_version_and_help() -> None:
     assert call("--version").stdout.decode() == f"lodestream {lodestream.__version__}\n"
     done = call("--help")
     assert done.returncode == 0
-    commands = re.findall(r"^    ([a-z]+)\b", done.stdout.decode(), re.MULTILINE)
+    commands = re.findall(r"^  ([a-z]+)\b", done.stdout.decode(), re.MULTILINE)
     assert set(commands) == set(manual.COMMANDS)
 
 

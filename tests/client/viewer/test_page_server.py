@@ -1,4 +1,4 @@
-"""The file server of `lodestream view`: the page and one container, for one browser of this machine."""
+"""The file server of `lodestream open`: the page and one container, for one browser of this machine."""
 
 from __future__ import annotations
 

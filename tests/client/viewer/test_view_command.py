@@ -1,4 +1,4 @@
-"""``lodestream view``: its pictures, and the page until Ctrl-C."""
+"""``lodestream view`` and its pictures; ``lodestream open`` and its page, until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def container(tmp_path: Path) -> Path:
 def test_a_page_that_is_not_built_is_told(
     container: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("lodestream_client.commands.view.assets", dict)
-    assert main(["view", str(container)]) == 1
+    monkeypatch.setattr("lodestream_client.commands.open.assets", dict)
+    assert main(["open", str(container)]) == 1
     assert "make page" in capsys.readouterr().err
 
 
@@ -49,7 +49,7 @@ def test_what_cannot_be_read_gets_no_address(tmp_path: Path, capsys: pytest.Capt
         path.write_text("Dear reader, this is no surface.")
     elif kind == "folder":
         path.mkdir()
-    assert main(["view", "--no-browser", str(path)]) == 1
+    assert main(["open", "--no-browser", str(path)]) == 1
     told = capsys.readouterr()
     assert told.out == ""
     assert "hills.npy" in told.err
@@ -177,19 +177,22 @@ def test_pictures_of_every_kind(tmp_path: Path, surface: ls.Surface) -> None:
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--at", "1kB"],
-        ["--roi", "0:9,0:9"],
-        ["--until-done"],
-        ["--png", "a.png", "--until-done", "--at", "1kB"],
-        ["--png", "a.png", "--until-done", "--roi", "0:9,0:9"],
-        ["--png", "a.gif"],
-        ["--port", "65536"],
-        ["other.npy", "http://host/a.lode"],
+        ["view"],
+        ["view", "--at", "1kB"],
+        ["view", "--roi", "0:9,0:9"],
+        ["view", "--until-done"],
+        ["view", "--png", "a.png", "--until-done", "--at", "1kB"],
+        ["view", "--png", "a.png", "--until-done", "--roi", "0:9,0:9"],
+        ["view", "--png", "a.gif"],
+        ["open", "--png", "a.png"],
+        ["open", "--port", "65536"],
+        ["open", "other.npy", "http://host/a.lode"],
+        ["open", "s3://bucket/a.lode"],
     ],
 )
 def test_wrong_command_lines(container: Path, arguments: list[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        main(["view", str(container), *arguments])
+        main([*arguments, str(container)])
     assert ended.value.code == 2
 
 
@@ -241,11 +244,11 @@ def test_a_container_of_another_host_that_has_changed(tmp_path: Path, container:
 def viewing(built: Path, container: Path) -> Iterator[subprocess.Popen[str]]:
     code = (
         f"import sys; from pathlib import Path; from lodestream import page; made = page.assets(Path({str(built)!r}))\n"
-        "from lodestream_client.commands import view; view.assets = lambda: made\n"
+        "from lodestream_client.commands import open; open.assets = lambda: made\n"
         "from lodestream_client.program import main; sys.exit(main(sys.argv[1:]))"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONUNBUFFERED": ""}
-    command = [sys.executable, "-c", code, "view", str(container), "--no-browser"]
+    command = [sys.executable, "-c", code, "open", str(container), "--no-browser"]
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
