@@ -52,6 +52,7 @@ PLACES = (
     "scratch",
     "scratch/index.sqlite",
     "scratch/incoming",
+    "scratch/partial",
     "scratch/work",
     "scratch/levels",
 )

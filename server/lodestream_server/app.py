@@ -29,11 +29,12 @@ from .operation.metrics import Metrics
 from .operation.observation import Observation
 from .operation.pace import Pace, Paced
 from .operation.settings import Settings
-from .routes import files, interface, levels, maps, names, pages, streams, surfaces
+from .routes import files, interface, levels, maps, names, pages, resumable, streams, surfaces
 from .routes.routing import State
 from .store.containers import Containers
 from .store.data_folder import DataFolder
 from .store.index import Surface
+from .store.partial_uploads import PartialUploads
 from .upkeep import Upkeep
 
 __all__ = ["create_app"]
@@ -92,8 +93,11 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             return len(surfaces.index) + named, surfaces.index.count_of(owner) + named_by_owner
 
         def kept(owner: str | None) -> int:
-            return surfaces.index.kept(owner)
+            return surfaces.index.kept(owner) + partial_uploads.kept(owner)
 
+        partial_uploads = await asyncio.to_thread(
+            PartialUploads, folder.partial, chosen.max_partial_uploads, chosen.partial_seconds
+        )
         containers = Containers(surfaces, lost=queue_again)
         limits = Limits(chosen, (folder.root, folder.scratch), count, kept, lambda: access.alone)
         builder = Builder(surfaces, Work(folder.work), chosen, limits, metrics.built)
@@ -101,9 +105,21 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         files_of_levels = await asyncio.to_thread(_level_files, chosen, folder, limits)
         levels = LevelMaker(chosen, containers, files_of_levels, builder.fork_server, limits)
         tiles = TileMaker(chosen, containers, builder.fork_server, limits)
-        upkeep = Upkeep(surfaces, builder, levels)
+        upkeep = Upkeep(surfaces, builder, levels, partial_uploads)
         app.state.parts = State(
-            chosen, folder, surfaces, upkeep, builder, containers, access, limits, metrics, levels, tiles, pace
+            settings=chosen,
+            folder=folder,
+            surfaces=surfaces,
+            partial_uploads=partial_uploads,
+            upkeep=upkeep,
+            builder=builder,
+            containers=containers,
+            access=access,
+            limits=limits,
+            metrics=metrics,
+            levels=levels,
+            tiles=tiles,
+            pace=pace,
         )
         try:
             await builder.start()
@@ -131,7 +147,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app)
     for status in (404, 405):  # of the framework; routes raise errors of ours
         app.add_exception_handler(status, unrouted)
-    routers = (pages.router, surfaces.router, names.router, files.router, levels.router, maps.router, streams.router)
+    modules = (pages, surfaces, resumable, names, files, levels, maps, streams)
+    routers = [module.router for module in modules]
     for router in routers:
         app.include_router(router)
     app.state.routes = [router.routes for router in routers]
@@ -143,9 +160,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.add_middleware(
             CORSMiddleware,
             allow_origins=chosen.origins,
-            allow_methods=["DELETE", "GET", "HEAD", "POST", "PUT"],
-            allow_headers=["authorization", "if-none-match", "if-range", "range"],
-            expose_headers=["content-location", "content-range", "etag", "location", "retry-after", "x-request-id"],
+            allow_methods=["DELETE", "GET", "HEAD", "PATCH", "POST", "PUT"],
+            allow_headers=["authorization", "if-none-match", "if-range", "range", *resumable.REQUEST_HEADERS],
+            expose_headers=[
+                *("content-location", "content-range", "etag", "location", "retry-after", "x-request-id"),
+                *resumable.ANSWER_HEADERS,
+            ],
         )
     app.add_middleware(Paced, pace=pace)
     app.add_middleware(Observation, metrics=metrics, log_reads=chosen.log_reads)

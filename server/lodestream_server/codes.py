@@ -111,11 +111,28 @@ MEANINGS: Mapping[str, Meaning] = {
         "There is no such method here",
         "The address is right, but not the method. The header `Allow` says which there are.",
     ),
+    "wrong-offset": Meaning(
+        409,
+        "The bytes are not the next ones of the upload",
+        "The upload has fewer or more bytes than the client believes; `Upload-Offset` says how many. Go on there.",
+    ),
+    "wrong-version": Meaning(
+        412,
+        "The request does not name the version of the protocol",
+        "Requests about resumable uploads have the header `Tus-Resumable: 1.0.0`. The client is none of tus, or one of "
+        "another version.",
+    ),
     "too-large": Meaning(
         413,
         "The request, or what it asks for, is too large",
         "`detail` says which limit is exceeded. Send or ask for less, such as a coarser level; or whoever runs the "
         "server raises the limit.",
+    ),
+    "wrong-type": Meaning(
+        415,
+        "The body has another type",
+        "A part of a resumable upload has the header `Content-Type: application/offset+octet-stream`. This is a fault "
+        "of the client.",
     ),
     "requested-range-not-satisfiable": Meaning(
         416,
@@ -138,6 +155,12 @@ MEANINGS: Mapping[str, Meaning] = {
         "An option does not exist, or its value is not valid",
         "A parameter of the address, or an option of the upload, is unknown or has a value that it cannot have. "
         "`detail` says which, and what there is.",
+    ),
+    "locked": Meaning(
+        423,
+        "Another request is at work on this upload",
+        "Two requests send the same upload; one of them goes on. A client that has lost its connection asks for the "
+        "offset first (`HEAD`), which ends the request that was lost.",
     ),
     "no-websocket": Meaning(
         426,

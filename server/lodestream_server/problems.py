@@ -41,6 +41,7 @@ __all__ = [
     "DamagedNameError",
     "ForeignOriginError",
     "FullError",
+    "LockedError",
     "NoTokenError",
     "NoWebSocketError",
     "NotOwnerError",
@@ -51,6 +52,9 @@ __all__ = [
     "SlowUploadError",
     "SmallScopeError",
     "TooManyError",
+    "WrongOffsetError",
+    "WrongTypeError",
+    "WrongVersionError",
     "answer",
     "document",
     "install",
@@ -92,6 +96,36 @@ class SlowUploadError(LodestreamError):
 
 class SilentError(LodestreamError):
     """The client of a stream sent nothing, or did not read, for too long."""
+
+
+class WrongOffsetError(LodestreamError):
+    """Bytes of an upload that are not the next ones.
+
+    Attributes
+    ----------
+    headers : mapping of str to str
+        With the offset of the next ones.
+    """
+
+    def __init__(self, expected: int, got: int) -> None:
+        super().__init__(f"The upload goes on at byte {expected}, and these bytes begin at {got}")
+        self.headers = {"upload-offset": str(expected)}
+
+
+class LockedError(LodestreamError):
+    """Another request is at work on the same upload."""
+
+    headers: ClassVar = {"retry-after": "1"}
+
+
+class WrongVersionError(LodestreamError):
+    """A request of another version of the protocol of resumable uploads."""
+
+    headers: ClassVar = {"tus-version": "1.0.0"}
+
+
+class WrongTypeError(LodestreamError):
+    """A body of a type that the route does not take."""
 
 
 class NoTokenError(LodestreamError):
@@ -163,6 +197,10 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     UnavailableError: _Kind("unavailable"),
     NotFoundError: _Kind("not-found"),
     SlowUploadError: _Kind("idle"),
+    WrongOffsetError: _Kind("wrong-offset"),
+    LockedError: _Kind("locked"),
+    WrongVersionError: _Kind("wrong-version"),
+    WrongTypeError: _Kind("wrong-type"),
     SilentError: _Kind("idle"),
     NoTokenError: _Kind("no-token"),
     BadTokenError: _Kind("bad-token"),

@@ -9,6 +9,7 @@ from contextlib import suppress
 from .builds.builder import Builder
 from .builds.level_maker import LevelMaker
 from .store.index import IndexLostError, Surface
+from .store.partial_uploads import PartialUploads
 from .store.surfaces import Surfaces
 
 __all__ = ["Upkeep"]
@@ -31,12 +32,16 @@ class Upkeep:
     surfaces : Surfaces
     builder : Builder
     levels : LevelMaker
+    partial_uploads : PartialUploads
     """
 
-    def __init__(self, surfaces: Surfaces, builder: Builder, levels: LevelMaker) -> None:
+    def __init__(
+        self, surfaces: Surfaces, builder: Builder, levels: LevelMaker, partial_uploads: PartialUploads
+    ) -> None:
         self._surfaces = surfaces
         self._builder = builder
         self._levels = levels
+        self._partial_uploads = partial_uploads
         self._lost, self._synced = asyncio.Event(), asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -44,7 +49,8 @@ class Upkeep:
         """Begin."""
         loop = asyncio.get_running_loop()
         self._surfaces.tell_lost = lambda: loop.call_soon_threadsafe(self._lost.set)
-        self._tasks = [asyncio.create_task(self._keep_index()), asyncio.create_task(self._expire())]
+        works = (self._keep_index(), self._expire(), self._expire_uploads())
+        self._tasks = [asyncio.create_task(work) for work in works]
 
     async def close(self) -> None:
         """End."""
@@ -91,4 +97,9 @@ class Upkeep:
                     pass  # it is told; what is due stays so
                 except Exception:
                     _log.exception("replaced surfaces cannot be deleted now, which is tried again")
+            await asyncio.sleep(_EXPIRE_SECONDS)
+
+    async def _expire_uploads(self) -> None:
+        while True:
+            await self._partial_uploads.expire()
             await asyncio.sleep(_EXPIRE_SECONDS)

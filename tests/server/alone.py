@@ -32,7 +32,9 @@ def _within() -> dict[str, Any]:
         with contextlib.suppress(OSError):
             target = str(link.readlink())
             sockets += target.startswith("socket:")
-            if any(f"/{name}/" in target for name in ("containers", "incoming", "uploads", "work", "records")):
+            if any(
+                f"/{name}/" in target for name in ("containers", "incoming", "partial", "uploads", "work", "records")
+            ):
                 files.append(target)
     return {"tasks": tasks, "sockets": sockets, "files": files}
 

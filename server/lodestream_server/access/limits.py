@@ -87,7 +87,7 @@ class Limits:
         self._alone = alone
         share = partial(Share, alone=alone)
         stored = partial(share, full=FullError, beyond=FullError, advice="delete some of them")
-        # What callers share. Of the last four it is counted elsewhere who has how much.
+        # What callers share. Of the last five it is counted elsewhere who has how much.
         self._uploads = share("uploads in progress", settings.max_uploads)
         self.builds = share("pending builds", settings.max_builds)
         self.streams = share("open streams", settings.max_streams)
@@ -97,6 +97,9 @@ class Limits:
         self.tiles = share("requests for tiles", settings.max_tile_requests)
         self.lent = share("bytes of levels that are being read", 0, advice="read them first")
         self._indexes = share("bytes of memory for indexes of surfaces that are streamed", 0)
+        self._partial = stored(
+            "resumable uploads", settings.max_partial_uploads, advice="complete some of them, or give them up"
+        )
         self._surfaces = stored("surfaces", settings.max_surfaces)
         self._kept = stored("bytes of surfaces", 0, each=settings.owner_bytes)
         self.plans = Turns(1, _PLANS_REMEMBERED)
@@ -126,10 +129,20 @@ class Limits:
                 yield BASE_CREDIT + more
 
     @asynccontextmanager
-    async def upload(self, request: Request, caller: Caller, *, stored: bool = True) -> AsyncIterator[Request]:
+    async def upload(
+        self, request: Request, caller: Caller, *, stored: bool = True, size: int | None = None
+    ) -> AsyncIterator[Request]:
         """Count an upload in progress, and yield a request that checks the limits while its body arrives.
 
         An upload that is not stored needs no disk space and makes no surface, so only the number of uploads limits it.
+
+        Parameters
+        ----------
+        request : Request
+        caller : Caller
+        stored : bool
+        size : int or None
+            Bytes that are announced; None: as many as the body has.
 
         Raises
         ------
@@ -145,8 +158,9 @@ class Limits:
         """
         if stored:
             self.builds.check(caller)
-        size = request.headers.get("content-length", "")
-        promised = int(size) if size.isascii() and size.isdecimal() and len(size) < 19 else 0
+        length = request.headers.get("content-length", "")
+        promised = int(length) if length.isascii() and length.isdecimal() and len(length) < 19 else 0
+        promised = promised if size is None else size
         # One that is too large anyway is refused for that.
         room = _Room(self, caller, promised if stored and promised <= self._settings.upload_bytes else 0, stored)
         clock = asyncio.timeout(None)
@@ -235,6 +249,16 @@ class Limits:
         size = min(size, room.promised)
         room.promised -= size
         _subtract(self._promised, room.caller.key, size)
+
+    def check_partial(self, caller: Caller, count: int, own: int) -> None:
+        """Check that a caller may begin one more resumable upload, of `count` ones and `own` of its owner.
+
+        Raises
+        ------
+        FullError
+            If there are as many as allowed, or fewer would be left for others than it has.
+        """
+        self._partial.check(_owner(caller.owner), held=Held(self._settings.max_partial_uploads, count, own))
 
     def check_index(self, caller: Caller, size: int, most: int, taken: int, own: int) -> None:
         """Check that a caller may have memory for one more index; may be called from any thread.

@@ -47,6 +47,7 @@ from lodestream.stores import AbsentError, StoreError
 from ..access.access import key_of
 from ..access.limits import Limits
 from ..operation.settings import Settings
+from ..operation.threads import carried_out
 from ..problems import FullError
 from ..store.durable import discard
 from ..store.index import IndexLostError, Surface
@@ -60,7 +61,7 @@ from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
 from .fork_server import Allowed
 from .processes import Call, ForkServer, Pool
-from .runner import Runner, carried_out
+from .runner import Runner
 from .work import Work
 
 __all__ = ["Builder"]

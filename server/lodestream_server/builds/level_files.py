@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from ..operation.threads import carried_out
 from ..store.durable import discard
-from .runner import carried_out
 
 __all__ = ["REMOVED", "Key", "Lease", "LevelFiles"]
 

@@ -33,6 +33,7 @@ from ..access.access import Caller
 from ..access.limits import Limits
 from ..access.shares import Held
 from ..operation.settings import Settings
+from ..operation.threads import carried_out
 from ..problems import BusyError, FullError
 from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
@@ -41,7 +42,7 @@ from .fork_server import Allowed
 from .level_files import REMOVED, Key, Lease, LevelFiles
 from .levels import LevelJob, MadeLevel, make_level
 from .processes import Call, ForkServer, Pool
-from .runner import Runner, carried_out
+from .runner import Runner
 
 __all__ = ["LevelMaker", "Loan"]
 

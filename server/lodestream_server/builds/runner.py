@@ -29,7 +29,7 @@ from ..operation.logs import event
 from ..problems import RestartingError
 from .processes import Call, Question, Worker
 
-__all__ = ["Runner", "Work", "carried_out"]
+__all__ = ["Runner", "Work"]
 
 _log = logging.getLogger(__name__)
 
@@ -182,19 +182,6 @@ class Runner(Generic[_Key, _Call]):
         # Before their end: a process that is kept would finish first what was begun.
         await asyncio.to_thread(self._worker.close)
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-async def carried_out(change: Callable[[], None]) -> None:
-    """Make or remove files of a job in a thread, to the end even if the task is cancelled.
-
-    Otherwise a thread that has not begun would never run, and one that has would go on beside what comes next.
-    """
-    changing = asyncio.ensure_future(asyncio.to_thread(change))
-    try:
-        await asyncio.shield(changing)
-    except asyncio.CancelledError:
-        await asyncio.gather(changing, return_exceptions=True)
-        raise
 
 
 def _cut_short(task: asyncio.Task[Any]) -> None:

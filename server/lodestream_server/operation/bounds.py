@@ -29,6 +29,8 @@ class Bounds(BaseModel):
 
     upload_files: int = _count(64, "files in one upload")
     max_uploads: int = _count(64, "uploads in progress")
+    max_partial_uploads: int = _count(256, "resumable uploads that are not complete")
+    partial_seconds: float = _seconds(86400.0, "seconds for which a resumable upload is kept that nobody continues")
     max_surfaces: int = _count(100_000, "surfaces on the server")
     owner_bytes: int | None = _follows(
         1,

@@ -9,15 +9,20 @@ from lodestream.quality import EFFORTS
 __all__ = [
     "BINARY",
     "CONTAINER_TYPE",
+    "CONTINUED",
     "LEVEL",
     "NAMES",
+    "OVERRIDDEN",
     "PAGE",
     "POINTING",
     "PROBLEM_SCHEMA",
     "QUEUED",
     "READY",
+    "RESUMABLE",
     "UPLOAD",
+    "VERSIONED",
     "answer",
+    "headed",
 ]
 
 CONTAINER_TYPE = "application/vnd.lodestream.container"
@@ -159,6 +164,47 @@ UPLOAD: dict[str, Any] = {
     },
 }
 
+
+def _header(name: str, description: str, *, required: bool = True, **schema: Any) -> dict[str, Any]:
+    return {"name": name, "in": "header", "required": required, "description": description, "schema": schema}
+
+
+_TUS = _header("Tus-Resumable", "version of the protocol", type="string", enum=["1.0.0"])
+
+#: The query and headers of the beginning of a resumable upload.
+RESUMABLE: dict[str, Any] = {
+    "parameters": [
+        *UPLOAD["parameters"],
+        _TUS,
+        _header("Upload-Length", "bytes of the file", type="integer", minimum=1),
+        _header(
+            "Upload-Metadata",
+            "`filename`, `filetype` and `sha256`, each followed by its Base64, with commas between them",
+            required=False,
+            type="string",
+            maxLength=4096,
+        ),
+    ],
+}
+
+#: The headers and body of a request that continues one.
+CONTINUED: dict[str, Any] = {
+    "parameters": [_TUS, _header("Upload-Offset", "bytes that are there", type="integer", minimum=0)],
+    "requestBody": {"required": True, "content": {"application/offset+octet-stream": {"schema": BINARY}}},
+}
+
+#: The same with another method.
+OVERRIDDEN: dict[str, Any] = {
+    **CONTINUED,
+    "parameters": [
+        *CONTINUED["parameters"],
+        _header("X-HTTP-Method-Override", "the method that is meant", type="string", enum=["PATCH", "HEAD", "DELETE"]),
+    ],
+}
+
+#: The headers of all other requests about one.
+VERSIONED: dict[str, Any] = {"parameters": [_TUS]}
+
 PROBLEM_SCHEMA: dict[str, Any] = {
     "title": "Problem",
     "description": "A problem document (RFC 9457)",
@@ -184,3 +230,11 @@ def answer(description: str, example: dict[str, Any], *, location: bool = False)
     if location:
         documented["headers"] = {"Location": {"description": "the surface", "schema": {"type": "string"}}}
     return documented
+
+
+def headed(description: str, **headers: str) -> dict[str, Any]:
+    """Return an OpenAPI response without a body, whose headers say everything."""
+    return {
+        "description": description,
+        "headers": {name: {"description": meaning, "schema": {"type": "string"}} for name, meaning in headers.items()},
+    }

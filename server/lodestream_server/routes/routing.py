@@ -20,6 +20,7 @@ from ..operation.pace import Pace
 from ..operation.settings import Settings
 from ..store.containers import Containers
 from ..store.data_folder import DataFolder
+from ..store.partial_uploads import PartialUploads
 from ..store.surfaces import Surfaces
 from ..upkeep import Upkeep
 
@@ -35,6 +36,7 @@ class State:
     settings: Settings
     folder: DataFolder
     surfaces: Surfaces
+    partial_uploads: PartialUploads
     upkeep: Upkeep
     builder: Builder
     containers: Containers

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,7 +27,7 @@ from ..store.layout import Manifest
 from . import examples
 from .routing import Parts, State, readable
 
-__all__ = ["answer", "base", "owned", "router"]
+__all__ = ["answer", "base", "keep", "owned", "router"]
 
 router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
 
@@ -74,7 +75,9 @@ async def upload(caller: Writer, request: Request, parts: Parts) -> Response:
                 raise refusal from None
             surface = known
         else:
-            received, surface = await _keep(watched, chosen, caller, parts)
+            received, surface = await keep(
+                lambda folder: uploads.receive(watched, folder, parts.settings, chosen.filename), chosen, caller, parts
+            )
     parts.metrics.uploaded(received.size)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
     return await answer(surface, caller, parts, request, located=True)
@@ -179,13 +182,22 @@ def _changeable(caller: Caller, parts: State, surface: str) -> Surface:
     return found
 
 
-async def _keep(
-    request: Request, chosen: options.SurfaceOptions, caller: Caller, parts: State
+async def keep(
+    receive: Callable[[Path], Awaitable[uploads.Upload]], chosen: options.SurfaceOptions, caller: Caller, parts: State
 ) -> tuple[uploads.Upload, Surface]:
+    """Make a surface of what `receive` puts into the folder that it is given; return both.
+
+    Raises
+    ------
+    InputError
+        If no surface can be made of it.
+    BusyError, StoreError
+        If it cannot be kept now.
+    """
     try:
         folder = await asyncio.to_thread(parts.folder.new_upload)
         try:
-            received = await uploads.receive(request, folder, parts.settings, chosen.filename)
+            received = await receive(folder)
             manifest = await asyncio.to_thread(_manifest, received, chosen, caller.owner, parts)
         except BaseException:
             await asyncio.to_thread(discard, folder)

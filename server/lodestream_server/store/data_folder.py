@@ -8,11 +8,13 @@
     DATA/lock               locked by the one process that uses the folder
     SCRATCH/index.sqlite    see `index`
     SCRATCH/incoming/       uploads in progress
+    SCRATCH/partial/        uploads that are sent in parts, see `partial_uploads`
     SCRATCH/work/           builds in progress, see `builds.work`
     SCRATCH/levels/         levels as files, made on request
 
 SCRATCH is DATA/scratch, or the folder ``lodestream`` where the setting `scratch` says. All of it can be made again: it
-may be removed while no server runs. What a start finds of uploads and levels is of a server that ended, and is removed.
+may be removed while no server runs; what was being sent in parts is then sent again. What a start finds of other
+uploads and of levels is of a server that ended, and is removed.
 """
 
 from __future__ import annotations
@@ -90,6 +92,8 @@ class DataFolder:
         Folder of builds.
     levels : Path
         Folder of levels as files.
+    partial : Path
+        Folder of uploads that are sent in parts.
 
     Raises
     ------
@@ -102,7 +106,7 @@ class DataFolder:
     def __init__(self, root: Path, scratch: Path | None = None) -> None:
         self.root = root
         self.scratch = scratch = scratch_of(root, scratch)
-        self.work, self.levels = scratch / "work", scratch / "levels"
+        self.work, self.levels, self.partial = scratch / "work", scratch / "levels", scratch / "partial"
         self._incoming = scratch / "incoming"
         new = make_private(root)
         self._guards = [claim(root)]

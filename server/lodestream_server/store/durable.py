@@ -10,7 +10,8 @@ import logging
 import os
 import secrets
 import shutil
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -18,6 +19,8 @@ from typing import BinaryIO, Self
 __all__ = ["Disk", "NewFile", "discard", "disk", "make_folder", "remove", "rename", "sync_folder"]
 
 _log = logging.getLogger(__name__)
+
+_COPIED = 1 << 20
 
 
 class Disk:
@@ -32,6 +35,14 @@ class Disk:
         # Unbuffered: the bytes reach the file in `write`, and nothing is left to fail when it is closed.
         return open(path, "xb", buffering=0, opener=_private)
 
+    @contextmanager
+    def extend(self, path: Path, size: int) -> Iterator[BinaryIO]:
+        """Open a file for writing after so many bytes; what is beyond them is cut off."""
+        with open(path, "r+b", buffering=0) as file:
+            file.truncate(size)
+            file.seek(size)
+            yield file
+
     def write(self, file: BinaryIO, data: bytes) -> None:
         """Append bytes, all of them."""
         rest = memoryview(data)
@@ -41,6 +52,16 @@ class Disk:
     def sync(self, handle: int, path: Path) -> None:
         """Synchronise a file's bytes, or the names in a folder, to disk."""
         os.fsync(handle)
+
+    def link(self, source: Path, target: Path) -> None:
+        """Give a file a second name; where that is not possible, make a copy."""
+        try:
+            target.hardlink_to(source)
+        except FileNotFoundError:
+            raise
+        except OSError:
+            with source.open("rb") as file, self.create(target) as copy:
+                shutil.copyfileobj(file, copy, _COPIED)
 
     def rename(self, source: Path, target: Path) -> None:
         """Rename a file or folder, replacing what has the new name."""

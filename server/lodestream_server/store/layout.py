@@ -24,6 +24,7 @@ import json
 import re
 import secrets
 import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from typing import Any, TypeVar
@@ -52,6 +53,7 @@ __all__ = [
     "Name",
     "Summary",
     "built_key",
+    "check_text",
     "container_key",
     "describe",
     "dump",
@@ -140,12 +142,17 @@ class Manifest:
     write: str
 
     def __post_init__(self) -> None:
-        length = len(json.dumps([self.name, self.filenames, self.options], ensure_ascii=False).encode())
-        if length > MOST_TEXT:
-            raise InputError(
-                f"Names and options of a surface may have {MOST_TEXT} bytes, and these have {length}: shorter names of "
-                "files, or fewer files, will do"
-            )
+        check_text(self.name, self.filenames, self.options)
+
+
+def check_text(name: str | None, filenames: Sequence[str], options: Mapping[str, str]) -> None:
+    """Check the length of the texts of a surface; InputError is raised if it is more than `MOST_TEXT`."""
+    length = len(json.dumps([name, filenames, options], ensure_ascii=False).encode())
+    if length > MOST_TEXT:
+        raise InputError(
+            f"Names and options of a surface may have {MOST_TEXT} bytes, and these have {length}: shorter names of "
+            "files, or fewer files, will do"
+        )
 
 
 @dataclass(frozen=True)

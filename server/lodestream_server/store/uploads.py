@@ -26,10 +26,11 @@ from .layout import Manifest
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks
 
-__all__ = ["Body", "Upload", "check_upload", "digest_of", "receive", "take_apart"]
+__all__ = ["Body", "Upload", "blocks", "check_promised", "check_upload", "digest_of", "receive", "take_apart"]
 
 # Larger blocks than the network's, so that a thread is asked less often; small enough for many uploads at once.
 _BUFFER = 64 * 1024
+_READ = 1 << 20
 _FIELD = "file"
 _MOST_PART_HEADERS = 16 * 1024
 
@@ -106,6 +107,20 @@ class Upload:
         self._file = None
         self._stack.close()
 
+    def adopt(self, name: str | None) -> str:
+        """Take the next file as it is there already, complete; return the SHA-256 of the file alone."""
+        assert self._folder is not None
+        path, before = self._folder / str(len(self.names)), self.size
+        alone = hashlib.sha256()
+        self.names.append(name)
+        with path.open("rb") as file:
+            while block := file.read(_READ):
+                alone.update(block)
+                self.digest.update(block)
+                self.size += len(block)
+        self.digest.update((self.size - before).to_bytes(8, "big"))
+        return alone.hexdigest()
+
     def abort(self) -> None:
         """Close open files, after an error."""
         self._stack.close()
@@ -127,7 +142,7 @@ def digest_of(files: Iterable[Path]) -> str:
     for path in files:
         size = 0
         with path.open("rb") as file:
-            while block := file.read(1 << 20):
+            while block := file.read(_READ):
                 digest.update(block)
                 size += len(block)
         digest.update(size.to_bytes(8, "big"))
@@ -264,11 +279,11 @@ async def receive(request: Request, folder: Path | None, settings: Settings, nam
     SlowUploadError
         If nothing arrived for too long.
     """
-    _check_promised(request, settings.upload_bytes)
+    check_promised(request, settings.upload_bytes)
     upload = Upload(folder, settings.upload_files)
     try:
         reader = await asyncio.to_thread(take_apart, upload, request.headers.get("content-type"), name)
-        async for block in _blocks(request, settings):
+        async for block in blocks(request, settings, settings.upload_bytes):
             await asyncio.to_thread(reader.feed, block)
         await asyncio.to_thread(reader.finish)
     finally:
@@ -296,13 +311,29 @@ def take_apart(upload: Upload, content_type: str | None, name: str | None = None
         raise FormatError(f"The boundary of the form cannot be used: {error}") from None
 
 
-def _check_promised(request: Request, most: int) -> None:
+def check_promised(request: Request, most: int) -> None:
+    """Check the announced length of a body.
+
+    Raises
+    ------
+    TooLargeError
+        If it is more than `most` bytes.
+    """
     promised = request.headers.get("content-length", "")
     if promised.isdecimal() and int(promised) > most:
         raise TooLargeError(f"The upload has {promised} bytes, and may have {most}")
 
 
-async def _blocks(request: Request, settings: Settings) -> AsyncIterator[bytes]:
+async def blocks(request: Request, settings: Settings, most: int) -> AsyncIterator[bytes]:
+    """Yield the body of a request in larger blocks; what came before an error, or the end of the task, is too.
+
+    Raises
+    ------
+    TooLargeError
+        If there are more than `most` bytes.
+    SlowUploadError
+        If nothing arrived for too long.
+    """
     pending = bytearray()
     size = 0
     chunks = aiter(request.stream())
@@ -310,13 +341,17 @@ async def _blocks(request: Request, settings: Settings) -> AsyncIterator[bytes]:
         try:
             async with asyncio.timeout(settings.idle_seconds):
                 chunk = await anext(chunks, None)
-        except TimeoutError:
+        except (Exception, asyncio.CancelledError) as error:
+            if pending:
+                yield bytes(pending)
+            if not isinstance(error, TimeoutError):
+                raise
             raise SlowUploadError(f"Nothing more of the upload came within {settings.idle_seconds:g} s") from None
         if chunk is None:
             break
         size += len(chunk)
-        if size > settings.upload_bytes:
-            raise TooLargeError(f"The upload has more than the {settings.upload_bytes} bytes that it may have")
+        if size > most:
+            raise TooLargeError(f"The upload has more than the {most} bytes that it may have")
         pending += chunk
         if len(pending) >= _BUFFER:
             yield bytes(pending)

@@ -40,6 +40,12 @@ ROUTES: dict[tuple[str, str], str | None] = {
     ("GET", "/v1/surfaces/{surface}/stream"): "read",
     ("GET", "/v1/surfaces/{surface}/levels/{level}"): "read",
     ("GET", "/v1/containers/{sha256}.lode"): "read",
+    ("OPTIONS", "/v1/uploads"): "write",
+    ("POST", "/v1/uploads"): "write",
+    ("POST", "/v1/uploads/{upload}"): "write",
+    ("PATCH", "/v1/uploads/{upload}"): "write",
+    ("DELETE", "/v1/uploads/{upload}"): "write",
+    ("HEAD", "/v1/uploads/{upload}"): "write",
     ("GET", "/v1/names"): "read",
     ("PUT", "/v1/names/{name}"): "write",
     ("GET", "/v1/names/{name}"): "read",
@@ -51,7 +57,7 @@ ROUTES: dict[tuple[str, str], str | None] = {
         for path in ("map.json", "tiles/{z}/{x}/{y}.{image}", "terrain/layer.json", "terrain/{z}/{x}/{y}.terrain")
     },
 }
-GUARDED = [(method, path) for (method, path), scope in ROUTES.items() if scope is not None]
+GUARDED = [(method, path) for (method, path), scope in ROUTES.items() if scope is not None and method != "HEAD"]
 WRITING = [(method, path) for method, path in GUARDED if method != "GET"]
 LOCAL = "http://127.0.0.1:8000"
 
@@ -185,12 +191,12 @@ def test_every_route_is_known_here(tmp_path: Path) -> None:
         (method, getattr(route, "path", ""))
         for route in routes_of(app)
         for method in getattr(route, "methods", None) or ()
-        if method != "HEAD"
     }
-    assert routes == set(ROUTES)
+    # HEAD is like GET where there is one.
+    assert {(method, path) for method, path in routes if method != "HEAD" or ("GET", path) not in routes} == set(ROUTES)
 
 
-@pytest.mark.parametrize(("method", "path"), ROUTES)
+@pytest.mark.parametrize(("method", "path"), [key for key in ROUTES if key[0] != "HEAD"])  # whose answers have no body
 def test_a_token_opens_what_its_scope_says(locked: Door, keys: Keys, method: str, path: str) -> None:
     needed = ROUTES[method, path]
     nothing = locked.ask(method, path)

@@ -54,6 +54,7 @@ NOT_SHARED = {
     "dask": "an address; builds go there in their turns (workers)",
     "upload_bytes": "of one upload",
     "upload_files": "of one upload",
+    "partial_seconds": "a time; what it keeps counts as its owner's (max_partial_uploads, owner_bytes)",
     "max_vertices": "of one surface",
     "keep_free": "disk space that nobody gets; the rest is shared (owner_bytes)",
     "threads": "of one build",
@@ -140,6 +141,16 @@ def surfaces(folder: Path) -> None:
 
     with pytest.raises(FullError, match="anna may have no more surfaces than are left for others"):
         asyncio.run(two())
+
+
+def partial_uploads(folder: Path) -> None:
+    town, there = Town(folder, max_partial_uploads=8), Counter[str | None]()
+
+    def take(caller: Caller) -> None:
+        town.limits.check_partial(caller, there.total(), there[caller.owner])
+        there[caller.owner] += 1
+
+    assert [taken(take, caller) for caller in (ANNA, BERT, CARL)] == [4, 2, 1]
 
 
 def disk(folder: Path) -> None:
@@ -322,6 +333,7 @@ def test_memory_of_indexes_is_shared(tmp_path: Path) -> None:
 SHARED: dict[str, Callable[[Path], None]] = {
     "max_uploads": uploads,
     "max_surfaces": surfaces,
+    "max_partial_uploads": partial_uploads,
     "owner_bytes": disk,
     "max_builds": builds,
     "max_streams": open_streams,

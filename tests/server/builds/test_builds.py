@@ -22,8 +22,8 @@ import pytest
 from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.builds import builder, worker
-from lodestream_server.builds.runner import carried_out
 from lodestream_server.builds.work import Work
+from lodestream_server.operation.threads import carried_out
 from lodestream_server.store.data_folder import DataFolder
 from lodestream_server.store.durable import discard
 from tests.server.builds import slow
@@ -329,7 +329,7 @@ def busy(answer: httpx.Response) -> bool:
     return problem(answer) == (503, "busy") and int(answer.headers["retry-after"]) >= 1
 
 
-@pytest.mark.parametrize("path", ["{url}/container", "{url}/levels/0", "/v1/containers/{container}.lode"])
+@pytest.mark.parametrize("path", ["{url}/container", "{url}/levels/0", "/v1/containers/{container_sha256}.lode"])
 def test_a_lost_container_is_built_again_when_somebody_opens_it(tmp_path: Path, path: str) -> None:
     data = tmp_path / "data"
     with running(data) as http:

@@ -306,6 +306,8 @@ def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None
         "/v1/names",
         "/v1/names/{name}",
         "/v1/names/{name}/container",
+        "/v1/uploads",
+        "/v1/uploads/{upload}",
         *(
             f"/v1/{kind}/{{surface}}/{path}"
             for kind in ("surfaces", "names")
