@@ -25,6 +25,7 @@ from .builds.level_files import LevelFiles
 from .builds.level_maker import LevelMaker
 from .builds.tile_maker import TileMaker
 from .builds.work import Work
+from .following import Following
 from .operation.metrics import Metrics
 from .operation.observation import Observation
 from .operation.pace import Pace, Paced
@@ -32,12 +33,12 @@ from .operation.settings import Settings
 from .routes import files, interface, levels, maps, names, pages, resumable, streams, surfaces
 from .routes.routing import State
 from .store.containers import Containers
-from .store.data_folder import DataFolder
+from .store.data import Data
 from .store.index import Surface
 from .store.partial_uploads import PartialUploads
 from .upkeep import Upkeep
 
-__all__ = ["create_app"]
+__all__ = ["create_app", "open_data"]
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     Returns
     -------
     FastAPI
-        An ASGI application. It opens its data folder when it starts and releases it when it ends.
+        An ASGI application. It opens its data when it starts and releases them when it ends.
 
     Raises
     ------
@@ -80,9 +81,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
         # A server has opened it before, so that it can say in one line why it does not start.
-        opened: DataFolder | None = getattr(app.state, "folder", None)
-        folder = await asyncio.to_thread(DataFolder, chosen.data, chosen.scratch) if opened is None else opened
-        surfaces, loop = folder.surfaces, asyncio.get_running_loop()
+        opened: Data | None = getattr(app.state, "data", None)
+        data = await asyncio.to_thread(open_data, chosen) if opened is None else opened
+        surfaces, loop = data.surfaces, asyncio.get_running_loop()
 
         def queue_again(lost: list[Surface]) -> None:
             for surface in lost:
@@ -96,19 +97,20 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             return surfaces.index.kept(owner) + partial_uploads.kept(owner)
 
         partial_uploads = await asyncio.to_thread(
-            PartialUploads, folder.partial, chosen.max_partial_uploads, chosen.partial_seconds
+            PartialUploads, data.partial, chosen.max_partial_uploads, chosen.partial_seconds
         )
         containers = Containers(surfaces, lost=queue_again)
-        limits = Limits(chosen, (folder.root, folder.scratch), count, kept, lambda: access.alone)
-        builder = Builder(surfaces, Work(folder.work), chosen, limits, metrics.built)
-        metrics.watch(folder.root, lambda: len(surfaces.index), lambda: builder.pending)
-        files_of_levels = await asyncio.to_thread(_level_files, chosen, folder, limits)
+        limits = Limits(chosen, data.disks, count, kept, lambda: access.alone, endless=data.is_endless)
+        builder = Builder(surfaces, Work(data.work), chosen, limits, metrics.built)
+        metrics.watch(data.disks[0], lambda: len(surfaces.index), lambda: builder.pending)
+        files_of_levels = await asyncio.to_thread(_level_files, chosen, data, limits)
         levels = LevelMaker(chosen, containers, files_of_levels, builder.fork_server, limits)
         tiles = TileMaker(chosen, containers, builder.fork_server, limits)
         upkeep = Upkeep(surfaces, builder, levels, partial_uploads)
+        following = Following(chosen, surfaces, access)
         app.state.parts = State(
             settings=chosen,
-            folder=folder,
+            data=data,
             surfaces=surfaces,
             partial_uploads=partial_uploads,
             upkeep=upkeep,
@@ -124,13 +126,16 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         try:
             await builder.start()
             upkeep.start()
+            data.start()
+            following.start()
             yield
         finally:
+            await asyncio.to_thread(following.close)
             await upkeep.close()
             await tiles.close()
             await levels.close()
             await builder.close()
-            await asyncio.to_thread(folder.close)
+            await asyncio.to_thread(data.close)
 
     app = FastAPI(
         title="Lodestream",
@@ -172,13 +177,18 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     return app
 
 
-def _level_files(settings: Settings, folder: DataFolder, limits: Limits) -> LevelFiles:
+def open_data(settings: Settings) -> Data:
+    """Open the data of a server; see `Data` for the errors."""
+    return Data(settings.data, settings.scratch, read_only=settings.read_only, lease_seconds=settings.lease_seconds)
+
+
+def _level_files(settings: Settings, data: Data, limits: Limits) -> LevelFiles:
     most = settings.level_disk
     if most is None:
         try:
-            size = shutil.disk_usage(folder.scratch).total
+            size = shutil.disk_usage(data.scratch).total
         except OSError as error:  # level files can be made again: no reason not to start
             _log.warning("the size of the disk is unknown, so that few level files are kept: %s", error)
             size = 0
         most = max(min(_LEVEL_DISK, size // 20), _LEAST_LEVEL_DISK)
-    return LevelFiles(folder.levels, most, limits.room)
+    return LevelFiles(data.levels, most, limits.room)

@@ -69,8 +69,8 @@ _OF_STREAMS = {
     "client.",
     "damaged": "The stored container is damaged. What was received before is right. Whoever runs the server repairs it "
     "with `lodestream fsck --repair`, which builds it again from the upload.",
-    "busy": "The server has as much in progress as it can handle, or its store does not answer. Try again after the "
-    "time in `Retry-After`.",
+    "busy": "The server has as much in progress as it can handle, its store does not answer, or another server of the "
+    "same bucket writes. Try again after the time in `Retry-After`.",
     "internal": "Something went wrong that nobody has foreseen. Nothing is told of it here; the server's log has it, "
     "beside the id in the header `X-Request-ID`.",
     "restarting": "The server is being stopped or started. Try again in a few seconds; clients of the project do.",
@@ -100,6 +100,12 @@ MEANINGS: Mapping[str, Meaning] = {
         "Pages of other sites may not do this",
         "A page of another site asked, and only this server's own page may. Whoever runs the server allows others with "
         "the setting `LODESTREAM_ORIGINS`.",
+    ),
+    "read-only": Meaning(
+        403,
+        "This server only reads",
+        "Several servers share the data, and this one never changes them. Send what changes something to the address "
+        "of one that writes.",
     ),
     "not-owner": Meaning(
         403,

@@ -47,10 +47,12 @@ __all__ = [
     "NotOwnerError",
     "NotReadyError",
     "PostponedError",
+    "ReadOnlyError",
     "RestartingError",
     "SilentError",
     "SlowUploadError",
     "SmallScopeError",
+    "StandbyError",
     "TooManyError",
     "WrongOffsetError",
     "WrongTypeError",
@@ -88,6 +90,16 @@ class NotOwnerError(LodestreamError):
 
 class DamagedNameError(LodestreamError):
     """What is stored of a name cannot be read."""
+
+
+class StandbyError(stores.StoreError):
+    """Another server writes to the bucket, or this one is about to."""
+
+    headers: ClassVar = {"retry-after": "5"}
+
+
+class ReadOnlyError(LodestreamError):
+    """This server only reads."""
 
 
 class SlowUploadError(LodestreamError):
@@ -218,6 +230,8 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     DamagedNameError: _Kind("damaged-name"),
     StreamError: _Kind("damaged"),
     UnsupportedVersionError: _Kind("unsupported-version"),
+    StandbyError: _Kind("busy"),
+    ReadOnlyError: _Kind("read-only"),
     stores.FullError: _Kind("disk-full", "Nothing was stored; delete surfaces or enlarge the disk"),
     stores.UnacknowledgedError: _Kind("busy", f"It is not known whether that was done; {_SEE_LOG}"),
     stores.StoreError: _Kind("busy", f"The server's store cannot be used now; {_SEE_LOG}"),

@@ -17,12 +17,11 @@ import uvicorn
 from lodestream.errors import LodestreamError
 from lodestream.protocol.messages import MAX_MESSAGE
 
-from .app import create_app
+from .app import create_app, open_data
 from .connections.connections import connections
 from .connections.cuts import Cuts
 from .operation.logs import drain
 from .operation.settings import Settings
-from .store.data_folder import DataFolder
 
 __all__ = ["Server", "make_server", "running_server", "serve_alone"]
 
@@ -40,7 +39,7 @@ class Server(uvicorn.Server):
     Attributes
     ----------
     refusal : LodestreamError, OSError or None
-        Why it did not start: its data folder could not be opened, or it cannot listen at its address.
+        Why it did not start: its data could not be opened, or it cannot listen at its address.
     """
 
     def __init__(self, config: uvicorn.Config, settings: Settings, listening: Callable[[str], None]) -> None:
@@ -51,10 +50,10 @@ class Server(uvicorn.Server):
         self._state = getattr(config.app, "state", None)
 
     async def startup(self, sockets: list[Any] | None = None) -> None:
-        """Open the data folder, listen, start, then report the address."""
+        """Open the data, listen, start, then report the address."""
         assert self._state is not None, "the application is that of `create_app`"
         try:
-            folder = await asyncio.to_thread(DataFolder, self._settings.data, self._settings.scratch)
+            data = await asyncio.to_thread(open_data, self._settings)
         except (LodestreamError, OSError) as error:
             self._refuse(error)
             return
@@ -62,10 +61,10 @@ class Server(uvicorn.Server):
             # uvicorn would write what is wrong into its log, and end the process with a code of its own.
             listening = await _listen(self.config.host, self.config.port, self.config.backlog)
         except LodestreamError as error:
-            folder.close()
+            data.close()
             self._refuse(error)
             return
-        self._state.folder = folder
+        self._state.data = data
         await super().startup(listening)
         if self.started:
             host, port = self.servers[0].sockets[0].getsockname()[:2]
@@ -171,13 +170,13 @@ def serve_alone(settings: Settings, listening: Callable[[str], None]) -> Server:
 
 
 @contextmanager
-def running_server(data: Path, **settings: Any) -> Iterator[str]:
+def running_server(data: Path | str, **settings: Any) -> Iterator[str]:
     """Run a server on a free port of this machine, in a thread, for the length of the ``with`` block.
 
     Parameters
     ----------
-    data : Path
-        The server's data folder.
+    data : Path or str
+        The server's data folder, or the address of a bucket.
     **settings
         Fields of `Settings`.
 

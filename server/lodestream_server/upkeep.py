@@ -1,10 +1,14 @@
-"""What a server does beside answering: it keeps its index up to date, makes a lost one again, deletes what is due."""
+"""What a server does beside answering: it keeps its index up to date, makes a lost one again, deletes what is due.
+
+Of servers that share a bucket the one with the lease builds and deletes, once it knows what others have done.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from contextlib import suppress
+from functools import partial
 
 from .builds.builder import Builder
 from .builds.level_maker import LevelMaker
@@ -22,6 +26,9 @@ _LOOK_SECONDS = 300.0
 # How often replaced surfaces are looked at, and what failed is tried again.
 _EXPIRE_SECONDS = 300.0
 _AGAIN_SECONDS = 2.0
+
+# How often strays in a bucket are collected; a folder has few, which `fsck` removes.
+_COLLECT_SECONDS = 6 * 3600.0
 
 
 class Upkeep:
@@ -48,13 +55,18 @@ class Upkeep:
     def start(self) -> None:
         """Begin."""
         loop = asyncio.get_running_loop()
-        self._surfaces.tell_lost = lambda: loop.call_soon_threadsafe(self._lost.set)
-        works = (self._keep_index(), self._expire(), self._expire_uploads())
+        wake = partial(loop.call_soon_threadsafe, self._lost.set)
+        self._surfaces.tell_lost = wake
+        if self._surfaces.lease is not None:
+            self._surfaces.lease.turned = wake
+        works = (self._keep_index(), self._expire(), self._expire_uploads(), self._collect())
         self._tasks = [asyncio.create_task(work) for work in works]
 
     async def close(self) -> None:
         """End."""
         self._surfaces.tell_lost = lambda: None
+        if self._surfaces.lease is not None:
+            self._surfaces.lease.turned = lambda: None
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -66,10 +78,13 @@ class Upkeep:
                     _log.error("the index of the surfaces is lost; requests are answered 503 until it is made again")
                     await asyncio.to_thread(self._surfaces.restore)
                     _log.info("the index of the surfaces is made again")
-                elif not self._surfaces.is_synced:
+                elif not self._surfaces.is_current:
                     await asyncio.to_thread(self._surfaces.sync)
                 self._synced.set()
-                await self._builder.resume()
+                if self._surfaces.writes:
+                    await self._builder.resume()
+                else:
+                    await self._builder.halt()
                 with suppress(TimeoutError):
                     async with asyncio.timeout(_LOOK_SECONDS):
                         await self._lost.wait()
@@ -89,7 +104,7 @@ class Upkeep:
     async def _expire(self) -> None:
         await self._synced.wait()
         while True:
-            if self._surfaces.is_synced:
+            if self._surfaces.is_synced and self._surfaces.writes:
                 try:
                     for surface in await asyncio.to_thread(self._surfaces.names.expire):
                         self.forget_levels(surface)
@@ -103,3 +118,13 @@ class Upkeep:
         while True:
             await self._partial_uploads.expire()
             await asyncio.sleep(_EXPIRE_SECONDS)
+
+    async def _collect(self) -> None:
+        while self._surfaces.lease is not None:
+            await asyncio.sleep(_COLLECT_SECONDS)
+            if self._surfaces.writes:
+                try:
+                    removed = await asyncio.to_thread(self._surfaces.collect)
+                    _log.info("removed %d objects that nothing refers to", len(removed))
+                except Exception as error:  # whatever it is, nobody else would do this work
+                    _log.error("strays could not be removed now, which is tried again: %s", error)

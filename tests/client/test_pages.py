@@ -52,6 +52,10 @@ RUN = {
     ("docs/protocol.md", "python"): "tests/client/stream/test_streams.py",
     ("docs/publishing.md", "indented"): "not run: the bucket is an example; tests/client/publishing runs the same",
     ("docs/python.md", "python"): "tests/client/test_python_page.py",
+    (
+        "docs/scaling.md",
+        "console",
+    ): "not run: the bucket is an example; tests/server/test_many_servers.py runs the same",
     ("docs/tutorial.md", "console"): "tests/test_tutorial.py",
     ("docs/tutorial.md", "indented"): "not run: pip needs the network; the test installs the wheel",
     ("docs/tutorial.md", "python"): "tests/test_tutorial.py",

@@ -39,6 +39,8 @@ EXPECTED = [
     (problems.NotOwnerError("x"), 403, "not-owner"),
     (problems.ForeignOriginError("x"), 403, "foreign-origin"),
     (problems.NoWebSocketError("x"), 426, "no-websocket"),
+    (problems.ReadOnlyError("x"), 403, "read-only"),
+    (problems.StandbyError("x"), 503, "busy"),
     (problems.TooManyError("x"), 429, "too-many"),
     (problems.BusyError("x"), 503, "busy"),
     (problems.RestartingError("x"), 503, "restarting"),

@@ -55,6 +55,8 @@ class Bucket:
     address : str
         Such as ``s3://bucket/prefix``; see `lodestream.stores.connections`.
     limits : Limits
+    fetched : Path, optional
+        Folder for the files of `local`, which is there; otherwise that of the system for what is temporary.
 
     Raises
     ------
@@ -66,7 +68,9 @@ class Bucket:
         If settings in the environment are missing or cannot be used.
     """
 
-    def __init__(self, address: str, limits: Limits | None = None) -> None:
+    at_once = 16
+
+    def __init__(self, address: str, limits: Limits | None = None, *, fetched: Path | None = None) -> None:
         place = parsed(address)
         endpoint_of(place.scheme)  # in words of ours, before the library tries it
         try:
@@ -79,6 +83,7 @@ class Bucket:
         self._address = place.address
         self._prefix = place.prefix
         self._limits = limits = limits or Limits()
+        self._fetched = fetched
         try:
             self._store = ask(lambda: connected(place, limits, limits.stalled, limits.request))
             self._parts = ask(lambda: connected(place, limits, limits.part, limits.part))
@@ -140,7 +145,7 @@ class Bucket:
     @contextmanager
     def local(self, key: str) -> Iterator[Path]:
         """Fetch an object into a temporary file for the length of a block."""
-        with TemporaryDirectory(prefix="lodestream-") as folder, self.open(key) as blob:
+        with TemporaryDirectory(prefix="lodestream-", dir=self._fetched) as folder, self.open(key) as blob:
             path = Path(folder) / key.rpartition("/")[2]
             try:
                 with path.open("wb") as file:

@@ -67,6 +67,8 @@ class Folder:
         Whether only the user who writes may access what is made; otherwise the umask of the process says who may.
     """
 
+    at_once = 1
+
     def __init__(self, root: str | os.PathLike[str], *, private: bool = False) -> None:
         self.root = Path(root).absolute()
         self._own = self.root / OWN

@@ -100,6 +100,11 @@ class Store(Protocol):
     A process that forks must do so before it opens a store; see `docs/stores.md`.
     """
 
+    @property
+    def at_once(self) -> int:
+        """How many reads are best made at the same time: each of a bucket takes a round trip."""
+        ...
+
     def get(self, key: str, most: int = SMALL) -> tuple[bytes, Tag]:
         """Read a small object and its tag.
 

@@ -19,7 +19,7 @@ from lodestream.errors import LodestreamError
 
 from ..operation.settings import Settings
 from ..problems import BadTokenError, ForeignOriginError, NoTokenError, SmallScopeError
-from .tokens import Tokens
+from .tokens import Tokens, tokens_of
 
 __all__ = ["Access", "Caller", "anybody", "is_loopback", "key_of"]
 
@@ -70,6 +70,11 @@ class Access:
     ----------
     settings : Settings
 
+    Attributes
+    ----------
+    look : callable
+        See `TokenList.look`; it waits for the store.
+
     Raises
     ------
     LodestreamError, OSError
@@ -79,17 +84,19 @@ class Access:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._tokens = Tokens(settings.tokens)
+        tokens = tokens_of(settings)
+        self._tokens = Tokens(tokens)
+        self.look = tokens.look
         if not (settings.insecure or self._tokens.used or is_loopback(settings.host)):
             raise LodestreamError(
-                f"expected a token in {settings.tokens}, since others can reach {settings.host}, got none; create one "
+                f"expected a token in {tokens.place}, since others can reach {settings.host}, got none; create one "
                 "with `lodestream token create`, or allow everything to everybody with --insecure"
             )
 
         anywhere = _ANY_SITE & set(settings.origins)
         if anywhere and not self._tokens.used:
             raise LodestreamError(
-                f"expected a token in {settings.tokens}, since LODESTREAM_ORIGINS={min(anywhere)} allows the pages of "
+                f"expected a token in {tokens.place}, since LODESTREAM_ORIGINS={min(anywhere)} allows the pages of "
                 "all sites, got none; create one with `lodestream token create`, or name the sites"
             )
 

@@ -43,6 +43,9 @@ _STREAM_SHARE = 8
 # What an upload may still take when the server is told to end.
 _LAST_SECONDS = 2.0
 
+# Free bytes of a store without an end: of it `owner_bytes` alone limits what an owner may have.
+_ENDLESS = 1 << 62
+
 # For so many seconds it counts who has had plans made.
 _PLANS_REMEMBERED = 60.0
 
@@ -62,6 +65,8 @@ class Limits:
         Returns the bytes on disk of an owner's surfaces and names.
     alone : callable
         Returns whether there is nobody to share with.
+    endless : bool
+        Whether what is stored takes no room on these disks.
 
     Attributes
     ----------
@@ -79,9 +84,12 @@ class Limits:
         surfaces: Callable[[str | None], tuple[int, int]],
         kept: Callable[[str | None], int],
         alone: Callable[[], bool],
+        *,
+        endless: bool = False,
     ) -> None:
         self._settings = settings
         self._folders = folders
+        self._endless = endless
         self._count_surfaces = surfaces
         self._count_kept = kept
         self._alone = alone
@@ -239,6 +247,7 @@ class Limits:
     async def _check_bytes(self, owner: str | None, free: int, promised: int) -> None:
         if self._settings.owner_bytes is None and self._alone():
             return
+        free = _ENDLESS if self._endless else free
         has = await asyncio.to_thread(self._count_kept, owner) + self._taken[owner]
         self._kept.check(_owner(owner), promised, Held(has + free, has, has))
 

@@ -1,4 +1,7 @@
-"""The scope that a route needs, as a dependency of FastAPI: it is asked for before any byte of a body is read."""
+"""The scope that a route needs, as a dependency of FastAPI: it is asked for before any byte of a body is read.
+
+What changes something is refused here too by a server that does not write.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,10 @@ class _Token(SecurityBase):
         self.scheme_name = SCHEME
 
     async def __call__(self, connection: HTTPConnection, scopes: SecurityScopes) -> Caller:
-        return _access(connection).authorize(connection, scopes.scope_str)
+        caller = _access(connection).authorize(connection, scopes.scope_str)
+        if connection.scope.get("method", "GET") not in _READING:
+            connection.app.state.parts.surfaces.check_writer()
+        return caller
 
 
 async def _stream_reader(socket: WebSocket) -> Caller | None:

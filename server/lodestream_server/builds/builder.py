@@ -200,8 +200,10 @@ class Builder:
     async def resume(self) -> None:
         """Take up builds of surfaces that are queued: more may have been found in the store.
 
-        Of a long queue some are taken up now, and others when these end.
+        Of a long queue some are taken up now, and others when these end. A server that does not write takes up none.
         """
+        if not self._surfaces.writes:
+            return
         queued = await asyncio.to_thread(self._surfaces.index.queued, _TAKEN_UP)
         self._has_more = len(queued) == _TAKEN_UP
         for surface in queued:
@@ -239,7 +241,7 @@ class Builder:
         self._submit(surface.id, caller or key_of(surface.manifest.owner))
 
     def _submit(self, surface: str, caller: str | None) -> None:
-        if surface not in self._tasks and not self._closing:
+        if surface not in self._tasks and not self._closing and self._surfaces.writes:
             task = asyncio.create_task(self._build(surface))
             self._tasks[surface] = task
             if caller is not None:
@@ -335,6 +337,14 @@ class Builder:
         """Try again what waits for disk space."""
         room, self._room = self._room, asyncio.Event()
         room.set()
+
+    async def halt(self) -> None:
+        """Cut all builds short: another server writes now. Until this one does again, none begins."""
+        tasks = list(self._tasks.values())
+        for task in tasks:
+            if not task.cancelling():  # a second time it would not wait for the end of its process
+                task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
 
     async def wait(self) -> None:
         """Wait until the queue is empty."""
@@ -446,11 +456,19 @@ class Builder:
 
     async def _in_turn(self, surface: Surface, held: ExitStack) -> _Outcome:
         await self._check_share(surface)
-        files = held.enter_context(self._surfaces.upload(surface))
+        files = await self._fetched(surface, held)
         problem = await self._damage(surface, files)
         if problem is not None:
             return await self._do_without(surface.id, problem)
         return await self._attempt(surface, files)
+
+    async def _fetched(self, surface: Surface, held: ExitStack) -> Sequence[Path]:
+        """Return the files of an upload, which are there until the stack is closed; a bucket is asked for them."""
+        with ExitStack() as stack:
+            files: list[Path] = []
+            await carried_out(lambda: files.extend(stack.enter_context(self._surfaces.upload(surface))))
+            held.push(stack.pop_all())
+            return files
 
     async def _try(self, note: Callable[[], object]) -> None:
         """Note something of a build that is found out again if it is lost."""

@@ -82,7 +82,7 @@ def fsck(args: argparse.Namespace) -> int:
     from ..maintenance.strays import collect
     from ..maintenance.waiting import retry, waiting
     from ..store.claim import LOCK
-    from ..store.data_folder import INDEX, check_version, scratch_of
+    from ..store.data import INDEX, check_version, scratch_of
     from .serve import chosen_settings
 
     folder: Path = args.data

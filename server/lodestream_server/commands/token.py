@@ -1,7 +1,7 @@
 """The command ``lodestream token``: create, list and revoke the tokens of a server; found through the entry points.
 
-It edits the token file and does not contact the server. So everybody who can write the file can use it, and a running
-server notices the change.
+It edits the token file, or the object in a bucket, and does not contact the server. So everybody who can write it can
+use it, and a running server notices the change.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..access.tokens import SCOPES, TokenFile
+from ..access.tokens import SCOPES, TokenList, tokens_of
 from ..linux import require_linux
 from .serve import add_option, asked_for, chosen_settings
 
@@ -38,8 +38,9 @@ def register(subparsers: Any, argv: Sequence[str] = ()) -> None:
     parser = subparsers.add_parser(
         "token",
         help="create, list or revoke the tokens of a server",
-        description="Create, list or revoke the tokens of a server. Only their hashes are stored, in a file. A running "
-        "server notices a change at once.",
+        description="Create, list or revoke the tokens of a server. Only their hashes are stored, in a file, or "
+        "in the bucket that holds the data. A running server notices a change at once, those of a bucket within ten "
+        "seconds.",
         allow_abbrev=False,
     )
     if places is None:
@@ -75,29 +76,29 @@ def register(subparsers: Any, argv: Sequence[str] = ()) -> None:
     end.set_defaults(run=revoke)
 
 
-def _file(args: argparse.Namespace) -> TokenFile:
+def _list(args: argparse.Namespace) -> TokenList:
     require_linux()
-    return TokenFile(chosen_settings(args).tokens)
+    return tokens_of(chosen_settings(args))
 
 
 def create(args: argparse.Namespace) -> int:
     """Create a token and print it."""
-    file = _file(args)
+    where = _list(args)
     scopes = tuple(dict.fromkeys(scope for group in args.scope or [("read",)] for scope in group))
-    text, token = file.create(args.name or f"token-{secrets.token_hex(3)}", scopes, args.days)
+    text, token = where.create(args.name or f"token-{secrets.token_hex(3)}", scopes, args.days)
     if args.json:
-        _print({"name": token.name, "token": text, "scopes": scopes, "expires": token.expires, "file": str(file.path)})
+        _print({"name": token.name, "token": text, "scopes": scopes, "expires": token.expires, "file": where.place})
     else:
         until = f" until {token.expires}" if token.expires else ""
-        print(f"{token.name}: {', '.join(scopes)}{until}; its hash is in {file.path}", file=sys.stderr)
+        print(f"{token.name}: {', '.join(scopes)}{until}; its hash is in {where.place}", file=sys.stderr)
         print(text)
     return 0
 
 
 def list_tokens(args: argparse.Namespace) -> int:
     """Print one line for each token."""
-    file = _file(args)
-    tokens = file.load()
+    where = _list(args)
+    tokens = where.load()
     shown = [
         {
             "name": token.name,
@@ -109,7 +110,7 @@ def list_tokens(args: argparse.Namespace) -> int:
         for token in tokens
     ]
     if args.json:
-        _print({"tokens": shown, "file": str(file.path)})
+        _print({"tokens": shown, "file": where.place})
         return 0
     for token in tokens:
         end = (
@@ -117,16 +118,16 @@ def list_tokens(args: argparse.Namespace) -> int:
         )
         print(f"{token.name}  {','.join(token.scopes)}  made {token.created}  {end}")
     if not tokens:
-        print(f"no tokens in {file.path}", file=sys.stderr)
+        print(f"no tokens in {where.place}", file=sys.stderr)
     return 0
 
 
 def revoke(args: argparse.Namespace) -> int:
     """Remove a token."""
-    file = _file(args)
-    file.revoke(args.name)
+    where = _list(args)
+    where.revoke(args.name)
     if args.json:
-        _print({"revoked": args.name, "file": str(file.path)})
+        _print({"revoked": args.name, "file": where.place})
     else:
         print(f"revoked {args.name}", file=sys.stderr)
     return 0

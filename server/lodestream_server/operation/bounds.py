@@ -79,4 +79,11 @@ class Bounds(BaseModel):
     head_seconds: float = _seconds(
         20.0, "seconds until the head of a request is complete, or until the token of a stream has arrived"
     )
+    lease_seconds: float = _seconds(
+        15.0, "seconds after which another server that shares a bucket takes over from one that has ended"
+    )
+    look_seconds: float = _seconds(
+        3.0, "seconds between two looks at what other servers that share a bucket have changed, and at its tokens"
+    )
+    list_seconds: float = _seconds(600.0, "seconds between two lists of everything in a bucket")
     bye_seconds: float = _seconds(10.0, "seconds that the server waits for the client's bye after the end of a stream")

@@ -57,10 +57,12 @@ class Metrics:
 
     def watch(self, folder: Path, surfaces: Callable[[], int], builds: Callable[[], int]) -> None:
         """Set the sources of gauges: the disk of a folder, the number of surfaces, the number of builds."""
-        self._gauge("surfaces", "surfaces in the data folder", surfaces)
+        self._gauge("surfaces", "surfaces of the server", surfaces)
         self._gauge("builds_pending", "builds that wait or run", builds)
         self._gauge(
-            "disk_free_bytes", "free space on the disk of the data folder", lambda: shutil.disk_usage(folder).free
+            "disk_free_bytes",
+            "free space on the disk of the data folder, or of the scratch folder of a bucket",
+            lambda: shutil.disk_usage(folder).free,
         )
 
     def answered(self, method: str, route: str, status: int, seconds: float) -> None:

@@ -33,6 +33,8 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
+from lodestream.errors import InputError
+
 from .bounds import Bounds
 
 __all__ = ["FORMATS", "GROUPS", "Choice", "Settings", "choices", "words_of"]
@@ -96,6 +98,20 @@ def _place(value: Any) -> Any:
     return value
 
 
+def _folder_or_bucket(value: Any) -> Any:
+    """Return a folder as a path, and the address of a bucket as a text."""
+    from lodestream.stores.addresses import place_of
+
+    value = _place(value)
+    if not isinstance(value, str):
+        return value
+    try:
+        place = place_of(value)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+    return Path(value) if place is None else place.address
+
+
 def _rooted(path: str) -> str:
     if path and (not path.startswith("/") or path.endswith("/")):
         raise ValueError("expected a path that begins with a slash and does not end with one")
@@ -140,6 +156,7 @@ _ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://[^/?#@\s]+", re.IGNORECASE)
 _Words = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_parted)]
 _Formats = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_named), AfterValidator(_known)]
 _Path = Annotated[Path, BeforeValidator(_place)]
+_Data = Annotated[Path | str, BeforeValidator(_folder_or_bucket)]
 
 
 def _choice(default: Any, group: str, meaning: str, *, metavar: str = "", usual: str = "", **limits: Any) -> Any:
@@ -178,8 +195,17 @@ class Settings(BaseSettings, Bounds):
 
     host: str = _choice("127.0.0.1", "network", "address to listen on", metavar="H")
     port: int = _choice(8000, "network", "port to listen on; 0 takes a free one", metavar="P", ge=0, le=65535)
-    data: _Path = _choice(
-        Path("lodestream-data"), "network", "data folder, which holds uploads and containers", metavar="DIR"
+    data: _Data = _choice(
+        Path("lodestream-data"),
+        "network",
+        "data folder, which holds uploads and containers, or a bucket for them, such as s3://bucket/prefix, which any "
+        "number of servers may share",
+        metavar="DIR",
+    )
+    read_only: bool = _choice(
+        False,
+        "network",
+        "only read what another server writes to the bucket of the data: nothing is uploaded, built or deleted here",
     )
     scratch: _Path | None = _choice(
         None,
@@ -187,7 +213,7 @@ class Settings(BaseSettings, Bounds):
         "folder on a local disk, in which the server makes its folder lodestream for what it can make again: the index "
         "of the surfaces, uploads and builds in progress, levels as files",
         metavar="DIR",
-        usual="scratch in the data folder",
+        usual="scratch in the data folder; lodestream-scratch where the data are in a bucket",
     )
     root_path: Annotated[str, AfterValidator(_rooted)] = _choice(
         "",
@@ -222,7 +248,7 @@ class Settings(BaseSettings, Bounds):
         "access",
         "file with the hashes of the tokens, written by `lodestream token`",
         metavar="FILE",
-        usual="tokens.json in the data folder",
+        usual="tokens.json in the data folder or the bucket",
     )
     public_reads: bool = _choice(False, "access", "allow anyone to list, fetch and stream surfaces without a token")
     origins: Annotated[_Words, AfterValidator(_origins)] = _choice(
@@ -279,7 +305,7 @@ class Settings(BaseSettings, Bounds):
         "",
         "limits",
         "address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers build what is too large for the "
-        "memory of one build; they must see the data folder under the same path",
+        "memory of one build; they must see the scratch folder under the same path",
         metavar="ADDRESS",
         usual="none",
     )
@@ -321,11 +347,6 @@ class Settings(BaseSettings, Bounds):
             if name in given or os.environ.get(_PREFIX + name.upper()):
                 raise ValueError(f"the setting {name} is gone: use {replacement}")
         return given
-
-    @property
-    def tokens(self) -> Path:
-        """Path of the file with the token hashes, whether it exists or not."""
-        return self.data / "tokens.json" if self.token_file is None else self.token_file
 
     @property
     def memory_of_build(self) -> int:

@@ -12,7 +12,7 @@ import re
 from fastapi import Request
 from starlette.exceptions import HTTPException
 
-__all__ = ["sort_out"]
+__all__ = ["only_range", "sort_out"]
 
 _MOST = 16
 _RANGE = re.compile(r"\s*(\d{1,18})-(\d{1,18})?\s*|\s*-(\d{1,18})\s*")
@@ -42,6 +42,17 @@ def sort_out(request: Request, size: int, etag: str) -> None:
                 f"The file has {size} bytes, and not the range {requested[0].strip()}",
                 {"content-range": f"bytes */{size}"},
             )
+
+
+def only_range(request: Request, size: int) -> tuple[int, int] | None:
+    """Return where the only range begins and ends that is asked for, after `sort_out`; None: all is to be sent."""
+    ranges = request.headers.get("range", "").partition("=")[2].split(",")
+    wanted = _RANGE.fullmatch(ranges[0]) if len(ranges) == 1 else None
+    if wanted is None:
+        return None
+    if wanted[3]:
+        return max(size - int(wanted[3]), 0), size
+    return int(wanted[1]), min(int(wanted[2]) + 1, size) if wanted[2] else size
 
 
 def _ordered(requested: re.Match[str] | None) -> bool:

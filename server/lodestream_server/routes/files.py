@@ -11,6 +11,8 @@ from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
+from lodestream.stores import Blob
+
 from ..access.scopes import READ
 from ..problems import BusyError, responses
 from ..store.containers import Containers
@@ -18,7 +20,7 @@ from ..store.index import Surface
 from . import examples
 from .byte_ranges import sort_out
 from .routing import Parts, State, caching, matches, readable
-from .sending import SentFile, ready, still_there
+from .sending import SentBlob, SentFile, ready, still_there
 
 __all__ = ["CONTAINER", "container_of", "router"]
 
@@ -71,23 +73,26 @@ async def get_container(request: Request, parts: Parts, sha256: str) -> Response
 
 
 async def _sent(request: Request, parts: State, sha256: str, headers: dict[str, str]) -> Response:
-    path, status = await asyncio.to_thread(_file, parts.containers, sha256)
+    place, size = await asyncio.to_thread(_place, parts.containers, sha256)
     etag = f'"{sha256}"'
     headers = {**headers, "etag": etag}
     unchanged = matches(request.headers.get("if-none-match"), etag)
     if unchanged is not None:
         unchanged.headers.update(headers)
         return unchanged
-    sort_out(request, status.st_size, etag)
-    return _Container(parts.containers, sha256, path, headers, status)
+    sort_out(request, size, etag)
+    if isinstance(place, tuple):
+        return _Container(parts.containers, sha256, *place, headers)
+    return SentBlob(place, request, headers, examples.CONTAINER_TYPE)
 
 
-def _file(containers: Containers, sha256: str) -> tuple[Path, os.stat_result]:
-    """Return the file of a container, which may be deleted at any moment, and its status."""
+def _place(containers: Containers, sha256: str) -> tuple[tuple[Path, os.stat_result] | Blob, int]:
+    """Return the file of a container, which may be deleted at any moment, and its status, or its blob; and its size."""
     with containers.blob(sha256) as blob:
-        assert blob.path is not None, "the store is a folder"
+        if blob.path is None:  # in a bucket, where nothing is to be closed
+            return blob, blob.size
         try:
-            return blob.path, blob.path.stat()
+            return (blob.path, blob.path.stat()), blob.size
         except FileNotFoundError:
             raise BusyError(f"The container {sha256} was deleted and stored again meanwhile; try again") from None
 
@@ -96,7 +101,7 @@ class _Container(SentFile):
     """A stored container, which may be deleted before it is opened."""
 
     def __init__(
-        self, containers: Containers, sha256: str, path: Path, headers: dict[str, str], status: os.stat_result
+        self, containers: Containers, sha256: str, path: Path, status: os.stat_result, headers: dict[str, str]
     ) -> None:
         super().__init__(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
         self._containers = containers
@@ -106,5 +111,5 @@ class _Container(SentFile):
         try:
             await super().__call__(scope, receive, send)
         except FileNotFoundError:
-            await asyncio.to_thread(_file, self._containers, self._sha256)  # which says why
+            await asyncio.to_thread(_place, self._containers, self._sha256)  # which says why
             raise BusyError(f"The container {self._sha256} was deleted and stored again; try again") from None

@@ -11,6 +11,7 @@ from lodestream.errors import NotFoundError
 
 from ..access.scopes import ADMIN, WRITE
 from ..codes import PAGE
+from ..store.surfaces import Surfaces
 from . import examples
 from .documentation import render, render_codes
 from .html_page import html_page
@@ -92,28 +93,45 @@ async def healthz() -> Response:
     responses={
         200: examples.answer(
             "Builds can begin",
-            {"status": "ready", "index": "current", "confinement": "landlock+seccomp", "missing": []},
+            {
+                "status": "ready",
+                "index": "current",
+                "role": "writer",
+                "confinement": "landlock+seccomp",
+                "missing": [],
+            },
         ),
         503: examples.answer(
             "Not yet",
-            {"status": "starting", "index": "being brought up to date", "confinement": None, "missing": []},
+            {
+                "status": "starting",
+                "index": "being brought up to date",
+                "role": "writer",
+                "confinement": None,
+                "missing": [],
+            },
         ),
     },
 )
 async def readyz(parts: Parts) -> Response:
-    """Return whether builds can start and all surfaces are known. Before that uploads wait, and all else works.
+    """Return whether processes can start and all surfaces are known. Before that uploads wait, and all else works.
 
     ``index`` is ``current``; ``being brought up to date`` with the data folder, so that what was stored or deleted
     there while no server ran is not told right yet; or ``being made again`` because it was lost, while whatever is
     about surfaces is answered 503.
 
+    ``role`` is ``writer``; ``reader`` for a server that only reads; or ``waiting`` for one that shares a bucket and
+    answers uploads 503 because another one writes, which ``writer`` names.
+
     ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``; ``missing``
     says for each mechanism that this machine lacks what a build may do.
     """
     surfaces = parts.surfaces
-    index = "being made again" if surfaces.is_lost else "current" if surfaces.is_synced else "being brought up to date"
-    told = {"index": index, "confinement": parts.builder.confinement, "missing": parts.builder.missing}
-    if parts.builder.ready and index == "current":
+    index = "current" if surfaces.is_current else "being brought up to date"
+    index = "being made again" if surfaces.is_lost else index
+    builder = parts.builder
+    told = {"index": index, **_role(surfaces), "confinement": builder.confinement, "missing": builder.missing}
+    if builder.ready and index == "current":
         return JSONResponse({"status": "ready", **told})
     return JSONResponse({"status": "starting", **told}, 503, {"retry-after": "1"})
 
@@ -141,6 +159,14 @@ async def formats(parts: Parts) -> Response:
 async def metrics(parts: Parts) -> Response:
     """Return all metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
+
+
+def _role(surfaces: Surfaces) -> dict[str, str | None]:
+    if surfaces.writes or surfaces.lease is None:
+        return {"role": "writer"}
+    if not surfaces.lease.wanted:
+        return {"role": "reader"}
+    return {"role": "waiting", "writer": surfaces.lease.holder}
 
 
 def _sent(request: Request, name: str) -> Response | None:

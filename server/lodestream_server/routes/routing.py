@@ -19,7 +19,7 @@ from ..operation.metrics import Metrics
 from ..operation.pace import Pace
 from ..operation.settings import Settings
 from ..store.containers import Containers
-from ..store.data_folder import DataFolder
+from ..store.data import Data
 from ..store.partial_uploads import PartialUploads
 from ..store.surfaces import Surfaces
 from ..upkeep import Upkeep
@@ -34,7 +34,7 @@ class State:
     """The parts of a running server."""
 
     settings: Settings
-    folder: DataFolder
+    data: Data
     surfaces: Surfaces
     partial_uploads: PartialUploads
     upkeep: Upkeep

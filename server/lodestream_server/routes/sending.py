@@ -9,21 +9,26 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from fastapi import Request
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, StreamingResponse
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
 from lodestream.errors import NotFoundError
+from lodestream.stores import Blob
 
 from ..problems import BuildFailedError, BusyError, NotReadyError, PostponedError
 from ..store.index import Surface
+from .byte_ranges import only_range
 from .routing import State
 
-__all__ = ["SentFile", "ready", "still_there", "while_there"]
+__all__ = ["SentBlob", "SentFile", "ready", "still_there", "while_there"]
 
 _log = logging.getLogger(__name__)
 
 _Result = TypeVar("_Result")
+
+# Bytes of a blob that are sent at once.
+_PIECE = 256 << 10
 
 
 class SentFile(FileResponse):
@@ -55,6 +60,43 @@ class SentFile(FileResponse):
                 raise
             # The connection would be cut, perhaps with the client's next request on it.
             _log.warning("%s was sent completely, but could not be closed: %s", self.path, error.strerror or error)
+
+
+class SentBlob(StreamingResponse):
+    """An object of a bucket, or the one range of it that is asked for; of several ranges, all of it.
+
+    Its first bytes are read before anything is sent, so that one that is not there can still be answered by a problem
+    document.
+
+    Parameters
+    ----------
+    blob : Blob
+    request : Request
+        See `byte_ranges.sort_out`.
+    headers : dict of str to str
+    media_type : str
+    """
+
+    def __init__(self, blob: Blob, request: Request, headers: dict[str, str], media_type: str) -> None:
+        wanted = only_range(request, blob.size)
+        start, end = wanted or (0, blob.size)
+        headers |= {"content-length": str(end - start), "accept-ranges": "bytes"}
+        if wanted is not None:
+            headers["content-range"] = f"bytes {start}-{end - 1}/{blob.size}"
+        pieces = iter(()) if request.method == "HEAD" else _pieces(blob, start, end)
+        super().__init__(pieces, 200 if wanted is None else 206, headers, media_type)
+        self._blob = blob
+        self._first = start, min(_PIECE, end - start)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        await asyncio.to_thread(self._blob.read, *self._first)
+        await super().__call__(scope, receive, send)
+
+
+def _pieces(blob: Blob, start: int, end: int) -> Iterator[bytes]:
+    for offset in range(start, end, _PIECE):
+        yield blob.read(offset, min(_PIECE, end - offset))
 
 
 def ready(parts: State, surface: str) -> Surface:

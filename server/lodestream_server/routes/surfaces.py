@@ -195,7 +195,7 @@ async def keep(
         If it cannot be kept now.
     """
     try:
-        folder = await asyncio.to_thread(parts.folder.new_upload)
+        folder = await asyncio.to_thread(parts.data.new_upload)
         try:
             received = await receive(folder)
             manifest = await asyncio.to_thread(_manifest, received, chosen, caller.owner, parts)

@@ -170,7 +170,7 @@ class Containers:
         """Open the bytes of a container; return also how many it had when it was stored."""
         size = self._check(sha256)
         try:
-            return self._surfaces.store.open(layout.container_key(sha256)), size
+            return self._surfaces.store.open(layout.container_key(sha256), size), size
         except AbsentError:
             self._gone(sha256)
 
@@ -227,6 +227,9 @@ class Containers:
             blob.close()
             self.tell_damage(sha256, error)
             raise
+        except AbsentError:  # of a bucket the first read says so
+            blob.close()
+            self._gone(sha256)
         except BaseException:
             blob.close()
             raise

@@ -9,6 +9,12 @@
     built/<id>.json               what became of the build: a container, or the reason of a final failure
     names/<name>.json             a name that stays: the surface that it leads to, and those that it led to of late
 
+and, where several servers share a bucket, what they tell each other, none of which is the truth about a surface::
+
+    writer.json                   the lease: which server writes
+    changes.json                  what has changed of late
+    tokens.json                   the hashes of tokens, see `access.tokens`; in a folder a file beside the store
+
 Bytes come first, then the small object that refers to them; a delete goes the other way. What no small object refers to
 is a *stray*: it is of no harm, and of no use after a day. A start moves and deletes nothing.
 
@@ -37,21 +43,26 @@ from lodestream.stores.keys import is_key
 
 __all__ = [
     "BUILT",
+    "CHANGES",
     "CONTAINERS",
     "IDENTITY",
     "LONGEST_NAME",
+    "MOST_CHANGES",
     "MOST_REASON",
     "MOST_TEXT",
     "NAME",
     "NAMES",
     "SURFACES",
     "UPLOADS",
+    "WRITER",
     "Built",
+    "Changes",
     "DamagedObjectError",
     "Identity",
     "Manifest",
     "Name",
     "Summary",
+    "Writer",
     "built_key",
     "check_text",
     "container_key",
@@ -69,6 +80,11 @@ __all__ = [
 
 IDENTITY = "lodestream.json"
 UPLOADS, SURFACES, CONTAINERS, BUILT, NAMES = "uploads/", "surfaces/", "containers/", "built/", "names/"
+
+WRITER, CHANGES = "writer.json", "changes.json"
+
+#: Changes of which it is told what has changed.
+MOST_CHANGES = 1000
 
 #: Bytes of text that a surface may have: its name, names of files and options; and the reason of a failure.
 MOST_TEXT, MOST_REASON = 3072, 1024
@@ -237,6 +253,53 @@ class Name:
         name_key(self.name)
 
 
+@dataclass(frozen=True)
+class Writer:
+    """Which server writes to a bucket.
+
+    Attributes
+    ----------
+    holder : str or None
+        Id that a server has given itself; None: it was given up.
+    name : str
+        Of its machine and process, for people.
+    number : int
+        How often the lease has been taken.
+    seconds : float
+        How long it lasts after this write.
+    write : str
+        Id of this write.
+    """
+
+    holder: str | None
+    name: str
+    number: int
+    seconds: float
+    write: str
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What has changed of late.
+
+    Attributes
+    ----------
+    series : str
+        Changes of another series are counted anew: nothing is known of what was between the two.
+    number : int
+        Of the last change.
+    what : tuple of str
+        The last changes, at most `MOST_CHANGES`, oldest first: ids of surfaces, and keys of names.
+    write : str
+        Id of this write.
+    """
+
+    series: str
+    number: int
+    what: tuple[str, ...]
+    write: str
+
+
 def new_write() -> str:
     """Return the id of a new write."""
     return secrets.token_hex(16)
@@ -317,10 +380,10 @@ def describe(info: dict[str, Any]) -> tuple[bytes, Summary]:
 
 @cache
 def _adapters() -> dict[type[Any], TypeAdapter[Any]]:
-    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built, Name)}
+    return {kind: TypeAdapter(kind) for kind in (Identity, Manifest, Built, Name, Writer, Changes)}
 
 
-def dump(small: Identity | Manifest | Built | Name) -> bytes:
+def dump(small: Identity | Manifest | Built | Name | Writer | Changes) -> bytes:
     """Return a small object as bytes. The description in a ``built`` is JSON, and stands on a line of its own.
 
     Raises

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import InputError, LodestreamError, NotFoundError
 from lodestream.stores import AbsentError, StoreError, Tag, UnacknowledgedError
 
-from ..problems import DamagedNameError, NotOwnerError
+from ..problems import DamagedNameError, NotOwnerError, StandbyError
 from . import layout
 from .index import IndexLostError, Named, Surface
 from .layout import NAMES, DamagedObjectError, Name
@@ -47,13 +47,18 @@ class Names:
     ----------
     surfaces : Surfaces
     lock : context manager
-        Held for each change of surfaces and names.
+        Held for each change of the index.
+    writing : context manager
+        Held for each change of the store, see `Surfaces.writing`.
     """
 
-    def __init__(self, surfaces: Surfaces, lock: AbstractContextManager[None]) -> None:
+    def __init__(
+        self, surfaces: Surfaces, lock: AbstractContextManager[None], writing: AbstractContextManager[None]
+    ) -> None:
         self._surfaces = surfaces
         self._store = surfaces.store
         self._lock = lock
+        self._writing = writing
         self._kept = set[str]()  # surfaces that are to be kept once the names that have replaced them are known
 
     def get(self, name: str) -> Named:
@@ -116,7 +121,7 @@ class Names:
             If it could not be stored, or it is not known whether it was.
         """
         key, now = layout.name_key(name), time.time()
-        with self._lock:
+        with self._writing:
             _check_owner(f"the surface {surface}", self._surfaces.get(surface).manifest.owner, may_change)
             before, tag = self._changeable(name, may_change, fits)
             if len(self._surfaces.index.names_of(surface) - {key}) >= MOST_NAMES:
@@ -140,6 +145,7 @@ class Names:
                 with suppress(StoreError):
                     self._current(key)  # it may lead there now, so that surface is not to be deleted
                 raise
+            self._surfaces.tell(key)
             self._surfaces.note(lambda: self._surfaces.index.put_name(key, new))
             return Named(name, new.owner, new.surface, new.changed)
 
@@ -185,9 +191,10 @@ class Names:
             If it is not known whether it is gone; to delete it again is harmless.
         """
         key = layout.name_key(name)
-        with self._lock:
+        with self._writing:
             _, tag = self._before(key, may_change)
             self._store.delete([key])  # also of what is gone already: perhaps not from the disk
+            self._surfaces.tell(key)
             self._surfaces.index.gone(key)
             if tag is None:
                 raise _absent(name)
@@ -204,7 +211,7 @@ class Names:
             self._kept.add(surface)
         if not self._surfaces.index.replaced_by(surface):  # as of most: nobody need wait for others
             return
-        with self._lock:
+        with self._writing:
             for key in self._surfaces.index.replaced_by(surface):
                 if (found := self._current(key)) is not None:
                     name, tag = found
@@ -229,7 +236,7 @@ class Names:
         gone: list[Surface] = []
         for key in self._surfaces.index.due(now):
             try:
-                with self._lock:
+                with self._writing:
                     gone += self._expire(key, now)
             except IndexLostError:
                 raise
@@ -256,6 +263,7 @@ class Names:
         """Write a name with these surfaces as those that it has replaced; return its tag."""
         name, key = replace(name, replaced=replaced, write=layout.new_write()), layout.name_key(name.name)
         tag = self._store.replace(key, layout.dump(name), tag)
+        self._surfaces.tell(key)
         self._surfaces.index.put_name(key, name)
         return tag
 
@@ -277,7 +285,19 @@ class Names:
                     self._current(key, tags.get(0))
         kept, self._kept = self._kept, set()
         for surface in kept:
-            self.keep(surface)
+            with suppress(StandbyError):  # it is another server's to keep now
+                self.keep(surface)
+
+    def refresh(self, key: str) -> None:
+        """Read a name, by its key, from the store again.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read.
+        """
+        with self._lock:
+            self._current(key)
 
     def _current(self, key: str, seen: str | None = None) -> tuple[Name, Tag] | None:
         """Return a name and its tag, and tell the index; None if there is none, or it cannot be read."""

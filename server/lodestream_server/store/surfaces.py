@@ -1,7 +1,12 @@
 """The surfaces of a server: what is accepted, built and deleted, in the store and in the index.
 
 Every change is made in the store first and in the index after it, so an index is never ahead of the store. `sync`
-brings it up to date: at a start, after it was lost, and (later) in readers. What is acknowledged is in the store.
+brings it up to date: at a start, after it was lost, and in servers that do not write. What is acknowledged is in the
+store.
+
+In a bucket that several servers share, one of them writes (`lease`). It tells the others what it has changed, and they
+read that again. It removes no bytes at once: another server that writes meanwhile may refer to them, so they become
+strays, which are collected after a day.
 """
 
 from __future__ import annotations
@@ -10,15 +15,18 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError
 from lodestream.stores import AbsentError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
 
+from ..problems import ReadOnlyError, StandbyError
 from . import layout
+from .changes import ChangeLog
 from .comparison import Comparison, compare
 from .identity import establish
 from .index import Index, IndexLostError, Surface, state_of
@@ -30,6 +38,7 @@ from .layout import (
     DamagedObjectError,
     Manifest,
 )
+from .lease import Lease
 from .names import Names
 from .private import make_private
 from .states import Event, after
@@ -44,8 +53,9 @@ STRAY = 86400.0
 # Another upload, or somebody who asks for it, begins another attempt of these.
 _STOPPED = ("failed", "waiting")
 
-# Surfaces that `sync` reads in one transaction.
+# Surfaces that `sync` reads in one transaction; strays that are removed while uploads wait.
 _AT_ONCE = 500
+_REMOVED_AT_ONCE = 100
 
 
 class Surfaces:
@@ -59,6 +69,8 @@ class Surfaces:
     lost : callable
         Called by whatever thread finds that the index cannot be used any more; `restore` makes it again, and until then
         everything raises `IndexLostError`.
+    lease : Lease or None
+        Of a bucket that several servers share; None: nobody else changes the store.
 
     Attributes
     ----------
@@ -71,6 +83,12 @@ class Surfaces:
         See ``lost``.
     names : Names
         The names that lead to surfaces.
+    lease : Lease or None
+    changes : ChangeLog
+        Tells other servers what has changed, if there is a lease.
+    writing : context manager
+        Held for each change of the store. It raises `StandbyError` or `ReadOnlyError` when this server does not write,
+        also at its end: then nothing may be acknowledged.
 
     Raises
     ------
@@ -78,9 +96,14 @@ class Surfaces:
         If the store holds something else, or is not fit.
     """
 
-    def __init__(self, store: Store, index: Path, lost: Callable[[], object] = lambda: None) -> None:
+    def __init__(
+        self, store: Store, index: Path, lost: Callable[[], object] = lambda: None, *, lease: Lease | None = None
+    ) -> None:
         self.store = store
+        self.lease = lease
+        self.changes = ChangeLog(store)
         self.is_synced = False
+        self._synced_in: int | None = None  # number of the lease since which `sync` has come to its end
         self._identity = establish(store)
         self._path = index
         self.tell_lost = lost
@@ -88,6 +111,7 @@ class Surfaces:
         self._mender: int | None = None  # the thread that makes the index again
         #: Held for each change, so that what was looked at is still so when it is written.
         self._lock = _Changes(self)
+        self.writing = _Writing(self, self._lock)
         #: Prefixes and keys of large objects that are being put and that no small object refers to yet.
         self._coming: Counter[str] = Counter()
         self._counting = threading.Lock()
@@ -99,7 +123,7 @@ class Surfaces:
             _log.warning("%s", error)
             self._open_new()
             self.is_lost = False
-        self.names = Names(self, self._lock)
+        self.names = Names(self, self._lock, self.writing)
 
     def _open_new(self) -> None:
         Index.remove(self._path)
@@ -128,6 +152,39 @@ class Surfaces:
         """Close the index, once the change that is under way is made."""
         with self._lock.lock:
             self._index.close()
+
+    @property
+    def writes(self) -> bool:
+        """Whether this server changes the store: it has the lease, and knows what those before have done."""
+        return self.lease is None or (self.lease.held and self._synced_in == self.lease.number)
+
+    @property
+    def is_current(self) -> bool:
+        """Whether no `sync` is due: the last one ended, and since then no other server can have changed anything."""
+        return self.is_synced and (self.lease is None or not self.lease.held or self.writes)
+
+    def check_writer(self) -> None:
+        """Check that this server changes the store.
+
+        Raises
+        ------
+        ReadOnlyError
+            If it never does.
+        StandbyError
+            If another one does now, or this one is about to.
+        """
+        if self.writes:
+            return
+        assert self.lease is not None
+        if not self.lease.wanted:
+            raise ReadOnlyError("This server only reads (read_only); send this to one that writes")
+        writer = "this one is about to" if self.lease.held else f"{self.lease.holder or 'nobody'} does"
+        raise StandbyError(f"This server does not write to its bucket now, {writer}; try again soon")
+
+    def tell(self, what: str) -> None:
+        """Tell other servers that a surface has changed, by its id, or a name, by its key."""
+        if self.lease is not None:
+            self.changes.add(what)
 
     @property
     def index(self) -> Index:
@@ -205,9 +262,11 @@ class Surfaces:
             If a surface of another upload has the same id.
         StoreError
             If it could not be stored, or it is not known whether it was: the same upload again is harmless.
+        ReadOnlyError
+            If this server never writes; so do all methods below that change the store.
         """
         self.names.keep(manifest.id)
-        with self._lock:
+        with self.writing:
             known = self._known(manifest)
             if known is not None and known.state not in _STOPPED and self._is_whole(known):
                 self._created(known.manifest)  # what a killed server left is not on disk before it is written again
@@ -215,7 +274,7 @@ class Surfaces:
         keys = [layout.upload_key(manifest.upload, number) for number in range(len(files))]
         with self._arriving(keys):
             self._put_upload(manifest, keys, files, known is None)
-            with self._lock:
+            with self.writing:
                 known = self._known(manifest)
                 if known is not None:
                     gone = known.state == "ready" and not self._is_whole(known)
@@ -279,6 +338,7 @@ class Surfaces:
 
     def _noted_or_taken_back(self, new: Surface, *, ours: bool) -> None:
         """Tell the index of a surface; if it cannot be told, and the manifest is ours, there is no such surface."""
+        self.tell(new.id)
         try:
             self.index.put(new)
         except StoreError as error:
@@ -324,7 +384,7 @@ class Surfaces:
             If the store cannot remove them; they are strays then.
         """
         # Before the end of the first `sync` the index may not know who refers to them.
-        if not self.is_synced or self._damaged is not None or self.is_lost:
+        if self.lease is not None or not self.is_synced or self._damaged is not None or self.is_lost:
             return
         unused = [key for key in keys if not self._coming[key] and not self._is_used(key, but=deleted)]
         if unused:
@@ -374,6 +434,7 @@ class Surfaces:
 
     def begin(self, surface: str) -> Surface | None:
         """Note that a build begins: it counts as an attempt until it ends. None: there is nothing to be built."""
+        self.check_writer()
         return self._noted(surface, "begun", attempt=1)
 
     def later(self, surface: str, reason: str | None = None, *, counts: bool = False) -> Surface | None:
@@ -426,6 +487,7 @@ class Surfaces:
         OSError
             If the file cannot be read.
         """
+        self.check_writer()
         if self.index.find(surface) is None:
             return None
         described, summary = layout.describe(info)
@@ -434,7 +496,7 @@ class Surfaces:
             shared = self.is_synced and self.index.uses_container(sha256, surface)
             if not shared or self._size(key) != size:
                 self.store.put_file(key, container, given=True)
-            with self._lock:
+            with self.writing:
                 known = self.index.find(surface)
                 if known is None or (known.state == "ready" and known.container == sha256):
                     return known
@@ -450,7 +512,7 @@ class Surfaces:
         StoreError
             If that could not be stored; nobody may be told then what a restart could take back.
         """
-        with self._lock:
+        with self.writing:
             known = self.index.find(surface)
             if known is None:
                 return None
@@ -471,6 +533,7 @@ class Surfaces:
                 container = layout.parse(Built, key, there).container
                 before += [layout.container_key(container)] if container not in (None, built.container) else []
         told = _surface(known.manifest, built, tag)
+        self.tell(known.id)
         self.note(lambda: self.index.put(told))
         with suppress(StoreError):
             self._remove_unused(before)
@@ -486,7 +549,7 @@ class Surfaces:
         StoreError
             If a failure could not be taken back.
         """
-        with self._lock:
+        with self.writing:
             known = self.get(surface)
             state = after(known.state, "retry")
             if state == known.state:
@@ -497,13 +560,14 @@ class Surfaces:
                 tag = None
             again = replace(known, state=state, reason=None, attempts=0, built_tag=tag)
             if known.state == "failed":
+                self.tell(surface)
                 self.note(lambda: self.index.put(again))
             else:
                 self.index.put(again)
             return again
 
     def lose(self, container: str, *, unreadable: bool = False) -> list[Surface]:
-        """Queue the surfaces of a container again that is not there; return them.
+        """Queue the surfaces of a container again that is not there; return them: none if this server does not write.
 
         Parameters
         ----------
@@ -512,6 +576,8 @@ class Surfaces:
         unreadable : bool
             It is there, but of a version of the format that is no longer read.
         """
+        if not self.writes:
+            return []
         with self._lock:
             if not unreadable and self._size(layout.container_key(container)) is not None:
                 return []
@@ -547,12 +613,13 @@ class Surfaces:
         StoreError
             If it is not known whether the manifest is gone; to delete it again is harmless.
         """
-        with self._lock:
+        with self.writing:
             if self.index.find(surface) is None and layout.id_of(layout.manifest_key(surface)) is not None:
                 self.store.delete([layout.manifest_key(surface)])  # of a killed server, whose delete is not on disk yet
             known = self.get(surface)
             it = known.manifest
             self.store.delete([layout.manifest_key(surface)])  # it is deleted from here on
+            self.tell(surface)
             keys = [layout.upload_key(it.upload, number) for number in range(len(it.filenames))]
             keys += [layout.container_key(known.container)] if known.container is not None else []
             try:
@@ -583,6 +650,7 @@ class Surfaces:
 
     def _synced(self, progress: Callable[[int], None] = lambda _: None) -> tuple[int, DamagedObjectError | None]:
         """Return the number of surfaces that were read, and what is wrong with one that cannot be."""
+        number = self.lease.number if self.lease is not None and self.lease.held else None
         taken = looked = 0
         changed: list[Comparison] = []
         damaged = None
@@ -601,43 +669,74 @@ class Surfaces:
         self.names.sync()
         self._index.complete()
         self.is_synced, self._damaged = True, damaged
+        if number is not None and self._synced_in != number:
+            self._synced_in = number
+            self.changes.begin()
         return taken, damaged
+
+    def refresh(self, changed: Iterable[str]) -> None:
+        """Read surfaces, by their ids, and names, by their keys, from the store again: another server has changed them.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read.
+        """
+        them = tuple(dict.fromkeys(changed))
+        surfaces = [id_ for id_ in them if layout.id_of(layout.manifest_key(id_)) is not None]
+        for first in range(0, len(surfaces), _AT_ONCE):
+            self._take([Comparison(id_, None, None, None) for id_ in surfaces[first : first + _AT_ONCE]])
+        for key in them:
+            if layout.name_of(key) is not None:
+                self.names.refresh(key)
 
     def _take(self, changed: Sequence[Comparison]) -> DamagedObjectError | None:
         """Read surfaces from the store into the index; return what is wrong with one that cannot be read."""
         damaged = None
-        with self._lock, self._index.together():
-            for found in changed:
-                key = layout.manifest_key(found.id)
-                try:
-                    manifest = layout.parse(Manifest, key, self.store.get(key)[0])
-                except AbsentError:
+        with self._lock, self._index.together(), _side_by_side(self.store.at_once) as each:
+            for found, there in zip(changed, each(self._stored, [found.id for found in changed]), strict=True):
+                if there is None:
                     self._index.drop(found.id)
                     continue
-                except DamagedObjectError as error:
-                    _log.error("%s; nothing is changed", error)
-                    damaged = error
+                if there.wrong is not None:
+                    unread = "nothing is changed" if there.manifest is None else "the surface is built again"
+                    _log.error("%s; %s", there.wrong, unread)
+                    damaged = there.wrong
+                if there.manifest is None:
                     continue
                 tags = [None if entry is None else entry.tag for entry in (found.manifest, found.built)]
-                try:
-                    built = self._read_built(manifest)
-                except DamagedObjectError as error:
-                    _log.error("%s; the surface is built again", error)
-                    damaged, built = error, None
+                if there.wrong is not None:
                     tags[1] = None  # so that it is told each time, until it is replaced
-                surface = _surface(manifest, *(built or (None, None)))
+                surface = _surface(there.manifest, *(there.built or (None, None)))
                 before = self._index.find(found.id)
-                if before is not None and before.manifest.write == manifest.write:
+                if before is not None and before.manifest.write == there.manifest.write:
                     if before.built_tag == surface.built_tag:
                         surface = before  # with what only the index knows: whether it waits, is built, and how often
                     elif surface.state == "queued":
                         # What was ready once is not refused for good: `builds.builder` has to know.
                         once = before.container, before.container_bytes
                         surface = replace(surface, attempts=before.attempts, container=once[0], container_bytes=once[1])
-                if surface is not before and surface.state == "ready" and not self._is_whole(surface):
+                if surface is not before and surface.state == "ready" and not there.whole:
                     surface = replace(surface, state=after("ready", "lost"))
                 self._index.put(surface, *tags)
         return damaged
+
+    def _stored(self, surface: str) -> _Stored | None:
+        """Read what the store has of a surface; None if there is none."""
+        key = layout.manifest_key(surface)
+        try:
+            manifest = layout.parse(Manifest, key, self.store.get(key)[0])
+        except AbsentError:
+            return None
+        except DamagedObjectError as error:
+            return _Stored(None, None, error)
+        try:
+            built = self._read_built(manifest)
+        except DamagedObjectError as error:
+            return _Stored(manifest, None, error)
+        container = None if built is None else built[0].container
+        whole = container is not None and self._size(layout.container_key(container)) is not None
+        return _Stored(manifest, built, None, whole)
 
     def restore(self) -> None:
         """Make an index that was lost again, from the store.
@@ -685,13 +784,21 @@ class Surfaces:
             If the store does not answer, or a small object cannot be read now. What was not removed goes at another
             time.
         """
-        with self._lock:  # so that nothing is taken into use meanwhile
-            _, damaged = self._synced()
-            if damaged is not None:
-                raise DamagedObjectError(f"{damaged}; what it refers to is not known, so nothing is removed")
-            found = self.strays(older)
-            self.store.delete([entry.key for entry in found])
-        return found
+        self.check_writer()
+        _, damaged = self._synced()
+        if damaged is not None:
+            raise DamagedObjectError(f"{damaged}; what it refers to is not known, so nothing is removed")
+        found, removed = self.strays(older), list[Entry]()
+        for first in range(0, len(found), _REMOVED_AT_ONCE):
+            with self.writing:  # so that nothing is taken into use between the look and the removal
+                unused = [
+                    entry
+                    for entry in found[first : first + _REMOVED_AT_ONCE]
+                    if not self._coming[entry.key] and not self._is_used(entry.key)
+                ]
+                self.store.delete([entry.key for entry in unused])
+            removed += unused
+        return removed
 
 
 class _Changes:
@@ -707,6 +814,43 @@ class _Changes:
 
     def __exit__(self, *_: object) -> None:
         self.lock.release()
+
+
+class _Writing:
+    """The same for changes of the store: they are refused to a server that does not write."""
+
+    def __init__(self, surfaces: Surfaces, lock: _Changes) -> None:
+        self._surfaces = surfaces
+        self._lock = lock
+
+    def __enter__(self) -> None:
+        self._surfaces.check_writer()
+        self._lock.__enter__()
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._lock.__exit__()
+        if kind is None:  # a server that was stopped meanwhile has not noticed that another one took over
+            self._surfaces.check_writer()
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What a store has of a surface: manifest and ``built``, what is wrong with one, whether the container is there."""
+
+    manifest: Manifest | None
+    built: tuple[Built, Tag] | None
+    wrong: DamagedObjectError | None
+    whole: bool = False
+
+
+@contextmanager
+def _side_by_side(at_once: int) -> Iterator[Callable[..., Iterator[Any]]]:
+    """Give what maps a function over things, so many at the same time."""
+    if at_once == 1:
+        yield map
+        return
+    with ThreadPoolExecutor(at_once) as pool:
+        yield pool.map
 
 
 def _surface(manifest: Manifest, built: Built | None, tag: Tag | None) -> Surface:

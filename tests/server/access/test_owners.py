@@ -12,7 +12,7 @@ from lodestream.stores import Folder, StoreError
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import worker
-from lodestream_server.store.data_folder import DataFolder
+from lodestream_server.store.data import Data
 from lodestream_server.store.layout import CONTAINERS
 from tests.patience import PATIENCE
 from tests.server.builds import slow
@@ -207,7 +207,7 @@ def test_what_a_delete_could_not_remove_is_a_stray(tmp_path: Path, monkeypatch: 
     with running_server(data, workers=1) as url:
         assert httpx.get(f"{url}{where}", trust_env=False).status_code == 404
         assert kept(data, "containers") == [left], "a start removes nothing"
-    folder = DataFolder(data)
+    folder = Data(data)
     try:
         folder.surfaces.collect(older=-60.0)  # whatever its age
     finally:

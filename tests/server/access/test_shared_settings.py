@@ -37,7 +37,8 @@ nothing: Any = None
 NOT_SHARED = {
     "host": "an address",
     "port": "an address",
-    "data": "a path",
+    "data": "a path or an address",
+    "read_only": "a switch",
     "scratch": "a path",
     "root_path": "a path",
     "trusted_proxies": "addresses",
@@ -68,6 +69,9 @@ NOT_SHARED = {
     "least_rate": "of one connection",
     "head_seconds": "of one connection",
     "bye_seconds": "of one connection",
+    "lease_seconds": "of this server",
+    "look_seconds": "of this server",
+    "list_seconds": "of this server",
 }
 
 

@@ -49,7 +49,7 @@ def test_a_scope_includes_those_before_it(path: Path) -> None:
 
 
 def test_a_server_follows_the_file(path: Path) -> None:
-    tokens = Tokens(path)
+    tokens = Tokens(TokenFile(path))
     assert not tokens.used
     assert tokens.find("lode_x") is None
     one, kept = TokenFile(path).create("one", ("read",))
@@ -73,11 +73,11 @@ def test_a_token_expires(path: Path) -> None:
     text, token = TokenFile(path).create("short", ("read",), days=1)
     assert token.expires is not None
     assert timedelta(hours=23) < datetime.fromisoformat(token.expires) - datetime.now(UTC) <= timedelta(days=1)
-    assert Tokens(path).find(text) == token
+    assert Tokens(TokenFile(path)).find(text) == token
     document = json.loads(path.read_text())
     document["tokens"][0]["expires"] = (datetime.now(UTC) - timedelta(seconds=1)).isoformat()
     path.write_text(json.dumps(document))
-    assert Tokens(path).find(text) is None
+    assert Tokens(TokenFile(path)).find(text) is None
 
 
 @pytest.mark.parametrize(
@@ -98,13 +98,13 @@ def test_a_token_expires(path: Path) -> None:
 )
 def test_a_file_of_something_else_allows_nobody_anything(path: Path, content: str) -> None:
     text, _ = TokenFile(path).create("one", ("admin",))
-    tokens = Tokens(path)
+    tokens = Tokens(TokenFile(path))
     assert tokens.find(text) is not None
     path.write_text(content)
     assert tokens.find(text) is None
     assert tokens.used
     with pytest.raises(LodestreamError, match="token"):
-        Tokens(path)
+        Tokens(TokenFile(path))
     with pytest.raises(LodestreamError, match="token"):
         TokenFile(path).create("two", ("admin",))
     assert path.read_text() == content
@@ -114,7 +114,7 @@ def test_nothing_of_a_file_that_is_none_is_told(path: Path) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(b"secret \xff" * 100_000)
     with pytest.raises(LodestreamError, match="expected a token file") as caught:
-        Tokens(path)
+        Tokens(TokenFile(path))
     assert len(str(caught.value)) < 500
     assert "secret" not in str(caught.value)
 
@@ -150,7 +150,7 @@ def test_the_command_makes_lists_and_revokes(tmp_path: Path, capsys: pytest.Capt
     text = out.removesuffix("\n")
     assert "\n" not in text
     assert str(tmp_path / "tokens.json") in err
-    found = Tokens(tmp_path / "tokens.json").find(text)
+    found = Tokens(TokenFile(tmp_path / "tokens.json")).find(text)
     assert found is not None
     assert found.scopes == ("read", "write", "admin")
     assert run("create", *data, "--json") == 0
@@ -178,7 +178,7 @@ def test_the_command_takes_the_file_from_the_environment(
 ) -> None:
     monkeypatch.setenv("LODESTREAM_TOKEN_FILE", str(path))
     assert run("create", "x") == 0
-    assert Tokens(path).find(capsys.readouterr().out.strip()) is not None
+    assert Tokens(TokenFile(path)).find(capsys.readouterr().out.strip()) is not None
 
 
 @pytest.mark.parametrize(

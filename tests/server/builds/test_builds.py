@@ -24,7 +24,7 @@ from lodestream_server import running_server
 from lodestream_server.builds import builder, worker
 from lodestream_server.builds.work import Work
 from lodestream_server.operation.threads import carried_out
-from lodestream_server.store.data_folder import DataFolder
+from lodestream_server.store.data import Data
 from lodestream_server.store.durable import discard
 from tests.server.builds import slow
 from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, problem, push, settled, upload_of
@@ -199,9 +199,9 @@ def test_a_restart_keeps_surfaces_and_takes_up_builds(tmp_path: Path, monkeypatc
 
 
 @contextmanager
-def stopped(data: Path) -> Iterator[DataFolder]:
+def stopped(data: Path) -> Iterator[Data]:
     """The data folder of a server that does not run."""
-    folder = DataFolder(data)
+    folder = Data(data)
     try:
         yield folder
     finally:
@@ -259,7 +259,7 @@ def test_a_build_under_which_server_after_server_dies_is_given_up(
 
 def test_of_a_long_queue_some_builds_are_taken_up_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, most = tmp_path / "data", list[int]()
-    folder = DataFolder(data)
+    folder = Data(data)
     for number in range(11):
         folder.surfaces.accept(*upload(tmp_path, number))
     folder.close()
@@ -405,8 +405,8 @@ def test_a_manifest_that_cannot_be_read_is_left_alone_with_its_bytes(tmp_path: P
 
 def test_two_servers_never_share_a_folder(tmp_path: Path) -> None:
     with stopped(tmp_path), pytest.raises(LodestreamError, match="which another one uses"):
-        DataFolder(tmp_path)
-    DataFolder(tmp_path).close()
+        Data(tmp_path)
+    Data(tmp_path).close()
 
 
 @pytest.mark.parametrize("name", ["surfaces", "built"])

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from lodestream.container import capacity
 from lodestream.errors import OptionError
 from lodestream_server import Settings
+from lodestream_server.access.tokens import tokens_of
 from lodestream_server.commands.serve import chosen_settings, register
 from lodestream_server.operation.bounds import Bounds
 from lodestream_server.operation.settings import GROUPS, Choice, choices
@@ -163,8 +164,10 @@ def test_the_command_line_says_what_is_expected(
 def test_lists_and_paths() -> None:
     settings = parse("--origins", " https://a.example , https://b.example,", "--data", "here")
     assert settings.origins == ("https://a.example", "https://b.example")
-    assert settings.tokens == Path("here/tokens.json")
-    assert parse("--token-file", "there").tokens == Path("there")
+    assert settings.data == Path("here")
+    assert tokens_of(settings).place == "here/tokens.json"
+    assert tokens_of(parse("--token-file", "there")).place == "there"
+    assert parse("--data", "S3://bucket/a/b/").data == "s3://bucket/a/b"
 
 
 def test_bounds_are_no_business_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

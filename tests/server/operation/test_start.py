@@ -25,7 +25,7 @@ from lodestream_client.__main__ import main
 from lodestream_server import Settings, create_app, running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.store import durable
-from lodestream_server.store.data_folder import DataFolder
+from lodestream_server.store.data import Data
 from lodestream_server.store.durable import Disk
 from tests.server.helpers import PATIENCE, Keys, hills, npy, problem, push
 
@@ -102,7 +102,7 @@ def test_a_folder_that_can_be_read_but_not_written_any_more(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data = tmp_path / "data"
-    DataFolder(data).close()
+    Data(data).close()
     folder = data / name
     folder.mkdir(exist_ok=True)
     folder.chmod(0o500)
@@ -113,7 +113,7 @@ def test_a_folder_that_can_be_read_but_not_written_any_more(
         pass
     folder.chmod(0o700)
     monkeypatch.undo()
-    DataFolder(data).close()
+    Data(data).close()
 
 
 def test_a_data_folder_of_an_earlier_version_is_refused_and_left_alone(tmp_path: Path, refused: Refused) -> None:
@@ -259,13 +259,13 @@ def test_a_data_folder_that_is_open_to_others_is_closed(tmp_path: Path, caplog: 
     for setup in (0o755, 0o777, 0o2750):
         data.mkdir(exist_ok=True)
         data.chmod(setup)
-        DataFolder(data).close()
+        Data(data).close()
         assert mode(data) == setup & ~0o077
     assert not [record for record in caplog.records if record.levelname == "WARNING"]
     # With something else in it, it may be somebody's home.
     (data / "thesis.tex").write_text("")
     data.chmod(0o755)
-    DataFolder(data).close()
+    Data(data).close()
     assert mode(data) == 0o755
     (warning,) = [record for record in caplog.records if record.levelname == "WARNING"]
     assert "thesis.tex" in warning.getMessage()
@@ -280,7 +280,7 @@ def test_a_data_folder_that_cannot_be_closed_is_warned_of(
 
     tmp_path.chmod(0o755)
     monkeypatch.setattr(Path, "chmod", chmod)
-    DataFolder(tmp_path).close()
+    Data(tmp_path).close()
     assert "Operation not permitted" in caplog.text
     assert str(tmp_path) in caplog.text
 

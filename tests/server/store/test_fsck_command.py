@@ -20,7 +20,7 @@ from lodestream.stores import Folder
 from lodestream_server import running_server
 from lodestream_server.commands.fsck import register
 from lodestream_server.store.claim import claim
-from lodestream_server.store.data_folder import DataFolder
+from lodestream_server.store.data import Data
 from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
 from tests.server.helpers import hills, npy, push, settled, upload_of
@@ -228,7 +228,7 @@ def test_a_folder_without_surfaces_and_one_of_an_earlier_version(
     earlier = tmp_path / "earlier"
     (earlier / "records").mkdir(parents=True)
     with pytest.raises(InputError) as served:
-        DataFolder(earlier)
+        Data(earlier)
     with pytest.raises(InputError) as checked:
         run(str(earlier))
     assert str(checked.value) == str(served.value)

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from lodestream_server.builds import builder, worker
-from lodestream_server.store import data_folder, durable, surfaces
-from lodestream_server.store.data_folder import DataFolder
+from lodestream_server.store import data, durable, surfaces
+from lodestream_server.store.data import Data
 from tests.history.site import Disk, can_fill
 from tests.server.builds import slow
 from tests.server.builds.test_builds import running
@@ -29,7 +29,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 def fillable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Stores and indexes that `FullFolder.fill` fills."""
     FullFolder.fill(None)
-    monkeypatch.setattr(data_folder, "Folder", FullFolder)
+    monkeypatch.setattr(data, "Folder", FullFolder)
     monkeypatch.setattr(surfaces, "Index", FullIndex)
     yield
     FullFolder.fill(None)
@@ -144,7 +144,7 @@ def test_a_failure_that_cannot_be_stored(tmp_path: Path) -> None:
         path.unlink()
     with running(data) as http:
         assert settled(http, queued["url"])["state"] == "failed"
-    folder = DataFolder(data)
+    folder = Data(data)
     assert folder.surfaces.get(queued["id"]).state == "failed"
     folder.close()
 

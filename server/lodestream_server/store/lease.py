@@ -1,0 +1,210 @@
+"""The lease of a bucket: which of its servers writes. A folder has a lock instead, see `claim`.
+
+Whoever has the lease writes the object ``writer.json`` anew every few seconds. Whoever wants it watches that object,
+and takes it over when its tag has been the same for as long as the lease lasts, by the watcher's own clock: the clocks
+of two machines are never compared. A holder trusts the lease for a fifth less than it lasts, from before its last write
+was begun: so it stops before anybody takes over, even if it was stopped for a while. Every write is made in place of
+the one that was read, so of several that take over at once one does.
+
+Should all of this fail, nothing is overwritten: each change of the data is made under a condition too.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from lodestream.errors import LodestreamError
+from lodestream.stores import AbsentError, ConflictError, ExistsError, Store, StoreError, Tag
+
+from . import layout
+from .layout import WRITER, DamagedObjectError, Writer
+
+__all__ = ["LEASE_SECONDS", "Lease"]
+
+_log = logging.getLogger(__name__)
+
+#: How long a lease lasts.
+LEASE_SECONDS = 15.0
+
+# Nobody waits longer for another server, whatever its object says.
+_LONGEST = 600.0
+# Of what it lasts: when it is renewed, how often it is watched, for how long its holder trusts it.
+_RENEWED, _WATCHED, _TRUSTED = 1 / 3, 1 / 15, 4 / 5
+
+_LONGEST_NAME = 100
+
+
+def _clock() -> float:
+    """Return seconds that go on while the machine sleeps: then others take over."""
+    return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+class Lease:
+    """The lease of a bucket, as one server has it, waits for it, or leaves it to others.
+
+    Parameters
+    ----------
+    store : Store
+    seconds : float
+        How long it lasts.
+    wanted : bool
+        Whether this server is to write when nobody else does.
+    clock : callable
+        Returns seconds.
+
+    Attributes
+    ----------
+    wanted : bool
+    number : int
+        How often it has been taken, when this server took it last: another number, and others may have written.
+    turned : callable
+        Called, in a thread of the lease, when it was taken, is lost, or is held again.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        seconds: float = LEASE_SECONDS,
+        *,
+        wanted: bool = True,
+        clock: Callable[[], float] = _clock,
+    ) -> None:
+        self.wanted = wanted
+        self.number = 0
+        self.turned: Callable[[], object] = lambda: None
+        self._store = store
+        self._seconds = seconds
+        self._clock = clock
+        self._own = layout.new_write()
+        self._name = f"{socket.gethostname()[:_LONGEST_NAME]} (process {os.getpid()})"
+        self._ours = False  # whether the object that was read or written last is of this server
+        self._until = -math.inf  # by the clock; so long it is trusted
+        self._tag: Tag | None = None
+        self._there: Writer | None = None
+        self._since = 0.0  # since when the object is known to be the same
+        self._one_at_a_time = threading.Lock()
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._told: tuple[bool, int, str | None] | None = None
+        self._failing = False
+
+    @property
+    def held(self) -> bool:
+        """Whether this server has it, and nobody else can have taken it over."""
+        return self._clock() < self._until
+
+    @property
+    def holder(self) -> str | None:
+        """Name of the machine and process that has it, as far as is known; None: nobody."""
+        return None if self._there is None or self._there.holder is None else self._there.name
+
+    def tend(self) -> None:
+        """Renew it, or look who has it and take it if nobody does.
+
+        Raises
+        ------
+        StoreError
+            If the store does not answer. A lease that is not renewed ends.
+        """
+        with self._one_at_a_time:
+            begun = self._clock()
+            if self._ours:
+                self._renew(begun)
+            elif self._look(begun) and self.wanted:
+                number = max(self._there.number if self._there else 0, self.number) + 1
+                with suppress(ExistsError, ConflictError):  # somebody else was first, as the next look tells
+                    self._write(begun, number)
+            elif self._there is not None and self._there.holder == self._own:
+                self._write(begun, self._there.number)  # it was taken, and no answer came
+
+    def _renew(self, begun: float) -> None:
+        try:
+            self._write(begun, self.number)
+            return
+        except ConflictError:
+            self._ours, self._tag = False, None
+        free = self._look(begun)
+        if self._there is not None and self._there.holder == self._own:
+            self._ours = True  # a renewal of which no answer came
+            self._write(begun, self.number)
+        elif not free:
+            self._until = -math.inf
+
+    def _look(self, begun: float) -> bool:
+        """Look what is there; return whether it may be taken."""
+        try:
+            found = self._store.get_if(WRITER, self._tag)
+        except AbsentError:
+            self._tag, self._there, self._until = None, None, -math.inf
+            return True
+        if found is None:
+            lasts = self._seconds if self._there is None else max(self._seconds, min(self._there.seconds, _LONGEST))
+            return begun - self._since >= lasts
+        data, self._tag = found
+        self._since = self._clock()
+        try:
+            self._there = layout.parse(Writer, WRITER, data)
+        except DamagedObjectError as error:
+            _log.error("%s; it is replaced unless somebody renews it", error)
+            self._there = None
+        return self._there is not None and self._there.holder is None
+
+    def _write(self, begun: float, number: int, *, released: bool = False) -> None:
+        there = Writer(None if released else self._own, self._name, number, self._seconds, layout.new_write())
+        data = layout.dump(there)
+        if self._tag is None:
+            self._tag = self._store.create(WRITER, data)
+        else:
+            self._tag = self._store.replace(WRITER, data, self._tag)
+        self._there, self._ours, self.number = there, not released, number
+        self._until = -math.inf if released else begun + _TRUSTED * self._seconds
+
+    def start(self) -> None:
+        """Tend it from now on, in a thread of its own: it must not wait for what requests do."""
+        if self.wanted:
+            self._thread = threading.Thread(target=self._run, name="lodestream-lease", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Give it up, so that others need not wait."""
+        self._ending.set()
+        if self._thread is not None:
+            self._thread.join()
+        if self._ours:
+            with suppress(LodestreamError), self._one_at_a_time:
+                self._write(self._clock(), self.number, released=True)
+        self._until = -math.inf
+
+    def _run(self) -> None:
+        pause = 0.0
+        while not self._ending.wait(pause):
+            try:
+                self.tend()
+                self._failing = False
+            except StoreError as error:
+                if not self._failing:
+                    _log.error("the lease of the bucket could not be looked at: %s", error)
+                self._failing = True
+            self._tell()
+            pause = self._seconds * (_RENEWED if self._ours and not self._failing else _WATCHED)
+
+    def _tell(self) -> None:
+        held = self.held
+        now = held, self.number if held else 0, self.holder
+        before, self._told = self._told, now
+        if now == before:
+            return
+        if held:
+            _log.info("this server has the lease of the bucket from now on, the %d. one, and writes", self.number)
+        elif before is not None and before[0]:
+            _log.error("this server has lost the lease of the bucket, and writes nothing; %s has it", self.holder)
+        else:
+            _log.info("%s has the lease of the bucket; this server waits for it, and answers reads", self.holder)
+        self.turned()

@@ -1,0 +1,312 @@
+"""Surfaces in a bucket that several servers share: one writes, others follow, and a takeover loses nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lodestream.errors import LodestreamError, NotFoundError
+from lodestream.stores import Store, StoreError, open_store
+from lodestream_server.problems import ReadOnlyError, StandbyError
+from lodestream_server.store import layout
+from lodestream_server.store.changes import ChangeReader
+from lodestream_server.store.lease import Lease
+from lodestream_server.store.surfaces import Surfaces
+
+from .test_lease import SECONDS, Clock
+from .test_surfaces import build, check, keys, scenario
+from .world import CutError, Failing, container, upload
+
+
+class Server:
+    """A server of the bucket, as far as its surfaces go; nothing happens by itself."""
+
+    def __init__(self, store: Store, index: Path, clock: Clock, *, writes: bool = True) -> None:
+        self.lease = Lease(store, clock=clock, wanted=writes)
+        self.surfaces = Surfaces(store, index, lease=self.lease)
+        self._reader = ChangeReader(store)
+        self.listed = 0
+
+    def tend(self) -> None:
+        """What it does again and again."""
+        self.lease.tend()
+        if not self.surfaces.is_current:
+            self.surfaces.sync()
+        self.surfaces.changes.write()
+        if not self.surfaces.writes:
+            self._reader.look(self._take)
+
+    def _take(self, changed: tuple[str, ...] | None) -> None:
+        if changed is None:
+            self.listed += 1
+            self.surfaces.sync()
+        else:
+            self.surfaces.refresh(changed)
+
+    def states(self) -> dict[str, str]:
+        return {it.id: it.state for it in self.surfaces.index.page((0.0, ""), 100)}
+
+
+Make = Callable[..., Server]
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock(1000.0)
+
+
+@pytest.fixture
+def server(memory: str, tmp_path: Path, clock: Clock) -> Make:
+    def make(name: str, *, store: Any = None, writes: bool = True) -> Server:
+        return Server(store or open_store(memory), tmp_path / f"{name}.sqlite", clock, writes=writes)
+
+    return make
+
+
+def test_readers_see_what_the_writer_does(server: Make, tmp_path: Path) -> None:
+    writer, reader = server("writer"), server("reader", writes=False)
+    writer.tend()
+    reader.tend()
+    manifests = [upload(tmp_path, number)[0] for number in range(3)]
+    for number, manifest in enumerate(manifests):
+        writer.surfaces.accept(manifest, upload(tmp_path, number)[1])
+    writer.tend()
+    reader.tend()
+    assert reader.states() == {manifest.id: "queued" for manifest in manifests}
+    build(writer.surfaces, manifests[0], tmp_path)
+    writer.surfaces.begin(manifests[1].id)
+    writer.surfaces.refused(manifests[1].id, "no surface")
+    writer.surfaces.delete(manifests[2].id)
+    writer.surfaces.names.point("a", manifests[0].id, None, lambda _: True, 60.0)
+    writer.tend()
+    reader.tend()
+    assert reader.states() == {manifests[0].id: "ready", manifests[1].id: "failed"}
+    assert reader.surfaces.get(manifests[1].id).reason == "no surface"
+    assert reader.surfaces.info(reader.surfaces.get(manifests[0].id))
+    assert reader.surfaces.names.get("a").surface == manifests[0].id
+    writer.surfaces.retry(manifests[1].id)
+    writer.surfaces.names.delete("a", lambda _: True)
+    writer.tend()
+    reader.tend()
+    assert reader.states()[manifests[1].id] == "queued"
+    with pytest.raises(NotFoundError):
+        reader.surfaces.names.get("a")
+    assert reader.listed == 1, "but for the first time nothing was listed"
+
+
+def changes(server: Server, folder: Path) -> dict[str, Callable[[], object]]:
+    manifest, files = upload(folder, 0)
+    surfaces, everybody = server.surfaces, lambda _: True
+    return {
+        "accept": lambda: surfaces.accept(manifest, files),
+        "begin": lambda: surfaces.begin(manifest.id),
+        "built": lambda: surfaces.built(manifest.id, *container(folder, manifest)),
+        "refused": lambda: surfaces.refused(manifest.id, "no surface"),
+        "retry": lambda: surfaces.retry(manifest.id),
+        "delete": lambda: surfaces.delete(manifest.id),
+        "collect": surfaces.collect,
+        "point": lambda: surfaces.names.point("a", manifest.id, None, everybody, 60.0),
+        "forget": lambda: surfaces.names.delete("a", everybody),
+    }
+
+
+@pytest.mark.parametrize("writes", [False, True])
+def test_whoever_does_not_write_changes_nothing(server: Make, tmp_path: Path, writes: bool) -> None:
+    writer, other = server("writer"), server("other", writes=writes)
+    writer.tend()
+    writer.surfaces.accept(*upload(tmp_path, 0))
+    writer.tend()
+    other.tend()
+    before = keys(writer.surfaces.store)
+    refusal = StandbyError if writes else ReadOnlyError
+    for name, change in changes(other, tmp_path).items():
+        with pytest.raises(refusal):
+            change()
+        assert keys(writer.surfaces.store) == before, name
+    assert not other.surfaces.lose("0" * 64)
+    if writes:
+        with pytest.raises(StandbyError, match="process"):  # which names who writes
+            other.surfaces.check_writer()
+
+
+def test_a_server_that_takes_over_knows_what_the_one_before_has_done(
+    server: Make, clock: Clock, tmp_path: Path
+) -> None:
+    first, second, reader = server("first"), server("second"), server("reader", writes=False)
+    for each in (first, second, reader):
+        each.tend()
+    manifest, files = upload(tmp_path, 0)
+    first.surfaces.accept(manifest, files)  # and is killed before it can tell
+    reader.tend()
+    assert reader.states() == {}
+    clock.now += SECONDS + 1
+    second.lease.tend()
+    assert second.lease.held
+    with pytest.raises(StandbyError, match="about to"):
+        second.surfaces.check_writer()
+    second.tend()
+    assert second.surfaces.writes
+    assert second.states() == {manifest.id: "queued"}
+    second.tend()
+    reader.tend()
+    assert reader.states() == {manifest.id: "queued"}
+
+
+WHEN = ("create", "put_file", "get")
+
+
+@pytest.mark.parametrize("when", WHEN)
+@pytest.mark.parametrize("change", ["accept", "built", "delete", "point"])
+def test_a_writer_that_is_stopped_during_a_change_acknowledges_nothing(
+    server: Make, memory: str, clock: Clock, tmp_path: Path, change: str, when: str
+) -> None:
+    store: Any = open_store(memory)
+    method = getattr(store, when)
+    stopped: list[bool] = []
+
+    def stop(*given: Any, **named: Any) -> Any:
+        result = method(*given, **named)
+        if stopped:
+            stopped.clear()
+            clock.now += SECONDS + 1
+            second.tend()
+            assert second.surfaces.writes
+        return result
+
+    setattr(store, when, stop)
+    first, second = server("first", store=store), server("second")
+    first.tend()
+    second.tend()
+    manifest, files = upload(tmp_path, 0)
+    changed = changes(first, tmp_path)
+    if change != "accept":
+        first.surfaces.accept(manifest, files)
+        first.surfaces.begin(manifest.id)
+    stopped.append(True)
+    try:
+        changed[change]()
+    except StandbyError:
+        assert not stopped
+    else:
+        assert stopped, "it made no such request"
+    if not stopped:
+        assert not first.lease.held
+        # Whatever was written is there for the one that writes now, and nothing of it was overwritten.
+        second.surfaces.sync()
+        second.surfaces.accept(*upload(tmp_path, 0))
+        second.tend()
+        assert manifest.id in second.states()
+        with pytest.raises(StandbyError):
+            changed["accept"]()
+
+
+def test_two_that_both_believe_to_write_do_not_overwrite_each_other(server: Make, clock: Clock, tmp_path: Path) -> None:
+    first, second = server("first"), server("second")
+    first.tend()
+    second.tend()
+    clock.now += SECONDS + 1
+    second.tend()
+    first.lease._until = clock.now + 3600.0  # its clock stands
+    assert first.surfaces.writes
+    assert second.surfaces.writes
+    manifest, files = upload(tmp_path, 0)
+    other, other_files = upload(tmp_path, 0)
+    first.surfaces.accept(manifest, files)
+    found, new = second.surfaces.accept(other, other_files)
+    assert found.manifest.write == manifest.write, "it finds the one that is there"
+    build(first.surfaces, manifest, tmp_path)
+    build(second.surfaces, manifest, tmp_path)
+    first.surfaces.names.point("a", manifest.id, None, lambda _: True, 60.0)
+    second.surfaces.names.point("a", manifest.id, None, lambda _: True, 60.0)
+    for each in (first, second):
+        each.surfaces.sync()
+        assert each.states() == {manifest.id: "ready"}
+    first.surfaces.changes.write()
+    second.surfaces.changes.write()
+    assert new
+
+
+def test_bytes_that_nothing_refers_to_stay_for_a_day_in_case_another_server_refers_to_them(
+    server: Make, tmp_path: Path
+) -> None:
+    writer = server("writer")
+    writer.tend()
+    manifest, files = upload(tmp_path, 0)
+    writer.surfaces.accept(manifest, files)
+    build(writer.surfaces, manifest, tmp_path)
+    writer.surfaces.delete(manifest.id)
+    left = {key.partition("/")[0] for key in keys(writer.surfaces.store)}
+    assert left == {"lodestream.json", "writer.json", "changes.json", "uploads", "containers"}
+    assert writer.surfaces.collect() == []
+    assert len(writer.surfaces.collect(older=-1.0)) == 2
+
+
+def test_a_cut_at_every_step_loses_nothing_whoever_goes_on(memory: str, tmp_path: Path) -> None:
+    at = strays = 0
+    while True:
+        store = open_store(memory)
+        store.delete(entry.key for entry in store.entries(""))
+        clock = Clock()
+        failing: Any = Failing(store, at)
+        acked, deleted, begun = dict[str, bytes](), set[str](), set[str]()
+        done = False
+        with suppress(CutError):
+            first = Server(failing, tmp_path / f"{at}.sqlite", clock)
+            first.tend()
+            scenario(first.surfaces, tmp_path, acked, deleted, begun)
+            done = True
+        second = Server(store, tmp_path / f"{at}-second.sqlite", clock)
+        second.tend()
+        clock.now += SECONDS + 1
+        second.tend()
+        assert second.surfaces.writes
+        assert second.states().keys() >= acked.keys() - begun
+        strays += check(store, tmp_path / f"{at}-check.sqlite", acked, deleted, begun)
+        if done:
+            break
+        at += 5
+    assert at > 30
+    assert strays > 0
+
+
+def test_an_index_that_is_lost_is_made_again_in_a_reader(server: Make, tmp_path: Path) -> None:
+    writer, reader = server("writer"), server("reader", writes=False)
+    writer.tend()
+    for number in range(3):
+        writer.surfaces.accept(*upload(tmp_path, number))
+    reader.tend()
+    (tmp_path / "reader.sqlite").unlink()
+    with pytest.raises(LodestreamError):
+        reader.states()
+    reader.surfaces.restore()
+    assert len(reader.states()) == 3
+
+
+def test_a_hint_that_names_what_is_no_surface_is_harmless(server: Make) -> None:
+    reader = server("reader")
+    reader.surfaces.refresh(["", "../a", "names/../a.json", "0" * 20, "names/a.json"])
+    assert reader.states() == {}
+
+
+def test_a_bucket_that_fails_while_it_is_read_leaves_the_index_as_it_was(
+    server: Make, memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer, reader = server("writer"), server("reader", writes=False)
+    writer.tend()
+    writer.surfaces.accept(*upload(tmp_path, 0))
+    writer.tend()
+
+    def fail(key: str, *_: object) -> Any:
+        raise StoreError("no network")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(reader.surfaces.store, "get", fail)
+        with pytest.raises(StoreError):
+            reader.tend()
+    assert reader.states() == {}
+    reader.tend()
+    assert reader.states() == {layout.id_of(layout.manifest_key(f"{0:020x}")): "queued"}

@@ -1,0 +1,156 @@
+"""One server that writes to a bucket, others that wait for that, and others that only read."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from lodestream.errors import InputError, LodestreamError
+from lodestream.stores import open_store
+from lodestream_client.program import main
+from lodestream_server import running_server
+from lodestream_server.access.tokens import TokenObject
+from tests.patience import PATIENCE
+from tests.server.helpers import eventually, hills, npy, problem, push
+from tests.stores.emulators import ministack, s3
+from tests.stores.memory import memory
+
+__all__ = ["memory", "ministack", "s3"]
+
+LEASE, LOOK = 2.0, 0.2
+
+
+@dataclass
+class Site:
+    """Servers of one bucket."""
+
+    address: str
+    folder: Path
+    stack: ExitStack
+
+    def start(self, name: str, **settings: Any) -> httpx.Client:
+        """Start one; what it does again and again, it does often."""
+        usual = {"workers": 1, "lease_seconds": LEASE, "look_seconds": LOOK, "scratch": self.folder / name}
+        url = self.stack.enter_context(running_server(self.address, **(usual | settings)))
+        return self.stack.enter_context(httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE))
+
+
+@pytest.fixture
+def site(memory: str, tmp_path: Path) -> Iterator[Site]:
+    with ExitStack() as stack:
+        yield Site(memory, tmp_path, stack)
+
+
+def role(http: httpx.Client) -> str:
+    return str(http.get("/readyz").json()["role"])
+
+
+def writer(site: Site, name: str = "writer", **settings: Any) -> httpx.Client:
+    http = site.start(name, **settings)
+    eventually(lambda: role(http) == "writer", "the server to write")
+    return http
+
+
+def states(http: httpx.Client) -> dict[str, str]:
+    return {it["id"]: it["state"] for it in http.get("/v1/surfaces").json()["surfaces"]}
+
+
+def within(seconds: float, look: Callable[[], object], what: str) -> None:
+    """As `eventually`, by a clock that a busy machine does not stop: so there is room above what is promised."""
+    begun = time.monotonic()
+    eventually(look, what)
+    assert time.monotonic() - begun < seconds, what
+
+
+def test_a_reader_serves_what_the_writer_built_and_changes_nothing(site: Site) -> None:
+    first = writer(site)
+    reader = site.start("reader", read_only=True)
+    assert role(reader) == "reader"
+    uploaded = push(first, npy(hills()))
+    assert uploaded["state"] == "ready"
+    within(5.0, lambda: states(reader) == {uploaded["id"]: "ready"}, "the reader to see it")
+    location = f"/v1/surfaces/{uploaded['id']}"
+    container = f"/v1/containers/{uploaded['container_sha256']}.lode"
+    whole = first.get(container)
+    assert whole.status_code == 200
+    assert reader.get(container).content == whole.content
+    assert reader.head(container).headers["content-length"] == str(len(whole.content))
+    part = reader.get(container, headers={"range": "bytes=10-99"})
+    assert (part.status_code, part.content) == (206, whole.content[10:100])
+    assert part.headers["content-range"] == f"bytes 10-99/{len(whole.content)}"
+    assert reader.get(container, headers={"range": "bytes=-7"}).content == whole.content[-7:]
+    assert reader.get(container, headers={"range": "bytes=1-2,5-6"}).content == whole.content
+    assert reader.get(container, headers={"range": f"bytes={len(whole.content)}-"}).status_code == 416
+    assert reader.get(f"{location}/levels/0?format=npy").status_code == 200
+    writes = ("POST", "/v1/surfaces"), ("DELETE", location), ("POST", f"{location}/retry"), ("PUT", "/v1/names/a")
+    for method, path in writes:
+        assert problem(reader.request(method, path, content=b"")) == (403, "read-only")
+    first.delete(location).raise_for_status()
+    within(5.0, lambda: states(reader) == {}, "the reader to see that it is gone")
+    assert reader.get(location).status_code == 404
+
+
+def test_another_server_waits_says_for_whom_and_takes_over(site: Site) -> None:
+    first = writer(site)
+    uploaded = push(first, npy(hills()))
+    second = site.start("second")
+    eventually(lambda: second.get("/readyz").json().get("writer"), "the second one to know who writes")
+    assert role(second) == "waiting"
+    eventually(lambda: states(second) == {uploaded["id"]: "ready"}, "it to answer reads")
+    refused = second.post("/v1/surfaces", content=npy(hills(seed=2)))
+    assert problem(refused) == (503, "busy")
+    assert "process" in refused.json()["detail"]
+    assert refused.headers["retry-after"] == "5"
+
+
+def test_what_the_reader_of_a_folder_or_of_nothing_is_told(site: Site, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="in a bucket"):
+        site.stack.enter_context(running_server(tmp_path / "data", read_only=True))
+    with pytest.raises(InputError, match="expected the data of a server in s3://memory/data, got none"):
+        site.start("reader", read_only=True)
+    open_store(site.address).create("view.json", b"{}")
+    with pytest.raises(LodestreamError, match="published prefix"):
+        site.start("writer")
+
+
+def test_a_token_that_is_revoked_ends_at_every_reader(site: Site) -> None:
+    tokens = TokenObject(open_store(site.address))
+    text, _ = tokens.create("ann", ("write",))
+    writer(site)
+    reader = site.start("reader", read_only=True)
+    header = {"authorization": f"Bearer {text}"}
+    assert reader.get("/v1/surfaces").status_code == 401
+    assert reader.get("/v1/surfaces", headers=header).status_code == 200
+    assert problem(reader.post("/v1/surfaces", headers=header))[1] == "read-only"
+    tokens.revoke("ann")
+    within(10.0, lambda: reader.get("/v1/surfaces", headers=header).status_code == 401, "it to be refused")
+
+
+def test_a_pull_that_is_cut_short_goes_on_at_another_server(
+    site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("LODESTREAM_CACHE", str(tmp_path / "cache"))
+    first = writer(site)
+    reader = site.start("reader", read_only=True)
+    surface = hills(200, 200)
+    uploaded = push(first, npy(surface))
+    eventually(lambda: states(reader).get(uploaded["id"]) == "ready", "the reader to see it")
+    out = tmp_path / "out.npy"
+    urls = [str(http.base_url).rstrip("/") + f"/v1/surfaces/{uploaded['id']}" for http in (first, reader)]
+    assert main(["pull", urls[0], str(out), "--resume", "--max-bytes", "20000"]) == 0
+    capsys.readouterr()
+    assert main(["pull", urls[1], str(out), "--resume", "--json"]) == 0
+    told = capsys.readouterr()
+    assert "are here from an earlier pull" in told.err
+    figures = json.loads(told.out)
+    assert figures["wire_bytes"] < figures["bytes"] - 15_000
+    assert np.load(out).tobytes() == surface.tobytes()
