@@ -101,6 +101,14 @@ def test_what_is_to_stay_free_stays_free(tmp_path: Path, disk: dict[str, int], l
             asyncio.run(read(made, request(b"x", length=length)))
 
 
+def test_of_two_disks_the_fuller_one_has_the_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = {tmp_path: 900, tmp_path / "scratch": 700}
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(100_000, 0, free[path]))
+    for folders in (list(free), list(free)[::-1]):
+        made = Limits(Settings(keep_free=500), folders, lambda _: (0, 0), lambda _: 0, lambda: True)
+        assert asyncio.run(made.room()) == 200
+
+
 def test_a_twentieth_of_a_small_disk_stays_free_if_nothing_is_said(tmp_path: Path, disk: dict[str, int]) -> None:
     disk["total"] = 20_000
     asyncio.run(read(limits(tmp_path), request(b"", length=0)))

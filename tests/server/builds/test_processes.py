@@ -356,9 +356,8 @@ def test_closing_kills_what_runs(server: ForkServer, tmp_path: Path) -> None:
     asyncio.run(check())
 
 
-@pytest.mark.parametrize(
-    "ending", ["cancel", *(pytest.param(it, marks=pytest.mark.long) for it in ("close", "fork server"))]
-)
+@pytest.mark.parametrize("ending", ["cancel", "close", "fork server"])
+@pytest.mark.long
 def test_what_a_call_has_started_ends_with_it(tmp_path: Path, ending: str) -> None:
     server = ForkServer()
     begun, other = tmp_path / "begun", tmp_path / "begun.other"

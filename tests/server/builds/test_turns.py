@@ -230,3 +230,37 @@ def test_whoever_was_passed_over_while_away_stands_in_line_again() -> None:
         return began.is_set()
 
     assert asyncio.run(come_back())
+
+
+def test_tasks_of_a_caller_come_in_the_order_of_their_ranks() -> None:
+    async def crowd() -> list[tuple[int, int]]:
+        order: list[tuple[int, int]] = []
+        turns = Turns(1, 600.0)
+
+        async def work(rank: int, number: int) -> None:
+            async with turns.turn("anna", rank):
+                order.append((rank, number))
+
+        async with asyncio.timeout(PATIENCE), asyncio.TaskGroup() as group, turns.turn("anna"):
+            for number, rank in enumerate((2, 0, 1, 0)):
+                group.create_task(work(rank, number))
+            await asyncio.sleep(0)
+            assert not order
+        return order
+
+    assert asyncio.run(crowd()) == [(0, 1), (0, 3), (1, 2), (2, 0)]
+
+
+def test_what_a_caller_has_used_adds_up() -> None:
+    async def crowd() -> list[str]:
+        clock = Clock()
+        turns = Turns(1, 600.0, clock)
+        for caller, seconds in (("anna", 20), ("bert", 30), ("anna", 20)):
+            async with turns.turn(caller):
+                clock.now += seconds
+        async with turns.turn("carl"):
+            waiting = asyncio.create_task(order_of(turns, clock, ["anna", "bert"]))
+            await asyncio.sleep(0.01)
+        return await waiting
+
+    assert asyncio.run(crowd()) == ["bert", "anna"]
