@@ -20,7 +20,7 @@ EFFORTS: tuple[Effort, ...] = get_args(Effort)
 class Quality:
     """How closely a container keeps a surface, by default bit for bit; and with how much effort it is made.
 
-    >>> Quality.of("1e-4d").precision
+    >>> Quality.of("0.01%").precision
     Tolerance(value=0.0001, relative=True)
     >>> Quality.of(rms=0.5, attributes={"depth": 2}).attributes
     {'depth': Tolerance(value=2.0, relative=False)}
@@ -82,7 +82,7 @@ class Quality:
     def parse(cls, precisions: Iterable[str] = (), rms: str | None = None, effort: str = "default") -> Quality:
         """Parse a quality from the texts of a command line or a query, which `texts` returns.
 
-        >>> Quality.parse(["1e-4d", "depth=0.5"]) == Quality.of("1e-4d", attributes={"depth": 0.5})
+        >>> Quality.parse(["0.01%", "depth=0.5"]) == Quality.of("0.01%", attributes={"depth": 0.5})
         True
 
         Parameters
@@ -114,8 +114,8 @@ class Quality:
     def texts(self) -> tuple[list[str], str | None]:
         """Return the texts of errors that `parse` reads: the precisions and the RMS error, in canonical spelling.
 
-        >>> Quality.of(attributes={"depth": 0.5}, rms="0.10d").texts()
-        (['depth=0.5'], '0.1d')
+        >>> Quality.of(attributes={"depth": 0.5}, rms="10.0%").texts()
+        (['depth=0.5'], '10%')
         """
         precisions = [] if self.precision is None else [str(self.precision)]
         precisions += [f"{name}={tolerance}" for name, tolerance in self.attributes.items()]

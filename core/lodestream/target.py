@@ -66,7 +66,7 @@ class Tolerance:
     Examples
     --------
     >>> import lodestream
-    >>> lodestream.Tolerance.of("1e-3d").absolute(extent=2000.0)
+    >>> lodestream.Tolerance.of("0.1%").absolute(extent=2000.0)
     2.0
     """
 
@@ -81,7 +81,7 @@ class Tolerance:
     def of(cls, error: Tolerance | float | str) -> Tolerance:
         """Convert an error: a tolerance, a number in the surface's unit, or a text for `parse`.
 
-        >>> Tolerance.of("1e-3d")
+        >>> Tolerance.of("0.1%")
         Tolerance(value=0.001, relative=True)
 
         Raises
@@ -100,22 +100,30 @@ class Tolerance:
 
     @classmethod
     def parse(cls, text: str) -> Tolerance:
-        """Parse ``0.5`` (in the surface's unit) or ``1e-3d`` (1e-3 times the extent).
+        """Parse ``0.5`` (in the surface's unit) or ``0.1%`` (of the extent).
 
         Raises
         ------
         OptionError
             If the text is neither.
         """
-        number, relative = (text[:-1], True) if text.endswith("d") else (text, False)
+        number, relative = (text[:-1].rstrip(), True) if text.endswith("%") else (text, False)
+        mantissa, exponential, exponent = number.lower().partition("e")
         try:
+            if relative:  # by the exponent, so that the number is that of the decimals without rounding twice
+                number = f"{mantissa}e{int(exponent if exponential else 0) - 2}"
             return cls(float(number), relative)
         except ValueError:
-            raise OptionError(f"expected a number such as 0.5, or 1e-3d (times the extent), got {text!r}") from None
+            raise OptionError(f"expected a number such as 0.5, or 0.1% (of the extent), got {text!r}") from None
 
     def __str__(self) -> str:
         """Return the canonical text of this tolerance, which `parse` reads."""
-        return f"{float(self.value)!r}{'d' if self.relative else ''}"
+        if not self.relative:
+            return f"{float(self.value)!r}"
+        from decimal import Decimal
+
+        percent = Decimal(repr(float(self.value))).scaleb(2).normalize()  # exact, as the exponent alone changes
+        return f"{percent:f}%" if -7 < percent.adjusted() < 17 else f"{percent:e}%"
 
     def absolute(self, extent: float) -> float:
         """Return the tolerance in the unit of a surface with this extent."""
@@ -247,5 +255,5 @@ def _limits(given: Limits | None) -> Tolerance | dict[str, Tolerance] | None:
     for name, limit in limits.items():
         if limit.relative:
             # The extent is one of lengths; a channel has its own unit.
-            raise OptionError(f"expected an error of {name!r} in its own unit, got {limit}, which is times the extent")
+            raise OptionError(f"expected an error of {name!r} in its own unit, got {limit}, which is of the extent")
     return limits or None

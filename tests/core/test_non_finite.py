@@ -161,7 +161,7 @@ def test_every_surface_comes_back_bit_for_bit(surface: ls.Surface) -> None:
 @given(surfaces(), st.booleans())
 def test_with_a_precision_or_an_error_infinities_come_back_and_the_rest_nearly(surface: ls.Surface, rms: bool) -> None:
     attributes = {name: "0.25" for name in ("t", "flow") if name in surface.blocks[0].attributes}
-    error = {"rms": "1e-2d"} if rms else {"precision": "1e-2d"}
+    error = {"rms": "1%"} if rms else {"precision": "1%"}
     decoder = ls.Decoder()
     decoder.feed(ls.encode(surface, **error, attribute_precision=attributes))  # type: ignore[call-overload]
     assert decoder.header is not None
@@ -190,8 +190,8 @@ KINDS: dict[str, Callable[[], tuple[ls.Surface, dict[str, Any]]]] = {
     "xyz": lambda: (ls.Surface(lake((60, 75), 3, "float64"), attributes={"t": lake((60, 75), 1)}), {}),
     "plane": lambda: (ls.Surface(plane()), {}),
     "terraces": lambda: (ls.Surface(terraces()), {}),
-    "precision": lambda: (ls.Surface(lake((70, 66))), {"precision": "1e-3d"}),
-    "error": lambda: (ls.Surface(lake((70, 66), 3)), {"rms": "1e-3d"}),
+    "precision": lambda: (ls.Surface(lake((70, 66))), {"precision": "0.1%"}),
+    "error": lambda: (ls.Surface(lake((70, 66), 3)), {"rms": "0.1%"}),
     "blocks": lambda: (ls.Surface(blocks=pair()), {}),
     "sphere": lambda: (ls.Surface(globe(), (False, True)), {}),
 }

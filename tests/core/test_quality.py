@@ -30,7 +30,7 @@ def test_a_quality_is_the_one_that_its_texts_say(
 
 
 def test_numbers_and_texts_are_a_shorthand() -> None:
-    assert Quality.of(np.float64(0.5), attributes={"heat": "1e-3d"}) == Quality(
+    assert Quality.of(np.float64(0.5), attributes={"heat": "0.1%"}) == Quality(
         precision=Tolerance(0.5), attributes={"heat": Tolerance(1e-3, relative=True)}
     )
     assert Quality.of(rms=2) == Quality(rms=Tolerance(2.0))
@@ -65,8 +65,8 @@ def test_what_is_no_error_is_refused(place: str, error: Any) -> None:
 def test_the_encoder_takes_a_quality_or_its_shorthand() -> None:
     heights = np.cumsum(np.random.default_rng(3).normal(size=(20, 30)), axis=0)
     surface = ls.Surface(heights, attributes={"heat": heights[::-1]})
-    quality = Quality.of("1e-2d", attributes={"heat": 0.1})
-    short = ls.encode(surface, "1e-2d", attribute_precision={"heat": 0.1})
+    quality = Quality.of("1%", attributes={"heat": 0.1})
+    short = ls.encode(surface, "1%", attribute_precision={"heat": 0.1})
     assert ls.encode(surface, quality=quality) == short
     assert ls.encode(heights, quality=Quality.of(rms=0.1)) == ls.encode(heights, rms=0.1)
     for more in ({"precision": 1.0}, {"rms": 1.0}, {"attribute_precision": {"heat": 0.1}}):

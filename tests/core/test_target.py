@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,10 @@ from lodestream import OptionError, Selection, Target, Tolerance
     ("text", "tolerance"),
     [
         ("0.5", Tolerance(0.5)),
-        ("1e-3d", Tolerance(1e-3, relative=True)),
+        ("0.1%", Tolerance(1e-3, relative=True)),
         ("0", Tolerance(0.0)),
-        (" 2 d", Tolerance(2.0, relative=True)),
+        (" 200 %", Tolerance(2.0, relative=True)),
+        ("7e-2%", Tolerance(7e-4, relative=True)),
     ],
 )
 def test_an_error_is_in_the_unit_or_a_fraction(text: str, tolerance: Tolerance) -> None:
@@ -28,14 +30,18 @@ def test_an_error_is_in_the_unit_or_a_fraction(text: str, tolerance: Tolerance) 
 def test_a_tolerance_is_the_one_that_its_text_says(value: float, relative: bool) -> None:
     tolerance = Tolerance(value, relative)
     assert Tolerance.parse(str(tolerance)) == tolerance
-    assert str(Tolerance.parse(f" {value:.20e}{'d' if relative else ''}")) == str(tolerance)
+    text = f"{Decimal(value).scaleb(2):.40e}%" if relative else f" {value:.20e}"
+    assert str(Tolerance.parse(text)) == str(tolerance)
 
 
 @pytest.mark.parametrize(
     ("tolerance", "text"),
     [
         (Tolerance(0.5), "0.5"),
-        (Tolerance(1e-3, relative=True), "0.001d"),
+        (Tolerance(1e-3, relative=True), "0.1%"),
+        (Tolerance(0.29, relative=True), "29%"),
+        (Tolerance(0, relative=True), "0%"),
+        (Tolerance(1e-12, relative=True), "1e-10%"),
         (Tolerance(2), "2.0"),
         (Tolerance(np.float64(0.25)), "0.25"),
     ],
@@ -44,7 +50,7 @@ def test_a_tolerance_has_one_spelling(tolerance: Tolerance, text: str) -> None:
     assert str(tolerance) == text
 
 
-@pytest.mark.parametrize("text", ["", "d", "fine", "-1", "nan", "inf", "1e-3dd", "1 m"])
+@pytest.mark.parametrize("text", ["", "%", "fine", "-1", "-1%", "nan", "nan%", "inf", "0.1%%", "1e%", "1e-3d", "1 m"])
 def test_other_texts_are_refused(text: str) -> None:
     with pytest.raises(OptionError, match="expected"):
         Tolerance.parse(text)
@@ -105,7 +111,7 @@ def test_no_errors_of_channels_are_no_limit() -> None:
 @pytest.mark.parametrize(
     ("limits", "expected"),
     [
-        ({"until_rms": {"a": "1e-3d"}}, "an error of 'a' in its own unit, got 0.001d"),
+        ({"until_rms": {"a": "0.1%"}}, "an error of 'a' in its own unit, got 0.1%"),
         ({"until_rms": {"a": -1}}, "an error of 0 or more, got -1"),
         ({"until_rms": {"a": 1}, "until_max": 2}, "either an error of the whole surface or errors of channels"),
         ({"until_rms": {"a": 1}, "region": ((0, 1), (0, 1))}, "either errors of channels or a region"),

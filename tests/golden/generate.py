@@ -238,14 +238,14 @@ def _simple() -> dict[str, Original]:
         "heights-float32": Original(ls.Surface(wave.astype(np.float32))),
         "heights-float64-hostile": Original(ls.Surface(hostile)),
         "heights-noise": Original(ls.Surface(noise.astype(np.uint32).view(np.float32))),
-        "heights-precision": Original(ls.Surface(_wave(90, 70)), "1e-4d"),
+        "heights-precision": Original(ls.Surface(_wave(90, 70)), "0.01%"),
         "heights-constant": Original(ls.Surface(np.full((5, 8), 12.5))),
         "heights-offsets": Original(ls.Surface(quantised.astype(np.float32))),
         "heights-widest": Original(ls.Surface(widest.astype(np.int32))),
         "heights-tower": Original(ls.Surface(tower)),
         "planar-open": Original(ls.Surface(_torus(13, 11)[..., :2].astype(np.float32))),
         "torus-odd": Original(ls.Surface(_torus(21, 33).astype(np.float32), (True, True))),
-        "cylinder-even": Original(ls.Surface(_torus(24, 18), (True, False)), "1e-3d"),
+        "cylinder-even": Original(ls.Surface(_torus(24, 18), (True, False)), "0.1%"),
         "attributes": Original(ls.Surface(attributes, (False, True))),
         "curve": Original(ls.Surface(_torus(1, 70)[0][:, None].astype(np.float32), (True, False))),
         "two-points": Original(ls.Surface(np.array([[1.0, 4.0]]))),
@@ -268,7 +268,7 @@ def _with_holes() -> dict[str, Original]:
     return {
         "holes-float32": Original(ls.Surface(floats)),
         "holes-int16": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -32768})),
-        "holes-closed": Original(ls.Surface(tube, (True, True)), "1e-4d"),
+        "holes-closed": Original(ls.Surface(tube, (True, True)), "0.01%"),
     }
 
 
@@ -293,7 +293,7 @@ def _not_finite() -> dict[str, Original]:
         "infinite-points": Original(ls.Surface(points, (True, True), attributes=named)),
         "infinite-plane": Original(ls.Surface(plane)),
         "infinite-blocks": Original(_blocks(blocks)),
-        "infinite-error": Original(ls.Surface(heights), rms="1e-2d"),
+        "infinite-error": Original(ls.Surface(heights), rms="1%"),
     }
 
 
@@ -357,7 +357,7 @@ def _planes() -> dict[str, Original]:
     found["plane-centres"] = np.stack([*np.meshgrid(x, y), z], axis=-1)
     found["plane-span"] = np.stack([*np.meshgrid(np.linspace(0.3, 2.9, 65), y), z], axis=-1)
     found["plane-uneven"] = found["plane-turned"][:29, :54]
-    return {name: Original(ls.Surface(points), "1e-3d") for name, points in found.items()}
+    return {name: Original(ls.Surface(points), "0.1%") for name, points in found.items()}
 
 
 def _arrangements() -> dict[str, Original]:
@@ -395,7 +395,7 @@ def _arrangements() -> dict[str, Original]:
         "cylinder-disc": Original(_blocks([wall, disc], (False, True))),
         "cylinder-flap": Original(ls.Surface(blocks=[ls.Block(wall, (False, True)), ls.Block(flap)])),
         "moebius": Original(_blocks(_cut(_moebius(41, 8), [0, 12, 26, 40], [0, 7]))),
-        "blocks-groups": Original(_blocks(large), "2e-3d"),
+        "blocks-groups": Original(_blocks(large), "0.2%"),
     }
 
 
@@ -408,13 +408,13 @@ def _made_for_an_error() -> dict[str, Original]:
     colors: dict[str, NDArray[Any]] = {"color": rng.integers(0, 256, (48, 51, 3)).astype(np.uint8)}
     globe = np.concatenate([_sphere(17, 24), _sphere(17, 24)[:, :1]], axis=1)
     return {
-        "error-smooth": Original(ls.Surface(_wave(120, 141).astype(np.float32)), rms="1e-3d"),
-        "error-trellis": Original(ls.Surface(rough), rms="1e-2d"),
-        "error-trellis-tiles": Original(ls.Surface(np.concatenate([rough, rough[::-1]])), rms="5e-3d"),
+        "error-smooth": Original(ls.Surface(_wave(120, 141).astype(np.float32)), rms="0.1%"),
+        "error-trellis": Original(ls.Surface(rough), rms="1%"),
+        "error-trellis-tiles": Original(ls.Surface(np.concatenate([rough, rough[::-1]])), rms="0.5%"),
         "error-holes": Original(ls.Surface(metres, mask=~lake, metadata={"nodata": -9999}), rms="5"),
-        "error-attributes": Original(ls.Surface(_torus(48, 51), (True, True), attributes=colors), rms="2e-3d"),
-        "error-blocks": Original(_blocks(_cut(globe, [0, 16], [0, 9, 24])), rms="1e-3d"),
-        "error-curve": Original(ls.Surface(_torus(1, 90)[0][:, None], (True, False)), rms="1e-3d"),
+        "error-attributes": Original(ls.Surface(_torus(48, 51), (True, True), attributes=colors), rms="0.2%"),
+        "error-blocks": Original(_blocks(_cut(globe, [0, 16], [0, 9, 24])), rms="0.1%"),
+        "error-curve": Original(ls.Surface(_torus(1, 90)[0][:, None], (True, False)), rms="0.1%"),
     }
 
 
@@ -443,10 +443,10 @@ def _large() -> dict[str, Original]:
             ls.Surface(_torus(26, 70).astype(np.float32), (True, False), attributes=attributes), crafted=everywhere
         ),
         "large-blocks": Original(ls.Surface(blocks=sides), crafted=everywhere),
-        "large-closed": Original(ls.Surface(_torus(21, 72)), "1e-5d", crafted=everywhere),
+        "large-closed": Original(ls.Surface(_torus(21, 72)), "0.001%", crafted=everywhere),
         "large-error": Original(
             ls.Surface(_torus(26, 70), (True, False), attributes={"color": attributes["color"]}),
-            rms="2e-3d",
+            rms="0.2%",
             crafted=everywhere,
         ),
         "large-holes": Original(ls.Surface(holes, mask=~lake), crafted=everywhere),
@@ -505,7 +505,7 @@ def _of_levels() -> dict[str, Original]:
             rewritten=lambda parts: parts.with_more_planes(2),
             detailed=True,
         ),
-        "levels-quantised": Original(ls.Surface(_wave(21, 30)), rms="1e-2d", detailed=True),
+        "levels-quantised": Original(ls.Surface(_wave(21, 30)), rms="1%", detailed=True),
     }
 
 
@@ -605,7 +605,7 @@ def _of_strings() -> dict[str, Original]:
             rewritten=lambda parts: parts.with_segments(lambda s: s.data[:-1] if len(s.data) > 9 else s.data),
         ),
         "strings-indices": Original(
-            ls.Surface(_wave(21, 30)), rms="1e-2d", rewritten=lambda parts: parts.with_header(large=1)
+            ls.Surface(_wave(21, 30)), rms="1%", rewritten=lambda parts: parts.with_header(large=1)
         ),
         "strings-states": Original(
             ls.Surface(np.rint(40 * _wave(26, 40)).astype(np.int16)),
@@ -645,8 +645,8 @@ def _of_values() -> dict[str, Original]:
         )
         for name, (dtype, *lattice) in types.items()
     } | {
-        "values-steps-least": Original(ls.Surface(_wave(40, 33)), rms="1e-2d", rewritten=with_base(1)),
-        "values-steps-most": Original(quantised, rms="2e-4d", rewritten=with_base((1 << 24) - 1)),
+        "values-steps-least": Original(ls.Surface(_wave(40, 33)), rms="1%", rewritten=with_base(1)),
+        "values-steps-most": Original(quantised, rms="0.02%", rewritten=with_base((1 << 24) - 1)),
     }
 
 

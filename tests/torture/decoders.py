@@ -15,7 +15,7 @@ from tests.core.decoding.comparison import agree_on, surfaces
 
 __all__ = ["Compared", "run"]
 
-_OPTIONS: tuple[dict[str, str], ...] = ({}, {}, {"precision": "1e-3d"}, {"rms": "1e-2d"}, {"rms": "1e-4d"})
+_OPTIONS: tuple[dict[str, str], ...] = ({}, {}, {"precision": "0.1%"}, {"rms": "1%"}, {"rms": "0.01%"})
 
 
 @dataclass

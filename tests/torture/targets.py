@@ -173,7 +173,7 @@ def _surfaces() -> tuple[ls.Surface, ...]:
 @functools.cache
 def _containers() -> tuple[bytes, ...]:
     whole = [ls.encode(surface) for surface in _surfaces()]
-    lossy = ls.encode(_surfaces()[0], precision=5.0), ls.encode(_surfaces()[0], rms="1e-2d")
+    lossy = ls.encode(_surfaces()[0], precision=5.0), ls.encode(_surfaces()[0], rms="1%")
     return (*whole, *lossy)
 
 
@@ -255,7 +255,7 @@ def _chunks(data: bytes) -> Iterator[bytes]:
 
 @functools.cache
 def _messages() -> tuple[bytes, ...]:
-    targets = (ls.Target(), ls.Target(level=2), ls.Target(until_rms=ls.Tolerance.parse("1e-3d"), max_bytes=99))
+    targets = (ls.Target(), ls.Target(level=2), ls.Target(until_rms=ls.Tolerance.parse("0.1%"), max_bytes=99))
     opens = [Open(target, credit) for target, credit in zip(targets, (0, 1000, 2**18), strict=True)]
     others: list[Event] = [
         Open(held=((0, 10), (90, 7))),

@@ -28,7 +28,7 @@ def surfaces() -> dict[str, tuple[Any, dict[str, Any]]]:
         "int16": (np.rint(heights).astype(np.int16), {}),
         "float32": ((heights / 3).astype(np.float32), {}),
         "xyz-float32": (around.astype(np.float32), {}),
-        "xyz-rms": (around.astype(np.float32), {"rms": "1e-4d"}),
+        "xyz-rms": (around.astype(np.float32), {"rms": "0.01%"}),
     }
 
 

@@ -59,9 +59,7 @@ def encoded(chance: Random, number: int) -> bytes:
     while True:
         options: dict[str, Any] = {}
         if chance.random() < 0.25:
-            options = chance.choice(
-                [{"precision": "1e-3d"}, {"rms": "1e-3d"}, {"rms": "1e-2d"}, {"precision": "1e-2d"}]
-            )
+            options = chance.choice([{"precision": "0.1%"}, {"rms": "0.1%"}, {"rms": "1%"}, {"precision": "1%"}])
         options["effort"] = chance.choice(EFFORTS)
         try:
             made = surface(chance, number)

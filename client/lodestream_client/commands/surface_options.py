@@ -64,7 +64,7 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=parse_precision,
         metavar="[NAME=]P",
-        help="maximum error of the complete surface: a number in the surface's unit, or 1e-3d for 1e-3 times its "
+        help="maximum error of the complete surface: a number in the surface's unit, or 0.1%% of its "
         "extent; NAME=P sets it for an attribute, a coordinate (z) or a component (wind_0); may be repeated "
         "(default: lossless)",
     )
@@ -73,7 +73,7 @@ def add_surface_options(parser: argparse.ArgumentParser) -> None:
         type=parse_tolerance,
         metavar="R",
         help="encode for one root mean square error: a container as small as possible whose complete surface has an "
-        "error of at most R, a number in the surface's unit, or 1e-3d for 1e-3 times its extent; cannot be combined "
+        "error of at most R, a number in the surface's unit, or 0.1%% of its extent; cannot be combined "
         "with a --precision of the points",
     )
     group.add_argument(

@@ -18,7 +18,7 @@ def add_target_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "target",
         "What to decode and where to stop. The first limit that is met ends it. E is a number in the surface's unit, "
-        "or 1e-3d for 1e-3 times its extent. NAME=E is the error of an attribute, a coordinate (z) or a component "
+        "or 0.1% of its extent. NAME=E is the error of an attribute, a coordinate (z) or a component "
         "(wind_0), a number in its own unit; it may be repeated, and all of them have to be met; it cannot be "
         "combined with --roi, since containers tell errors of windows for all channels together.",
     )

@@ -135,7 +135,7 @@ export interface OptionalSection {
   readonly range: ByteRange;
 }
 
-/** An error in the surface's unit, or relative to its extent (text such as "1e-3d"). */
+/** An error in the surface's unit, or relative to its extent (text such as "0.1%"). */
 export interface Tolerance {
   readonly value: number;
   readonly relative: boolean;

@@ -55,7 +55,7 @@ describe.each([true, false])("over a server that knows errors of channels: %s", 
 
 describe("errors of channels", () => {
   it.each<[TargetOptions, RegExp]>([
-    [{ untilRms: { a: "1e-3d" } }, /expected an error of a in its own unit/],
+    [{ untilRms: { a: "0.1%" } }, /expected an error of a in its own unit/],
     [{ untilRms: { a: 1 }, untilMax: 2 }, /either an error of the whole surface or errors of channels/],
     [{ untilRms: { a: 1 }, level: 2 }, /either a level or other limits/],
     [{ untilMax: { a: -1 } }, /an error of 0 or more/],

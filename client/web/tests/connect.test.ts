@@ -137,7 +137,7 @@ describe.each(WAYS)("%s", (_, way) => {
   });
 
   it("looking elsewhere, another target, a stop, and going on", async () => {
-    const stream = connect(served.surface, { untilRms: "1e-2d" }, options({ window: 4000 }));
+    const stream = connect(served.surface, { untilRms: "1%" }, options({ window: 4000 }));
     for await (const view of stream)
       if (view.number === 1)
         await stream.focus([

@@ -74,10 +74,12 @@ describe("bytes in memory", () => {
 
 describe("targets", () => {
   it("are checked", () => {
-    expect(makeTarget({ untilRms: "1e-3d", maxBytes: 7 })).toEqual({
+    expect(makeTarget({ untilRms: "0.1%", maxBytes: 7 })).toEqual({
       ...{ untilRms: { value: 1e-3, relative: true }, maxBytes: 7, order: "quality" },
     });
-    expect(absolute(tolerance("1e-3d"), 500)).toBe(0.5);
+    expect(absolute(tolerance("0.1%"), 500)).toBe(0.5);
+    expect(tolerance("7e-2%").value).toBe(7e-4);
+    expect(() => tolerance("1e-3d")).toThrow(/0.1% \(of the extent\)/);
     expect(absolute(tolerance(2), 500)).toBe(2);
     for (const wrong of ["", "d", "much", "1e-3x", -1, Number.NaN, Number.POSITIVE_INFINITY, "Infinity"]) {
       expect(() => tolerance(wrong)).toThrow(OptionError);

@@ -88,7 +88,7 @@ describe.each(TRANSPORTS)("over %s", (name, source, options) => {
   });
 
   it.each<[TargetOptions, string]>([
-    [{ untilRms: "1e-2d" }, "rms"],
+    [{ untilRms: "1%" }, "rms"],
     [{ untilMax: 30 }, "max"],
     [{ maxBytes: 3000 }, "bytes"],
     [{ level: 3 }, "level"],

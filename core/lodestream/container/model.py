@@ -101,7 +101,7 @@ class Header:
     predictors : int8 array of shape (channel, level, axis, 2)
         The third step's (a, b) of the step from ``level`` to ``level + 1`` along each axis, see `predictors`.
     extent : float
-        Range of the heights, or diagonal of the box of the points; what ``1e-3d`` refers to.
+        Range of the heights, or diagonal of the box of the points; what ``0.1%`` refers to.
     empty : tuple of int
         For each channel the levels, as bits, that have no coefficient other than 0.
     tile : (int, int)

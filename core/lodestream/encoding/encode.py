@@ -105,7 +105,7 @@ def encode(
         Objects of xarray are converted as by `Surface.from_xarray`, with coordinates, CRS, unit and name, also window
         by window. A path, str or path-like, is that of a file or a Zarr store, which is read as by `read`.
     precision : float, str, Tolerance or None
-        Maximum error of the points: in the surface's unit or, as ``"1e-4d"``, relative to the range of the heights or
+        Maximum error of the points: in the surface's unit or, as ``"0.01%"``, relative to the range of the heights or
         the diagonal of the bounding box. None: all values are restored bit for bit. Attributes are restored bit for bit
         unless `attribute_precision` names them.
     rms : float, str, Tolerance or None

@@ -128,17 +128,17 @@ UPLOAD: dict[str, Any] = {
         for name, description, values, example in (
             (
                 "precision",
-                "maximum error of the complete surface: in its unit, or <x>d for x times the extent; NAME=P sets it "
+                "maximum error of the complete surface: in its unit, or <x>% of the extent; NAME=P sets it "
                 "for an attribute, a coordinate (z) or a component (wind_0); may be repeated",
                 None,
-                "1e-4d",
+                "0.01%",
             ),
             (
                 "rms",
                 "encode for this root mean square error, in the same notation; cannot be combined with a precision of "
                 "the points",
                 None,
-                "1e-3d",
+                "0.1%",
             ),
             ("effort", "fast: half the time; small: fewer bytes; both in few layers", list(EFFORTS), None),
             ("closed", "closed axes", ["auto", "none", "rows", "cols", "both"], None),

@@ -27,7 +27,7 @@ _HOME = f"""<h1>Lodestream {lodestream.__version__}</h1>
 <pre>
 lodestream push surface.npy HOST      upload
 lodestream list HOST                  list the surfaces
-lodestream pull URL out.npy --until-rms 1e-3d
+lodestream pull URL out.npy --until-rms 0.1%
 </pre>
 <ul>
 <li><a href="v1/surfaces">Surfaces on this server</a></li>

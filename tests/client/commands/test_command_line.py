@@ -301,7 +301,7 @@ def test_standard_input_has_the_format_that_is_said(
 
 def test_bytes_that_are_read_twice_count_once(run: Run, container_file: Path, tmp_path: Path) -> None:
     size = container_file.stat().st_size
-    for options in ((), ("--level", "1"), ("--until-rms", "1e-2d")):
+    for options in ((), ("--level", "1"), ("--until-rms", "1%")):
         code, stdout, _ = run("decode", container_file, tmp_path / "a.npy", "--json", *options)
         assert code == 0
         assert 0 < json.loads(stdout)["wire_bytes"] <= size
@@ -471,7 +471,7 @@ def test_encode_for_a_root_mean_square_error(
     run: Run, terrain_file: Path, terrain: Terrain, container_file: Path, tmp_path: Path
 ) -> None:
     made, out = tmp_path / "r.lode", tmp_path / "r.npy"
-    assert run("encode", terrain_file, made, "--rms", "1e-2d")[0] == 0
+    assert run("encode", terrain_file, made, "--rms", "1%")[0] == 0
     assert run("decode", made, out)[0] == 0
     described = json.loads(run("info", made, "--json")[1])
     assert described["exact"] is False

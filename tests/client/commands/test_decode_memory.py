@@ -92,7 +92,7 @@ def test_a_level_is_decoded_by_bands_to_the_same_file(
 def test_what_is_not_decoded_by_bands_is_refused_with_the_reason(run: Run, container: Path) -> None:
     words = "at most 1 MiB to decode, got one that takes about 3 MiB and is not decoded by bands: "
     assert words + "standard output is written in one piece" in refused(run, container, "-", *LITTLE)
-    for options in (("--partial",), ("--until-rms", "0.1d")):
+    for options in (("--partial",), ("--until-rms", "10%")):
         assert words + "only the whole surface or a level is" in refused(run, container, "a.npy", *LITTLE, *options)
     rows, columns = np.indices(HEIGHTS.shape)
     container.write_bytes(ls.encode(ls.Surface(np.stack([columns, rows, HEIGHTS], axis=-1).astype(np.float32))))

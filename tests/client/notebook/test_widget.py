@@ -189,7 +189,7 @@ def test_values_go_both_ways(container: bytes, fake_page: Page) -> None:
 
 
 def test_a_target_is_sent_in_the_unit_of_the_surface(container: bytes, terrain: ls.Surface, fake_page: Page) -> None:
-    shown = widget(container, target=ls.Target(until_rms=ls.Tolerance.of("1e-3d")))
+    shown = widget(container, target=ls.Target(until_rms=ls.Tolerance.of("0.1%")))
     extent = float(np.ptp(terrain.points))
     assert fake_page.opening["_target"] == {"rms": pytest.approx(extent / 1000)}
     for target, sent in (

@@ -110,7 +110,7 @@ def test_what_is_asked_for_is_done_before_it_is_sent(server: str) -> None:
     made = sync.upload(
         server,
         given,
-        precision="1e-3d",
+        precision="0.1%",
         attribute_precision={"heat": 0.5},
         effort="small",
         name="asked for",
@@ -119,7 +119,7 @@ def test_what_is_asked_for_is_done_before_it_is_sent(server: str) -> None:
     before = given.blocks[0]
     closed = ls.Block(before.points, (False, True), mask=before.mask, attributes=before.attributes)
     wanted = ls.Surface(blocks=[closed], metadata={"name": "asked for"})
-    assert container_of(made) == ls.encode(wanted, "1e-3d", attribute_precision={"heat": 0.5}, effort="small")
+    assert container_of(made) == ls.encode(wanted, "0.1%", attribute_precision={"heat": 0.5}, effort="small")
     assert (made.details["name"], made.details["errors"]) == ("asked for", "told")
     assert (made.details["options"], made.details["closed"]) == ({}, [False, True])
     assert (given.metadata, given.closed) == ({"name": "given"}, (False, False))

@@ -212,7 +212,7 @@ def test_an_iteration_that_is_cancelled_may_be_continued(surface: str, terrain: 
 def test_upload_tells_progress_and_list_and_delete_follow(server: str, terrain_file: Path) -> None:
     stages: list[tuple[str, float]] = []
     surface = sync.upload(
-        server, terrain_file, precision="1e-3d", name="Hills", progress=lambda *stage: stages.append(stage)
+        server, terrain_file, precision="0.1%", name="Hills", progress=lambda *stage: stages.append(stage)
     )
     assert surface.ready
     assert surface.details["exact"] is False
@@ -245,12 +245,12 @@ def test_upload_for_asyncio(server: str, terrain_file: Path) -> None:
 
 def test_uploads_for_a_root_mean_square_error(server: str, terrain_file: Path) -> None:
     wanted = 0.01 * float(np.ptp(np.load(terrain_file).astype(float)))
-    surface = sync.upload(server, terrain_file, rms="1e-2d")
+    surface = sync.upload(server, terrain_file, rms="1%")
     assert surface.details["exact"] is False
     assert 0 < surface.details["layers"][-1]["rms"] <= wanted
     again = asyncio.run(client.upload(server, terrain_file, rms=ls.Tolerance(0.01, relative=True)))
     assert again.url == surface.url
-    assert again.details["options"] == {"rms": "0.01d"}
+    assert again.details["options"] == {"rms": "1%"}
 
 
 def test_an_upload_has_one_error_at_most() -> None:

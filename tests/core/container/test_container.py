@@ -236,7 +236,7 @@ def test_a_container_names_the_codecs_that_it_needs() -> None:
         (ls.encode(np.rint(heights).astype(np.int16)), (1,)),
         (ls.encode(heights), (1, 5)),
         (ls.encode(ls.Surface(np.rint(heights).astype(np.int16), mask=holes)), (1, 4)),
-        (ls.encode(np.add.outer(np.arange(40.0), np.arange(50.0)) ** 1.5, rms="1e-2d"), (1, 3)),
+        (ls.encode(np.add.outer(np.arange(40.0), np.arange(50.0)) ** 1.5, rms="1%"), (1, 3)),
     ]
     for container, codecs in kinds:
         assert index_of(container).header.codecs == codecs

@@ -41,9 +41,9 @@ SURFACES: dict[str, tuple[ls.Surface, dict[str, Any]]] = {
         ls.Surface(
             torus(40, 33, "float64"), (True, True), attributes={"rgb": RNG.integers(0, 255, (40, 33, 3)).astype("u1")}
         ),
-        {"precision": "1e-3d"},
+        {"precision": "0.1%"},
     ),
-    "wide": (ls.Surface(np.concatenate([torus(40, 33), rough((40, 33, 2), "float32")], axis=2)), {"rms": "1e-2d"}),
+    "wide": (ls.Surface(np.concatenate([torus(40, 33), rough((40, 33, 2), "float32")], axis=2)), {"rms": "1%"}),
     "precise": (
         ls.Surface(terrain((40, 33)), attributes={"a": rough((40, 33, 2), "float64"), "b": rough((40, 33), "int64")}),
         {"attribute_precision": {"a": 0.5}},

@@ -72,8 +72,8 @@ def test_the_finest_levels_are_large_from_so_many_points_on() -> None:
 def test_units_of_indices_are_never_large() -> None:
     heights = terrain((60, 70), 2)
     with all_large():
-        alone = ls.encode(heights, rms="1e-2d")
-        both = ls.encode(ls.Surface(heights, attributes={"k": np.rint(heights).astype(np.int16)}), rms="1e-2d")
+        alone = ls.encode(heights, rms="1%")
+        both = ls.encode(ls.Surface(heights, attributes={"k": np.rint(heights).astype(np.int16)}), rms="1%")
     assert LARGE_UNITS not in index_of(alone).header.codecs
     assert LARGE_UNITS in index_of(both).header.codecs
     assert np.array_equal(ls.decode(both).attributes["k"], np.rint(heights).astype(np.int16))

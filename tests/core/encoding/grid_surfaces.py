@@ -45,7 +45,7 @@ def _surfaces() -> dict[str, tuple[Surface, dict[str, Any]]]:
         "integers": (Surface(metres), {}),
         "floats": (Surface(terrain((300, 70)).astype(np.float32)), {}),
         "doubles": (Surface(terrain((260, 70))), {}),
-        "precision": (Surface(terrain((300, 70)).astype(np.float32)), {"precision": "1e-4d"}),
+        "precision": (Surface(terrain((300, 70)).astype(np.float32)), {"precision": "0.01%"}),
         "holes": (Surface(metres, mask=mask), {}),
         "floats with holes": (Surface(np.where(mask, metres, np.nan).astype(np.float32)), {}),
         "attributes": (Surface(metres, attributes={"speed": speed, "kind": (metres > 0).astype(np.uint8)}), {}),
@@ -57,7 +57,7 @@ def _surfaces() -> dict[str, tuple[Surface, dict[str, Any]]]:
         "torus": (Surface(_torus((226, 70)), (True, True)), {}),
         "torus with attributes": (
             Surface(_torus((214, 69)), (True, True), attributes={"speed": speed[:214, :69]}),
-            {"precision": "1e-4d"},
+            {"precision": "0.01%"},
         ),
         "int64": (Surface(metres.astype(np.int64) * 2**45 + 1), {}),
         "uint64 with holes": (Surface(metres.astype(np.uint64) + np.uint64(2**63), mask=mask), {"precision": 2e4}),

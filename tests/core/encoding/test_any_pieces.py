@@ -176,7 +176,7 @@ tiles = st.sampled_from([None, (4, 4), (3, 5), (5, 3)])
     closed=st.tuples(st.booleans(), st.booleans()),
     kind=st.sampled_from(["smooth", "far", "ends"]),
     more=st.sampled_from(["", "", "holes", "attributes", "holes and attributes"]),
-    precision=st.sampled_from([None, "1e-3d", 0.5]),
+    precision=st.sampled_from([None, "0.1%", 0.5]),
     tile=tiles,
     points=st.integers(1, 3000),
     core=st.integers(1, 600),
@@ -185,7 +185,7 @@ tiles = st.sampled_from([None, (4, 4), (3, 5), (5, 3)])
 )
 @example("int64", (100, 30), 1, (True, True), "ends", "holes", None, (4, 4), 1, 9, 2, 0)
 @example("uint64", (298, 66), 1, (True, False), "far", "attributes", None, None, 1, 9, 1, 1)
-@example("int16", (150, 9), 3, (True, True), "smooth", "", "1e-3d", (5, 3), 1000, 9, 1, 2)
+@example("int16", (150, 9), 3, (True, True), "smooth", "", "0.1%", (5, 3), 1000, 9, 1, 2)
 @example("float64", (149, 33), 3, (True, True), "smooth", "holes and attributes", None, (3, 5), 1, 9, 1, 3)
 @example("uint64", (131, 40), 3, (False, False), "ends", "holes", None, (4, 4), 300, 9, 1, 4)
 def test_any_pieces_of_any_grid(
@@ -216,7 +216,7 @@ sides = st.integers(4, 20) | st.integers(4, 60)
     count=st.integers(1, 4),
     dtype=st.sampled_from(["float32", "float64", "int32", "int64"]),
     more=st.sampled_from(["", "", "holes", "attributes", "holes and attributes"]),
-    precision=st.sampled_from([None, "1e-3d", 0.02]),
+    precision=st.sampled_from([None, "0.1%", 0.02]),
     tile=tiles,
     points=st.integers(1, 2000),
     core=st.integers(1, 300),
@@ -224,10 +224,10 @@ sides = st.integers(4, 20) | st.integers(4, 60)
     seed=st.integers(0, 2**32 - 1),
 )
 @example("plates", (60, 50), 2, "float32", "holes and attributes", None, (4, 4), 1, 9, 2, 1)
-@example("plates", (90, 80), 3, "float64", "", "1e-3d", None, 1, 1, 2, 2)
+@example("plates", (90, 80), 3, "float64", "", "0.1%", None, 1, 1, 2, 2)
 @example("cylinders", (80, 60), 3, "float32", "", None, (3, 5), 1, 1, 1, 3)
 @example("sphere", (60, 70), 1, "float32", "attributes", None, (4, 4), 1, 1, 1, 4)
-@example("seam", (60, 63), 1, "float32", "", "1e-3d", None, 1, 1, 1, 5)
+@example("seam", (60, 63), 1, "float32", "", "0.1%", None, 1, 1, 1, 5)
 @example("moebius", (24, 90), 3, "int32", "", None, (3, 5), 1, 9, 1, 6)
 @example("heights", (120, 40), 3, "int64", "holes", None, (4, 4), 1, 1, 1, 7)
 @pytest.mark.long

@@ -130,7 +130,7 @@ def test_of_special_surfaces_too(name: str, base: int) -> None:
 def test_streams_of_special_surfaces_keep_the_error(name: str) -> None:
     surface = SURFACES[name]
     for wanted in (1e-2, 1e-4):
-        container = ls.encode(surface, rms=f"{wanted}d")
+        container = ls.encode(surface, rms=ls.Tolerance(wanted, relative=True))
         decoder = ls.Decoder()
         decoder.feed(container)
         decoder.finish()

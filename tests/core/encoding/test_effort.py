@@ -158,7 +158,7 @@ def test_a_build_does_not_continue_one_of_another_effort(effort: Effort, tmp_pat
 @every_effort
 @pytest.mark.parametrize("points", [rough((90, 100)), torus(60, 70)], ids=["heights", "torus"])
 def test_streams_for_one_error_take_an_effort_too(points: NDArray[Any], effort: Effort) -> None:
-    surface = ls.decode(ls.encode(points, rms="1e-3d", effort=effort))
+    surface = ls.decode(ls.encode(points, rms="0.1%", effort=effort))
     flat = points.reshape(-1, points.shape[2] if points.ndim == 3 else 1).astype(np.float64)
     away = (surface.points.astype(np.float64) - points).reshape(flat.shape)
     assert np.sqrt((away**2).sum(axis=1).mean()) <= 1e-3 * np.linalg.norm(np.ptp(flat, axis=0))

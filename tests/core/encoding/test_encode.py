@@ -88,7 +88,7 @@ def test_a_file_has_the_bytes_of_one_piece(tmp_path: Path) -> None:
 
 def test_bytes_are_those_of_one_piece() -> None:
     surface = _heights()
-    assert ls.encode(surface, "1e-3d", memory=LITTLE) == ls.encode(surface, "1e-3d")
+    assert ls.encode(surface, "0.1%", memory=LITTLE) == ls.encode(surface, "0.1%")
 
 
 @pytest.mark.long
@@ -195,7 +195,7 @@ def test_points_that_are_one_are_found_again_in_the_values() -> None:
 def test_what_has_no_bands_says_so() -> None:
     surface = ls.Surface(np.rint(300 * terrain((510, 130))).astype(np.int16))
     with pytest.raises(ls.TooLargeError, match="rms"):
-        ls.encode(surface, memory=LITTLE, rms="1e-3d")
+        ls.encode(surface, memory=LITTLE, rms="0.1%")
 
 
 def test_numbers_whose_squares_are_no_float64_keep_to_the_memory(tmp_path: Path) -> None:

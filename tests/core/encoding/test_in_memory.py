@@ -161,11 +161,11 @@ def test_with_a_precision_the_largest_error_is_never_above_it(
 def test_a_precision_is_a_number_a_text_or_a_tolerance() -> None:
     points = terrain((20, 20))
     extent = float(np.ptp(points))
-    relative = ls.encode(points, "1e-3d")
+    relative = ls.encode(points, "0.1%")
     assert ls.encode(points, ls.Tolerance(1e-3, relative=True)) == relative
     assert ls.encode(points, extent * 1e-3) == relative
     assert len(relative) < len(ls.encode(points))
-    assert ls.decode(ls.encode(np.ones((4, 4)), "1e-3d")).points.tolist() == np.ones((4, 4)).tolist()
+    assert ls.decode(ls.encode(np.ones((4, 4)), "0.1%")).points.tolist() == np.ones((4, 4)).tolist()
     with pytest.raises(OptionError, match="expected a number such as"):
         ls.encode(points, "fine")
     for refused in (0.0, 1e-15):
@@ -306,7 +306,7 @@ def test_noise_is_stored_rather_than_coded_at_any_price(dtype: str, shape: tuple
 def test_a_precision_leaves_attributes_as_they_are() -> None:
     rng = np.random.default_rng(6)
     points = np.concatenate([torus(20, 31), rng.normal(size=(20, 31, 2))], axis=-1)
-    container = ls.encode(points, "1e-3d")
+    container = ls.encode(points, "0.1%")
     decoder = ls.Decoder()
     decoder.feed(container)
     decoded = decoder.surface().points

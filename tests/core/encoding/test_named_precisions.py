@@ -49,7 +49,7 @@ def test_a_coordinate_has_its_own_and_the_others_are_exact(dtype: str) -> None:
     found = errors(surface, attribute_precision={"z": 5})
     assert 1 <= found.pop("z") <= 5
     assert set(found.values()) == {0}
-    found = errors(surface, precision="1e-4d", attribute_precision={"z": "1e-2d"})
+    found = errors(surface, precision="0.01%", attribute_precision={"z": "1%"})
     extent = np.sqrt((np.ptp(points.astype("f8"), axis=(0, 1)) ** 2).sum())
     assert np.hypot(found["x"], found["y"]) <= 1e-4 * extent
     assert 1e-4 * extent < found["z"] <= 1e-2 * np.ptp(points[..., 2])
@@ -113,7 +113,7 @@ def test_a_precision_holds_beside_noise_of_which_the_lattice_keeps_a_few_bits() 
 
 def test_a_constant_channel_is_exact_whatever_share_of_its_range_is_allowed() -> None:
     surface = ls.Surface(np.full((5, 6), 3.25), attributes={"b": np.full((5, 6, 2), 7.5)})
-    assert set(errors(surface, attribute_precision={"z": "1e-3d", "b_0": "1e-3d"}).values()) == {0}
+    assert set(errors(surface, attribute_precision={"z": "0.1%", "b_0": "0.1%"}).values()) == {0}
 
 
 @pytest.mark.parametrize(

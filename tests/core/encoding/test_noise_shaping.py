@@ -94,10 +94,10 @@ def test_shaping_never_costs_much(shape: tuple[int, int], roughness: float, want
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0], : shape[1]]
     heights = np.sin(x / 9 + seed % 7) * np.cos(y / 7) + roughness * 0.2 * rng.normal(size=shape)
-    made = ls.encode(heights, rms=f"{wanted}d")
+    made = ls.encode(heights, rms=ls.Tolerance(wanted, relative=True))
     with pytest.MonkeyPatch.context() as patch:
         flat = FILTERS.copy()
         flat[:, :, :2] = 0
         patch.setattr("lodestream.encoding.noise_shaping.FILTERS", flat)
-        alone = ls.encode(heights, rms=f"{wanted}d")
+        alone = ls.encode(heights, rms=ls.Tolerance(wanted, relative=True))
     assert len(made) <= 1.1 * len(alone) + 40

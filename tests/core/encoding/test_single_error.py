@@ -62,7 +62,7 @@ def test_the_error_is_kept_and_told(
     seed: int,
 ) -> None:
     points = _ragged(np.random.default_rng(seed), shape, channels, dtype, scale)
-    container = ls.encode(ls.Surface(points, closed), rms=f"{rms}d")
+    container = ls.encode(ls.Surface(points, closed), rms=ls.Tolerance(rms, relative=True))
     decoder = ls.Decoder()
     decoder.feed(container)
     decoder.finish()
@@ -81,7 +81,7 @@ def test_the_error_is_kept_and_told(
 def test_it_takes_fewer_bytes_than_what_else_meets_the_error() -> None:
     points = waves(129, 170).astype(np.float64) + 0.02 * np.random.default_rng(5).normal(size=(129, 170))
     wanted = 2e-3 * _extent(points)
-    made = ls.encode(points, rms="2e-3d")
+    made = ls.encode(points, rms="0.2%")
     index = read_index(lambda offset, length: made[offset : offset + length], len(made))
     exact = ls.encode(points)
     layers = read_index(lambda offset, length: exact[offset : offset + length], len(exact)).layers
@@ -93,7 +93,7 @@ def test_it_takes_fewer_bytes_than_what_else_meets_the_error() -> None:
 
 def test_windows_are_those_of_the_whole() -> None:
     points = waves(300, 310) + 0.05 * np.random.default_rng(6).normal(size=(300, 310))
-    container = ls.encode(points, rms="5e-3d")
+    container = ls.encode(points, rms="0.5%")
     whole = ls.decode(container).points
     region = ((130, 190), (7, 60))
     decoder = ls.Decoder()
@@ -102,7 +102,7 @@ def test_windows_are_those_of_the_whole() -> None:
     assert np.array_equal(window.points, whole[130:190, 7:60])
 
 
-@pytest.mark.parametrize("wanted", [0, "0d", 1e-9])
+@pytest.mark.parametrize("wanted", [0, "0%", 1e-9])
 def test_no_error_at_all_is_an_exact_stream(wanted: float | str) -> None:
     points = waves(30, 20).astype(np.float32)
     container = ls.encode(points, rms=wanted)
@@ -116,7 +116,7 @@ def test_whole_numbers_stay_whole_where_that_is_shorter() -> None:
 
 
 def test_a_constant_is_a_constant() -> None:
-    assert (ls.decode(ls.encode(np.full((4, 7), 2.5), rms="1e-3d")).points == 2.5).all()
+    assert (ls.decode(ls.encode(np.full((4, 7), 2.5), rms="0.1%")).points == 2.5).all()
 
 
 def test_either_a_precision_or_an_error() -> None:
@@ -128,7 +128,7 @@ def test_either_a_precision_or_an_error() -> None:
     ("base", "refused"), [(0, False), (1, False), (2**24 - 1, False), (2**24, True), (2**40, True)]
 )
 def test_steps_that_are_too_long_are_refused(base: int, refused: bool) -> None:
-    made = ls.encode(waves(33, 40), rms="1e-2d")
+    made = ls.encode(waves(33, 40), rms="1%")
     header = read_index(lambda offset, length: made[offset : offset + length], len(made)).header
     assert header.quantiser is not None
     payload = serialize_header(header)[10:-4]
@@ -153,7 +153,7 @@ def test_a_brief_stream_of_heights_takes_few_bytes_beside_its_segments(shape: tu
     ridges = 400 * np.abs(np.sin(rows + np.cos(columns))) + 90 * np.sin(3 * columns - rows) * np.cos(2 * rows)
     ridges += 60 * np.sin(17 * rows + 5 * columns) + 40 * np.sin(23 * columns - 9 * rows)
     points = np.rint(1200 + ridges + np.random.default_rng(6).normal(size=shape)).astype(np.int16)
-    made = ls.encode(points, rms="1e-2d")
+    made = ls.encode(points, rms="1%")
     index = read_index(lambda offset, length: made[offset : offset + length], len(made))
     segments = sum(segment.range.length for segment in index.segments)
     assert 500 < segments < 6000

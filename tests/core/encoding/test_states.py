@@ -86,9 +86,9 @@ def _surfaces() -> dict[str, tuple[ls.Surface, dict[str, Any]]]:
     return {
         "heights": (ls.Surface(heights), {}),
         "float32": (ls.Surface(terrain((300, 260)).astype(np.float32)), {}),
-        "blocks": (ls.Surface(blocks=halves), {"precision": "1e-5d"}),
+        "blocks": (ls.Surface(blocks=halves), {"precision": "0.001%"}),
         "attributes": (ls.Surface(heights, mask=mask, attributes={"colour": colours}), {}),
-        "one error": (ls.Surface(terrain((120, 140))), {"rms": "1e-3d"}),
+        "one error": (ls.Surface(terrain((120, 140))), {"rms": "0.1%"}),
     }
 
 

@@ -124,7 +124,7 @@ SURFACES = {
 @pytest.mark.parametrize("name", SURFACES)
 def test_a_layer_ends_where_an_error_is_just_met(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     surface = SURFACES[name]
-    rms = "1e-5d" if name == "for one error" else None
+    rms = "0.001%" if name == "for one error" else None
     container = ls.encode(surface, rms=rms)
     found = stops(index_of(container))
     monkeypatch.setitem(CHOICES, "default", replace(CHOICES["default"], stop_turns=0))

@@ -103,7 +103,7 @@ def test_a_seam_and_poles_stay_closed() -> None:
     seamed = np.concatenate([ball, ball[:, :1]], axis=1)
     assert_watertight(ls.Surface(seamed))
     assert_watertight(ls.Surface(ball, (False, True)))
-    index = index_of(ls.encode(ball, "1e-6d"))
+    index = index_of(ls.encode(ball, "0.0001%"))
     assert index.header.arrangement is not None
     assert sorted(interface.length for interface in index.header.arrangement.interfaces)[:2] == [1, 1]
 

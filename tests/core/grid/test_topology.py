@@ -243,7 +243,7 @@ def test_closed_surfaces_are_closed_at_every_level(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["wing", "halves", "corners"])
-@pytest.mark.parametrize("options", [{"precision": "5e-2d"}, {"rms": "3e-2d"}])
+@pytest.mark.parametrize("options", [{"precision": "5%"}, {"rms": "3%"}])
 def test_a_precision_joins_nothing_that_was_apart(name: str, options: dict[str, str]) -> None:
     surface = SURFACES[name]()
     expected = topologies(surface)

@@ -62,7 +62,7 @@ def counted(container: bytes | None = None) -> tuple[ls.Container, Counting]:
     return opened, source
 
 
-@pytest.mark.parametrize("limit", [{"rms": 3}, {"max_error": "1e-2d"}, {"bytes": 9000}, {"rms": {"kind": 0.5}}])
+@pytest.mark.parametrize("limit", [{"rms": 3}, {"max_error": "1%"}, {"bytes": 9000}, {"rms": {"kind": 0.5}}])
 def test_a_limit_reads_the_file_up_to_the_layer_that_meets_it(limit: dict[str, Any]) -> None:
     opened, source = counted()
     view = opened.view(**limit)

@@ -31,7 +31,7 @@ CONTAINERS: dict[tuple[str, int, bool], tuple[ls.Surface, bytes]] = {}
 def encoded(kind: str, shape: int, single: bool) -> tuple[ls.Surface, bytes]:
     if (kind, shape, single) not in CONTAINERS:
         surface = surface_of(kind, *SHAPES[shape])
-        CONTAINERS[kind, shape, single] = surface, ls.encode(surface, rms="1e-3d" if single else None)
+        CONTAINERS[kind, shape, single] = surface, ls.encode(surface, rms="0.1%" if single else None)
     return CONTAINERS[kind, shape, single]
 
 

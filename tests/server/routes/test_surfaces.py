@@ -74,13 +74,13 @@ def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> 
 
 def test_a_root_mean_square_error_is_part_of_the_surface(http: httpx.Client) -> None:
     body = npy(hills(seed=2))
-    first = push(http, body, rms="1e-2d")
-    assert first["options"] == {"rms": "0.01d"}
+    first = push(http, body, rms="1%")
+    assert first["options"] == {"rms": "1%"}
     assert first["exact"] is False
     assert 0 < first["layers"][-1]["rms"] <= 0.01 * float(np.ptp(hills(seed=2).astype(float)))
-    again = http.post("/v1/surfaces", content=body, params={"rms": "0.010d"})
+    again = http.post("/v1/surfaces", content=body, params={"rms": "1.0%"})
     assert (again.status_code, again.json()["id"]) == (200, first["id"])
-    others = [push(http, body, **{key: "0.02d"})["id"] for key in ("rms", "precision")]
+    others = [push(http, body, **{key: "2%"})["id"] for key in ("rms", "precision")]
     assert len({first["id"], *others}) == 3
 
 
@@ -97,10 +97,10 @@ def test_an_effort_is_part_of_the_surface(http: httpx.Client) -> None:
 
 
 def test_options_reach_the_surface(http: httpx.Client) -> None:
-    surface = push(http, npy(hills(seed=3)), closed="both", precision="1e-2d")
+    surface = push(http, npy(hills(seed=3)), closed="both", precision="1%")
     assert surface["closed"] == [True, True]
     assert surface["exact"] is False
-    assert surface["options"] == {"closed": "both", "precision": "0.01d"}
+    assert surface["options"] == {"closed": "both", "precision": "1%"}
 
 
 def test_options_of_a_format_reach_its_reader(http: httpx.Client, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import { OptionError } from "../errors";
 import type { ChannelLimit, Region, Target, Tolerance } from "../types";
 
-/** An error: a number in the surface's unit, `"1e-3d"` (times the extent), or both. */
+/** An error: a number in the surface's unit, `"0.1%"` (of the extent), or both. */
 export type Limit = number | string | Tolerance;
 
 /** An error of the whole surface, or errors of channels by name, each in its own unit. */
@@ -77,7 +77,9 @@ function ofChannels(given: Limits | undefined, which: "rms" | "max"): ChannelLim
   return Object.entries(given).map(([name, limit]) => {
     const { value, relative } = tolerance(limit);
     if (relative) {
-      throw new OptionError(`expected an error of ${name} in its own unit, got ${value}d, which is times the extent`);
+      throw new OptionError(
+        `expected an error of ${name} in its own unit, got ${100 * value}%, which is of the extent`,
+      );
     }
     return [name, which, value];
   });
@@ -102,20 +104,22 @@ export function checkSpans(region: Region): void {
 }
 
 /**
- * A tolerance from a number in the surface's unit, from text such as `0.5` or `1e-3d` (times the extent), or from itself.
+ * A tolerance from a number in the surface's unit, from text such as `0.5` or `0.1%` (of the extent), or from itself.
  *
  * @throws OptionError if it is none of these, negative or not finite.
  */
 export function tolerance(given: number | string | Tolerance): Tolerance {
   if (typeof given === "object") return checked(given.value, given.relative);
   if (typeof given === "number") return checked(given, false);
-  const relative = given.endsWith("d");
+  const relative = given.endsWith("%");
   const digits = relative ? given.slice(0, -1) : given;
   // Number("") is 0.
   if (digits.trim() === "" || Number.isNaN(Number(digits))) {
-    throw new OptionError(`expected a number such as 0.5, or 1e-3d (times the extent), got ${JSON.stringify(given)}`);
+    throw new OptionError(`expected a number such as 0.5, or 0.1% (of the extent), got ${JSON.stringify(given)}`);
   }
-  return checked(Number(digits), relative);
+  // By the exponent, so that the number is that of the decimals without rounding twice.
+  const [mantissa, exponent = "0"] = digits.trim().toLowerCase().split("e");
+  return checked(relative ? Number(`${mantissa}e${Number(exponent) - 2}`) : Number(digits), relative);
 }
 
 /** A tolerance in the unit of a surface with this extent. */
