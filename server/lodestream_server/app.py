@@ -64,7 +64,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     Returns
     -------
     FastAPI
-        An ASGI application. It opens its data when it starts and releases them when it ends.
+        An ASGI application. It opens its data when it starts and releases them when it ends. A program that mounts it
+        in its own enters ``app.router.lifespan_context(app)`` in its own lifespan.
 
     Raises
     ------

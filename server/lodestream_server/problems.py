@@ -324,9 +324,10 @@ async def refused(request: Request, error: Exception) -> Response:
 
 def _methods(request: Request) -> list[str]:
     methods = set[str]()
+    path = request.url.path.removeprefix(request.scope.get("root_path", ""))
     for routes in request.app.state.routes:
         for route in routes:
-            if isinstance(route, Route) and route.path_regex.match(request.url.path):
+            if isinstance(route, Route) and route.path_regex.match(path):
                 methods |= route.methods or set()
     return sorted(methods)
 

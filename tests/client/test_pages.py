@@ -46,6 +46,7 @@ RUN = {
     ("docs/maps.md", "html"): "not run: it is client/web/examples/map.html, which tests/web opens",
     ("docs/maps.md", "python"): "tests/core/maps/test_page.py",
     ("docs/maps.md", "xml"): "tests/server/routes/test_gis.py",
+    ("docs/mounting.md", "python"): "tests/server/routes/test_mounting.py",
     ("docs/notebooks.md", "python"): "not run: it shows a widget; tests/client/notebook runs docs/notebook.ipynb",
     ("docs/operating.md", "console"): "tests/server/routes/test_operating_page.py",
     ("docs/operating.md", "python"): "not run: it needs a cluster, as the page says",

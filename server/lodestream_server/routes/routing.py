@@ -50,7 +50,12 @@ class State:
 
 # A coroutine, because FastAPI calls a plain function in a thread.
 async def _parts(connection: HTTPConnection) -> State:
-    state: State = connection.app.state.parts
+    state: State | None = getattr(connection.app.state, "parts", None)
+    if state is None:
+        raise RuntimeError(
+            "the application of surfaces was not started: a program that mounts it enters "
+            "app.router.lifespan_context(app) in its own lifespan"
+        )
     return state
 
 
