@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .decoding.view import View
     from .encoding.encode import encode
     from .errors import (
+        ChoiceError,
         CorruptStreamError,
         FormatError,
         FormatWarning,
@@ -49,6 +50,7 @@ _HOMES = {
     "View": "decoding.view",
     "decode": "decoding.decoder",
     "encode": "encoding.encode",
+    "ChoiceError": "errors",
     "CorruptStreamError": "errors",
     "FormatError": "errors",
     "FormatWarning": "errors",
@@ -79,6 +81,7 @@ _HOMES = {
 
 __all__ = [
     "Block",
+    "ChoiceError",
     "Container",
     "CorruptStreamError",
     "Decoder",

@@ -5,6 +5,7 @@
     LodestreamError
     ├── InputError (ValueError)          the caller's input cannot be used
     │   ├── FormatError                  a file is invalid, cut short, or not a structured surface
+    │   │   ├── ChoiceError              a file has several surfaces, and options have to choose one
     │   │   └── SwitchedOffError         a file's format is switched off
     │   ├── TooLargeError                more bytes or vertices than allowed
     │   └── OptionError                  an option, level or format that does not exist; the message names valid ones
@@ -27,10 +28,13 @@ found, and where.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 __all__ = [
+    "Choice",
+    "ChoiceError",
     "CorruptStreamError",
     "FormatError",
     "FormatWarning",
@@ -89,6 +93,46 @@ class FormatError(InputError):
     Traceback (most recent call last):
     lodestream.errors.FormatError: notes.tif: expected a file of format npy, ..., got text that begins with 'no raster'
     """
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Options by which one of the surfaces of a file is read.
+
+    Attributes
+    ----------
+    options : mapping of str to str
+        Beside those that were given.
+    shape : tuple of int
+        Rows and columns; empty if they are not known.
+    """
+
+    options: Mapping[str, str]
+    shape: tuple[int, ...] = ()
+
+
+class ChoiceError(FormatError):
+    """A file has several surfaces, and options have to choose one.
+
+    Attributes
+    ----------
+    choices : tuple of Choice
+        Options that choose. There may be more, of which the message tells.
+
+    Examples
+    --------
+    >>> import lodestream, numpy
+    >>> numpy.savez("two.npz", low=numpy.zeros((4, 5)), high=numpy.ones((4, 5)))
+    >>> try:
+    ...     lodestream.read("two.npz")
+    ... except lodestream.ChoiceError as error:
+    ...     print([choice.options for choice in error.choices])
+    [{'array': 'low'}, {'array': 'high'}]
+    """
+
+    def __init__(self, message: str, choices: Iterable[Choice] = ()) -> None:
+        super().__init__(message)
+        self.choices = tuple(choices)
 
 
 class SwitchedOffError(FormatError):

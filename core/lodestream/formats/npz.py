@@ -13,13 +13,13 @@ from zipfile import ZIP_DEFLATED, ZIP_STORED, BadZipFile, ZipFile, ZipInfo
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FormatError, InputError, OptionError, TooLargeError
+from ..errors import Choice, ChoiceError, FormatError, InputError, OptionError, TooLargeError
 from ..surface import Surface
 from .notes import listing, warn
 from .npy import NpyHeader, read_header, read_values
 from .npz_writer import COORDINATES, HEIGHTS, MASK, POINTS, WORDS
 from .placed import Coordinate, place
-from .source import Source, number, refuse_array
+from .source import MOST_CHOICES, Source, number, refuse_array
 
 __all__ = ["READ_OPTIONS", "read", "sniff"]
 
@@ -250,8 +250,10 @@ def _choose(contents: _Contents) -> str:
     if len(others) == 1 or len(surfaces) == 1:
         return (others or surfaces)[0]
     if surfaces:
-        raise FormatError(
-            f"expected one array that is a surface, got {len(surfaces)}: choose one with array= {' or '.join(surfaces)}"
+        names = " or ".join(surfaces)
+        raise ChoiceError(
+            f"expected one array that is a surface, got {len(surfaces)}: choose one with array= {names}",
+            [Choice({"array": name}, contents.headers[name].shape[:2]) for name in surfaces[:MOST_CHOICES]],
         )
     raise FormatError(
         f"expected an array of shape (H, W), (H, W, 2) or (H, W, C >= 3) of numbers, got {contents.listing}"

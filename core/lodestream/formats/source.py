@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,26 @@ from ..errors import FormatError, InputError, OptionError, SwitchedOffError, Too
 from ..scratch import IN_MEMORY, Room
 from ..surface import Closed
 
-__all__ = ["DEFAULT_MAX_VERTICES", "UNLIMITED_VERTICES", "Source", "check_allowed", "number", "with_name"]
+__all__ = [
+    "DEFAULT_MAX_VERTICES",
+    "MOST_CHOICES",
+    "UNLIMITED_VERTICES",
+    "Source",
+    "check_allowed",
+    "number",
+    "reworded",
+    "with_name",
+]
+
+_Error = TypeVar("_Error", bound=InputError)
 
 #: What `read` accepts unless told otherwise: 2 GiB of float64 heights.
 DEFAULT_MAX_VERTICES = 1 << 28
 #: And where large arrays go to files.
 UNLIMITED_VERTICES = 1 << 48
+
+#: Surfaces of a file that are offered where one has to be chosen (`ChoiceError`); a file may have thousands.
+MOST_CHOICES = 50
 
 #: Values per allowed vertex, so that a grid of few vertices and millions of channels is no way around the limit.
 _MAX_CHANNELS = 64
@@ -202,4 +217,11 @@ def counted(count: int, singular: str, plural: str) -> str:
 def with_name(error: InputError, label: str) -> InputError:
     """Return an error with the file's name before its message, which stays one line whatever either holds."""
     message = f"{label}: {error}"
-    return type(error)("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message))
+    return reworded(error, "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message))
+
+
+def reworded(error: _Error, message: str) -> _Error:
+    """Return an error like another one, with all that this has but its message."""
+    other = copy(error)
+    other.args = (message,)
+    return other

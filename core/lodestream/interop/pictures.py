@@ -1,8 +1,9 @@
-"""Draw surfaces with matplotlib: heights as a shaded map, others in space."""
+"""Draw surfaces: heights as a shaded map, others in space; with matplotlib, which no server needs."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,17 @@ from ..surface import Block, Surface
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["DPI", "SMALL", "draw_surface", "is_height_field", "pixels_of", "small_png"]
+__all__ = [
+    "DPI",
+    "RELIEF",
+    "SMALL",
+    "draw_surface",
+    "is_height_field",
+    "pixels_of",
+    "points_in_space",
+    "points_of_map",
+    "small_png",
+]
 
 #: Pixels of an inch.
 DPI = 100
@@ -23,13 +34,15 @@ DPI = 100
 #: Pixels of a small picture, along the longer side.
 SMALL = 320
 
+#: Height of the relief of a map for its shading, in widths of the surface.
+RELIEF = 0.15
+
 _COLOURS = "terrain"  # the colour map of heights
 _LIGHT = 315, 45  # azimuth and altitude in degrees: north-west, as maps have it
 _FLAT = 1e-300  # heights that differ by no more have no relief, and no factor would give them one
 _DEGREES = 360.0  # of a full turn
 _OTHER_UNIT = 10  # so many times higher than wide are points of x, y, z whose z has another unit
 _FITTED = 0.2  # height of these, in widths of the surface
-_RELIEF = 0.15  # height of the relief for its shading, in widths of the surface
 
 
 def draw_surface(figure: Figure, surface: Surface, pixels: int) -> None:
@@ -161,7 +174,7 @@ def _shaded(heights: NDArray[np.float64]) -> NDArray[np.float64]:
     colours = matplotlib.colormaps[_COLOURS]
     known = np.nan_to_num(heights, nan=low)
     if min(heights.shape) > 1:
-        rise = _RELIEF * max(heights.shape) / height if height > _FLAT else 0.0
+        rise = RELIEF * max(heights.shape) / height if height > _FLAT else 0.0
         shaded = LightSource(*_LIGHT).shade(known, colours, blend_mode="soft", vmin=low, vmax=high, vert_exag=rise)
     else:
         shaded = colours(Normalize(low, high)(known))
@@ -173,11 +186,7 @@ def _in_space(figure: Figure, surface: Surface, pixels: int) -> None:
     figure.set_size_inches(0.8 * pixels / DPI, 0.8 * pixels / DPI)
     most = pixels // 4
     axes: Any = figure.add_subplot(projection="3d")
-    periods, lift = _periods(surface.metadata), _lift(surface)
-    for block in surface.blocks:
-        points = _placed(_valid(block.points.astype(np.float64), block.mask))
-        points = _without_jumps(_wrapped(points, block.closed, periods), periods)
-        points[..., 2] *= lift
+    for points in points_in_space(surface):
         strides = [max(1, -(-count // most)) for count in points.shape[:2]]
         if min(points.shape[:2]) == 1:
             axes.plot(*points.reshape(-1, 3).T, color="#3b6ea5")
@@ -186,6 +195,35 @@ def _in_space(figure: Figure, surface: Surface, pixels: int) -> None:
             axes.plot_surface(x, y, z, rstride=strides[0], cstride=strides[1], color="#8fb3d9", linewidth=0)
     axes.set_aspect("equal")
     axes.set_axis_off()
+
+
+def points_in_space(surface: Surface) -> Iterator[NDArray[np.float64]]:
+    """Yield the points of each block as they are drawn in space.
+
+    Yields
+    ------
+    ndarray of float64, shape (row, column, xyz)
+        Closed axes have their first points again at the end, so there is a row or a column more. NaN in holes, and
+        where an angle jumps. Heights that have another unit than x and y are lower or higher.
+    """
+    periods, lift = _periods(surface.metadata), _lift(surface)
+    for block in surface.blocks:
+        points = _placed(_valid(block.points.astype(np.float64), block.mask))
+        points = _without_jumps(_wrapped(points, block.closed, periods), periods)
+        points[..., 2] *= lift
+        yield points
+
+
+def points_of_map(surface: Surface) -> NDArray[np.float64]:
+    """Return the points of a height field as they are drawn as a map, north at the top if that is known.
+
+    Returns
+    -------
+    ndarray of float64, shape (row, column, xyz)
+        x grows to the right by 1 with each column, y upwards; NaN in holes.
+    """
+    block = _as_map(surface)
+    return _placed(_valid(block.points.astype(np.float64), block.mask))
 
 
 def _valid(points: NDArray[np.float64], mask: NDArray[np.bool_] | None) -> NDArray[np.float64]:

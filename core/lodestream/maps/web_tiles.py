@@ -7,7 +7,6 @@ stand for numbers must never be resampled: what is wanted at another size is com
 from __future__ import annotations
 
 import math
-import struct
 import zlib
 from typing import Literal, TypeAlias, get_args
 
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import OptionError, UnavailableError
 from ..interop.optional import require_library
+from ..interop.png_file import png_file
 from .field import HeightField
 from .tile_grids import web_grid
 
@@ -220,11 +220,7 @@ def png(pixels: NDArray[np.uint8]) -> bytes:
     filtered[:, 0] = 1
     filtered[:, 1:] = pixels.reshape(rows, -1)
     filtered[:, 1 + bands :] -= pixels[:, :-1].reshape(rows, -1)
-    head = struct.pack(">IIBBBBB", columns, rows, 8, _COLOUR_TYPES[bands], 0, 0, 0)
-    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(filtered.tobytes(), 1)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
-    )
+    return png_file(columns, rows, 8, _COLOUR_TYPES[bands], zlib.compress(filtered.tobytes(), 1))
 
 
 def webp(pixels: NDArray[np.uint8]) -> bytes:

@@ -37,7 +37,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from lodestream import stores
 from lodestream.confinement import missing
@@ -55,8 +55,9 @@ from ..store.layout import Manifest
 from ..store.states import State
 from ..store.surfaces import Surfaces
 from ..store.uploads import check_upload
-from . import results, worker
+from . import results, thumbnails, worker
 from .answers import ProcessDiedError, UnforeseenError, WrongAnswerError, reason_of
+from .choices import told
 from .cluster_build import ClusterJob
 from .clusters import build_by_cluster
 from .fork_server import Allowed
@@ -539,7 +540,7 @@ class Builder:
                 await self._try(partial(self._surfaces.later, it.id))
                 return "again"
             if result.final:
-                return await self._refuse(surface, files, result.reason)
+                return await self._refuse(surface, files, result.reason, told(result.choices))
             return await self._postpone(it.id, result.reason)
         except _LaterError as error:
             held = error.held and self._is_held_shortly(it.id)
@@ -582,7 +583,7 @@ class Builder:
             # No folder could be made, or no process started.
             return _not_now(error)
         if isinstance(result, worker.Refused):
-            return worker.Refused(reason_of(result.reason), result.final)
+            return worker.Refused(reason_of(result.reason), result.final, result.choices)
         return result
 
     async def _run_by_cluster(self, surface: str, job: worker.Job) -> worker.Built | worker.Refused:
@@ -607,14 +608,17 @@ class Builder:
     async def _keep(self, surface: str, job: worker.Job, built: worker.Built) -> worker.Refused | None:
         try:
             info = await asyncio.to_thread(results.check, job.container, built, job.files)
-            await asyncio.to_thread(self._surfaces.built, surface, job.container, built.sha256, info)
+            picture = thumbnails.png_of(built.thumbnail)
+            await asyncio.to_thread(self._surfaces.built, surface, job.container, built.sha256, info, picture)
         except OSError as error:
             return _not_now(error)
         except TooLargeError as error:
             return worker.Refused(str(error), final=False)
         return None
 
-    async def _refuse(self, surface: Surface, files: Sequence[Path], reason: str) -> State:
+    async def _refuse(
+        self, surface: Surface, files: Sequence[Path], reason: str, choices: list[dict[str, Any]]
+    ) -> State:
         # Only the bytes that were acknowledged can be refused for good: not what a bad disk makes of them.
         problem = await self._damage(surface, files)
         if problem is not None:
@@ -622,7 +626,7 @@ class Builder:
         if surface.container is not None:
             return await self._postpone(surface.id, f"it was ready before, and cannot be built again: {reason}")
         try:
-            await asyncio.to_thread(self._surfaces.refused, surface.id, reason)
+            await asyncio.to_thread(self._surfaces.refused, surface.id, reason, choices)
         except stores.FullError:
             raise
         except StoreError as error:

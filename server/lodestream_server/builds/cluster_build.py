@@ -26,6 +26,7 @@ from lodestream.errors import FormatWarning, InputError, LodestreamError, Option
 from lodestream.operating_system import lower_limit
 
 from ..store.durable import discard, make_folder, remove
+from . import thumbnails
 from .answers import answer_of
 from .work import tasks_of
 from .worker import Built, Job, Refused, may_pass, moved, raise_passing, reporter
@@ -135,7 +136,7 @@ def _build(task: ClusterJob) -> Built | Refused:
             # Of Dask: workers died, the scheduler has gone, a worker lacks this package or has another version.
             words = str(error) or "the scheduler has ended, or has dropped the tasks"
             return Refused(f"LODESTREAM_DASK: the cluster gave up: {type(error).__name__}: {words}", final=False)
-        return Built(moved(container, job.container))
+        return Built(moved(container, job.container), thumbnail=thumbnails.draw(job.container))
 
 
 def keep_parsed(job: Job) -> None:

@@ -7,7 +7,7 @@ import hashlib
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -26,9 +26,9 @@ from .answers import FileTooLongError, Refusal
 
 if TYPE_CHECKING:
     from lodestream import Surface
-    from lodestream.container import Header
+    from lodestream.container import Header, Index
 
-__all__ = ["MEDIA_TYPES", "LevelJob", "MadeLevel", "make_level", "written_by"]
+__all__ = ["MEDIA_TYPES", "LevelJob", "MadeLevel", "decode_level", "make_level", "written_by"]
 
 #: Raise this with every change by which a level of the same container becomes a file of other bytes: of a writer, of
 #: tags, metadata and overviews, of what decoding gives. Caches, and readers that fetch a file by ranges, take files of
@@ -121,10 +121,8 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
     FileTooLongError
         If there would be more of them than the file may have.
     """
-    from lodestream import Decoder, Target
     from lodestream.container import read_index
     from lodestream.decoding.piecewise import PiecewiseDecoder
-    from lodestream.planning.planner import plan
     from lodestream.scratch import FolderScratch, Room
 
     with job.container.open("rb") as file:
@@ -141,11 +139,31 @@ def _decode(job: LevelJob) -> tuple[Surface, int]:
             room = Room(lambda: FolderScratch(job.folder / "values"))
             pieces = PiecewiseDecoder(read, index, job.level)
             return pieces.surface(room, job.memory // _BAND, lambda fraction: None), aside
-        chosen = plan(index, Target(level=job.level))
-        decoder = Decoder(level=job.level)
-        for place in (*chosen.before, *chosen.ranges, *chosen.after):
-            decoder.feed_at(place.offset, read(place.offset, place.length))
-    return decoder.surface(job.level), 0
+        return decode_level(read, index, job.level), 0
+
+
+def decode_level(read: Callable[[int, int], bytes], index: Index, level: int) -> Surface:
+    """Decode a level of a container in one piece.
+
+    Parameters
+    ----------
+    read : callable (offset, length) -> bytes
+    index : Index
+    level : int
+
+    Raises
+    ------
+    LodestreamError
+        If there is no such level, it takes too much memory, or the container is damaged.
+    """
+    from lodestream import Decoder, Target
+    from lodestream.planning.planner import plan
+
+    chosen = plan(index, Target(level=level))
+    decoder = Decoder(level=level)
+    for place in (*chosen.before, *chosen.ranges, *chosen.after):
+        decoder.feed_at(place.offset, read(place.offset, place.length))
+    return decoder.surface(level)
 
 
 def _goes_by_pieces(header: Header, job: LevelJob) -> bool:

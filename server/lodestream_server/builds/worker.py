@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 from lodestream.container.capacity import memory_limit
 from lodestream.container.metadata import with_notes
 from lodestream.errors import (
+    Choice,
+    ChoiceError,
     FormatWarning,
     LodestreamError,
     StreamError,
@@ -32,7 +34,7 @@ from lodestream.errors import (
 from lodestream.operating_system import open_own
 
 from ..store.durable import NewFile
-from . import finished
+from . import finished, thumbnails
 from .stored_quality import without_quality
 
 if TYPE_CHECKING:
@@ -170,10 +172,13 @@ class Built:
     sha256 : str
     errors : str or None
         For an uploaded container, who vouches for its errors (`finished.ERRORS`).
+    thumbnail : str or None
+        Pixels of its thumbnail (`thumbnails.draw`).
     """
 
     sha256: str
     errors: str | None = None
+    thumbnail: str | None = None
 
 
 @dataclass(frozen=True)
@@ -198,10 +203,13 @@ class Refused:
         One line.
     final : bool
         True if the reader rejected the file, so that a retry would end the same; False if the reason may pass.
+    choices : tuple of Choice
+        Options by which one of its surfaces is built.
     """
 
     reason: str
     final: bool = True
+    choices: tuple[Choice, ...] = ()
 
 
 def preload() -> None:
@@ -223,6 +231,7 @@ def preload() -> None:
     import lodestream.encoding.request
     import lodestream.encoding.stored_surface
     import lodestream.formats
+    import lodestream.interop.thumbnails
     import lodestream.mesh.recognise
     import lodestream.planning.planner  # noqa: F401
     from lodestream.library import library
@@ -245,6 +254,8 @@ def build(job: Job) -> Built | Parsed | Refused:
         return _build(job)
     except SwitchedOffError as error:
         return Refused(f"{error} {ALLOWED_BY}", final=False)
+    except ChoiceError as error:
+        return Refused(str(error), choices=error.choices)
     except LodestreamError as error:
         raise_passing(error)
         return Refused(str(error), final=not may_pass(error))
@@ -312,7 +323,7 @@ def _build(job: Job) -> Built | Parsed:
     if finished.is_container(job.files[0]):
         check_allowed(("lode",), job.allowed)
         try:
-            return Built(*finished.keep(job, path, reporter(job.folder)))
+            return Built(*finished.keep(job, path, reporter(job.folder)), thumbnails.draw(path))
         except (StreamError, TooLargeError) as error:
             error.args = (f"{job.filename or UNNAMED}: {error}", *error.args[1:])
             raise
@@ -327,11 +338,11 @@ def _build(job: Job) -> Built | Parsed:
                 return Parsed(sum(block.shape[0] * block.shape[1] for block in surface.blocks))
             encoded = job.folder / _MADE
             encode(surface, quality=quality, progress=report, out=encoded, memory=job.room, scratch=job.bands)
-            return Built(moved(encoded, path))
+            return Built(moved(encoded, path), thumbnail=thumbnails.draw(path))
         container = encode(surface, quality=quality, progress=report)
     with NewFile(path) as file:
         file.write(container)
-    return Built(hashlib.sha256(container).hexdigest())
+    return Built(hashlib.sha256(container).hexdigest(), thumbnail=thumbnails.draw(path))
 
 
 def moved(container: Path, path: Path) -> str:

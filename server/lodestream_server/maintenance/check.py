@@ -150,7 +150,7 @@ class _Judge:
         return self._found(found, remove, "removed; the next start of the server builds it again")
 
     def _describe(self, it: Found) -> None:
-        """Write the description of a container again; who vouches for its errors is known to the old one alone."""
+        """Write the description of a container again; the old one alone has a thumbnail, and who vouches for errors."""
         assert it.container is not None
         key = layout.built_key(it.id)
         data, tag = self._store.get(key)
@@ -158,7 +158,7 @@ class _Judge:
         errors = it.errors if it.errors in _vouchers(it) else TOLD if it.upload_kind == CONTAINER else None
         with self._store.open(layout.container_key(it.container)) as blob:
             figures, size = figures_of(read_index(blob.read, blob.size), {ERRORS: errors}, ()), blob.size
-        info, summary = layout.describe(figures)
+        info, summary = layout.describe(figures, built.summary.thumbnail)
         new = replace(built, container_bytes=size, info=info, summary=summary, write=layout.new_write())
         self._store.replace(key, layout.dump(new), tag)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from lodestream.container import FrameReader, read_index
 from lodestream.errors import LodestreamError, UnsupportedVersionError
@@ -77,7 +77,8 @@ def errors_of(info: bytes) -> str | None:
 
 
 def digest_of(size: int, info: bytes, summary: Summary) -> str:
-    """Return a hash of a description, but for who vouches for the errors, which no container says."""
+    """Return a hash of a description, but for what no container says: who vouches for the errors, and the thumbnail."""
     figures = json.loads(info or b"{}")
     figures.pop(ERRORS, None)
-    return hashlib.sha256(json.dumps([size, figures, asdict(summary)], sort_keys=True).encode()).hexdigest()
+    told = asdict(replace(summary, thumbnail=None))
+    return hashlib.sha256(json.dumps([size, figures, told], sort_keys=True).encode()).hexdigest()

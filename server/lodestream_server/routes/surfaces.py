@@ -31,6 +31,10 @@ __all__ = ["answer", "base", "keep", "owned", "router"]
 
 router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
 
+Thumbnails = Annotated[
+    bool, Query(description="add `thumbnail`: a data URL of a PNG of 96 x 72 pixels and less than 4 kB, or null")
+]
+
 _JSON = "application/json"
 
 # Bytes after which a page ends.
@@ -95,12 +99,14 @@ async def page(
     parts: Parts,
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
     after: Annotated[str | None, Query(pattern=_PLACE, description="from `next` of the previous page")] = None,
+    thumbnails: Thumbnails = False,
 ) -> Response:
     """Return surfaces without their files, options, layers and levels; `next` is the address of the next page, or null.
 
     A page may have fewer surfaces than its limit although more follow.
     """
-    return Response(await asyncio.to_thread(_page, _position(after), limit, caller, parts, request), media_type=_JSON)
+    content = await asyncio.to_thread(_page, _position(after), limit, thumbnails, caller, parts, request)
+    return Response(content, media_type=_JSON)
 
 
 @readable(
@@ -112,11 +118,17 @@ async def page(
         **responses(404),
     },
 )
-async def look(caller: Reader, request: Request, parts: Parts, surface: str) -> Response:
+async def look(
+    caller: Reader, request: Request, parts: Parts, surface: str, thumbnails: Thumbnails = False
+) -> Response:
     """Return the state of a surface and, once it is ready, what ``lodestream info --json`` prints.
 
     The state is queued, building or ready; or, with a reason, failed (the file is not a surface) or waiting (it could
     not be built and needs a retry). A surface that is queued with a reason is tried again by itself.
+
+    If it failed because its file has several surfaces, `choices` has the options that choose one, which an upload of
+    the file then has in its query: `{"options": {"variable": "Te0"}, "shape": [68, 64]}`. `shape` is empty where it is
+    not known. There may be more; the reason names them.
 
     A surface that was uploaded as a container also has `errors`: `checked` if the server has measured the errors of its
     layers and levels again, which is possible if it is exact; otherwise `told`, by whoever uploaded it.
@@ -124,7 +136,7 @@ async def look(caller: Reader, request: Request, parts: Parts, surface: str) -> 
     A surface that a name has replaced has `replaced_until`: then the server deletes it, unless a name leads to it again
     or it is uploaded again.
     """
-    return await answer(parts.surfaces.get(surface), caller, parts, request)
+    return await answer(parts.surfaces.get(surface), caller, parts, request, thumbnails=thumbnails)
 
 
 @router.post(
@@ -255,7 +267,13 @@ def _manifest(received: uploads.Upload, chosen: options.SurfaceOptions, owner: s
 
 
 async def answer(
-    surface: Surface, caller: Caller, parts: State, request: Request, *, located: bool = False
+    surface: Surface,
+    caller: Caller,
+    parts: State,
+    request: Request,
+    *,
+    located: bool = False,
+    thumbnails: bool = False,
 ) -> Response:
     """Return the answer that describes a surface.
 
@@ -267,8 +285,10 @@ async def answer(
     request : Request
     located : bool
         Whether somebody asked for its build: 202 unless it is ready, with its address in a header.
+    thumbnails : bool
+        Whether its thumbnail is told.
     """
-    head = _told(surface, caller, parts, request)
+    head = _told(surface, caller, parts, request, thumbnails=thumbnails)
     head["filenames"] = list(surface.manifest.filenames)
     head["options"] = surface.manifest.options
     until = parts.surfaces.index.replaced_until(surface.id)
@@ -285,27 +305,29 @@ async def answer(
 def _joined(parts: State, surface: Surface, head: dict[str, Any]) -> bytes:
     """Return a JSON object with what is told of a surface, and the description of its container as it was stored."""
     start = _json({key: value for key, value in head.items() if key not in surface.summary.shown})
-    info = parts.surfaces.info(surface) if surface.state == "ready" else b"{}"
+    info = parts.surfaces.info(surface) if surface.state in ("ready", "failed") else b"{}"
     return start if info == b"{}" else start[:-1] + b", " + info[1:]
 
 
-def _page(start: Position, limit: int, caller: Caller, parts: State, request: Request) -> bytes:
+def _page(start: Position, limit: int, thumbnails: bool, caller: Caller, parts: State, request: Request) -> bytes:
     """Return a page of surfaces that come after a position, as JSON of at most about `_MOST_PAGE` bytes."""
     following = parts.surfaces.index.page(start, limit + 1)
     shown, size = list[bytes](), 0
     for surface in following[:limit]:
-        shown.append(_json(_told(surface, caller, parts, request)))
+        shown.append(_json(_told(surface, caller, parts, request, thumbnails=thumbnails)))
         size += len(shown[-1])
         if size > _MOST_PAGE:
             break
     address = None
     if len(shown) < len(following):
         created, id_ = following[len(shown) - 1].position
-        address = f"{base(request)}?limit={limit}&after={created!r}_{id_}"
+        address = f"{base(request)}?limit={limit}&after={created!r}_{id_}{'&thumbnails=true' * thumbnails}"
     return b'{"surfaces": [' + b", ".join(shown) + b'], "next": ' + _json(address) + b"}"
 
 
-def _told(surface: Surface, caller: Caller, parts: State, request: Request) -> dict[str, Any]:
+def _told(
+    surface: Surface, caller: Caller, parts: State, request: Request, *, thumbnails: bool = False
+) -> dict[str, Any]:
     """Return what a list tells of a surface."""
     it, ready = surface.manifest, surface.state == "ready"
     name = it.name or options.printable(surface.summary.name or "") or next(filter(None, it.filenames), None)
@@ -322,7 +344,12 @@ def _told(surface: Surface, caller: Caller, parts: State, request: Request) -> d
         "container_sha256": surface.container if ready else None,
         # What is built again has the figures of the container that was lost.
         **(surface.summary.shown if ready else {}),
+        **({"thumbnail": _address(surface.summary.thumbnail if ready else None)} if thumbnails else {}),
     }
+
+
+def _address(thumbnail: str | None) -> str | None:
+    return None if thumbnail is None else f"data:image/png;base64,{thumbnail}"
 
 
 def _json(value: Any) -> bytes:

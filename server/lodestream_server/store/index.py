@@ -54,6 +54,7 @@ CREATE TABLE IF NOT EXISTS surface (
     title TEXT,
     levels INTEGER NOT NULL DEFAULT 0,
     shown TEXT NOT NULL DEFAULT '{}',
+    thumbnail TEXT,
     built_tag TEXT,
     seen TEXT,
     built_seen TEXT
@@ -90,7 +91,7 @@ CREATE TABLE IF NOT EXISTS source (identity TEXT NOT NULL, file TEXT NOT NULL, c
 
 _COLUMNS = (
     "id, created, owner, name, filenames, options, upload, upload_bytes, write, state, reason, attempts, container, "
-    "container_bytes, title, levels, shown, built_tag"
+    "container_bytes, title, levels, shown, thumbnail, built_tag"
 )
 
 
@@ -523,6 +524,7 @@ class Index:
             surface.summary.name,
             surface.summary.levels,
             json.dumps(surface.summary.shown, ensure_ascii=False),
+            surface.summary.thumbnail,
             surface.built_tag,
             seen,
             built_seen,
@@ -669,8 +671,8 @@ def _surface(row: tuple[Any, ...]) -> Surface:
         upload_bytes,
         write,
     )
-    state, reason, attempts, container, container_bytes, title, levels, shown, built_tag = row[9:]
-    summary = Summary(title, levels, json.loads(shown))
+    state, reason, attempts, container, container_bytes, title, levels, shown, thumbnail, built_tag = row[9:]
+    summary = Summary(title, levels, json.loads(shown), thumbnail)
     return Surface(manifest, state, reason, attempts, container, container_bytes, summary, built_tag)
 
 

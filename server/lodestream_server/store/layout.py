@@ -182,11 +182,14 @@ class Summary:
     levels : int
     shown : mapping
         ``shape``, ``closed``, ``bytes`` of the description, and the place in a series.
+    thumbnail : str or None
+        A PNG in Base64; None: there is nothing to be seen, or an earlier version has built the surface.
     """
 
     name: str | None = None
     levels: int = 0
     shown: dict[str, Any] = field(default_factory=dict)
+    thumbnail: str | None = field(repr=False, default=None)
 
 
 @dataclass(frozen=True)
@@ -206,7 +209,8 @@ class Built:
         Id of this write.
     summary : Summary
     info : bytes
-        The description: what ``lodestream info --json`` prints of the container, as JSON. It is sent as it is.
+        The description: what ``lodestream info --json`` prints of the container, as JSON; of a failed build
+        ``choices``, if the files have several surfaces. It is sent as it is.
     """
 
     manifest: str
@@ -360,8 +364,8 @@ def sha256_of(key: str) -> str | None:
     return None if found is None else found[1] or found[2]
 
 
-def describe(info: dict[str, Any]) -> tuple[bytes, Summary]:
-    """Return a description as JSON, and its summary.
+def describe(info: dict[str, Any], thumbnail: str | None = None) -> tuple[bytes, Summary]:
+    """Return a description as JSON, and its summary, with a thumbnail that no description tells.
 
     Raises
     ------
@@ -374,7 +378,8 @@ def describe(info: dict[str, Any]) -> tuple[bytes, Summary]:
     place = place_of(metadata)
     if place is not None:
         shown[SERIES] = place.told()
-    summary = Summary(name[:LONGEST_NAME] if isinstance(name, str) and name else None, len(info["levels"]), shown)
+    title = name[:LONGEST_NAME] if isinstance(name, str) and name else None
+    summary = Summary(title, len(info["levels"]), shown, thumbnail)
     return json.dumps(info | shown, ensure_ascii=False, allow_nan=False).encode(), summary
 
 

@@ -11,10 +11,11 @@ strays, which are collected after a day.
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -225,7 +226,10 @@ class Surfaces:
         return found
 
     def info(self, surface: Surface) -> bytes:
-        """Return what ``lodestream info --json`` prints of a surface's container, as JSON; ``{}`` if it has none."""
+        """Return what is told of a surface beside its state, as a JSON object.
+
+        That is what ``lodestream info --json`` prints of its container, or the ``choices`` of one that has failed.
+        """
         built = self._built(surface.manifest)
         return (built and built[0].info) or b"{}"
 
@@ -466,7 +470,9 @@ class Surfaces:
             self.index.put(noted)
             return noted
 
-    def built(self, surface: str, container: Path, sha256: str, info: dict[str, Any]) -> Surface | None:
+    def built(
+        self, surface: str, container: Path, sha256: str, info: dict[str, Any], thumbnail: str | None = None
+    ) -> Surface | None:
         """Store what was built; None: the surface was deleted, and nothing is stored.
 
         Parameters
@@ -477,6 +483,8 @@ class Surfaces:
         sha256 : str
         info : mapping
             Description of the container.
+        thumbnail : str or None
+            A PNG in Base64.
 
         Raises
         ------
@@ -490,7 +498,7 @@ class Surfaces:
         self.check_writer()
         if self.index.find(surface) is None:
             return None
-        described, summary = layout.describe(info)
+        described, summary = layout.describe(info, thumbnail)
         key, size = layout.container_key(sha256), container.stat().st_size
         with self._arriving([key]):
             shared = self.is_synced and self.index.uses_container(sha256, surface)
@@ -504,8 +512,15 @@ class Surfaces:
                 built = Built(known.manifest.write, sha256, size, None, layout.new_write(), summary, info=described)
                 return self._told(known, built)
 
-    def refused(self, surface: str, reason: str) -> Surface | None:
+    def refused(self, surface: str, reason: str, choices: Sequence[Mapping[str, Any]] = ()) -> Surface | None:
         """Store that a reader refuses the files of a surface, for good; None: the surface was deleted.
+
+        Parameters
+        ----------
+        surface : str
+        reason : str
+        choices : sequence of mapping
+            As JSON: options by which one of the surfaces of the files is built.
 
         Raises
         ------
@@ -517,7 +532,9 @@ class Surfaces:
             if known is None:
                 return None
             after(known.state, "refused")
-            return self._told(known, Built(known.manifest.write, None, 0, _bounded(reason), layout.new_write()))
+            info = json.dumps({"choices": choices}, ensure_ascii=False).encode() if choices else b""
+            built = Built(known.manifest.write, None, 0, _bounded(reason), layout.new_write(), info=info)
+            return self._told(known, built)
 
     def _told(self, known: Surface, built: Built) -> Surface:
         """Write what became of a build in place of whatever is there, and tell the index."""

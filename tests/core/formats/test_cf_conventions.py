@@ -674,8 +674,11 @@ def grouped(folder: Path, kind: str) -> Path:
 @pytest.mark.parametrize("kind", ["nc", "zarr"])
 def test_groups_are_named_and_chosen(tmp_path: Path, kind: str) -> None:
     path = grouped(tmp_path, kind)
-    with pytest.raises(FormatError, match="there are groups: analysis, forecast/surface, choose with group="):
+    with pytest.raises(
+        ls.ChoiceError, match="there are groups: analysis, forecast/surface, choose with group="
+    ) as raised:
         ls.read(path)
+    assert [choice.options["group"] for choice in raised.value.choices] == ["analysis", "forecast/surface"]
     for group in ("forecast/surface", "/forecast/surface"):
         with pytest.warns(FormatWarning, match="left out groups: analysis"):
             surface = ls.read(path, group=group)

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from lodestream import encode, formats
 from lodestream.errors import (
+    Choice,
+    ChoiceError,
     FormatError,
     FormatWarning,
     InputError,
@@ -145,8 +147,10 @@ def test_npz_with_an_extent_says_where_its_cells_or_points_lie(
 def test_npz_of_two_surfaces_asks_which(tmp_path: Path) -> None:
     path = tmp_path / "two.npz"
     np.savez(path, bed=np.zeros((3, 4)), ice=np.ones((3, 4), np.float32, order="F"))
-    with pytest.raises(FormatError, match=r"one array that is a surface, got 2: choose one with array= bed or ice"):
+    words = "one array that is a surface, got 2: choose one with array= bed or ice"
+    with pytest.raises(ChoiceError, match=words) as raised:
         formats.read(path)
+    assert raised.value.choices == tuple(Choice({"array": name}, (3, 4)) for name in ("bed", "ice"))
     with pytest.warns(FormatWarning, match="^left out arrays of the archive: bed$"):
         assert formats.read(path, array="ice").points.tolist() == np.ones((3, 4)).tolist()
     with pytest.raises(OptionError, match=r"array= one of bed \(3 x 4 float64\), ice \(3 x 4 float32\), got 'snow'"):

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from lodestream import formats
 from lodestream.coordinates.height_fields import coordinates, to_xyz
 from lodestream.coordinates.seams import restore
-from lodestream.errors import FormatError, FormatWarning, OptionError, SwitchedOffError, UnavailableError
+from lodestream.errors import (
+    Choice,
+    ChoiceError,
+    FormatError,
+    FormatWarning,
+    OptionError,
+    SwitchedOffError,
+    UnavailableError,
+)
 from lodestream.surface import Surface
 
 xarray = pytest.importorskip("xarray")
@@ -264,8 +272,16 @@ def test_options_name_the_variable_and_its_coordinates(tmp_path: Path) -> None:
             "shift": ("x", np.arange(6.0) ** 2),
         },
     )
-    with pytest.raises(FormatError, match="one variable over a surface, got R, Z, psi: choose with variable="):
+    with pytest.raises(
+        ChoiceError, match="one variable over a surface, got R, Z, psi: choose with variable="
+    ) as raised:
         formats.read(path)
+    assert raised.value.choices == (
+        *(Choice({"variable": name}, (6, 9)) for name in ("R", "Z", "psi")),
+        Choice({"x": "R", "y": "Z"}, (6, 9)),
+    )
+    for choice in raised.value.choices:
+        assert formats.read(path, closed="auto", **dict[str, Any](choice.options)).shape == choice.shape
     planar = formats.read(path, x="R", y="Z", attributes="psi")
     np.testing.assert_array_equal(planar.points, np.dstack((rows + 1, columns)))
     np.testing.assert_array_equal(planar.attributes["psi"], hills())
@@ -297,22 +313,31 @@ def test_times_and_depths_are_chosen_by_name(tmp_path: Path, kind: str) -> None:
         kind,
     )
     ways = r"choose time \(3\) with time=0 to 2 and depth \(2\) with at=depth:0 to 1"
-    with pytest.raises(FormatError, match=f"expected two dimensions of t, got 4: {ways}"):
+    options: dict[str, str] = {}
+    with pytest.raises(ChoiceError, match=f"expected two dimensions of t, got 4: {ways}") as raised:
         formats.read(path)
+    assert [choice.options for choice in raised.value.choices] == [{"time": place} for place in "012"]
+    options |= raised.value.choices[2].options
+    with pytest.raises(ChoiceError, match="got 3: choose depth") as raised:
+        formats.read(path, closed="auto", **dict[str, Any](options))
+    assert [choice.options for choice in raised.value.choices] == [{"at": f"depth:{place}"} for place in "01"]
+    options |= raised.value.choices[1].options
+    chosen = formats.read(path, closed="auto", **dict[str, Any](options))
+    np.testing.assert_array_equal(chosen.points, values[2, 1, 0])
     for time, place in (("1", 1), ("-1", 2), ("2001-02", 1), ("2001-01-01T00", 0)):
         surface = formats.read(path, time=time, at=f"depth:{place % 2}")
         np.testing.assert_array_equal(surface.points, values[place, place % 2, 0])
     section = to_xyz(formats.read(path, at="x:4,depth:0"))
     np.testing.assert_array_equal(section.points[..., 2], values[:, 0, 0, :, 4])
     np.testing.assert_array_equal(section.points[:, 3, 1], [0, 31, 59])
-    for options, message in (
+    for wrong, message in (
         ({"time": "3"}, "time= with a number of 0 to 2 for time, got '3'"),
         ({"time": "2001"}, "one date of 2001-01-01.* to 2001-03-01.*, got '2001': 3 fit"),
         ({"time": "soon"}, "got 'soon': 0 fit"),
         ({"at": "depth:deep"}, "at= with a number of 0 to 1 for depth, got 'deep'"),
     ):
         with pytest.raises(OptionError, match=message):
-            formats.read(path, closed="auto", **dict[str, Any](options))
+            formats.read(path, closed="auto", **dict[str, Any](wrong))
 
 
 @pytest.mark.parametrize("own", ["none", "index"])

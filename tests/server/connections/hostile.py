@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import ctypes
 import fcntl
 import hashlib
@@ -22,6 +23,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from lodestream.errors import Choice
 from lodestream.library import library
 from lodestream.parallel import VARIABLE
 from lodestream_server.builds import worker
@@ -34,6 +36,7 @@ __all__ = [
     "burn",
     "dig",
     "escape",
+    "forge_choices",
     "forge_container",
     "forge_errors",
     "forge_folder",
@@ -45,6 +48,7 @@ __all__ = [
     "forge_path",
     "forge_reason",
     "forge_second_name",
+    "forge_thumbnail",
     "linger",
     "say_a_class",
     "say_deep",
@@ -282,6 +286,20 @@ def forge_errors(job: Job) -> Built | Parsed | Refused:
     built = build(job)
     assert isinstance(built, Built)
     return Built(built.sha256, "checked")
+
+
+def forge_thumbnail(job: Job) -> Built | Parsed | Refused:
+    """Say that a page with a script is the thumbnail."""
+    built = build(job)
+    assert isinstance(built, Built)
+    return Built(built.sha256, thumbnail=base64.b64encode(b"<script>" * 1000).decode())
+
+
+def forge_choices(job: Job) -> Built | Parsed | Refused:
+    """Offer what is no option, what nobody can read, and more than anybody wants."""
+    bad = [{"token": "x"}, {"variable": "a\x1b[31m"}, {"variable": "v" * 5000}, {}]
+    many = [{"variable": f"{number:0100d}"} for number in range(1000)]
+    return Refused("x", choices=tuple(Choice(options, (-1, 5)) for options in (*bad, *many)))
 
 
 def forge_reason(job: Job) -> Built | Parsed | Refused:

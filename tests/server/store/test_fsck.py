@@ -89,7 +89,7 @@ class Made:
 
     def build(self, surfaces: Surfaces, id_: str, like: str | None = None) -> None:
         path, sha256, info = self.containers[like or id_]
-        surfaces.built(id_, shutil.copyfile(path, path.with_suffix(".built")), sha256, info)
+        surfaces.built(id_, shutil.copyfile(path, path.with_suffix(".built")), sha256, info, "AAAA")
 
     def key(self, kind: str, id_: str) -> str:
         keys = {

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import FormatError, OptionError
+from ...errors import Choice as Offer
+from ...errors import ChoiceError, FormatError, OptionError
 from ...text import names_in
 from ..notes import listing
-from ..source import Source
+from ..source import MOST_CHOICES, Source
 from .names import REFERENCES, associated, is_date, is_longitude, is_time, letters_of, mate_of, time_of
 from .no_grids import NoGrid, no_grid_of
 from .positions import are_elsewhere
@@ -35,6 +36,11 @@ _ANCILLARY = "ancillary_variables"
 
 #: Names in a refusal: all that a file of a model has, but not thousands.
 _MOST_NAMES = 250
+
+#: Pairs of positions among what is offered. In files of tokamaks they are often R and Z, by names alone too little to
+#: be taken for positions without being asked for.
+_MOST_PAIRS = 4
+_CYLINDER = str.maketrans("Rr", "Zz")
 
 
 @dataclass(frozen=True)
@@ -112,7 +118,7 @@ def choose(source: Source, dataset: Any) -> Choice:
     variables: Mapping[Hashable, Any] = dataset.variables
     main, given, planar = _main(source, dataset)
     index = _index(source, dataset, variables[main].dims)
-    dims = _surface_dims(dataset, main, index)
+    dims = _surface_dims(source, dataset, main, index)
     shape = (int(dataset.sizes[dims[0]]), int(dataset.sizes[dims[1]]))
     index |= {dim: 0 for dim in variables[main].dims if dim not in dims and dim not in index}
     x, y = (_found(dataset, given[key], dims, index) if key in given else None for key in ("x", "y"))
@@ -237,9 +243,23 @@ def _only(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> str:
     if not wide:
         raise FormatError(f"expected a variable over two dimensions, got {_listing(variables)}")
     listing = _listing({name: variables[name] for name in chosen or wide})
-    raise FormatError(
-        f"expected one variable over a surface, got {listing}: choose with variable=, or planar points with x= and y="
+    raise ChoiceError(
+        f"expected one variable over a surface, got {listing}: choose with variable=, or planar points with x= and y=",
+        _offers(variables, chosen or wide),
     )
+
+
+def _offers(variables: Mapping[Hashable, Any], names: list[str]) -> list[Offer]:
+    """Return the options that choose each variable, or a pair of them as positions."""
+    pairs = [(name, mate) for name in names for mate in (mate_of(name), name.translate(_CYLINDER)) if mate in names]
+    alike = [(x, y) for x, y in pairs if x != y and variables[x].dims == variables[y].dims][:_MOST_PAIRS]
+    offers = [Offer({"variable": name}, _shape(variables[name])) for name in names[: MOST_CHOICES - len(alike)]]
+    return [*offers, *(Offer({"x": x, "y": y}, _shape(variables[x])) for x, y in alike)]
+
+
+def _shape(variable: Any) -> tuple[int, ...]:
+    """Return the lengths of a variable, but for those of 1."""
+    return tuple(int(length) for length in variable.shape if length > 1)
 
 
 def _fields(dataset: Any, coordinates: set[str], no_grid: NoGrid | None) -> tuple[list[str], list[str]]:
@@ -318,7 +338,7 @@ def _moment(dataset: Any, dim: str, text: str) -> int:
     return found[0]
 
 
-def _surface_dims(dataset: Any, name: str, index: Mapping[str, int]) -> tuple[str, str]:
+def _surface_dims(source: Source, dataset: Any, name: str, index: Mapping[str, int]) -> tuple[str, str]:
     """Return the two dimensions that are left; those of length 1 are left out first."""
     left = _left(dataset.variables[name].dims, index)
     long = [dim for dim in left if dataset.sizes[dim] > 1]
@@ -328,12 +348,24 @@ def _surface_dims(dataset: Any, name: str, index: Mapping[str, int]) -> tuple[st
             f"{dataset.sizes[dim] - 1}"
             for dim in long[:-2]
         ]
-        raise FormatError(f"expected two dimensions of {name}, got {len(long)}: choose {' and '.join(ways)}")
+        words = f"expected two dimensions of {name}, got {len(long)}: choose {' and '.join(ways)}"
+        raise ChoiceError(words, _places_of(source, dataset, long))
     if len(long) < 2:
         long = list(left[-2:])
     if len(long) < 2:
         raise FormatError(f"expected two dimensions of {name}, got {', '.join(left) or 'none'}")
     return long[0], long[1]
+
+
+def _places_of(source: Source, dataset: Any, dims: list[str]) -> list[Offer]:
+    """Return the options that choose each place along the first of too many dimensions, beside those that are given."""
+    first, *rest = dims
+    places = map(str, range(min(int(dataset.sizes[first]), MOST_CHOICES)))
+    shape = tuple(int(dataset.sizes[dim]) for dim in rest)
+    if is_time(dataset, first):
+        return [Offer({"time": place}, shape) for place in places]
+    given = str(source.options.get("at", ""))
+    return [Offer({"at": ",".join(filter(None, (given, f"{first}:{place}")))}, shape) for place in places]
 
 
 def _found(dataset: Any, name: str, dims: tuple[str, str], index: Mapping[str, int]) -> Found:

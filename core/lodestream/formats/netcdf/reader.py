@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from ...errors import FormatError, InputError, OptionError, TooLargeError, UnavailableError
+from ...errors import Choice, ChoiceError, FormatError, InputError, OptionError, TooLargeError, UnavailableError
 from ...surface import Surface
 from ..member import Member
 from ..notes import listing, warn
-from ..source import Source, check_allowed
+from ..source import MOST_CHOICES, Source, check_allowed
 from . import hdf5_guard, vmec
 from .mark import MARK
 from .marked import surface_in
@@ -96,7 +96,7 @@ def of_group(
     Raises
     ------
     FormatError
-        If it holds no surface, with the names of the groups.
+        If it holds no surface, or several; as `ChoiceError` if there are others, or groups.
     OptionError, TooLargeError
         If an option does not fit, or it is too large.
     """
@@ -107,7 +107,8 @@ def of_group(
     except FormatError as error:
         if not inner:
             raise
-        raise FormatError(f"{error}; there are groups: {listing(inner)}, choose with group=") from None
+        choices = [*getattr(error, "choices", ()), *(Choice({"group": group}) for group in inner[:MOST_CHOICES])]
+        raise ChoiceError(f"{error}; there are groups: {listing(inner)}, choose with group=", choices) from None
     return surface, [*notes, *([f"left out groups: {listing(inner)}"] if inner else [])]
 
 

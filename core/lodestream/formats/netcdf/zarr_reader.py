@@ -18,7 +18,7 @@ from ...sources import read_source
 from ...surface import Surface
 from ..member import Member
 from ..notes import listing, warn
-from ..source import Source, number
+from ..source import Source, number, reworded
 from .members import members_of
 from .reader import check_group, group_of, of_group, parents_of, with_parents
 
@@ -189,7 +189,7 @@ def _opened(source: Source, notes: list[str]) -> Iterator[tuple[Any, Any, list[s
     except UnavailableError:
         raise
     except InputError as error:
-        raise type(error)("; ".join([str(error), *notes])) from None
+        raise reworded(error, "; ".join([str(error), *notes])) from None
     except MemoryError:
         raise TooLargeError("expected a Zarr store that fits into memory, got one that promises more") from None
     except Exception as error:  # none of these libraries says what it may raise
