@@ -111,6 +111,24 @@ def test_files_are_dropped_found_and_deleted(tabs: Tabs, shelf: Shelf, file: Pat
     expect(link).to_have_count(0)
 
 
+def test_thumbnails_come_with_the_list(tabs: Tabs, shelf: Shelf, heard: Heard, file: Path) -> None:
+    shelf.description("torus")
+    tab = tabs(shelf.server)
+    # Of a surface that was there, and of one that is uploaded now.
+    tab.page.get_by_label("Files to upload").set_input_files(file)
+    for name in ("torus", file.stem):
+        picture = tab.page.locator("tbody tr", has=tab.page.get_by_role("link", name=name, exact=True)).locator("img")
+        expect(picture.first).to_be_visible()
+        assert picture.first.evaluate("(image) => image.decode().then(() => image.naturalWidth)") == 96
+    asked = [url for url in heard.requests if "/v1/" in url]
+    assert sum("limit=" in url for url in asked) == 1
+    assert not any("png" in url for url in asked), "a picture is no request"
+    before = len(heard.requests)
+    tab.page.locator("tbody tr .entry", has_text="torus").first.click(position={"x": 20, "y": 20})
+    tab.everything()
+    assert len(heard.requests) > before, "whoever presses the picture opens the surface"
+
+
 def test_a_file_that_is_no_surface_is_told(tabs: Tabs, shelf: Shelf, heard: Heard) -> None:
     heard.allow(r"status of 4\d\d")
     tab = tabs(shelf.server)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from playwright.sync_api import expect
 
 from .browser import Heard, Tab
 from .conftest import Tabs
@@ -145,6 +148,59 @@ def test_axe_finds_nothing_wrong_with_a_surface(tabs: Tabs, shelf: Shelf, scheme
     tab.until(lambda: "row" in tab.read())
     tab.choose("Target", "RMS error")
     assert violations(tab) == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", [(900, 700), (360, 640)], ids=["wide", "narrow"])
+def test_axe_finds_nothing_wrong_where_a_surface_is_chosen(
+    tabs: Tabs, shelf: Shelf, scheme: str, size: tuple[int, int]
+) -> None:
+    shelf.description("terrain")
+    tab = tabs(shelf.server, color_scheme=scheme, size=size)
+    tab.page.get_by_role("link", name="terrain").wait_for()
+    choose(tab, f"{scheme}-{size[0]}")
+    tab.page.locator("tbody").get_by_role("button", name="More").first.wait_for()
+    assert violations(tab) == []
+    # Nothing is wider than the window.
+    assert tab.page.evaluate("document.documentElement.scrollWidth") == size[0]
+
+
+def choose(tab: Tab, name: str) -> None:
+    """Upload a file of several surfaces, each called by a long name, until one is to be chosen."""
+    file = io.BytesIO()
+    arrays = {f"{name} {'number ' * 5}{number}": np.full((6, 9 + number), float(number)) for number in range(8)}
+    np.savez(file, **dict[str, Any](arrays))
+    tab.page.get_by_label("Files to upload").set_input_files(
+        {"name": f"{name}.npz", "mimeType": "application/octet-stream", "buffer": file.getvalue()}
+    )
+    tab.page.get_by_role("button", name="Upload again").wait_for()
+
+
+def test_a_surface_of_a_file_is_chosen_by_the_keyboard(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.server)
+    choose(tab, "keys")
+    row = tab.page.locator("tbody tr", has_text="keys.npz")
+    expect(row).to_have_count(1)
+    words, more = row.locator(".words"), row.get_by_role("button", name="More")
+    lines = words.bounding_box()
+    tab_to(tab, lambda at: at["text"] == "More")
+    tab_to(tab, lambda at: at["tag"] == "SELECT")
+    tab.page.keyboard.press("End")
+    expect(tab.page.get_by_label("Choose an array")).to_have_value("7")
+    more.focus()
+    tab.page.keyboard.press("Enter")
+    expect(row.get_by_role("button", name="Less")).to_be_focused()
+    opened = words.bounding_box()
+    assert lines is not None
+    assert opened is not None
+    assert opened["height"] > 1.4 * lines["height"], "the rest is seen"
+    tab.page.get_by_role("button", name="Upload again").focus()
+    tab.page.keyboard.press("Enter")
+    made = tab.page.locator("tbody tr", has_text="6 \N{MULTIPLICATION SIGN} 16")
+    expect(made).to_have_count(1)
+    expect(row).to_have_count(0)
+    expect(tab.page.get_by_role("list", name="Uploads").get_by_role("listitem")).to_have_count(0)
+    expect(made.locator("img.picture")).to_be_visible()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

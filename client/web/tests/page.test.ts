@@ -1,7 +1,7 @@
 import { describe, expect, it } from "vitest";
-import { type ListedSurface, problemOf, Server } from "../src/page/api";
+import { type Choice, type ListedSurface, problemOf, Server } from "../src/page/api";
 import { parseConfiguration } from "../src/page/configuration";
-import { matches, nameOf } from "../src/page/names";
+import { choiceName, choiceQuestion, matches, nameOf } from "../src/page/names";
 import { seriesOf, stepOf } from "../src/page/series";
 
 const surface: ListedSurface = {
@@ -26,6 +26,25 @@ describe("the list", () => {
   it("calls a surface by its name or its id", () => {
     expect(nameOf(surface)).toBe("Jacksboro");
     for (const name of [null, ""]) expect(nameOf({ ...surface, name })).toBe(surface.id);
+  });
+});
+
+describe("the surfaces of a file", () => {
+  const choice = (options: Record<string, string>, shape: number[] = [68, 64]): Choice => ({ options, shape });
+
+  it("are called by what chooses them, with their points", () => {
+    expect(choiceName(choice({ variable: "Te0" }))).toBe("Te0 (68 × 64)");
+    expect(choiceName(choice({ x: "Rxy", y: "Zxy" }))).toBe("positions Rxy and Zxy (68 × 64)");
+    expect(choiceName(choice({ group: "forecast/surface" }, []))).toBe("forecast/surface");
+    expect(choiceName(choice({ time: "3" }, []))).toBe("time 3");
+    expect(choiceName(choice({ at: "lev:2,depth:0" }, []))).toBe("lev 2, depth 0");
+  });
+
+  it("are asked for by what is to be chosen", () => {
+    expect(choiceQuestion([choice({ variable: "Te0" }), choice({ x: "R", y: "Z" })])).toBe("Choose a variable");
+    expect(choiceQuestion([choice({ array: "a" })])).toBe("Choose an array");
+    expect(choiceQuestion([choice({ layer: "a" })])).toBe("Choose a surface");
+    expect(choiceQuestion([])).toBe("Choose a surface");
   });
 });
 

@@ -13,10 +13,23 @@ export interface ListedSurface {
   readonly reason: string | null;
   readonly created: string;
   readonly upload_bytes: number;
+  /** Those of its upload. Only where it was asked for by itself. */
+  readonly options?: Readonly<Record<string, string>>;
   readonly bytes?: number;
   readonly shape?: readonly [number, number] | null;
   /** Its place in a series: among the steps along a dimension, or the variables, of one file. */
   readonly series?: Place;
+  /** A data URL of a picture; null: there is none. Only where it was asked for. */
+  readonly thumbnail?: string | null;
+  /** What its file has, if it failed because one has to be chosen. Only where it was asked for by itself. */
+  readonly choices?: readonly Choice[];
+}
+
+/** Options of an upload by which one of the surfaces of a file is built. */
+export interface Choice {
+  readonly options: Readonly<Record<string, string>>;
+  /** Empty where it is not known. */
+  readonly shape: readonly number[];
 }
 
 /** A place in a series; surfaces with the same name belong together. */
@@ -27,6 +40,12 @@ export interface Place {
   readonly index: number;
   readonly value: number | string;
   readonly unit: string;
+}
+
+/** Some of the surfaces, and the address of the next ones. */
+interface Page {
+  readonly surfaces: readonly ListedSurface[];
+  readonly next: string | null;
 }
 
 /** What the server answered in place of what was asked for. */
@@ -44,6 +63,8 @@ export class ProblemError extends Error {
 
 /** The path of surfaces, relative to the page, so that the server may stand below a path of a proxy. */
 const SURFACES = "v1/surfaces";
+
+const THUMBNAILS = "thumbnails=true";
 
 /** Reads a problem document, or makes one from an answer without. */
 export function problemOf(status: number, text: string): ProblemError {
@@ -75,29 +96,31 @@ export class Server {
     this.readsOnly = false;
   }
 
-  /** One page of surfaces, oldest first, and the address of the next one. */
-  async page(address: string | null): Promise<{ surfaces: ListedSurface[]; next: string | null }> {
-    return (await this.json("GET", address ?? `${SURFACES}?limit=1000`)) as {
-      surfaces: ListedSurface[];
-      next: string | null;
-    };
+  /** The first page of surfaces with their thumbnails, oldest first, or the one at an address; and that of the next. */
+  async page(address: string | null): Promise<Page> {
+    return (await this.json("GET", address ?? `${SURFACES}?limit=1000&${THUMBNAILS}`)) as Page;
   }
 
-  /** All surfaces, page after page. */
+  /** All surfaces, page after page, without thumbnails. */
   async all(): Promise<ListedSurface[]> {
     const surfaces: ListedSurface[] = [];
-    let address: string | null = null;
+    let address: string | null = `${SURFACES}?limit=1000`;
     do {
-      const page: { surfaces: ListedSurface[]; next: string | null } = await this.page(address);
+      const page: Page = await this.page(address);
       surfaces.push(...page.surfaces);
       address = page.next;
     } while (address !== null);
     return surfaces;
   }
 
-  /** One surface. */
+  /** One surface, or that to which a name leads. */
   async look(url: string): Promise<ListedSurface> {
     return (await this.json("GET", url)) as ListedSurface;
+  }
+
+  /** One surface with its thumbnail, as a page has it. */
+  async listed(url: string): Promise<ListedSurface> {
+    return this.look(`${url}?${THUMBNAILS}`);
   }
 
   /** Where the tiles of a surface, or of what a name leads to, lie: west, south, east, north in degrees; and to which zoom. */
@@ -127,13 +150,19 @@ export class Server {
   /**
    * Uploads a file.
    *
+   * @param options - Of its format.
    * @param progress - Called with bytes sent.
    */
-  upload(file: File, progress: (sent: number) => void, signal: AbortSignal): Promise<ListedSurface> {
+  upload(
+    file: File,
+    options: Readonly<Record<string, string>>,
+    progress: (sent: number) => void,
+    signal: AbortSignal,
+  ): Promise<ListedSurface> {
     // Of fetch and XMLHttpRequest only the latter tells how much has been sent.
     return new Promise((resolve, reject) => {
       const request = new XMLHttpRequest();
-      request.open("POST", this.address(`${SURFACES}?filename=${encodeURIComponent(file.name)}`));
+      request.open("POST", this.address(`${SURFACES}?${new URLSearchParams({ ...options, filename: file.name })}`));
       request.setRequestHeader("content-type", "application/octet-stream");
       if (this.token !== null) request.setRequestHeader("authorization", `Bearer ${this.token}`);
       request.upload.onprogress = ({ loaded }) => progress(loaded);

@@ -1,10 +1,11 @@
 /** The list of a server's surfaces: search, upload, delete. */
 
-import { html, setText } from "../view/dom";
+import { arrange, html, setText } from "../view/dom";
 import { formatBytes } from "../view/format";
 import { type ListedSurface, ProblemError, type Server } from "./api";
 import { askDelete } from "./dialogs";
 import { matches, nameOf } from "./names";
+import { reasonElement } from "./reasons";
 import { Uploads } from "./uploads";
 
 /** Milliseconds after which surfaces that are being built are looked at again. */
@@ -25,7 +26,7 @@ export class Listing {
         "tr",
         {},
         ...["Surface", "Points", "Size", "Added"].map((name, k) =>
-          html("th", { scope: "col", class: k === 3 ? "optional" : "" }, name),
+          html("th", { scope: "col", class: k % 2 === 1 ? "optional" : "" }, name),
         ),
         html("th", { scope: "col" }, html("span", { class: "hidden-text" }, "Actions")),
       ),
@@ -33,6 +34,8 @@ export class Listing {
     this.rows,
   );
   private readonly surfaces = new Map<string, ListedSurface>();
+  /** What was drawn of a surface that has not changed since. */
+  private drawn = new WeakMap<ListedSurface, HTMLElement>();
   private timer: ReturnType<typeof setTimeout> | undefined;
   private closed = false;
   private readonly uploads: Uploads;
@@ -43,11 +46,20 @@ export class Listing {
     private readonly server: Server,
     private readonly allowed: (error: ProblemError) => Promise<boolean>,
   ) {
-    this.uploads = new Uploads(server, allowed, (surface) => {
-      this.surfaces.set(surface.id, surface);
-      this.draw();
-      this.poll();
-    });
+    this.uploads = new Uploads(
+      server,
+      allowed,
+      (surface) => {
+        const { thumbnail } = this.surfaces.get(surface.id) ?? {};
+        this.surfaces.set(surface.id, thumbnail ? { thumbnail, ...surface } : surface);
+        this.draw();
+        this.poll();
+      },
+      ({ id }) => {
+        this.surfaces.delete(id);
+        this.draw();
+      },
+    );
     this.search.addEventListener("input", () => this.draw());
     this.element = html(
       "main",
@@ -70,6 +82,7 @@ export class Listing {
   /** Hides what the token does not allow, as far as the server has said so. */
   showRights(): void {
     this.uploads.showRights();
+    this.drawn = new WeakMap();
     this.draw();
   }
 
@@ -84,7 +97,7 @@ export class Listing {
     let address: string | null = null;
     try {
       do {
-        const page: { surfaces: ListedSurface[]; next: string | null } = await this.server.page(address);
+        const page: Awaited<ReturnType<Server["page"]>> = await this.server.page(address);
         for (const surface of page.surfaces) this.surfaces.set(surface.id, surface);
         address = page.next;
         this.draw();
@@ -109,7 +122,7 @@ export class Listing {
     this.timer = setTimeout(async () => {
       for (const { url, id } of building.slice(0, 20)) {
         try {
-          this.surfaces.set(id, await this.server.look(url));
+          this.surfaces.set(id, await this.server.listed(url));
         } catch (error) {
           if (error instanceof ProblemError && error.status === 404) this.surfaces.delete(id);
         }
@@ -123,7 +136,12 @@ export class Listing {
     const all = [...this.surfaces.values()].sort((a, b) => (a.created < b.created ? 1 : -1));
     const found = all.filter((surface) => matches(surface, this.search.value.trim()));
     this.table.hidden = found.length === 0;
-    this.rows.replaceChildren(...found.slice(0, 500).map((surface) => this.row(surface)));
+    const rows = found.slice(0, 500).map((surface) => {
+      const row = this.drawn.get(surface) ?? this.row(surface);
+      this.drawn.set(surface, row);
+      return row;
+    });
+    arrange(this.rows, rows);
     this.message.classList.remove("error");
     const hidden = found.length > 500 ? `${found.length - 500} more: search for them.` : "";
     setText(
@@ -139,7 +157,8 @@ export class Listing {
   private row(surface: ListedSurface): HTMLElement {
     const name = nameOf(surface);
     const ready = surface.state === "ready";
-    const title = ready ? html("a", { href: `#s=${encodeURIComponent(surface.id)}` }, name) : html("span", {}, name);
+    const called = html("span", { class: "called", title: name }, name);
+    const title = ready ? html("a", { href: `#s=${encodeURIComponent(surface.id)}` }, called) : called;
     const state = ready ? "" : stateText(surface);
     const remove = html("button", { type: "button", class: "plain", "aria-label": `Delete ${name}` }, "Delete");
     remove.addEventListener("click", () => void this.remove(surface, name));
@@ -155,17 +174,17 @@ export class Listing {
       actions.append(retry);
     }
     if (mayWrite) actions.append(remove);
-    const reason = surface.state === "failed" || surface.state === "waiting";
+    const stopped = surface.state === "failed" || surface.state === "waiting";
+    const told = stopped ? reasonElement(state) : state === "" ? null : html("span", { class: "sub" }, state);
     return html(
       "tr",
       {},
+      html("td", { class: "name" }, html("div", { class: "entry" }, picture(surface), title, told)),
       html(
         "td",
-        { class: "name" },
-        title,
-        state === "" ? null : html("span", { class: reason ? "sub reason" : "sub" }, state),
+        { class: "number optional" },
+        surface.shape ? surface.shape.join(" × ") : ready ? "several blocks" : "",
       ),
-      html("td", { class: "number" }, surface.shape ? surface.shape.join(" × ") : ready ? "several blocks" : ""),
       html("td", { class: "number" }, formatBytes(surface.bytes ?? surface.upload_bytes)),
       html("td", { class: "number optional" }, new Date(surface.created).toLocaleDateString()),
       actions,
@@ -183,7 +202,7 @@ export class Listing {
   private async retry(surface: ListedSurface): Promise<void> {
     await this.change(async () => {
       await this.server.retry(surface.url);
-      this.surfaces.set(surface.id, await this.server.look(surface.url));
+      this.surfaces.set(surface.id, await this.server.listed(surface.url));
     });
     this.poll();
   }
@@ -197,6 +216,12 @@ export class Listing {
       this.fail(error);
     }
   }
+}
+
+/** The thumbnail of a surface, or what stands in its place. The name beside it says what it shows. */
+function picture({ thumbnail }: ListedSurface): HTMLElement {
+  if (!thumbnail) return html("span", { class: "picture" });
+  return html("img", { class: "picture", src: thumbnail, alt: "", width: 96, height: 72 });
 }
 
 function stateText(surface: ListedSurface): string {

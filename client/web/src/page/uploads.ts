@@ -2,7 +2,9 @@
 
 import { html, setText } from "../view/dom";
 import { formatBytes } from "../view/format";
-import { type ListedSurface, ProblemError, type Server } from "./api";
+import { type Choice, type ListedSurface, ProblemError, type Server } from "./api";
+import { choiceName, choiceQuestion } from "./names";
+import { reasonElement } from "./reasons";
 
 /** Milliseconds between questions about a build. */
 const POLL = 700;
@@ -24,11 +26,13 @@ export class Uploads {
   /**
    * @param allowed - Asks for a token if one is needed; false: it was not given.
    * @param changed - Called when a surface was made or is ready.
+   * @param gone - Called when a surface was deleted: its file came again, with the choice that it had lacked.
    */
   constructor(
     private readonly server: Server,
     private readonly allowed: (error: ProblemError) => Promise<boolean>,
     private readonly changed: (surface: ListedSurface) => void,
+    private readonly gone: (surface: ListedSurface) => void,
   ) {
     const choose = html("button", { type: "button" }, "Choose files");
     choose.addEventListener("click", () => this.input.click());
@@ -65,7 +69,12 @@ export class Uploads {
     for (const file of files ?? []) void this.upload(file);
   }
 
-  private async upload(file: File): Promise<void> {
+  /** @param failed - The surface of the same file that lacked these options. */
+  private async upload(
+    file: File,
+    options: Readonly<Record<string, string>> = {},
+    failed: ListedSurface | null = null,
+  ): Promise<void> {
     const what = html("span", { class: "what", role: "status" }, "Waiting");
     const bar = html("progress", { class: "bar", max: 1, value: 0, "aria-label": `Upload of ${file.name}` });
     const cancel = html("button", { type: "button", class: "plain" }, "Cancel");
@@ -76,41 +85,83 @@ export class Uploads {
     // Closing the page would end the transfer.
     const keep = (event: BeforeUnloadEvent): void => event.preventDefault();
     addEventListener("beforeunload", keep);
-    let sent = false;
+    let surface: ListedSurface | null = null;
     try {
-      const surface = await this.send(file, controller.signal, (bytes) => {
+      surface = await this.send(file, options, controller.signal, (bytes) => {
         bar.value = file.size > 0 ? bytes / file.size : 1;
         setText(what, `Sent ${formatBytes(bytes)} of ${formatBytes(file.size)}`);
       }).finally(() => removeEventListener("beforeunload", keep));
-      sent = true;
       cancel.remove();
       this.changed(surface);
-      await this.build(surface, what, bar);
+      if (failed !== null) await this.forget(failed);
+      surface = await this.build(surface, what, bar);
+      if (surface.state !== "ready") throw new Error(surface.reason ?? `The surface is ${surface.state}`);
       item.remove();
     } catch (error) {
       bar.remove();
       cancel.textContent = "Dismiss";
       if (!cancel.isConnected) what.before(cancel);
       cancel.addEventListener("click", () => item.remove());
-      setText(what, controller.signal.aborted ? "Cancelled" : sent ? "Uploaded, but not ready" : "Not uploaded");
-      if (!controller.signal.aborted)
+      const choices = surface?.choices ?? [];
+      if (surface !== null && choices.length > 0) {
+        setText(what, "Uploaded; it has more than one surface");
         item.append(
-          html("span", { class: "reason", role: "alert" }, error instanceof Error ? error.message : String(error)),
+          this.chooser(choices, (choice) => {
+            item.remove();
+            void this.upload(file, { ...surface?.options, ...choice.options }, surface);
+          }),
         );
+      } else
+        setText(what, controller.signal.aborted ? "Cancelled" : surface ? "Uploaded, but not ready" : "Not uploaded");
+      if (!controller.signal.aborted)
+        item.append(reasonElement(error instanceof Error ? error.message : String(error), "alert"));
     }
   }
 
-  private async send(file: File, signal: AbortSignal, progress: (sent: number) => void): Promise<ListedSurface> {
+  /** Offers the surfaces of a file. */
+  private chooser(choices: readonly Choice[], chosen: (choice: Choice) => void): HTMLElement {
+    const names = choices.map((choice, place) => html("option", { value: place }, choiceName(choice)));
+    const select = html("select", {}, ...names);
+    const use = html("button", { type: "button" }, "Upload again");
+    use.addEventListener("click", () => {
+      const choice = choices[Number(select.value)];
+      if (choice !== undefined) chosen(choice);
+    });
+    return html(
+      "div",
+      { class: "chooser" },
+      html("label", { class: "question" }, html("span", {}, `${choiceQuestion(choices)}: `), select),
+      use,
+    );
+  }
+
+  /** Deletes a surface that failed, if that is possible. */
+  private async forget(failed: ListedSurface): Promise<void> {
+    try {
+      await this.server.delete(failed.url);
+      this.gone(failed);
+    } catch (error) {
+      if (!(error instanceof ProblemError)) throw error;
+    }
+  }
+
+  private async send(
+    file: File,
+    options: Readonly<Record<string, string>>,
+    signal: AbortSignal,
+    progress: (sent: number) => void,
+  ): Promise<ListedSurface> {
     for (;;) {
       try {
-        return await this.server.upload(file, progress, signal);
+        return await this.server.upload(file, options, progress, signal);
       } catch (error) {
         if (!(error instanceof ProblemError) || !(await this.allowed(error))) throw error;
       }
     }
   }
 
-  private async build(surface: ListedSurface, what: HTMLElement, bar: HTMLProgressElement): Promise<void> {
+  /** Waits until a build has ended. @returns what became of the surface. */
+  private async build(surface: ListedSurface, what: HTMLElement, bar: HTMLProgressElement): Promise<ListedSurface> {
     while (surface.state === "queued" || surface.state === "building") {
       bar.value = surface.progress;
       setText(
@@ -118,9 +169,9 @@ export class Uploads {
         surface.state === "queued" ? "Waiting for its build" : `Building: ${Math.round(100 * surface.progress)} %`,
       );
       await new Promise((resolve) => setTimeout(resolve, POLL));
-      surface = await this.server.look(surface.url);
+      surface = await this.server.listed(surface.url);
     }
     this.changed(surface);
-    if (surface.state !== "ready") throw new Error(surface.reason ?? `The surface is ${surface.state}`);
+    return surface;
   }
 }
