@@ -274,13 +274,13 @@ def test_options_name_the_variable_and_its_coordinates(tmp_path: Path) -> None:
     )
     with pytest.raises(
         ChoiceError, match="one variable over a surface, got R, Z, psi: choose with variable="
-    ) as raised:
+    ) as refused:
         formats.read(path)
-    assert raised.value.choices == (
+    assert refused.value.choices == (
         *(Choice({"variable": name}, (6, 9)) for name in ("R", "Z", "psi")),
         Choice({"x": "R", "y": "Z"}, (6, 9)),
     )
-    for choice in raised.value.choices:
+    for choice in refused.value.choices:
         assert formats.read(path, closed="auto", **dict[str, Any](choice.options)).shape == choice.shape
     planar = formats.read(path, x="R", y="Z", attributes="psi")
     np.testing.assert_array_equal(planar.points, np.dstack((rows + 1, columns)))
