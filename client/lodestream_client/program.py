@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import lodestream
-from lodestream.errors import LodestreamError, UnavailableError
+from lodestream.errors import LodestreamError, RemoteError, UnavailableError
 
 from .commands import (
     completion,
@@ -30,7 +30,7 @@ from .commands import (
 from .commands.arguments import Subparsers, add_command
 from .starting import EndingAtOnce
 from .terminal.interrupts import exit_code, unwrapping
-from .terminal.output import GroupingParser, Parser, clean_warnings, note
+from .terminal.output import GroupingParser, Parser, clean_warnings, complain, speaking
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 __all__ = ["build_parser", "main"]
 
 _MODULES = (demo, encode, decode, convert, info, open, view, formats, push, pull, surfaces, retry, publish, completion)
+
+#: Codes of errors that another token may help against: of our server, and of any other.
+_NO_TOKEN = ("no-token", "bad-token", "http-401")
 
 #: How the help groups commands; others of other packages are under its last heading.
 _GROUPS = {
@@ -110,7 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             if completion.ASKED in os.environ and argv is None:
                 completion.complete(build_parser())
             args = build_parser(arguments).parse_args(arguments)
-        with clean_warnings(), unwrapping():
+        quiet, verbose = getattr(args, "quiet", False), getattr(args, "verbose", False)
+        with clean_warnings(), speaking(quiet=quiet, verbose=verbose), unwrapping():
             code: int = args.run(args)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -120,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interrupt:
         return exit_code(interrupt)
     except (LodestreamError, OSError) as error:
-        note(_words(error))
+        complain(_words(error))
         return 1
     return code
 
@@ -128,4 +132,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
+    if isinstance(error, RemoteError) and error.code in _NO_TOKEN:
+        return f"{error}; the token is given by --token or LODESTREAM_TOKEN"
     return str(error) or type(error).__name__

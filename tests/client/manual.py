@@ -44,12 +44,17 @@ What all commands have in common:
 
 - Results go to standard output. Progress, notes and errors go to standard error. With `--json`, standard output is one
   JSON object.
+- `-q` prints errors and results alone, `-v` also requests, what is read and how long it takes, in place of bars.
+- Where an error is asked for, `0.5` is in the surface's unit and `0.1%` is of its extent: the range of the heights, or
+  the diagonal of the bounding box.
 - Notes on standard error say what is lost: parts of a file that a surface cannot hold, values of attributes at holes,
   and whatever the format of OUT cannot hold. Notes of a build on a server are printed by `push` and kept as the
   surface's `notes`.
 - Exit codes: 0 success, 1 failure (one line says why), 2 wrong command line, 130 interrupted by Ctrl-C, 143 ended by
   SIGTERM.
 - The path `-` is standard input or output. Files are written under a temporary name and renamed when they are complete.
+- `open` shows a surface in a browser, `view` draws pictures of it; both take files, URLs and addresses in buckets
+  (`s3://bucket/prefix/name.lode`), whose credentials come from the environment ([stores.md](stores.md)).
 - The token for a server is taken from `--token` or from the environment variable `LODESTREAM_TOKEN`.
 
 `decode` and `pull`:

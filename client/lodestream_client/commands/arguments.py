@@ -45,6 +45,9 @@ def add_command(
     # argparse has no public way to say that -3.4e+38 is a value (--nodata -3.4e+38) and no option.
     parser._negative_number_matcher = _NEGATIVE_NUMBER
     parser.set_defaults(run=run, parser=parser)
+    loudness = parser.add_mutually_exclusive_group()
+    loudness.add_argument("-q", "--quiet", action="store_true", help="print errors and results only")
+    loudness.add_argument("-v", "--verbose", action="store_true", help="print requests, reads and times as well")
     return parser
 
 

@@ -18,7 +18,7 @@ from lodestream.errors import (
 from lodestream.target import Target
 
 from ..terminal.interrupts import interruptible
-from ..terminal.output import LONG, note, progress_bar
+from ..terminal.output import LONG, complain, progress_bar
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, standard_output_once
 from .building_options import add_memory_option
 from .decode_by_rows import by_rows
@@ -110,7 +110,7 @@ def decode_file(options: DecodeOptions) -> Outcome:
             if not options.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
                 advice = no_container(file) or _advice(options.partial, job, error)
                 raise named(error, options.container, advice) from None
-            note(f"{named(error, options.container)}; the last complete layer before that is written")
+            complain(f"{named(error, options.container)}; the last complete layer before that is written")
             job.ended = "truncated"
         except TooLargeError as error:
             raise named(error, options.container) from None

@@ -18,6 +18,7 @@ from ..requests.local import checked_options
 from ..terminal.interrupts import interruptible
 from ..terminal.output import (
     LONG,
+    complain,
     human_size,
     note,
     note_holes,
@@ -135,11 +136,11 @@ def _run_each(options: EncodeOptions, along: str, folder: Path) -> int:
                     reports.append(encode_files(step, part, show))
             except (LodestreamError, OSError) as error:
                 failed.append({"file": file, along: part.label, "reason": reason_of(error)})
-                note(f"{part.label}: {failed[-1]['reason']}")
+                complain(f"{part.label}: {failed[-1]['reason']}")
     if options.json:
         print_json({"surfaces": reports, "failed": failed})
     elif failed:
-        note(f"{len(failed)} of {len(surfaces)} surfaces failed")
+        complain(f"{len(failed)} of {len(surfaces)} surfaces failed")
     return 1 if failed else 0
 
 

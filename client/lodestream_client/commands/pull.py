@@ -23,7 +23,7 @@ from lodestream.target import Target
 
 from ..requests import addresses
 from ..terminal.interrupts import exit_code, interruptible
-from ..terminal.output import human_size, note
+from ..terminal.output import complain, human_size, note
 from .arguments import (
     Subparsers,
     add_command,
@@ -241,7 +241,7 @@ def _pull(options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
         kept.done(outcome.ended == "complete" and options.whole)
     if broke is None:
         return 0
-    note("; ".join(filter(None, (f"the data received so far are written to {options.name}", kept.words))))
+    complain("; ".join(filter(None, (f"the data received so far are written to {options.name}", kept.words))))
     return exit_code(broke) if isinstance(broke, KeyboardInterrupt) else 1
 
 
@@ -263,7 +263,7 @@ def _written(
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
                 broke.args = (f"{_words(broke)}: the first layer has not arrived, and {options.name} is not written",)
             raise broke
-        note(_words(broke))
+        complain(_words(broke))
         kept.failed(broke)
     outcome = _outcome(options, stream, metadata, arrived, started)
     outcome.write(options.out)

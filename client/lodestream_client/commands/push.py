@@ -16,7 +16,7 @@ from lodestream.quality import Quality
 
 from ..errors import UnreachableError
 from ..requests.addresses import name_url
-from ..terminal.output import human_size, note, note_details, print_json, progress_bar, say
+from ..terminal.output import complain, human_size, note_details, print_json, progress_bar, say
 from ..terminal.shared_notes import SharedNotes
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
 from .building_options import BuildingOptions
@@ -164,7 +164,7 @@ def _run_each(options: PushOptions) -> int:
             except (LodestreamError, OSError) as error:
                 reason = reason_of(error)
                 failed.append({**words, "reason": reason})
-                note(reason if label in reason else f"{label}: {reason}")
+                complain(reason if label in reason else f"{label}: {reason}")
                 continue
             uploaded.append({**surface.details, "url": surface.url, **words})
             if not options.json:
@@ -172,7 +172,7 @@ def _run_each(options: PushOptions) -> int:
     if options.json:
         print_json({"surfaces": uploaded, "failed": failed})
     elif failed:
-        note(f"{len(failed)} of {len(uploads)} {kind} failed")
+        complain(f"{len(failed)} of {len(uploads)} {kind} failed")
     return 1 if failed else 0
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from .output import note
+from .output import complain
 
 __all__ = ["Terminated", "exit_code", "interruptible", "raising", "unwrapping"]
 
@@ -73,5 +73,5 @@ def interruptible() -> Iterator[None]:
             with unwrapping():
                 yield
         except KeyboardInterrupt as interrupt:
-            note(str(interrupt) or "interrupted")
+            complain(str(interrupt) or "interrupted")
             raise

@@ -36,6 +36,7 @@ __all__ = [
     "Progress",
     "cell",
     "clean_warnings",
+    "complain",
     "console",
     "human_size",
     "human_time",
@@ -51,16 +52,62 @@ __all__ = [
     "say",
     "say_columns",
     "say_script",
+    "speaking",
 ]
+
+#: What ``-v`` prints, and from which level on: that of httpx has a line for each request.
+_LOGGED = {"lodestream": logging.DEBUG, "lodestream_client": logging.DEBUG, "httpx": logging.INFO}
 
 
 #: For `progress_bar`, of work that may take hours: its steps are minutes apart.
 LONG = 900.0
 
 
+class _Speech:
+    """How much is printed beside results and errors; one for the program, as standard error is."""
+
+    quiet = False
+    bars = True
+
+
 def note(text: str) -> None:
-    """Print one line that is not part of the result."""
+    """Print one line that is not part of the result, but for ``-q``."""
+    if not _Speech.quiet:
+        complain(text)
+
+
+def complain(text: str) -> None:
+    """Print one line about an error."""
     print(f"lodestream: {printable(' '.join(text.split()))}", file=sys.stderr)
+
+
+@contextmanager
+def speaking(*, verbose: bool, quiet: bool) -> Iterator[None]:
+    """Print less or more within the block.
+
+    Parameters
+    ----------
+    verbose : bool
+        Also what is logged: requests, what is read, how long it takes. It takes the place of bars.
+    quiet : bool
+        Errors and results alone.
+    """
+    before = _Speech.quiet, _Speech.bars
+    _Speech.quiet, _Speech.bars = quiet, not (verbose or quiet)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Printable("lodestream: %(message)s"))
+    loggers = [(logging.getLogger(name), level) for name, level in _LOGGED.items()] if verbose else []
+    levels = [logger.level for logger, _ in loggers]
+    try:
+        for logger, level in loggers:
+            logger.addHandler(handler)
+            logger.setLevel(level)
+        yield
+    finally:
+        for (logger, _), level in zip(loggers, levels, strict=True):
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+        _Speech.quiet, _Speech.bars = before
 
 
 def say(text: str) -> None:
@@ -271,7 +318,7 @@ def progress_bar(period: float = 30.0) -> Iterator[Progress]:
     period : float
         Seconds of the past from which the time left is estimated; what is told less than twice in them has none.
     """
-    if sys.stderr.isatty():
+    if _Speech.bars and sys.stderr.isatty():
         with _drawn(period) as bar:
             yield bar
     else:

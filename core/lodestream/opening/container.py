@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
+import time
 import weakref
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Self
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     import xarray
 
 __all__ = ["Container", "open"]
+
+_log = logging.getLogger(__name__)
 
 Bytes = bytes  # the name where a parameter is called bytes
 
@@ -278,7 +282,10 @@ class Container:
             if known is None:
                 if not self._open.alive:
                     raise InputError(f"expected an open container, got {self.source.place}, which was closed")
+                began = time.perf_counter()
                 known = self.source.read(at, end - at)
+                seconds = time.perf_counter() - began
+                _log.debug("read %d bytes at %d of %s in %.3f s", len(known), at, self.source.place, seconds)
             run += known[: end - at]
         return Bytes(run)
 
