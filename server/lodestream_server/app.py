@@ -7,6 +7,7 @@ import logging
 import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.middleware.cors import CORSMiddleware
@@ -32,6 +33,7 @@ from .operation.pace import Pace, Paced
 from .operation.settings import Settings
 from .routes import files, interface, levels, maps, names, pages, resumable, streams, surfaces
 from .routes.routing import State
+from .store.container_cache import ContainerCache
 from .store.containers import Containers
 from .store.data import Data
 from .store.index import Surface
@@ -51,6 +53,9 @@ MessagePack messages, see `docs/protocol.md`. Errors are problem documents (RFC 
 # What levels take of the disk where the settings say nothing, unless the disk is small.
 _LEVEL_DISK = 4 << 30
 _LEAST_LEVEL_DISK = 2 << 20
+
+# And what containers of a bucket take.
+_CACHE = 16 << 30
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
@@ -100,8 +105,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         partial_uploads = await asyncio.to_thread(
             PartialUploads, data.partial, chosen.max_partial_uploads, chosen.partial_seconds
         )
-        containers = Containers(surfaces, lost=queue_again)
         limits = Limits(chosen, data.disks, count, kept, lambda: access.alone, endless=data.is_endless)
+        cache = await asyncio.to_thread(_container_cache, chosen, data, limits)
+        containers = Containers(surfaces, lost=queue_again, cache=cache)
         builder = Builder(surfaces, Work(data.work), chosen, limits, metrics.built)
         metrics.watch(data.disks[0], lambda: len(surfaces.index), lambda: builder.pending)
         files_of_levels = await asyncio.to_thread(_level_files, chosen, data, limits)
@@ -136,6 +142,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             await tiles.close()
             await levels.close()
             await builder.close()
+            await asyncio.to_thread(containers.close)
             await asyncio.to_thread(data.close)
 
     app = FastAPI(
@@ -186,10 +193,26 @@ def open_data(settings: Settings) -> Data:
 def _level_files(settings: Settings, data: Data, limits: Limits) -> LevelFiles:
     most = settings.level_disk
     if most is None:
-        try:
-            size = shutil.disk_usage(data.scratch).total
-        except OSError as error:  # level files can be made again: no reason not to start
-            _log.warning("the size of the disk is unknown, so that few level files are kept: %s", error)
-            size = 0
-        most = max(min(_LEVEL_DISK, size // 20), _LEAST_LEVEL_DISK)
+        most = max(min(_LEVEL_DISK, _disk_of(data.scratch) // 20), _LEAST_LEVEL_DISK)
     return LevelFiles(data.levels, most, limits.room)
+
+
+def _container_cache(settings: Settings, data: Data, limits: Limits) -> ContainerCache | None:
+    """Return the cache of containers that are on another machine; None if they are on this one."""
+    if not data.is_endless:
+        return None
+    surfaces, most = data.surfaces, settings.cache_bytes
+    if most is None:
+        most = min(_CACHE, _disk_of(data.scratch) // 10)
+    cache = ContainerCache(data.containers, most, limits.room_now, surfaces.store)
+    cache.start(surfaces.index.uses_container)
+    return cache
+
+
+def _disk_of(folder: Path) -> int:
+    """Return the size of the disk of a folder; 0 if it is unknown, since all there can be made again."""
+    try:
+        return shutil.disk_usage(folder).total
+    except OSError as error:
+        _log.warning("the size of the disk is unknown, so that few levels and containers are kept: %s", error)
+        return 0

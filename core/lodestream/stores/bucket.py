@@ -9,6 +9,7 @@ import itertools
 import os
 import random
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, wait
 from contextlib import contextmanager, suppress
@@ -39,7 +40,7 @@ _MOST_PARTS = 9_000
 _PARTS_AT_ONCE = 3
 #: Objects that are deleted at once; threads that read ahead.
 _THREADS = 8
-#: Bytes that `local` asks for at once.
+#: Bytes that whoever wants all of an object asks for at once.
 _PIECE = 2 << 20
 
 
@@ -142,15 +143,34 @@ class Bucket:
             size = self._ask(key, lambda: self._library.head(self._store, at))["size"]
         return BucketBlob(self._blocks, Extent(key, size))
 
+    def pieces(self, key: str, size: int | None = None) -> Iterator[bytes]:
+        """Read an object from its beginning to its end; one piece is on its way while another is used."""
+        blob = self.open(key, size)
+        coming = deque[Future[bytes]]()
+        for offset in range(0, blob.size, _PIECE):
+            length = min(_PIECE, blob.size - offset)
+            coming.append(self._threads.submit(self._piece, key, blob, offset, length))
+            if len(coming) > 1:
+                yield wait_for(coming.popleft())
+        if coming:
+            yield wait_for(coming.popleft())
+
+    def _piece(self, key: str, blob: BucketBlob, offset: int, length: int) -> bytes:
+        """Read a piece past the blocks that are kept, unless it is there: nobody wants all of it again soon."""
+        data = blob.read_at_once(offset, length) or self._range(key, offset, length)
+        if len(data) != length:
+            raise StoreError(f"{self._named(key)}: expected {length:,} bytes at byte {offset:,}, got {len(data):,}")
+        return data
+
     @contextmanager
     def local(self, key: str) -> Iterator[Path]:
         """Fetch an object into a temporary file for the length of a block."""
-        with TemporaryDirectory(prefix="lodestream-", dir=self._fetched) as folder, self.open(key) as blob:
-            path = Path(folder) / key.rpartition("/")[2]
+        name = checked_key(key).rpartition("/")[2]
+        with TemporaryDirectory(prefix="lodestream-", dir=self._fetched) as folder:
+            path = Path(folder) / name
             try:
                 with path.open("wb") as file:
-                    for offset in range(0, blob.size, _PIECE):
-                        file.write(blob.read(offset, _PIECE))
+                    file.writelines(self.pieces(key))
             except OSError as error:
                 raise StoreError(f"{self._named(key)} cannot be kept in {folder}: {error.strerror}") from error
             yield path

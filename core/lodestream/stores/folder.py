@@ -137,6 +137,12 @@ class Folder:
         path = self._path(key)
         return FileBlob(path, self._opened(key, path))
 
+    def pieces(self, key: str, size: int | None = None) -> Iterator[bytes]:
+        """Read an object from its beginning to its end, piece by piece."""
+        with self.open(key, size) as blob:
+            for offset in range(0, blob.size, _PIECE):
+                yield blob.read(offset, _PIECE)
+
     @contextmanager
     def local(self, key: str) -> Iterator[Path]:
         """Give the file of an object for the length of a block; it must not be changed."""

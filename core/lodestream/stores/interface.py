@@ -217,6 +217,24 @@ class Store(Protocol):
         """
         ...
 
+    def pieces(self, key: str, size: int | None = None) -> Iterator[bytes]:
+        """Read an object from its beginning to its end, piece by piece; what is kept in memory of others stays there.
+
+        Parameters
+        ----------
+        key : str
+        size : int, optional
+            Its bytes if they are known, which saves a request; it must be right.
+
+        Raises
+        ------
+        AbsentError
+            If there is none, or it was deleted meanwhile.
+        StoreError
+            If it cannot be read.
+        """
+        ...
+
     def local(self, key: str) -> AbstractContextManager[Path]:
         """Give an object as a file on this machine for the length of a block; it must not be changed.
 

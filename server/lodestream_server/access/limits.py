@@ -234,11 +234,18 @@ class Limits:
 
     async def room(self) -> int:
         """Return bytes of free disk space, without the space to keep free; announced sizes are not subtracted."""
-        return max((await self._free())[0], 0)
+        return await asyncio.to_thread(self.room_now)
+
+    def room_now(self) -> int:
+        """Return the same as `room`, in a thread that may wait for the disk."""
+        return max(self._free_now()[0], 0)
 
     async def _free(self) -> tuple[int, int]:
+        return await asyncio.to_thread(self._free_now)
+
+    def _free_now(self) -> tuple[int, int]:
         """Return the bytes that may be taken, and the bytes that stay free."""
-        disks = [await asyncio.to_thread(shutil.disk_usage, folder) for folder in self._folders]
+        disks = [shutil.disk_usage(folder) for folder in self._folders]
         kept = [min(_KEPT, disk.total // 20) for disk in disks]
         if self._settings.keep_free is not None:
             kept = [self._settings.keep_free] * len(disks)

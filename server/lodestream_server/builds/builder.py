@@ -47,7 +47,7 @@ from lodestream.stores import AbsentError, StoreError
 from ..access.access import key_of
 from ..access.limits import Limits
 from ..operation.settings import Settings
-from ..operation.threads import carried_out
+from ..operation.threads import carried_out, entered
 from ..problems import FullError
 from ..store.durable import discard
 from ..store.index import IndexLostError, Surface
@@ -457,19 +457,12 @@ class Builder:
 
     async def _in_turn(self, surface: Surface, held: ExitStack) -> _Outcome:
         await self._check_share(surface)
-        files = await self._fetched(surface, held)
+        # They are there until the stack is closed; a bucket is asked for them.
+        files = await entered(self._surfaces.upload(surface), held)
         problem = await self._damage(surface, files)
         if problem is not None:
             return await self._do_without(surface.id, problem)
         return await self._attempt(surface, files)
-
-    async def _fetched(self, surface: Surface, held: ExitStack) -> Sequence[Path]:
-        """Return the files of an upload, which are there until the stack is closed; a bucket is asked for them."""
-        with ExitStack() as stack:
-            files: list[Path] = []
-            await carried_out(lambda: files.extend(stack.enter_context(self._surfaces.upload(surface))))
-            held.push(stack.pop_all())
-            return files
 
     async def _try(self, note: Callable[[], object]) -> None:
         """Note something of a build that is found out again if it is lost."""

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections import OrderedDict
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from ..operation.threads import carried_out
 from ..store.durable import discard
+from ..store.kept_files import KeptFiles, Lease
 
-__all__ = ["REMOVED", "Key", "Lease", "LevelFiles"]
+__all__ = ["REMOVED", "Key", "LevelFiles"]
 
 #: Why a level file is not where it was made, or cannot be made.
 REMOVED = "The server's scratch folder was removed meanwhile; ask again"
@@ -27,50 +26,11 @@ class Key(NamedTuple):
     format_name: str
 
 
-@dataclass
-class _File:
-    path: Path
-    size: int
-    readers: int = 0
-    forgotten: bool = False
-
-
-class Lease:
-    """A level file in use; it is not removed before it is released.
-
-    Attributes
-    ----------
-    path : Path
-    size : int
-        Bytes.
-    """
-
-    def __init__(self, files: LevelFiles, file: _File) -> None:
-        self.path = file.path
-        self.size = file.size
-        self._files: LevelFiles | None = files
-        self._file = file
-        file.readers += 1
-
-    def again(self) -> Lease:
-        """Return another lease of the same file."""
-        assert self._files is not None, "it was not given back"
-        return Lease(self._files, self._file)
-
-    def release(self) -> None:
-        """Release the file; further calls do nothing."""
-        files, self._files = self._files, None
-        if files is not None:
-            self._file.readers -= 1
-            files.released(self._file)
-
-
 class LevelFiles:
     """Level files in a folder of their own, which is created with the first of them.
 
     All files together, including a file that is being made, take at most ``most`` bytes. Before a file is made, files
-    that nobody reads are removed until half of that is free. Everything except disk access happens in the event loop,
-    so no lock is needed.
+    that nobody reads are removed until half of that is free.
 
     Parameters
     ----------
@@ -79,20 +39,14 @@ class LevelFiles:
         Bytes.
     free : callable
         Returns how many bytes of the disk may be used now.
-
-    Attributes
-    ----------
-    lent : int
-        Bytes of the files that somebody reads, removed ones included.
     """
 
     def __init__(self, folder: Path, most: int, free: Callable[[], Awaitable[int]]) -> None:
         self.folder = folder
         self.most = most
         self._free = free
-        self._files: OrderedDict[Key, _File] = OrderedDict()
+        self._files = KeptFiles[Key]()
         self._numbers = itertools.count()
-        self.lent = 0
 
     def close(self) -> None:
         """Remove all files."""
@@ -106,27 +60,16 @@ class LevelFiles:
     @property
     def size(self) -> int:
         """Bytes of all files, including removed ones that are still being read."""
-        return self.lent + sum(file.size for file in self._files.values() if not file.readers)
+        return self._files.size
+
+    @property
+    def lent(self) -> int:
+        """Bytes of the files that somebody reads, including removed ones."""
+        return self._files.lent
 
     def lend(self, key: Key) -> Lease | None:
         """Return a lease of a file, if it exists."""
-        file = self._files.get(key)
-        if file is None:
-            return None
-        self._files.move_to_end(key)
-        return self._lease(file)
-
-    def _lease(self, file: _File) -> Lease:
-        if not file.readers:
-            self.lent += file.size
-        return Lease(self, file)
-
-    def released(self, file: _File) -> None:
-        """Count a reader less of a file; `Lease` calls this."""
-        if not file.readers:
-            self.lent -= file.size
-            if file.forgotten:
-                discard(file.path)
+        return self._files.lend(key)
 
     async def make_room(self) -> int:
         """Remove files to make room for another one; return the bytes that it may have, 0 if there is no room."""
@@ -138,13 +81,7 @@ class LevelFiles:
         return max(min(self.longest, (self.most - self.size) // 2, free // 2), 0)
 
     async def _shrink(self, most: int) -> None:
-        for key, file in list(self._files.items()):
-            if self.size <= most:
-                return
-            # Meanwhile its container may have gone, or somebody may have begun to read it.
-            if self._files.get(key) is file and not file.readers:
-                del self._files[key]
-                await carried_out(partial(discard, file.path))
+        await carried_out(partial(self._files.shrink, most))
 
     def new_folder(self, key: Key) -> Path:
         """Return the path of a folder in which to make a file."""
@@ -154,15 +91,8 @@ class LevelFiles:
         """Take over a file from a folder of `new_folder`, and lend it; without `kept` it is removed at its release."""
         place = path.parent.with_name(f"{path.parent.name}.level")
         path.rename(place)
-        file = _File(place, size, forgotten=not kept)
-        if kept:
-            self._files[key] = file
-        return self._lease(file)
+        return self._files.add(key, place, size, kept=kept)
 
     def forget(self, container: str) -> None:
         """Remove the files of a container; those being read, when they are released."""
-        for key in [key for key in self._files if key.container == container]:
-            file = self._files.pop(key)
-            file.forgotten = True
-            if not file.readers:
-                discard(file.path)
+        self._files.forget(lambda key: key.container == container)

@@ -33,13 +33,14 @@ from ..access.access import Caller
 from ..access.limits import Limits
 from ..access.shares import Held
 from ..operation.settings import Settings
-from ..operation.threads import carried_out
+from ..operation.threads import carried_out, entered
 from ..problems import BusyError, FullError
 from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
+from ..store.kept_files import Lease
 from .answers import FileTooLongError, ProcessDiedError, Refusal, UnforeseenError, WrongAnswerError
 from .fork_server import Allowed
-from .level_files import REMOVED, Key, Lease, LevelFiles
+from .level_files import REMOVED, Key, LevelFiles
 from .levels import LevelJob, MadeLevel, make_level
 from .processes import Call, ForkServer, Pool
 from .runner import Runner
@@ -156,16 +157,16 @@ class LevelMaker:
         await asyncio.to_thread(self._files.close)
 
     def forget(self, container: str) -> None:
-        """Remove the files of a deleted container."""
+        """Remove the files of a deleted container, and what is kept of itself."""
         self._files.forget(container)
+        self._containers.forget(container)
 
     async def _make(self, key: Key, held: ExitStack) -> Lease:
         most = await self._files.make_room()
         if most < _LEAST_ROOM:
             raise self._no_room(most)
-        with ExitStack() as stack:  # a file of this machine, which a thread may have to fetch
-            local = self._containers.local(key.container)
-            container = await asyncio.to_thread(stack.enter_context, local)
+        with ExitStack() as stack:
+            container = await entered(self._containers.local(key.container), stack)
             return await self._make_from(container, key, most, held)
 
     async def _make_from(self, container: Path, key: Key, most: int, held: ExitStack) -> Lease:

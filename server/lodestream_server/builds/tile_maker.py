@@ -17,7 +17,6 @@ dies
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from base64 import b64decode
 from binascii import Error
@@ -30,6 +29,7 @@ from lodestream.errors import StreamError, TooLargeError
 from ..access.access import Caller
 from ..access.limits import Limits
 from ..operation.settings import Settings
+from ..operation.threads import entered
 from ..problems import BusyError
 from ..store.containers import Containers
 from . import tiles
@@ -114,9 +114,7 @@ class TileMaker:
         await self._runner.close()
 
     async def _make(self, container: str, order: TileOrder, held: ExitStack) -> bytes:
-        # A file of this machine, which a thread may have to fetch.
-        path = await asyncio.to_thread(held.enter_context, self._containers.local(container))
-        return await self._ask(container, order, path)
+        return await self._ask(container, order, await entered(self._containers.local(container), held))
 
     async def _ask(self, container: str, order: TileOrder, path: Path) -> bytes:
         question = Question(tiles.answer, (container, order), path, _LONGEST)

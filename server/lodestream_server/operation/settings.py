@@ -277,6 +277,15 @@ class Settings(BaseSettings, Bounds):
         usual="1GiB, or a twentieth of the disk if that is less",
         ge=0,
     )
+    cache_bytes: _Size | None = _choice(
+        None,
+        "limits",
+        "disk space of the scratch folder for containers of a bucket, which are fetched whole when they are read a "
+        "second time, and for levels and tiles; one may take half of it; 0 keeps none",
+        metavar=_SIZE,
+        usual="16GiB, or a tenth of the disk if that is less",
+        ge=0,
+    )
     workers: int = _choice(
         _processors,
         "limits",

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
 from typing import TypeVar
 
-__all__ = ["carried_out"]
+__all__ = ["carried_out", "entered"]
 
 T = TypeVar("T")
 
@@ -22,3 +23,11 @@ async def carried_out(change: Callable[[], T]) -> T:
     except asyncio.CancelledError:
         await asyncio.gather(changing, return_exceptions=True)
         raise
+
+
+async def entered(context: AbstractContextManager[T], held: ExitStack) -> T:
+    """Enter a context in a thread, leave it to a stack, and return what it gives; after a cancellation it is left."""
+    with ExitStack() as stack:
+        given = await carried_out(lambda: stack.enter_context(context))
+        held.push(stack.pop_all())
+        return given

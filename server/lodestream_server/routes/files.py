@@ -82,7 +82,7 @@ async def _sent(request: Request, parts: State, sha256: str, headers: dict[str, 
         return unchanged
     sort_out(request, size, etag)
     if isinstance(place, tuple):
-        return _Container(parts.containers, sha256, *place, headers)
+        return _Container(parts.containers, sha256, place, request, headers)
     return SentBlob(place, request, headers, examples.CONTAINER_TYPE)
 
 
@@ -98,18 +98,29 @@ def _place(containers: Containers, sha256: str) -> tuple[tuple[Path, os.stat_res
 
 
 class _Container(SentFile):
-    """A stored container, which may be deleted before it is opened."""
+    """A container in a file, which may be removed before it is opened."""
 
     def __init__(
-        self, containers: Containers, sha256: str, path: Path, status: os.stat_result, headers: dict[str, str]
+        self,
+        containers: Containers,
+        sha256: str,
+        place: tuple[Path, os.stat_result],
+        request: Request,
+        headers: dict[str, str],
     ) -> None:
+        path, status = place
         super().__init__(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
         self._containers = containers
         self._sha256 = sha256
+        self._request = request
+        self._given = headers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
             await super().__call__(scope, receive, send)
         except FileNotFoundError:
-            await asyncio.to_thread(_place, self._containers, self._sha256)  # which says why
+            place, _ = await asyncio.to_thread(_place, self._containers, self._sha256)  # or it says why
+            if not isinstance(place, tuple):  # the file was one of the cache, and had to make room
+                await SentBlob(place, self._request, self._given, examples.CONTAINER_TYPE)(scope, receive, send)
+                return
             raise BusyError(f"The container {self._sha256} was deleted and stored again; try again") from None

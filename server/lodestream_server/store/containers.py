@@ -19,6 +19,7 @@ from lodestream.stores import AbsentError, Blob
 
 from ..problems import BusyError
 from . import damage, layout
+from .container_cache import ContainerCache
 from .index import IndexLostError, Surface
 from .surfaces import Surfaces
 
@@ -102,12 +103,19 @@ class Containers:
         Bytes of memory that all indexes may take; None: `most_for_indexes`.
     lost : callable
         Called with surfaces that are queued again, because their container is not there or is no longer read.
+    cache : ContainerCache, optional
+        For a store on another machine.
     """
 
     def __init__(
-        self, surfaces: Surfaces, most: int | None = None, lost: Callable[[list[Surface]], object] = _nothing
+        self,
+        surfaces: Surfaces,
+        most: int | None = None,
+        lost: Callable[[list[Surface]], object] = _nothing,
+        cache: ContainerCache | None = None,
     ) -> None:
         self._surfaces = surfaces
+        self._cache = cache
         self._lost = lost
         self._most = most_for_indexes() if most is None else most
         self._coming: Counter[str] = Counter()  # bytes of indexes that are being read, by caller
@@ -149,12 +157,15 @@ class Containers:
         NotFoundError, BusyError, StoreError
             See `blob`.
         """
-        self._check(sha256)
-        try:
-            with self._surfaces.store.local(layout.container_key(sha256)) as path:
-                yield path
-        except AbsentError:
-            self._gone(sha256)
+        size = self._check(sha256)
+        with ExitStack() as stack:
+            path = None if self._cache is None else stack.enter_context(self._cache.local(sha256, size))
+            if path is None:
+                try:
+                    path = stack.enter_context(self._surfaces.store.local(layout.container_key(sha256)))
+                except AbsentError:
+                    self._gone(sha256)
+            yield path
 
     def is_used(self, sha256: str) -> bool:
         """Return whether a surface has this container, as far as the index knows."""
@@ -164,11 +175,25 @@ class Containers:
 
     def tell_damage(self, sha256: str, error: StreamError) -> None:
         """Log that a container turned out to be damaged when it was read."""
+        self.forget(sha256)  # it may be the file that is
         damage.tell(self._surfaces, sha256, error)
+
+    def forget(self, sha256: str) -> None:
+        """Remove what is kept of a container that is deleted."""
+        if self._cache is not None:
+            self._cache.forget(sha256)
+
+    def close(self) -> None:
+        """End what goes on in the background."""
+        if self._cache is not None:
+            self._cache.close()
 
     def _bytes(self, sha256: str) -> tuple[Blob, int]:
         """Open the bytes of a container; return also how many it had when it was stored."""
         size = self._check(sha256)
+        cached = None if self._cache is None else self._cache.open(sha256, size)
+        if cached is not None:
+            return cached, size
         try:
             return self._surfaces.store.open(layout.container_key(sha256), size), size
         except AbsentError:

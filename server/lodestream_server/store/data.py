@@ -13,6 +13,7 @@
     SCRATCH/work/           builds in progress, see `builds.work`
     SCRATCH/levels/         levels as files, made on request
     SCRATCH/fetched/        objects of a bucket, as files for a build or a level
+    SCRATCH/containers/     containers of a bucket that were read more than once, see `container_cache`
 
 DATA is a folder or a bucket. A folder belongs to one process; of the servers that share a bucket one writes, see
 `lease`. SCRATCH is DATA/scratch, or the folder ``lodestream`` where the setting `scratch` says. All of it can be made
@@ -113,6 +114,8 @@ class Data:
         Folder of builds.
     levels : Path
         Folder of levels as files.
+    containers : Path
+        Folder of containers of a bucket.
     partial : Path
         Folder of uploads that are sent in parts.
 
@@ -140,6 +143,7 @@ class Data:
         self.scratch = scratch = scratch_of(folder, scratch)
         self.disks = (scratch,) if folder is None else (folder, scratch)
         self.work, self.levels, self.partial = scratch / "work", scratch / "levels", scratch / "partial"
+        self.containers = scratch / "containers"
         self._incoming, fetched = scratch / "incoming", scratch / "fetched"
         self._guards: list[int] = []
         try:

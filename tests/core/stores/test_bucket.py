@@ -340,6 +340,7 @@ if os.fork() == 0:
         "read of a block that is there": lambda: blob.read(0, 10),
         "read of a block that is not there": lambda: blob.read(blob.size - 10, 10),
         "read at once": lambda: blob.read_at_once(0, 10),
+        "pieces": lambda: list(store.pieces("b")),
         "local": lambda: store.local("b").__enter__(),
         "delete": lambda: store.delete(["a"]),
         "delete of several": lambda: store.delete(["a", "b", "c"]),

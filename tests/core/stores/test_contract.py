@@ -83,6 +83,8 @@ def test_what_is_not_there_is_absent_for_every_reader(store: Store) -> None:
             store.get(key)
         with pytest.raises(AbsentError):
             store.open(key)
+        with pytest.raises(AbsentError):
+            list(store.pieces(key))
         with pytest.raises(AbsentError), store.local(key):
             pass
 
@@ -181,6 +183,16 @@ def test_many_threads_read_one_blob(store: Store, tmp_path: Path) -> None:
     assert read == [data[offset : offset + length] for offset, length in places]
 
 
+def test_an_object_is_read_from_its_beginning_to_its_end(store: Store, tmp_path: Path) -> None:
+    for size in (1, 5_000_000):
+        data = secrets.token_bytes(size)
+        put(store, f"a{size}", data, tmp_path)
+        for known in (None, size):
+            pieces = list(store.pieces(f"a{size}", known))
+            assert b"".join(pieces) == data
+            assert max(map(len, pieces)) <= 2 << 20
+
+
 def test_an_object_is_a_local_file_for_a_while(store: Store, tmp_path: Path) -> None:
     data = secrets.token_bytes(600_000)
     put(store, "uploads/a/1", data, tmp_path)
@@ -251,6 +263,7 @@ def test_what_cannot_be_a_key_is_refused_everywhere(store: Store, key: str, tmp_
         lambda: store.replace(key, b"", tag),
         lambda: store.put_file(key, path),
         lambda: store.open(key),
+        lambda: list(store.pieces(key)),
         lambda: store.local(key).__enter__(),
         lambda: store.delete(["good", key]),
     ):

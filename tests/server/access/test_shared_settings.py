@@ -57,6 +57,7 @@ NOT_SHARED = {
     "upload_files": "of one upload",
     "partial_seconds": "a time; what it keeps counts as its owner's (max_partial_uploads, owner_bytes)",
     "max_vertices": "of one surface",
+    "cache_bytes": "disk space for what can be fetched again; whoever reads gets its turn, and what is read stays",
     "keep_free": "disk space that nobody gets; the rest is shared (owner_bytes)",
     "threads": "of one build",
     "memory": "each build has its part of it (build_memory), whoever asked for it",

@@ -1,0 +1,283 @@
+"""Containers of a bucket as files: whoever reads one again, makes levels or tiles of it, has it on this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import re
+import secrets
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Self
+
+from lodestream.stores import Blob, Store, StoreError
+from lodestream.stores.folder import FileBlob
+from lodestream.stores.threads import Threads
+
+from . import layout
+from .durable import NewFile, discard, rename
+from .index import IndexLostError
+from .kept_files import KeptFiles, Lease
+from .private import make_private
+
+__all__ = ["ContainerCache"]
+
+_log = logging.getLogger(__name__)
+
+#: Containers of which it is known that they were read once.
+_SEEN = 10_000
+#: Containers that are fetched at the same time because they were read twice, and more that wait for that.
+_AT_ONCE = 2
+_WAITING = 32
+#: Seconds that the end of a server waits for fetches to notice it.
+_FAREWELL = 5.0
+
+_NAME = re.compile(r"([0-9a-f]{64})\.[0-9a-f]{8}\.lode")
+
+
+class ContainerCache:
+    """Files of containers, in a folder that outlives the server. All of it may be used from any thread.
+
+    A container that is read twice is fetched whole, in the background, if it takes no more than half of ``most`` and
+    half of what is free on the disk; for levels and tiles at once. Two who want it cause one fetch. Its bytes are
+    compared with its name as they come, and are on disk before the file has that name; so what a start finds is only
+    asked for its size. The least recently used ones go first, those in use stay. Whatever is wrong with disk or folder
+    is told in the log, and costs speed alone: then the store is read.
+
+    Parameters
+    ----------
+    folder : Path
+    most : int
+        Bytes of all files, those that are being fetched included.
+    room : callable
+        Returns how many bytes of the disk may be used now.
+    store : Store
+    """
+
+    def __init__(self, folder: Path, most: int, room: Callable[[], int], store: Store) -> None:
+        self._folder = folder
+        self._most = most
+        self._room = room
+        self._store = store
+        self._files = KeptFiles[str]()
+        self._lock = threading.Lock()
+        self._setting_aside = threading.Lock()  # held while files are removed, for which nobody else is to wait
+        self._seen: OrderedDict[str, None] = OrderedDict()
+        self._threads = Threads(_AT_ONCE)
+        self._wanted: dict[str, Future[None]] = {}  # in the background
+        self._coming: dict[str, Future[None]] = {}  # by whoever fetches
+        self._promised = 0  # bytes of files that are being fetched
+        self._fails = self._closed = False
+
+    def start(self, is_used: Callable[[str], bool]) -> None:
+        """Take over what an earlier server has left; what nobody uses any more, or is no whole container, goes."""
+        try:
+            make_private(self._folder)
+            found = sorted((path.lstat().st_mtime, path) for path in self._folder.iterdir())
+            for _, path in found:
+                name = _NAME.fullmatch(path.name)
+                if name and path.is_file() and not path.is_symlink() and _kept(is_used, name[1]):
+                    self.forget(name[1])  # an older one
+                    self._files.add(name[1], path, path.stat().st_size).release()
+                else:
+                    discard(path)
+        except OSError as error:
+            self._tell(error)
+        self._files.shrink(self._most)
+
+    def close(self) -> None:
+        """Give up what is being fetched; files stay for the next start."""
+        with self._lock:
+            self._closed = True
+            wanted = list(self._wanted.values())
+        wait([each for each in wanted if not each.cancel()], _FAREWELL)
+
+    def open(self, sha256: str, size: int) -> Blob | None:
+        """Open the file of a container, if it is there; the second time that it is not, it is fetched meanwhile."""
+        lease = self._files.lend(sha256)
+        if lease is None:
+            self._count(sha256, size)
+            return None
+        try:
+            file = FileBlob(lease.path, lease.path.open("rb"))
+        except OSError as error:
+            lease.release()
+            self._forget(sha256, error)
+            return None
+        if file.size != size:
+            file.close()
+            lease.release()
+            self._forget(sha256, f"expected {size} bytes, got {file.size}")
+            return None
+        return _CachedBlob(file, lease, self._instead(sha256, size))
+
+    @contextmanager
+    def local(self, sha256: str, size: int) -> Iterator[Path | None]:
+        """Give the file of a container for the length of a block, fetched if need be; None if there is no room."""
+        blob = self.open(sha256, size)
+        if blob is not None:
+            with blob:
+                yield blob.path
+            return
+        lease = self._fetch(sha256, size)
+        try:
+            yield None if lease is None else lease.path
+        finally:
+            if lease is not None:
+                lease.release()
+
+    def forget(self, sha256: str) -> None:
+        """Remove the file of a container, when nobody reads it any more."""
+        self._files.forget(lambda key: key == sha256)
+
+    def _forget(self, sha256: str, problem: object) -> None:
+        _log.warning("the container %s is fetched again: its file cannot be used: %s", sha256, problem)
+        self.forget(sha256)
+
+    def _instead(self, sha256: str, size: int) -> Callable[[StoreError], Blob]:
+        """Return what opens the container in the store when its file cannot be read."""
+
+        def opened(error: StoreError) -> Blob:
+            self._forget(sha256, error)
+            return self._store.open(layout.container_key(sha256), size)
+
+        return opened
+
+    def _count(self, sha256: str, size: int) -> None:
+        """Note that a container is read; the second time it is fetched."""
+        with self._lock:
+            if self._seen.pop(sha256, True) is not None:
+                self._seen[sha256] = None
+                if len(self._seen) > _SEEN:
+                    self._seen.popitem(last=False)
+                return
+            if self._closed or sha256 in self._wanted or len(self._wanted) >= _WAITING or not self._fits(size):
+                return
+            with suppress(RuntimeError):  # the program ends
+                self._wanted[sha256] = self._threads.submit(self._fetch_aside, sha256, size)
+
+    def _fetch_aside(self, sha256: str, size: int) -> None:
+        try:
+            lease = self._fetch(sha256, size)
+            if lease is not None:
+                lease.release()
+        finally:
+            with self._lock:
+                self._wanted.pop(sha256, None)
+
+    def _fits(self, size: int) -> bool:
+        return size <= self._most // 2
+
+    def _fetch(self, sha256: str, size: int) -> Lease | None:
+        """Fetch a container unless it is there, and lend its file; None if that is not possible."""
+        with self._lock:
+            lease = self._files.lend(sha256)
+            if lease is not None or self._closed or not self._fits(size):
+                return lease
+            coming = self._coming.get(sha256)
+            if coming is None:
+                done = self._coming[sha256] = Future[None]()
+        if coming is not None:
+            coming.result()
+            return self._files.lend(sha256)
+        try:
+            return self._fetched(sha256, size)
+        except (StoreError, OSError) as error:
+            if not self._closed:
+                self._tell(error)
+            return None
+        finally:
+            with self._lock:
+                del self._coming[sha256]
+            done.set_result(None)
+
+    def _fetched(self, sha256: str, size: int) -> Lease | None:
+        if not self._promise(size):
+            return None
+        # One that was forgotten may still be read under its own name.
+        path = self._folder / f"{sha256}.{secrets.token_hex(4)}.lode"
+        new = path.with_suffix(".new")
+        try:
+            make_private(self._folder)
+            digest = hashlib.sha256()
+            with NewFile(new) as file:
+                for piece in self._store.pieces(layout.container_key(sha256), size):
+                    if self._closed:
+                        raise StoreError("the server ends")
+                    digest.update(piece)
+                    file.write(piece)
+            if digest.hexdigest() != sha256:
+                raise StoreError(
+                    f"{layout.container_key(sha256)} has other bytes than its name says; run lodestream fsck"
+                )
+            rename(new, path)
+            self._fails = False
+            return self._files.add(sha256, path, size)
+        finally:
+            discard(new)
+            with self._setting_aside:
+                self._promised -= size
+
+    def _promise(self, size: int) -> bool:
+        """Make room for a file, if there can be room, and set it aside."""
+        with self._setting_aside:
+            self._files.shrink(self._most - self._promised - size)
+            # Half of what is free stays for uploads and builds.
+            lacking = 2 * (self._promised + size) - self._room()
+            if lacking > 0:
+                self._files.shrink(max(self._files.size - lacking, 0))
+                lacking = 2 * (self._promised + size) - self._room()
+            if lacking > 0 or self._files.size + self._promised + size > self._most:
+                return False
+            self._promised += size
+            return True
+
+    def _tell(self, error: Exception) -> None:
+        """Log what is wrong, once until a container is fetched again."""
+        level = logging.DEBUG if self._fails else logging.WARNING
+        self._fails = True
+        _log.log(level, "a container is read from the store, since it cannot be kept in %s: %s", self._folder, error)
+
+
+class _CachedBlob:
+    """A container that is open for reading, from its file as long as that can be read. See `Blob`."""
+
+    def __init__(self, file: FileBlob, lease: Lease, instead: Callable[[StoreError], Blob]) -> None:
+        self.path: Path | None = file.path
+        self.size = file.size
+        self._file = file
+        self._lease = lease
+        self._instead = instead
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Read bytes; fewer where the container ends."""
+        try:
+            return self._file.read(offset, length)
+        except StoreError as error:
+            with self._instead(error) as blob:
+                return blob.read(offset, length)
+
+    def read_at_once(self, offset: int, length: int) -> bytes | None:
+        """Read exactly so many bytes without waiting for the disk; None if that is not possible."""
+        return self._file.read_at_once(offset, length)
+
+    def close(self) -> None:
+        """Close the file, which may go then."""
+        self._file.close()
+        self._lease.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _kept(is_used: Callable[[str], bool], sha256: str) -> bool:
+    with suppress(IndexLostError):
+        return is_used(sha256)
+    return True
