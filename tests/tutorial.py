@@ -28,7 +28,7 @@ _BLOCK = re.compile(r"```console\n(.*?)```", re.DOTALL)
 _PROGRAM = re.compile(r"```python\n# (\S+\.py)\n(.*?)```", re.DOTALL)
 _MARK = "-- command"
 #: What differs from run to run.
-_VARIES = ((re.compile(r"/surfaces/[0-9a-f]{20}"), "/surfaces/ID"), (re.compile(r"in [0-9.]+ m?s\b"), "in T s"))
+_VARIES = ((re.compile(r"(/surfaces/|#s=)[0-9a-f]{20}"), r"\1ID"), (re.compile(r"in [0-9.]+ m?s\b"), "in T s"))
 
 
 def compiler() -> bool:

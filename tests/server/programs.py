@@ -56,13 +56,23 @@ class Server:
         A command that runs the one that follows it.
     preload : str
         The function of `alone` that builds and levels begin with.
+    address : str or None
+        Of a bucket in which its data are; then the folder only says where what it says goes.
     **settings
         Fields of `Settings`.
     """
 
-    def __init__(self, data: Path, wrapper: Sequence[str] = (), preload: str = "preload", **settings: Any) -> None:
+    def __init__(
+        self,
+        data: Path,
+        wrapper: Sequence[str] = (),
+        preload: str = "preload",
+        *,
+        address: str | None = None,
+        **settings: Any,
+    ) -> None:
         self.log = data.with_name(f"{data.name}.log")
-        chosen = {"host": "127.0.0.1", "port": 0, "workers": 1, "data": str(data), **settings}
+        chosen = {"host": "127.0.0.1", "port": 0, "workers": 1, "data": address or str(data), **settings}
         command = [*wrapper, sys.executable, "-m", "tests.server.alone", json.dumps(chosen), preload]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         with self.log.open("ab") as log:

@@ -15,8 +15,8 @@ from lodestream.errors import LodestreamError, OptionError
 from lodestream.quality import Quality
 
 from ..errors import UnreachableError
-from ..requests.addresses import name_url
-from ..terminal.output import complain, human_size, note_details, print_json, progress_bar, say
+from ..requests.addresses import name_url, page_url
+from ..terminal.output import complain, human_size, note, note_details, print_json, progress_bar, say
 from ..terminal.shared_notes import SharedNotes
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, standard_input_once, token_of
 from .building_options import BuildingOptions
@@ -46,7 +46,7 @@ def register(subparsers: Subparsers) -> None:
         run,
         "upload one or several files to a server as a surface",
         "Waits until the server has built the surface. The last line of standard output is its URL (that of its name\n"
-        "with --replace).\n"
+        "with --replace); standard error tells the address of the page that shows it.\n"
         "A container (.lode) is kept unchanged; --name is the only surface option it takes.\n"
         "If the server cannot build the surface now, push fails, and the server keeps the upload (lodestream retry).",
     )
@@ -140,10 +140,12 @@ def run(args: argparse.Namespace) -> int:
     surface = _sent(options)
     note_details(surface.details, words=option_words)
     named = {} if options.name_url is None else {"name_url": options.name_url}
+    url = options.name_url or surface.url
     if options.json:
-        print_json({**surface.details, "url": surface.url, **named})
+        print_json({**surface.details, "url": surface.url, **named, "page_url": page_url(url)})
     else:
-        say(options.name_url or surface.url)
+        note(f"in a browser: {page_url(url)}")
+        say(url)
     return 0
 
 

@@ -21,6 +21,7 @@ __all__ = [
     "name_url",
     "names_url",
     "origin",
+    "page_url",
     "published_name",
     "resolved",
     "same_origin",
@@ -108,6 +109,18 @@ def served_url(url: str) -> str:
         If this is neither ``http(s)://HOST/v1/surfaces/ID`` nor ``http(s)://HOST/v1/names/NAME``.
     """
     return _clean(url) if is_served(url) else surface_url(url)
+
+
+def page_url(url: str) -> str:
+    """Return the address at which the page of a server shows a surface, or what a name there leads to.
+
+    Raises
+    ------
+    OptionError
+        If this is the URL of neither.
+    """
+    base, kind, name = served_url(url).rsplit("/", 2)
+    return f"{base.removesuffix('/v1')}/#{'n' if kind == 'names' else 's'}={name}"
 
 
 def source_url(url: str) -> str:

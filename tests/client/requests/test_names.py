@@ -203,3 +203,17 @@ def test_rm_deletes_a_name() -> None:
     with scripted(lambda asked: Answer(204)) as server:
         assert main(["rm", server.url + NAME]) == 0
         assert [(asked.method, asked.path) for asked in server.asked] == [("DELETE", NAME)]
+
+
+@pytest.mark.parametrize(
+    ("url", "page"),
+    [
+        ("http://h:8000/v1/surfaces/0a1b", "http://h:8000/#s=0a1b"),
+        ("https://h/maps/v1/surfaces/0a1b/", "https://h/maps/#s=0a1b"),
+        ("https://h/v1/names/dem", "https://h/#n=dem"),
+    ],
+)
+def test_the_page_that_shows_a_surface(url: str, page: str) -> None:
+    assert addresses.page_url(url) == page
+    with pytest.raises(OptionError):
+        addresses.page_url("https://h/dem.lode")

@@ -338,8 +338,8 @@ def test_a_lost_container_is_built_again_when_somebody_opens_it(tmp_path: Path, 
         whole = container.read_bytes()
         container.unlink()
         lost = http.get(path.format(**surface), follow_redirects=True)
-        # Levels are asked for by surface, which is not ready now.
-        assert problem(lost) == (409, "not-ready") if "levels" in path else busy(lost)
+        # What is asked for by surface is told that it is not ready now.
+        assert problem(lost) == (409, "not-ready") if path.startswith("{url}") else busy(lost)
         again = eventually(lambda: (it := settled(http, surface["url"]))["container_sha256"] and it, "another build")
         assert again == surface
         assert container.read_bytes() == whole
@@ -358,7 +358,7 @@ def test_without_its_upload_a_lost_container_is_waited_for(tmp_path: Path) -> No
         assert http.get(surface["url"]).json() == surface, "its container is there"
         assert http.get(f"{surface['url']}/container", follow_redirects=True).status_code == 200
         container.rename(data / "lost")
-        assert busy(http.get(f"{surface['url']}/container", follow_redirects=True))
+        assert problem(http.get(f"{surface['url']}/container"))[0] == 409
         waiting = settled(http, surface["url"])
         assert (waiting["state"], waiting["container_sha256"]) == ("waiting", None)
         assert waiting["reason"] == "its upload is not in the server's store"

@@ -386,7 +386,7 @@ def test_the_process_that_hands_out_tasks_has_limited_memory(job: worker.Job, mo
     monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=io.BytesIO(line + b"\n")))
     monkeypatch.setattr(sys, "stdout", SimpleNamespace(buffer=told))
     cluster_build.main()
-    assert json.loads(told.getvalue()) == {"returned": {"reason": "tcp://127.0.0.1:1", "final": True}}
+    assert json.loads(told.getvalue()) == {"returned": {"reason": "tcp://127.0.0.1:1", "final": True, "choices": []}}
     most = (2 << 20) + cluster_build._BESIDE
     assert limits == [(resource.RLIMIT_DATA, (most, most))]
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from lodestream_server.routes import surfaces as routes
 from tests.server.builds.test_builds import running
 from tests.server.builds.test_confinement import build_by
 from tests.server.connections import hostile
-from tests.server.helpers import hills, npy, push
+from tests.server.helpers import eventually, hills, npy, push
 
 _START = "data:image/png;base64,"
 
@@ -85,11 +87,18 @@ def test_a_surface_that_cannot_be_drawn_is_as_good(tmp_path: Path) -> None:
     assert thumbnails.draw(tmp_path / "many") is None
 
 
-def test_after_a_start_with_a_new_index_it_is_there_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("index", ["none", "of an earlier version"])
+def test_after_a_start_with_another_index_it_is_there_again(tmp_path: Path, index: str) -> None:
     data = tmp_path / "data"
+    path = data / "scratch" / "index.sqlite"
     with running(data) as http:
         before = thumbnail(http, made := push(http, npy(hills(seed=78))))
-    for path in (data / "scratch").glob("index.sqlite*"):
+    if index == "none":
         path.unlink()
+    else:
+        with closing(sqlite3.connect(path)) as connection:
+            connection.execute("ALTER TABLE surface DROP COLUMN thumbnail")
+            connection.commit()
     with running(data) as http:
+        eventually(lambda: http.get(made["url"]).status_code == 200 or None, "the index to be made again")
         assert thumbnail(http, made) == before is not None
