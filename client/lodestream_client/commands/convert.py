@@ -13,7 +13,7 @@ from lodestream.errors import FormatError, StreamError, TooLargeError
 from lodestream.quality import Quality
 
 from ..terminal.interrupts import interruptible
-from ..terminal.output import note, print_json
+from ..terminal.output import note, print_json, working
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
 from .encode import read_surface
 from .inputs import named
@@ -85,7 +85,8 @@ def _surface(options: ConvertOptions) -> Surface:
     from lodestream import decode
 
     try:
-        surface = decode(Path(first).read_bytes())
+        with working("decoding"):
+            surface = decode(Path(first).read_bytes())
     except (StreamError, TooLargeError) as error:
         raise named(error, first) from None
     if options.surface.name:

@@ -26,6 +26,7 @@ from ..terminal.output import (
     progress_bar,
     require_folder,
     require_parent,
+    working,
 )
 from ..terminal.shared_notes import SharedNotes
 from .arguments import Subparsers, add_command, add_json_option, standard_input_once, standard_output_once
@@ -216,10 +217,12 @@ def read_surface(
         format_options = checked_options(options.format_options)
         given: dict[str, Any] = {"closed": options.closed, "filename": files.filename}
         given |= {"format_name": options.format_name, "nodata": options.nodata}
-        if "remesh" in format_options:  # nothing else takes long before the encoding
+        if "remesh" in format_options:  # nothing else tells how far it is
             bar = stack.enter_context(progress_bar(LONG))
             task = bar.add_task("remeshing", total=1.0, figures="")
             given["progress"] = lambda fraction: bar.update(task, completed=fraction)
+        else:
+            stack.enter_context(working("reading"))
         if folder is None:
             first, *more = files.paths
             surface = ls.read(first, *more, **given, **format_options)

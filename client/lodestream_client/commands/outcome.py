@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import FormatError, InputError
 from lodestream.target import Target
 
-from ..terminal.output import human_size, note, print_json, require_folder, require_parent
+from ..terminal.output import human_size, note, print_json, require_folder, require_parent, working
 
 if TYPE_CHECKING:
     from lodestream.container import Header
@@ -66,10 +66,11 @@ def write_surface(surface: Surface, out: str) -> None:
     """Write a surface to the file OUT; to standard output (``-``) as NPY."""
     from lodestream import formats
 
-    if out == "-":
-        formats.write_stream(surface, "npy", sys.stdout.buffer)
-    else:
-        formats.write(surface, out)
+    with working("writing"):
+        if out == "-":
+            formats.write_stream(surface, "npy", sys.stdout.buffer)
+        else:
+            formats.write(surface, out)
 
 
 def note_unmet(target: Target, ended: str, view: View, header: Header) -> None:

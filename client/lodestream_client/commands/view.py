@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import OptionError
 
 from ..terminal.interrupts import interruptible
-from ..terminal.output import note, require_folder
+from ..terminal.output import note, require_folder, working
 from .arguments import Subparsers, add_command
 from .shown import Shown, add_shown_arguments, shown_of
 from .values import parse_pictures, parse_region
@@ -100,7 +101,10 @@ def _draw(options: ViewOptions) -> None:
 
     out = options.png
     require_folder(out)
-    with options.shown.opened() as make, Container(make(lambda _: None), options.shown.max_vertices) as container:
+    with ExitStack() as stack:
+        source = stack.enter_context(options.shown.opened())(lambda _: None)
+        container = stack.enter_context(Container(source, options.shown.max_vertices))
+        stack.enter_context(working("drawing"))
         name = container.source.name
         if options.until_done:
             view, picture, share = view_when_done(container, name)

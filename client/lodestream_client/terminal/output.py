@@ -14,9 +14,10 @@ import math
 import os
 import secrets
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
@@ -53,6 +54,7 @@ __all__ = [
     "say_columns",
     "say_script",
     "speaking",
+    "working",
 ]
 
 #: What ``-v`` prints, and from which level on: that of httpx has a line for each request.
@@ -318,11 +320,44 @@ def progress_bar(period: float = 30.0) -> Iterator[Progress]:
     period : float
         Seconds of the past from which the time left is estimated; what is told less than twice in them has none.
     """
-    if _Speech.bars and sys.stderr.isatty():
+    if not (_Speech.bars and sys.stderr.isatty()):
+        yield _Unseen()
+        return
+    _Speech.bars = False  # one at a time: what has a bar of its own within this one shows none
+    try:
         with _drawn(period) as bar:
             yield bar
-    else:
-        yield _Unseen()
+    finally:
+        _Speech.bars = True
+
+
+@contextmanager
+def working(words: str, delay: float = 1.0) -> Iterator[None]:
+    """Show a bar without an end on standard error, if that is a terminal, as soon as the block takes long.
+
+    Parameters
+    ----------
+    words : str
+        What is done.
+    delay : float
+        Seconds until there is a bar.
+    """
+    if not (_Speech.bars and sys.stderr.isatty()):
+        yield
+        return
+    with ExitStack() as shown:
+
+        def show() -> None:
+            shown.enter_context(progress_bar()).add_task(printable(words), total=None, figures="")
+
+        timer = threading.Timer(delay, show)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield
+        finally:
+            timer.cancel()
+            timer.join()
 
 
 def _drawn(period: float = 30.0) -> rich.progress.Progress:

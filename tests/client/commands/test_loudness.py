@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import logging
 import re
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lodestream_client.terminal import output
 from lodestream_server import running_server
 from tests.client import files
 from tests.client.conftest import Run
+from tests.patience import PATIENCE
 
 HEIGHTS = np.add.outer(np.arange(40.0) ** 2, np.arange(50.0)).astype("f4")
 
@@ -69,3 +73,30 @@ def test_who_needs_a_token_is_told_how_to_give_it(
                 code, printed, said = run(*command, *more)
                 assert (code, printed) == (1, "")
                 assert said.rstrip().endswith("; the token is given by --token or LODESTREAM_TOKEN"), said
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_what_takes_long_has_a_bar(
+    long: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with output.working("reading\x1b", delay=0.0 if long else 1000.0):
+        until = time.monotonic() + PATIENCE
+        while long and output._Speech.bars and time.monotonic() < until:
+            time.sleep(0.01)
+        with output.progress_bar() as inner:
+            task = inner.add_task("another", total=1.0, figures="")
+            inner.update(task, completed=1.0)
+    said = capsys.readouterr().err
+    assert ("reading\\x1b" in said) == long
+    assert ("another" in said) != long, "one bar at a time"
+
+
+def test_quiet_commands_have_no_bars(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    for quiet in (True, False):
+        with output.speaking(verbose=not quiet, quiet=quiet), output.progress_bar() as bar:
+            bar.update(bar.add_task("sending", total=1.0, figures=""), completed=1.0)
+    assert capsys.readouterr().err == ""
