@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,15 @@ import numpy as np
 import pytest
 
 from lodestream.errors import InputError, LodestreamError
-from lodestream.stores import open_store
+from lodestream.stores import ConflictError, open_store
 from lodestream_client.program import main
 from lodestream_server import running_server
-from lodestream_server.access.tokens import TokenObject
+from lodestream_server.access.tokens import TokenObject, Tokens
+from lodestream_server.builds import worker
+from lodestream_server.store.lease import Lease
 from tests.patience import PATIENCE
-from tests.server.helpers import eventually, hills, npy, problem, push
+from tests.server.builds import slow
+from tests.server.helpers import eventually, hills, npy, problem, push, settled
 from tests.stores.emulators import ministack, s3
 from tests.stores.memory import memory
 
@@ -154,3 +157,70 @@ def test_a_pull_that_is_cut_short_goes_on_at_another_server(
     figures = json.loads(told.out)
     assert figures["wire_bytes"] < figures["bytes"] - 15_000
     assert np.load(out).tobytes() == surface.tobytes()
+
+
+def test_a_server_that_loses_its_lease_cuts_its_builds_short_and_goes_on_when_it_has_it_again(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "build", slow.wait)
+    http = writer(site)
+    location = http.post("/v1/surfaces", content=npy(hills())).headers["location"]
+    eventually(lambda: http.get(location).json()["progress"] == 0.5, "the build to begin")
+    store = open_store(site.address)
+    other = Lease(store)
+    while not other.held:
+        with suppress(ConflictError):  # it was renewed meanwhile
+            other._tag = store.get("writer.json")[1]
+            other._write(time.monotonic(), 99)
+    eventually(lambda: role(http) == "waiting", "it to notice")
+    eventually(lambda: http.get(location).json()["state"] == "queued", "the build to be cut short")
+    assert problem(http.post("/v1/surfaces", content=npy(hills(seed=2)))) == (503, "busy")
+    other.close()
+    eventually(lambda: role(http) == "writer", "it to write again")
+    (site.folder / "writer" / "go").touch()
+    assert settled(http, location)["state"] == "ready"
+
+
+def test_the_command_changes_the_tokens_in_a_bucket(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+    data = ("--data", site.address)
+    assert main(["token", "create", "ann", "--scope", "write", *data]) == 0
+    told = capsys.readouterr()
+    assert "its hash is in tokens.json in s3://memory/data" in told.err
+    found = Tokens(TokenObject(open_store(site.address))).find(told.out.strip())
+    assert found is not None
+    assert (found.name, found.scopes) == ("ann", ("write",))
+    assert main(["token", "create", "ben", *data]) == 0
+    assert main(["token", "list", *data]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert main(["token", "revoke", "ann", *data]) == 0
+    assert [token.name for token in TokenObject(open_store(site.address)).load()] == ["ben"]
+    assert main(["token", "revoke", "ann", *data]) == 1
+    assert "there are 'ben'" in capsys.readouterr().err
+
+
+def test_tokens_that_two_change_at_once_are_told_and_not_lost(memory: str) -> None:
+    first, second = TokenObject(open_store(memory)), TokenObject(open_store(memory))
+    tokens = Tokens(first)
+    assert not tokens.used
+    text, _ = first.create("ann", ("read",))
+    assert tokens.find(text) is not None
+
+    def change() -> None:
+        with second._change() as changed:
+            first.create("ben", ("read",))
+            changed.clear()
+
+    with pytest.raises(ConflictError):
+        change()
+    assert [token.name for token in first.load()] == ["ann", "ben"]
+    store = open_store(memory)
+    store.replace("tokens.json", b"[]", store.get("tokens.json")[1])
+    assert tokens.used
+    first.look()
+    assert tokens.find(text) is None, "nobody is let in by what cannot be read"
+
+
+def test_buckets_are_not_checked(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fsck", "s3://memory/data"])
+    assert "expected a folder, got s3://memory/data: buckets are not checked" in capsys.readouterr().err

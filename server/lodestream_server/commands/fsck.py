@@ -35,7 +35,7 @@ def register(subparsers: Any, _: Sequence[str] = ()) -> None:
         "loss; 1: something is damaged.",
         allow_abbrev=False,
     )
-    parser.add_argument("data", metavar="DIR", type=Path, help="data folder of a server")
+    parser.add_argument("data", metavar="DIR", type=_folder, help="data folder of a server; no bucket")
     parser.add_argument(
         "--scratch",
         metavar="DIR",
@@ -61,6 +61,19 @@ def register(subparsers: Any, _: Sequence[str] = ()) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=fsck)
+
+
+def _folder(text: str) -> Path:
+    from lodestream.errors import InputError
+    from lodestream.stores.addresses import place_of
+
+    try:
+        place = place_of(text)
+    except InputError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    if place is not None:
+        raise argparse.ArgumentTypeError(f"expected a folder, got {place.address}: buckets are not checked")
+    return Path(text)
 
 
 def fsck(args: argparse.Namespace) -> int:

@@ -371,7 +371,7 @@ def test_without_its_upload_a_lost_container_is_waited_for(tmp_path: Path) -> No
         assert settled(http, surface["url"]) == surface
         assert http.get(f"{surface['url']}/container", follow_redirects=True).status_code == 200
         container.unlink()
-        assert busy(http.get(f"{surface['url']}/container", follow_redirects=True))
+        assert problem(http.get(f"{surface['url']}/container"))[0] == 409
         assert settled(http, surface["url"])["state"] == "waiting"
         (data / "away").rename(upload)
         assert http.post(f"{surface['url']}/retry").status_code == 202
