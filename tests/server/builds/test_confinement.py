@@ -289,7 +289,8 @@ def test_the_server_says_what_the_kernel_holds_builds_to(
         with running(tmp_path / str(len(held))) as other:
             answer = eventually(partial(_ready, other), "the server to be ready")
             missing = answer.pop("missing")
-            assert answer == {"status": "ready", "index": "current", "confinement": "+".join(held) or "none"}
+            confinement = "+".join(held) or "none"
+            assert answer == {"status": "ready", "role": "writer", "index": "current", "confinement": confinement}
             assert [sentence.partition(": a build may ")[0] for sentence in missing] == names
         (warning,) = [record.getMessage() for record in caplog.records if words in record.getMessage()]
         assert all(sentence in warning for sentence in missing)

@@ -291,7 +291,7 @@ def test_a_container_that_is_lost_is_copied_again_and_never_encoded(tmp_path: Pa
         running_server(data, workers=1) as url,
         httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
-        assert problem(http.get(f"{made['url']}/container", follow_redirects=True)) == (503, "busy")
+        assert problem(http.get(f"{made['url']}/container")) == (409, "not-ready")
         again = push(http, exact)
         assert (again["state"], again["container_sha256"], again["errors"]) == (
             "ready",
