@@ -314,7 +314,9 @@ async def refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     detail, headers = error.detail, dict(error.headers or {})
     if error.status_code == 404:
-        detail = f"No such address on this server: {request.url.path[:100]!r}; /docs lists what there is"
+        path = request.url.path
+        hint = "without the slash at its end there may be one" if path.endswith("/") else "/docs lists what there is"
+        detail = f"No such address on this server: {path[:100]!r}; {hint}"
     if error.status_code == 405:
         # The framework names the methods of the first route of this path only.
         headers = {"allow": ", ".join(_methods(request))}
@@ -334,8 +336,10 @@ def _methods(request: Request) -> list[str]:
 
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    places = [(".".join(map(str, item["loc"])), item["msg"]) for item in error.errors()]
-    detail = "; ".join(f"{place}: {message}" for place, message in places)
+    wrong = [(*item["loc"][:2], item["msg"]) for item in error.errors()]
+    detail = "; ".join(
+        f"The parameter {name} of the {place}: {words[0].lower()}{words[1:]}" for place, name, words in wrong
+    )
     return _document(request, "bad-option", detail, {})
 
 

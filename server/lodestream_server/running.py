@@ -79,6 +79,7 @@ class Server(uvicorn.Server):
         parts = getattr(self._state, "parts", None)
         if parts is not None:
             parts.limits.end()
+            parts.builder.leave()
         await super().shutdown(sockets)
         # The signal that was caught is raised again after this, and ends the process at once.
         await asyncio.to_thread(drain)

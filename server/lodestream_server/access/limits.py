@@ -70,9 +70,10 @@ class Limits:
 
     Attributes
     ----------
-    builds, streams, openings, levels, tiles, lent : Share
-        Of the builds that wait or run, the open streams, the connections that have not shown a token yet, the requests
-        that wait for levels and for tiles, and the bytes of levels that are being read.
+    builds, streams, waits, openings, levels, tiles, lent : Share
+        Of the builds that wait or run, the open streams, the requests that wait for builds, the connections that have
+        not shown a token yet, the requests that wait for levels and for tiles, and the bytes of levels that are being
+        read.
     plans : Turns
         Held while a large plan is made: one at a time, because it slows down all other Python code.
     """
@@ -99,6 +100,7 @@ class Limits:
         self._uploads = share("uploads in progress", settings.max_uploads)
         self.builds = share("pending builds", settings.max_builds)
         self.streams = share("open streams", settings.max_streams)
+        self.waits = share("requests that wait for builds", settings.max_streams)
         self.openings = share("connections that have not sent a token yet", settings.max_streams)
         self._credit = share("bytes of send buffers beyond the least", settings.memory_of_streams)
         self.levels = share("requests for levels", settings.max_level_requests)

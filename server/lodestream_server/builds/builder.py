@@ -183,6 +183,8 @@ class Builder:
         self._room = asyncio.Event()
         self._closing = False
         self._deleting = set[str]()
+        self._awaited: dict[str, set[asyncio.Future[None]]] = {}  # by those who wait for the end of a build
+        self._leaving = False
 
     @property
     def pending(self) -> int:
@@ -253,7 +255,33 @@ class Builder:
         self._callers[surface] = caller
         self._limits.builds.add(caller)
 
+    async def settled(self, surface: str, seconds: float) -> None:
+        """Wait until a build of a surface ends, the surface is deleted, the server ends, or the seconds are over."""
+        heard = asyncio.get_running_loop().create_future()
+        waiting = self._awaited.setdefault(surface, set())
+        waiting.add(heard)
+        try:
+            known = self._find(surface)  # it may have ended before somebody listened
+            if known is not None and known.state in ("queued", "building") and not self._leaving:
+                await asyncio.wait((heard,), timeout=seconds)
+        finally:
+            waiting.discard(heard)
+            if not waiting and self._awaited.get(surface) is waiting:
+                del self._awaited[surface]
+
+    def leave(self) -> None:
+        """Let nobody wait any more for the end of a build: the server ends."""
+        self._leaving = True
+        for surface in list(self._awaited):
+            self._tell(surface)
+
+    def _tell(self, surface: str) -> None:
+        for heard in self._awaited.pop(surface, ()):
+            heard.set_result(None)
+
     def _ended(self, surface: str) -> None:
+        if surface not in self._deleting:
+            self._tell(surface)
         self._tasks.pop(surface, None)
         self._held.pop(surface, None)
         caller = self._callers.pop(surface, None)
@@ -329,6 +357,7 @@ class Builder:
             await asyncio.to_thread(self._work.forget, surface)
         finally:
             self._deleting.discard(surface)
+            self._tell(surface)
             kept = self._find(surface)
             if kept is not None:  # it could not be deleted
                 self._resume(kept)

@@ -41,7 +41,9 @@ class Bounds(BaseModel):
     max_connections: int | None = _follows(
         1, "connections of all kinds: 5000, or fewer if the limit of open files (ulimit -n) does not allow as many"
     )
-    max_streams: int = _count(2000, "open streams; the same number of connections may be waiting to authenticate")
+    max_streams: int = _count(
+        2000, "open streams; as many connections may be waiting to authenticate, and as many requests for builds"
+    )
     max_level_requests: int = _count(32, "requests for levels as files that wait at the same time")
     max_tile_requests: int = _count(64, "requests for tiles of maps that wait at the same time")
     level_memory: int | None = _follows(

@@ -48,6 +48,9 @@ async def level(
     wanted: Annotated[
         str, Query(alias="format", description=f"{', '.join(MEDIA_TYPES)}; or a suffix of theirs, such as tif")
     ] = "npy",
+    _: Annotated[
+        str | None, Query(alias="name", description="not used: for programs that go by how an address ends: level.nc")
+    ] = None,
 ) -> Response:
     """Return the grid of one level, 0 being the coarsest; the same file as ``lodestream decode --level`` writes.
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
-from fastapi.responses import FileResponse, JSONResponse, Response
+from fastapi.responses import FileResponse, Response
 from pydantic import BaseModel, ValidationError
 
 from lodestream.errors import InputError, NotFoundError, TooLargeError
@@ -18,15 +19,16 @@ from ..problems import SlowUploadError, responses
 from ..store.index import Named, Surface
 from ..store.layout import NAME
 from . import examples, files
-from .routing import Parts, State, readable
+from .routing import Parts, State, described, readable
 from .sending import ready
-from .surfaces import answer, base, owned
+from .surfaces import Wait, base, description, owned, settled
 
 __all__ = ["leads_to", "router"]
 
 router = APIRouter(prefix="/v1/names", tags=["names"])
 
 _Name = Annotated[str, Path(pattern=f"^{NAME}$")]
+_JSON = "application/json"
 _LONGEST_BODY = 1024
 _DAY = 86400.0
 
@@ -68,16 +70,19 @@ async def point(caller: Writer, request: Request, parts: Parts, name: _Name) -> 
         return Response(status_code=204)
     keep = _DAY * parts.settings.keep_replaced_days
     await asyncio.to_thread(names.point, name, found.id, caller.owner, caller.may_change, keep, fits)
-    described = await answer(found, caller, parts, request)
-    described.status_code = 201 if new else 200
-    return described
+    content = await description(found, caller, parts, request)
+    return Response(content, 201 if new else 200, media_type=_JSON)
 
 
 @readable(
     router,
     "",
     summary="List names",
-    responses={200: examples.answer("A page of names", examples.NAMES), **responses(422)},
+    responses={
+        200: examples.answer("A page of names", examples.NAMES),
+        304: {"description": "The client has it"},
+        **responses(422),
+    },
 )
 async def page(
     caller: Reader,
@@ -90,7 +95,7 @@ async def page(
 
     `next` is the address of the next page, or null.
     """
-    return await asyncio.to_thread(_page, after, limit, caller, parts, request)
+    return described(request, parts, await asyncio.to_thread(_page, after, limit, caller, parts, request))
 
 
 @readable(
@@ -99,14 +104,14 @@ async def page(
     summary="Describe the surface to which a name leads",
     responses={
         200: examples.answer("The surface to which it leads now", examples.READY),
-        **responses(404, 422, 503),
+        304: {"description": "The client has it"},
+        **responses(404, 422, 429, 503),
     },
 )
-async def look(caller: Reader, request: Request, parts: Parts, name: _Name) -> Response:
+async def look(caller: Reader, request: Request, parts: Parts, name: _Name, wait: Wait = 0.0) -> Response:
     """Return what is told of the surface to which a name leads now; its `url` is that of the surface."""
-    described = await answer(leads_to(parts, name), caller, parts, request)
-    described.headers["cache-control"] = "no-cache"
-    return described
+    await settled(request, parts, caller, leads_to(parts, name).id, wait)
+    return described(request, parts, await description(leads_to(parts, name), caller, parts, request))
 
 
 @readable(
@@ -167,13 +172,13 @@ def leads_to(parts: State, name: str) -> Surface:
     return found
 
 
-def _page(after: str, limit: int, caller: Caller, parts: State, request: Request) -> Response:
+def _page(after: str, limit: int, caller: Caller, parts: State, request: Request) -> bytes:
     following = parts.surfaces.index.names(after, limit + 1)
     shown = following[:limit]
     address = None
     if len(following) > limit:
         address = f"{_base(request)}?limit={limit}&after={shown[-1].name}"
-    return JSONResponse({"names": [_told(named, caller, request) for named in shown], "next": address})
+    return json.dumps({"names": [_told(named, caller, request) for named in shown], "next": address}).encode()
 
 
 def _told(named: Named, caller: Caller, request: Request) -> dict[str, Any]:

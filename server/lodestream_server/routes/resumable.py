@@ -28,7 +28,7 @@ from ..problems import WrongTypeError, WrongVersionError, responses
 from ..store import layout, uploads
 from ..store.partial_uploads import Declared, PartialUpload
 from . import examples, surfaces
-from .routing import Parts, State
+from .routing import AnyQuery, Parts, State
 
 __all__ = ["ANSWER_HEADERS", "REQUEST_HEADERS", "router"]
 
@@ -104,7 +104,7 @@ async def offer_uploads(parts: Parts) -> Response:
         **responses(412, 413, 422, 429, 503, 507),
     },
 )
-async def begin_upload(caller: Writer, request: Request, parts: Parts, _: _Tus) -> Response:
+async def begin_upload(caller: Writer, request: Request, parts: AnyQuery, _: _Tus) -> Response:
     """Begin an upload of one file that may be sent in parts, by tus 1.0.0; Location is its address.
 
     The options of the surface go into the query, as for an upload in one. `Upload-Metadata` may have `filename`,
@@ -232,10 +232,9 @@ async def override_method(caller: Writer, request: Request, parts: Parts, upload
 
 async def _finish(upload: PartialUpload, caller: Caller, parts: State) -> None:
     """Make a surface of a complete upload, which is held; one that cannot become a surface is removed."""
-    chosen = options.SurfaceOptions.parse(upload.declared.query)
     try:
         received, surface = await surfaces.keep(
-            lambda folder: asyncio.to_thread(upload.whole, folder), chosen, caller, parts
+            lambda folder: asyncio.to_thread(upload.whole, folder), upload.declared.query, caller, parts
         )
     except InputError:
         await parts.partial_uploads.remove(upload)

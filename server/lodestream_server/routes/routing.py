@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Depends
+from fastapi import APIRouter, Depends, Request
+from fastapi.dependencies.models import Dependant
 from fastapi.requests import HTTPConnection
 from fastapi.responses import Response
+from fastapi.routing import APIRoute
+
+from lodestream.errors import OptionError
 
 from ..access.access import Access
 from ..access.limits import Limits
@@ -24,7 +29,7 @@ from ..store.partial_uploads import PartialUploads
 from ..store.surfaces import Surfaces
 from ..upkeep import Upkeep
 
-__all__ = ["Parts", "State", "caching", "matches", "readable"]
+__all__ = ["AnyQuery", "Parts", "State", "caching", "described", "matches", "readable"]
 
 _Route = TypeVar("_Route", bound=Callable[..., Any])
 
@@ -59,8 +64,29 @@ async def _parts(connection: HTTPConnection) -> State:
     return state
 
 
-#: A route's parameter of this type is given the server's parts.
-Parts = Annotated[State, Depends(_parts)]
+#: The server's parts, for routes that look at the query themselves.
+AnyQuery = Annotated[State, Depends(_parts)]
+
+
+async def _checked(request: Request, parts: AnyQuery) -> State:
+    if request.scope["query_string"]:
+        _check_query(request)
+    return parts
+
+
+#: A route's parameter of this type is given the server's parts, once nothing unknown is in the query.
+Parts = Annotated[State, Depends(_checked)]
+
+
+def _check_query(request: Request) -> None:
+    """Refuse a key of the query that the route does not know: what a caller meant by it would not be done."""
+    route = request.scope["route"]
+    assert isinstance(route, APIRoute)
+    known = _parameters(route.dependant)
+    for key in request.query_params:
+        if key not in known:
+            what = f"only {', '.join(known)}" if known else "and no other"
+            raise OptionError(f"There is no parameter {key[:80]!a} here, {what}")
 
 
 def readable(
@@ -81,6 +107,20 @@ def caching(parts: State, *, forever: bool = False) -> str:
     if forever:
         return f"{'public' if parts.settings.public_reads else 'private'}, max-age=31536000, immutable"
     return "no-cache" if parts.settings.public_reads else "private, no-cache"
+
+
+def _parameters(dependant: Dependant) -> list[str]:
+    """Return the names of what is read from the query, by a route or by what it depends on."""
+    known = [parameter.alias for parameter in dependant.query_params]
+    return known + [name for other in dependant.dependencies for name in _parameters(other)]
+
+
+def described(request: Request, parts: State, content: bytes) -> Response:
+    """Return an answer with JSON, or 304 if the client has it; its strong ETag is made from what it says."""
+    etag = f'"{hashlib.sha256(content).hexdigest()[:32]}"'
+    answer = matches(request.headers.get("if-none-match"), etag) or Response(content, media_type="application/json")
+    answer.headers.update({"etag": etag, "cache-control": caching(parts)})
+    return answer
 
 
 def matches(header: str | None, etag: str) -> Response | None:

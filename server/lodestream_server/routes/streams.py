@@ -33,7 +33,7 @@ from ..codes import MEANINGS
 from ..operation.logs import event
 from ..problems import NoWebSocketError, SilentError, answer, problem, responses
 from ..store.containers import OpenContainer
-from .routing import Parts, readable
+from .routing import AnyQuery, readable
 from .sending import ready, still_there
 
 __all__ = ["router"]
@@ -73,7 +73,7 @@ _PATH = "/v1/surfaces/{surface}/stream"
     response_class=Response,
     responses={101: {"description": "The subprotocol lodestream.v1"}, **responses(404, 426)},
 )
-async def plain(parts: Parts) -> Response:
+async def plain(parts: AnyQuery) -> Response:
     """Open a stream: messages in MessagePack, see `docs/protocol.md`. A request that opens no WebSocket is 426.
 
     A token is in the handshake, or in `open` as the first message. Other refusals are messages in the stream.
@@ -82,7 +82,7 @@ async def plain(parts: Parts) -> Response:
 
 
 @router.websocket(_PATH)
-async def stream(caller: StreamReader, socket: WebSocket, parts: Parts, surface: str) -> None:
+async def stream(caller: StreamReader, socket: WebSocket, parts: AnyQuery, surface: str) -> None:
     """Send a surface under the client's credit."""
     try:
         offered = socket.scope["subprotocols"]
@@ -187,7 +187,7 @@ class _Session:
         socket: WebSocket,
         container: OpenContainer,
         sender: Sender,
-        parts: Parts,
+        parts: AnyQuery,
         first: bytes | None,
         caller: Caller,
     ) -> None:

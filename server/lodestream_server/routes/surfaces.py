@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AsyncExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,9 +25,10 @@ from ..store.durable import discard
 from ..store.index import Position, Surface
 from ..store.layout import Manifest
 from . import examples
-from .routing import Parts, State, readable
+from .routing import AnyQuery, Parts, State, described, readable
+from .sending import while_there
 
-__all__ = ["answer", "base", "keep", "owned", "router"]
+__all__ = ["Wait", "base", "description", "keep", "owned", "router", "settled"]
 
 router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
 
@@ -44,6 +45,12 @@ _MOST_PAGE = 1 << 20
 _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
 
 
+#: For how long somebody is ready to wait for a build.
+Wait = Annotated[
+    float, Query(ge=0, le=60, allow_inf_nan=False, description="seconds to wait until the build has ended")
+]
+
+
 @router.post(
     "",
     status_code=202,
@@ -56,16 +63,17 @@ _PLACE = r"^[0-9]{1,12}(\.[0-9]{1,12})?_[0-9a-f]{20}$"
         **responses(408, 413, 422, 429, 503, 507),
     },
 )
-async def upload(caller: Writer, request: Request, parts: Parts) -> Response:
+async def upload(caller: Writer, request: Request, parts: AnyQuery) -> Response:
     """Upload a file, as a raw body or as parts called ``file`` of a form; the surface is built in the background.
 
-    Parameters in the query other than precision, rms, effort, closed, nodata, name and filename are options of the
-    file's format. If the caller has already uploaded the same bytes with the same options and name, the answer is the
-    existing surface, even if the server has no room for new ones.
+    Options are parameters of the query, or fields of the form. Those other than precision, rms, effort, closed, nodata,
+    name and filename are options of the file's format. If the caller has already uploaded the same bytes with the same
+    options and name, the answer is the existing surface, even if the server has no room for new ones.
 
     A container (.lode) is checked and decoded once, and kept unchanged. It takes no options but name and filename.
     """
-    chosen = options.SurfaceOptions.parse(request.query_params.multi_items())
+    query = request.query_params.multi_items()
+    filename = options.SurfaceOptions.parse(query).filename  # what is wrong there is told before the body is read
     async with AsyncExitStack() as held:
         try:
             watched = await held.enter_async_context(parts.limits.upload(request, caller))
@@ -73,25 +81,29 @@ async def upload(caller: Writer, request: Request, parts: Parts) -> Response:
             if not _perhaps_known(request, parts):
                 raise
             watched = await held.enter_async_context(parts.limits.upload(request, caller, stored=False))
-            received = await uploads.receive(watched, None, parts.settings, chosen.filename)
-            known = await asyncio.to_thread(_known, received, chosen, caller.owner, parts)
+            received = await uploads.receive(watched, None, parts.settings, filename)
+            known = await asyncio.to_thread(_known, received, _chosen(query, received), caller.owner, parts)
             if known is None:
                 raise refusal from None
             surface = known
         else:
             received, surface = await keep(
-                lambda folder: uploads.receive(watched, folder, parts.settings, chosen.filename), chosen, caller, parts
+                lambda folder: uploads.receive(watched, folder, parts.settings, filename), query, caller, parts
             )
     parts.metrics.uploaded(received.size)
     # Whoever finds the surface ready need not come back; otherwise the answer is the same as to a new one.
-    return await answer(surface, caller, parts, request, located=True)
+    return await _located(surface, caller, parts, request)
 
 
 @readable(
     router,
     "",
     summary="List surfaces",
-    responses={200: examples.answer("A page of surfaces, oldest first", examples.PAGE), **responses(422)},
+    responses={
+        200: examples.answer("A page of surfaces, oldest first", examples.PAGE),
+        304: {"description": "The client has it"},
+        **responses(422),
+    },
 )
 async def page(
     caller: Reader,
@@ -106,7 +118,7 @@ async def page(
     A page may have fewer surfaces than its limit although more follow.
     """
     content = await asyncio.to_thread(_page, _position(after), limit, thumbnails, caller, parts, request)
-    return Response(content, media_type=_JSON)
+    return described(request, parts, content)
 
 
 @readable(
@@ -115,11 +127,12 @@ async def page(
     summary="Describe a surface",
     responses={
         200: examples.answer("Its state and, once it is ready, its description", examples.READY),
-        **responses(404),
+        304: {"description": "The client has it"},
+        **responses(404, 429, 503),
     },
 )
 async def look(
-    caller: Reader, request: Request, parts: Parts, surface: str, thumbnails: Thumbnails = False
+    caller: Reader, request: Request, parts: Parts, surface: str, thumbnails: Thumbnails = False, wait: Wait = 0.0
 ) -> Response:
     """Return the state of a surface and, once it is ready, what ``lodestream info --json`` prints.
 
@@ -135,8 +148,12 @@ async def look(
 
     A surface that a name has replaced has `replaced_until`: then the server deletes it, unless a name leads to it again
     or it is uploaded again.
+
+    With `wait` the answer comes when the surface is neither queued nor building any more, or after so many seconds.
     """
-    return await answer(parts.surfaces.get(surface), caller, parts, request, thumbnails=thumbnails)
+    await settled(request, parts, caller, surface, wait)
+    found = parts.surfaces.get(surface)
+    return described(request, parts, await description(found, caller, parts, request, thumbnails=thumbnails))
 
 
 @router.post(
@@ -159,7 +176,7 @@ async def retry(caller: Writer, request: Request, parts: Parts, surface: str) ->
     # Until the build counts by itself: others that are asked for meanwhile find it counted.
     with parts.limits.builds.take(caller) if known.state in ("failed", "waiting") else nullcontext():
         retried = await parts.builder.retry(surface, caller.key)
-    return await answer(retried, caller, parts, request, located=True)
+    return await _located(retried, caller, parts, request)
 
 
 @router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(403, 404))
@@ -194,8 +211,13 @@ def _changeable(caller: Caller, parts: State, surface: str) -> Surface:
     return found
 
 
+def _chosen(query: Sequence[tuple[str, str]], received: uploads.Upload) -> options.SurfaceOptions:
+    """Return the options of an upload: those of the query and those of the form."""
+    return options.SurfaceOptions.parse([*query, *received.options])
+
+
 async def keep(
-    receive: Callable[[Path], Awaitable[uploads.Upload]], chosen: options.SurfaceOptions, caller: Caller, parts: State
+    receive: Callable[[Path], Awaitable[uploads.Upload]], query: Sequence[tuple[str, str]], caller: Caller, parts: State
 ) -> tuple[uploads.Upload, Surface]:
     """Make a surface of what `receive` puts into the folder that it is given; return both.
 
@@ -210,7 +232,7 @@ async def keep(
         folder = await asyncio.to_thread(parts.data.new_upload)
         try:
             received = await receive(folder)
-            manifest = await asyncio.to_thread(_manifest, received, chosen, caller.owner, parts)
+            manifest = await asyncio.to_thread(_manifest, received, _chosen(query, received), caller.owner, parts)
         except BaseException:
             await asyncio.to_thread(discard, folder)
             raise
@@ -266,40 +288,40 @@ def _manifest(received: uploads.Upload, chosen: options.SurfaceOptions, owner: s
     )
 
 
-async def answer(
-    surface: Surface,
-    caller: Caller,
-    parts: State,
-    request: Request,
-    *,
-    located: bool = False,
-    thumbnails: bool = False,
-) -> Response:
-    """Return the answer that describes a surface.
+async def settled(request: Request, parts: State, caller: Caller, surface: str, seconds: float) -> None:
+    """Wait until the build of a surface has ended, the client is gone, or so many seconds are over.
 
-    Parameters
-    ----------
-    surface : Surface
-    caller : Caller
-    parts : State
-    request : Request
-    located : bool
-        Whether somebody asked for its build: 202 unless it is ready, with its address in a header.
-    thumbnails : bool
-        Whether its thumbnail is told.
+    Raises
+    ------
+    NotFoundError
+        If there is no such surface.
+    TooManyError, BusyError
+        If the caller, or all together, have as many requests that wait as allowed.
     """
+    if seconds and parts.surfaces.get(surface).state in ("queued", "building"):
+        with parts.limits.waits.take(caller):
+            await while_there(request, parts.builder.settled(surface, seconds), lambda _: None)
+
+
+async def _located(surface: Surface, caller: Caller, parts: State, request: Request) -> Response:
+    """Return the answer to somebody who asked for the build of a surface: 202 unless it is ready, with its address."""
+    content = await description(surface, caller, parts, request)
+    place = {"location": f"{base(request)}/{surface.id}"}
+    return Response(content, 200 if surface.state == "ready" else 202, place, media_type=_JSON)
+
+
+async def description(
+    surface: Surface, caller: Caller, parts: State, request: Request, *, thumbnails: bool = False
+) -> bytes:
+    """Return all that is told of a surface, as JSON."""
     head = _told(surface, caller, parts, request, thumbnails=thumbnails)
     head["filenames"] = list(surface.manifest.filenames)
     head["options"] = surface.manifest.options
     until = parts.surfaces.index.replaced_until(surface.id)
     if until is not None:
         head["replaced_until"] = datetime.fromtimestamp(until, UTC).isoformat(timespec="milliseconds")
-    status, headers = 200, {}
-    if located:
-        status, headers = 200 if surface.state == "ready" else 202, {"location": head["url"]}
     # What was built is described by bytes of the store, which may be many.
-    content = await asyncio.to_thread(_joined, parts, surface, head)
-    return Response(content, status, headers, media_type=_JSON)
+    return await asyncio.to_thread(_joined, parts, surface, head)
 
 
 def _joined(parts: State, surface: Surface, head: dict[str, Any]) -> bytes:

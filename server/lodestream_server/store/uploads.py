@@ -33,6 +33,8 @@ _BUFFER = 64 * 1024
 _READ = 1 << 20
 _FIELD = "file"
 _MOST_PART_HEADERS = 16 * 1024
+# Of a form: fields that are no files, and bytes of each.
+_MOST_OPTIONS, _MOST_OPTION = 64, 4096
 
 
 class Upload:
@@ -48,12 +50,15 @@ class Upload:
     ----------
     names : list of (str or None)
         Names of the files as the client sent them.
+    options : list of (str, str)
+        Fields of the form that are no files.
     size : int
         Bytes of all files.
     """
 
     def __init__(self, folder: Path | None, most_files: int) -> None:
         self.names: list[str | None] = []
+        self.options: list[tuple[str, str]] = []
         self.size = 0
         self.digest = hashlib.sha256()
         self._folder = folder
@@ -194,7 +199,7 @@ class _Raw:
 
 
 class _Multipart:
-    """A multipart body whose parts are all called ``file``."""
+    """A multipart body: parts called ``file`` are files, and parts that are no files are options."""
 
     def __init__(self, upload: Upload, boundary: bytes) -> None:
         self._upload = upload
@@ -202,6 +207,7 @@ class _Multipart:
         self._value = b""
         self._headers: dict[bytes, bytes] = {}
         self._ended = False
+        self._option: tuple[str, bytearray] | None = None  # the part that is being read, if it is one
         callbacks: MultipartCallbacks = {
             "on_part_begin": self._part_begin,
             "on_header_begin": self._header_begin,
@@ -210,7 +216,7 @@ class _Multipart:
             "on_header_end": self._header_end,
             "on_headers_finished": self._headers_finished,
             "on_part_data": self._part_data,
-            "on_part_end": upload.end,
+            "on_part_end": self._part_end,
             "on_end": self._end,
         }
         self._parser = MultipartParser(boundary, callbacks)
@@ -247,15 +253,35 @@ class _Multipart:
     def _headers_finished(self) -> None:
         _, options = parse_options_header(self._headers.get(b"content-disposition"))
         field = options.get(b"name", b"").decode("utf-8", "replace")
-        if field != _FIELD:
-            raise OptionError(
-                f"The form has a part called {field[:80]!a}; files are called {_FIELD}, and options go into the query"
-            )
         name = options.get(b"filename")
+        if field != _FIELD:
+            if name is not None or not field:
+                raise OptionError(f"The form has a file called {field[:80]!a}; files are called {_FIELD}")
+            if len(self._upload.options) == _MOST_OPTIONS:
+                raise TooLargeError(f"The form has more than the {_MOST_OPTIONS} options that it may have")
+            self._option = field, bytearray()
+            return
         self._upload.begin(None if name is None else name.decode("utf-8", "replace"))
 
     def _part_data(self, data: bytes, start: int, end: int) -> None:
-        self._upload.write(data[start:end])
+        if self._option is None:
+            self._upload.write(data[start:end])
+            return
+        name, value = self._option
+        value += data[start:end]
+        if len(value) > _MOST_OPTION:
+            raise TooLargeError(f"The option {name[:80]!a} has more than the {_MOST_OPTION} bytes that it may have")
+
+    def _part_end(self) -> None:
+        if self._option is None:
+            self._upload.end()
+            return
+        name, value = self._option
+        self._option = None
+        try:
+            self._upload.options.append((name, value.decode()))
+        except UnicodeDecodeError:
+            raise OptionError(f"The option {name[:80]!a} is not text in UTF-8") from None
 
     def _end(self) -> None:
         self._ended = True

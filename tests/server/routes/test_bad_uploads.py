@@ -168,8 +168,18 @@ def test_the_limit_itself_is_allowed(http: httpx.Client) -> None:
         ),
         (
             "multipart/form-data; boundary=x",
-            b'--x\r\nContent-Disposition: form-data; name="other"\r\n\r\nabc\r\n--x--\r\n',
+            b'--x\r\nContent-Disposition: form-data; name="other"; filename="a.npy"\r\n\r\nabc\r\n--x--\r\n',
             "'other'",
+        ),
+        (
+            "multipart/form-data; boundary=x",
+            b'--x\r\nContent-Disposition: form-data; name="name"\r\n\r\nabc\r\n--x--\r\n',
+            "no part called file",
+        ),
+        (
+            "multipart/form-data; boundary=x",
+            b'--x\r\nContent-Disposition: form-data; name="name"\r\n\r\n\xff\r\n--x--\r\n',
+            "'name' is not text",
         ),
         (
             "multipart/form-data; boundary=x",

@@ -51,7 +51,7 @@ def test_a_name_leads_to_the_newest_surface(http: httpx.Client, pushed: list[dic
     assert (answer.status_code, answer.json()["id"]) == (201, first["id"])
     found = http.get("/v1/names/dem")
     assert found.json() == http.get(first["url"]).json()
-    assert found.headers["cache-control"] == "no-cache"
+    assert found.headers["cache-control"] == "private, no-cache"
     assert http.head("/v1/names/dem").status_code == 200
     assert put(http, "dem", second["url"]).status_code == 200, "an address does as well"
     assert http.get("/v1/names/dem").json()["url"] == second["url"]

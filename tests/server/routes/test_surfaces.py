@@ -15,7 +15,7 @@ import pytest
 import lodestream as ls
 from lodestream_server.routes import surfaces as routes
 from lodestream_server.store import layout
-from tests.server.helpers import eventually, hills, kept, npy, push, settled, upload_of
+from tests.server.helpers import eventually, hills, kept, npy, problem, push, settled, upload_of
 
 
 def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
@@ -52,6 +52,63 @@ def test_an_upload_becomes_a_surface(http: httpx.Client, data: Path) -> None:
     assert answer.content.endswith(b", " + built.info[1:])
     keys = [key for key, _ in json.loads(answer.content, object_pairs_hook=list)]
     assert len(keys) == len(set(keys))
+
+
+def test_options_come_in_the_query_or_in_a_form(http: httpx.Client) -> None:
+    body = npy(hills(seed=31))
+    made = push(http, body, precision="0.25", name="Hills", closed="none")
+    fields = {"precision": "0.25", "name": "Hills", "closed": "none"}
+    for form, query in ((fields, {}), ({"name": "Hills"}, {"precision": "0.25", "closed": "none"})):
+        again = http.post("/v1/surfaces", data=form, params=query, files={"file": ("hills.npy", body)})
+        assert (again.status_code, again.json()["id"]) == (200, made["id"]), again.text
+        assert again.json()["options"] == {"precision": "0.25", "closed": "none"}
+    refused = http.post("/v1/surfaces", data=fields, params={"name": "Hills"}, files={"file": ("hills.npy", body)})
+    assert problem(refused) == (422, "bad-option")
+    assert "'name' is given twice" in refused.json()["detail"]
+    for form in ({"no-option": "1"}, {"name": "x" * 5000}, {f"option{n}": "1" for n in range(65)}):
+        refused = http.post("/v1/surfaces", data=form, files={"file": ("hills.npy", body)})
+        assert refused.status_code in (413, 422), refused.text
+
+
+def test_what_a_client_has_of_a_description_is_not_sent_again(http: httpx.Client) -> None:
+    made = push(http, npy(hills(seed=32)), name="one")
+    http.put("/v1/names/tagged", json={"surface": made["id"]})
+    for path in (made["url"], "/v1/surfaces", "/v1/names", "/v1/names/tagged"):
+        answer = http.get(path)
+        etag = answer.headers["etag"]
+        assert answer.headers["cache-control"] == "private, no-cache"
+        unchanged = http.get(path, headers={"if-none-match": etag})
+        assert (unchanged.status_code, unchanged.content, unchanged.headers["etag"]) == (304, b"", etag)
+        assert http.head(path).headers["etag"] == etag
+    etags = {path: http.get(path).headers["etag"] for path in ("/v1/surfaces", "/v1/names")}
+    other = push(http, npy(hills(seed=33)))
+    http.put("/v1/names/tagged", json={"surface": other["id"]})
+    for path, etag in etags.items():
+        assert http.get(path, headers={"if-none-match": etag}).status_code == 200, "it says something else now"
+    http.delete("/v1/names/tagged")
+
+
+def test_unknown_parameters_are_refused_with_those_that_there_are(http: httpx.Client) -> None:
+    made = push(http, npy(hills(seed=34)))
+    for method, path, words in (
+        ("GET", "/v1/surfaces?limit=3&befor=x", "'befor' here, only limit, after, thumbnails"),
+        ("GET", f"{made['url']}?x=1", "only thumbnails, wait"),
+        ("GET", f"{made['url']}/levels/1?fromat=npy", "only format"),
+        ("GET", f"{made['url']}/container?x", "and no other"),
+        ("GET", f"{made['url']}/map.json?x=", "only encoding"),
+        ("GET", f"/v1/containers/{made['container_sha256']}.lode?x=1", "and no other"),
+        ("GET", "/v1/formats?x=1", "and no other"),
+        ("POST", f"{made['url']}/retry?x=1", "and no other"),
+        ("DELETE", f"{made['url']}?x=1", "and no other"),
+        ("DELETE", "/v1/names/none?x=1", "and no other"),
+        ("POST", "/v1/surfaces?x=1", "no option 'x'"),
+    ):
+        refused = http.request(method, path, content=npy(hills(seed=34)) if path.startswith("/v1/surfaces?x") else None)
+        assert problem(refused) == (422, "bad-option"), path
+        assert words in refused.json()["detail"], refused.text
+    assert http.get(made["url"]).status_code == 200
+    wrong = http.get("/v1/surfaces?limit=0").json()["detail"]
+    assert wrong == "The parameter limit of the query: input should be greater than or equal to 1"
 
 
 def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> None:

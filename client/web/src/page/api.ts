@@ -118,9 +118,9 @@ export class Server {
     return (await this.json("GET", url)) as ListedSurface;
   }
 
-  /** One surface with its thumbnail, as a page has it. */
-  async listed(url: string): Promise<ListedSurface> {
-    return this.look(`${url}?${THUMBNAILS}`);
+  /** One surface with its thumbnail, as a page has it; once its build has ended, or after so many seconds. */
+  async listed(url: string, seconds = 0): Promise<ListedSurface> {
+    return this.look(`${url}?${THUMBNAILS}&wait=${seconds}`);
   }
 
   /** Where the tiles of a surface, or of what a name leads to, lie: west, south, east, north in degrees; and to which zoom. */

@@ -6,8 +6,8 @@ import { type Choice, type ListedSurface, ProblemError, type Server } from "./ap
 import { choiceName, choiceQuestion } from "./names";
 import { reasonElement } from "./reasons";
 
-/** Milliseconds between questions about a build. */
-const POLL = 700;
+/** For how long a question about a build waits for its end; so often its progress is shown. */
+const SECONDS = 1;
 
 /** The place where files are dropped, and the uploads in progress below it. */
 export class Uploads {
@@ -168,8 +168,7 @@ export class Uploads {
         what,
         surface.state === "queued" ? "Waiting for its build" : `Building: ${Math.round(100 * surface.progress)} %`,
       );
-      await new Promise((resolve) => setTimeout(resolve, POLL));
-      surface = await this.server.listed(surface.url);
+      surface = await this.server.listed(surface.url, SECONDS);
     }
     this.changed(surface);
     return surface;
