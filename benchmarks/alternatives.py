@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.demo.terrain import CELL, bilinear, terrain
 from lodestream_server import running_server
 from tests.client.files import Ranged, ranged
@@ -104,8 +104,8 @@ def _stream(points: NDArray[Any]) -> list[Fetch]:
 def _served(heights: Heights, folder: Path) -> list[Fetch]:
     """A stream over WebSocket, which is one request."""
     with running_server(folder / "server", workers=1) as server:
-        surface = sync.upload(server, heights)
-        with sync.connect(surface.url) as stream:
+        surface = Client(server).upload(heights)
+        with Client(surface.url).connect(surface.url) as stream:
             return [Fetch(view.bytes, 1, _error(view.points, heights)) for view in stream]
 
 
@@ -118,7 +118,7 @@ def _hosted(heights: Heights, folder: Path) -> list[Fetch]:
         targets = [ls.Target(max_bytes=1000), *(ls.Target(until_rms=ls.Tolerance(e * extent)) for e in ERRORS), None]
         for target in targets:
             host.requests.clear()
-            with sync.connect(f"{host.url}/terrain.lode", target=target) as stream:
+            with Client(f"{host.url}/terrain.lode").connect(f"{host.url}/terrain.lode", target=target) as stream:
                 view = list(stream)[-1]
             fetches.append(_counted(host, folder / "terrain.lode", _error(view.points, heights)))
     return fetches

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 import lodestream
 from lodestream.entropy.tiles import TileTable
 from lodestream.grid.layout import Grid, Layout
-from lodestream_client import sync
+from lodestream_client import Client
 
 from .arrays import ROOT, fractal
 from .measure import STATUS, Peak, memory, note, table
@@ -143,11 +143,11 @@ def place_tiles(side: int) -> None:
 def _server_rows(folder: Path, points: NDArray[Any]) -> Iterator[list[str]]:
     with _server(folder / "data") as (process, address), contextlib.ExitStack() as streams:
         np.save(folder / "surface.npy", points)
-        url = sync.upload(address, folder / "surface.npy").url
+        url = Client(address).upload(folder / "surface.npy").url
         opened, idle = 0, 0
         for count in STREAMS:
             for _ in range(count - opened):
-                next(iter(streams.enter_context(sync.connect(url))))
+                next(iter(streams.enter_context(Client(url).connect(url))))
             opened = count
             time.sleep(2)  # what is under way arrives in the buffers of both ends
             resident = process.memory_info().rss

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.viewer.picture_change import DONE
 from lodestream_server import running_server
 
@@ -189,7 +189,7 @@ def _cases() -> Iterator[Case]:
 
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder)) as server, chromium() as browser:
         for name, surface, fields in _surfaces():
-            entry = sync.upload(server, surface)
+            entry = Client(server).upload(surface)
             address = f"{server}/#s={entry.id}"
             camera: Mapping[str, Any] = {}
             for view in ("default", "near", *fields):

@@ -31,7 +31,7 @@ import numpy as np
 import lodestream as ls
 from lodestream.container import read_index
 from lodestream.planning.planner import plan
-from lodestream_client import sync
+from lodestream_client import Client
 
 from .__main__ import processor
 from .arrays import fractal
@@ -122,7 +122,7 @@ def measure(server: Server, way: str, url: str, container: bytes, count: int, ex
 def upload(server: Server, side: int) -> tuple[str, bytes]:
     """A surface on the server: its URL and its container."""
     points = fractal(side).astype(np.float32)
-    made = sync.upload(server.url, ls.Surface(points), precision="0.001%")
+    made = Client(server.url).upload(ls.Surface(points), precision="0.001%")
     answer = httpx.get(f"{made.url}/container", follow_redirects=True, trust_env=False).raise_for_status()
     return made.url, answer.content
 

@@ -21,7 +21,7 @@ import numpy as np
 
 import lodestream as ls
 from lodestream.protocol.messages import BASE_CREDIT
-from lodestream_client import aio, sync
+from lodestream_client import AsyncClient, AsyncStream, Client
 from lodestream_server import running_server
 from tests.links import Fault, Link
 
@@ -49,7 +49,7 @@ class Served:
     @property
     def file(self) -> str:
         """The container as a plain file."""
-        details = sync.describe(self.url).details
+        details = Client(self.url).get(self.url).details
         return f"{self.url.partition('/v1/')[0]}/v1/containers/{details['container_sha256']}.lode"
 
 
@@ -58,7 +58,7 @@ def main() -> None:
     arrays: dict[str, Array] = {array.name: array for array in load()}
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
         large = serve(server, fractal(1537))
-        list(sync.connect(large.url, target=ls.Target(max_bytes=20_000)))  # compiles what decoding needs
+        list(Client(large.url).connect(large.url, target=ls.Target(max_bytes=20_000)))  # compiles what decoding needs
         gate_table(serve(server, noise()), large)
         stop_table(large)
         dems = {name: serve(server, arrays[name].points) for name in DEMS if name in arrays}
@@ -68,8 +68,8 @@ def main() -> None:
 
 
 def serve(server: str, points: Any) -> Served:
-    surface = sync.upload(server, ls.Surface(points))
-    return Served(surface.url, sync.fetch_range(surface.url, 0, int(surface.details["bytes"])))
+    surface = Client(server).upload(ls.Surface(points))
+    return Served(surface.url, Client(surface.url).fetch_range(surface.url, 0, int(surface.details["bytes"])))
 
 
 def noise() -> Any:
@@ -97,7 +97,7 @@ def gate_table(large: Served, small: Served) -> None:
     table("Gate 4: 100 ms round trip, WebSocket", ["figure", "least", "median", "most", "aim", ""], rows)
 
 
-async def followed(stream: aio.Stream) -> None:
+async def followed(stream: AsyncStream) -> None:
     """Receive to the end."""
     async for _ in stream:
         pass
@@ -108,7 +108,7 @@ async def share_of_link(served: Served) -> float:
     fault = Fault(delay=ROUND_TRIP / 2, rate=FAST)
     async with Link(served.url, lambda _: fault) as link:
         started = time.monotonic()
-        async with aio.connect(link.url, transport="ws") as stream:
+        async with AsyncClient(link.url) as client, client.connect(link.url, transport="ws") as stream:
             async for view in stream:
                 if view.complete:
                     return stream.wire_bytes / FAST / (time.monotonic() - started)
@@ -141,7 +141,11 @@ async def stopped(
 ) -> tuple[int, int, float, int]:
     """Credit and bytes received at the stop; bytes after it, and how long they took."""
     fault = Fault(delay=ROUND_TRIP / 2, rate=rate)
-    async with Link(served.url, lambda _: fault) as link, aio.connect(link.url, window=window) as stream:
+    async with (
+        Link(served.url, lambda _: fault) as link,
+        AsyncClient(link.url) as client,
+        client.connect(link.url, window=window) as stream,
+    ):
         # Not by views: of noise there are few.
         following, until = asyncio.create_task(followed(stream)), time.monotonic() + 2.0
         while time.monotonic() < until and stream.received <= most and not following.done():
@@ -169,7 +173,7 @@ def first_table(surfaces: dict[str, Served]) -> None:
 async def first(url: str, transport: Any) -> tuple[float, int]:
     async with Link(url, lambda _: Fault(delay=ROUND_TRIP / 2)) as link:
         started = time.monotonic()
-        async with aio.connect(link.url, transport=transport) as stream:
+        async with AsyncClient(link.url) as client, client.connect(link.url, transport=transport) as stream:
             await anext(stream)
             return time.monotonic() - started, stream.wire_bytes
 
@@ -218,7 +222,7 @@ async def download(url: str, size: int) -> float:
 
 async def pull(url: str, target: ls.Target, rms: float, transport: Any) -> float:
     started = time.monotonic()
-    async with aio.connect(url, target=target, transport=transport) as stream:
+    async with AsyncClient(url) as client, client.connect(url, target=target, transport=transport) as stream:
         async for view in stream:
             if view.rms <= rms:
                 break

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream import kernels
 from lodestream.page import assets
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_server import running_server
 from tests.links import Fault, linked
 
@@ -209,7 +209,7 @@ def first_picture_table(folder: Path) -> None:
     most = {"least": 0.0, "median": 0.0}
     with running_server(folder / "data", workers=1) as server, chromium() as browser:
         for name, points in (("250 x 250", rough()[:250, :250]), ("1025 x 1025", fractal(1025).astype(np.float32))):
-            surface = sync.upload(server, ls.Surface(points))
+            surface = Client(server).upload(ls.Surface(points))
             with linked(server, Fault(delay=ROUND_TRIP / 2, rate=RATE)) as link:
                 found = []
                 for _ in range(PICTURES):

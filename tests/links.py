@@ -63,6 +63,8 @@ class Link:
         The address given, by way of this link.
     connections : int
         How many there were.
+    open : int
+        How many there are.
     down : int
         Bytes that went to clients.
     """
@@ -74,6 +76,10 @@ class Link:
         self.url = url
         self.connections = 0
         self.down = 0
+
+    @property
+    def open(self) -> int:
+        return len(self._tasks)
 
     async def __aenter__(self) -> Link:
         self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 
 from .registry import function_of
 from .surfaces import Specimen, specimen
@@ -101,7 +101,7 @@ def _streamed(url: str, error: float | None) -> NDArray[Any]:
     """Points of an RMS error relative to the extent, or all of them exact."""
     target = ls.Target(until_rms=ls.Tolerance(error, relative=True)) if error else None
     view = None
-    with sync.connect(url, target=target) as stream:
+    with Client(url).connect(url, target=target) as stream:
         for view in stream:
             view.prepare()  # while the rest is on its way; the last one is what was waited for
     assert view is not None

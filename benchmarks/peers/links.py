@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import lodestream
-from lodestream_client import sync
+from lodestream_client import Client
 
 from ..arrays import ROOT
 from ..server import Server
@@ -81,7 +81,7 @@ def measure(results: Results, surface: str = SURFACE) -> dict[str, Any]:
         (shared / RAW).write_bytes(points.tobytes())
         server = Server(folder)
         stack.callback(server.close)
-        url = sync.upload(server.url, lodestream.Surface(points)).url
+        url = Client(server.url).upload(lodestream.Surface(points)).url
         plain = stack.enter_context(_plain(shared))
         for threads in dict.fromkeys((1, os.cpu_count() or 1)):
             asked = {"surface": surface, "peers": settings, "folder": str(shared)}

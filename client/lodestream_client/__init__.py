@@ -1,7 +1,6 @@
-"""Clients of a Lodestream server: streams, uploads, and the command line.
+"""Clients of a Lodestream server: `Client`, and `AsyncClient` for asyncio; and the command line.
 
-The functions are asynchronous; `lodestream_client.sync` has the same names for programs without an event loop. Names
-are loaded when they are first used, so that the command line starts quickly.
+Names are loaded when they are first used, so that the command line starts quickly.
 """
 
 from __future__ import annotations
@@ -10,65 +9,36 @@ TYPE_CHECKING = False  # nothing is imported here: until the command line is the
 if TYPE_CHECKING:
     from typing import Any
 
-    from .aio import (
-        Stream,
-        connect,
-        delete,
-        describe,
-        describe_file,
-        fetch_range,
-        identify,
-        list_names,
-        list_surfaces,
-        locate,
-        retry,
-        upload,
-    )
-    from .aio import list_surfaces as list
+    from .async_client import AsyncClient
+    from .client import Client
     from .errors import SilenceError, UnreachableError
     from .notebook.widget import Widget
     from .requests.api import Description, Identity
+    from .stream.async_stream import AsyncStream
+    from .stream.blocking_stream import Stream
 
 _HOMES = {
-    "Description": ("requests.api", "Description"),
-    "Identity": ("requests.api", "Identity"),
-    "SilenceError": ("errors", "SilenceError"),
-    "Stream": ("aio", "Stream"),
-    "UnreachableError": ("errors", "UnreachableError"),
-    "Widget": ("notebook.widget", "Widget"),
-    "connect": ("aio", "connect"),
-    "delete": ("aio", "delete"),
-    "describe": ("aio", "describe"),
-    "describe_file": ("aio", "describe_file"),
-    "fetch_range": ("aio", "fetch_range"),
-    "identify": ("aio", "identify"),
-    "list": ("aio", "list_surfaces"),
-    "list_names": ("aio", "list_names"),
-    "list_surfaces": ("aio", "list_surfaces"),
-    "locate": ("aio", "locate"),
-    "retry": ("aio", "retry"),
-    "upload": ("aio", "upload"),
+    "AsyncClient": "async_client",
+    "AsyncStream": "stream.async_stream",
+    "Client": "client",
+    "Description": "requests.api",
+    "Identity": "requests.api",
+    "SilenceError": "errors",
+    "Stream": "stream.blocking_stream",
+    "UnreachableError": "errors",
+    "Widget": "notebook.widget",
 }
 
 __all__ = [
+    "AsyncClient",
+    "AsyncStream",
+    "Client",
     "Description",
     "Identity",
     "SilenceError",
     "Stream",
     "UnreachableError",
     "Widget",
-    "connect",
-    "delete",
-    "describe",
-    "describe_file",
-    "fetch_range",
-    "identify",
-    "list",
-    "list_names",
-    "list_surfaces",
-    "locate",
-    "retry",
-    "upload",
 ]
 
 
@@ -77,8 +47,7 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib
 
-    module, attribute = _HOMES[name]
-    value = getattr(importlib.import_module(f".{module}", __name__), attribute)
+    value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
     globals()[name] = value
     return value
 

@@ -19,9 +19,9 @@ class UnreachableError(LodestreamError, ConnectionError):
 
     Examples
     --------
-    >>> from lodestream_client import UnreachableError, sync
+    >>> from lodestream_client import Client, UnreachableError
     >>> try:
-    ...     sync.list("http://127.0.0.1:9")
+    ...     Client("http://127.0.0.1:9").list()
     ... except UnreachableError:
     ...     print("no connection")
     no connection
@@ -33,10 +33,11 @@ class SilenceError(LodestreamError, TimeoutError):
 
     Examples
     --------
-    >>> from lodestream_client import SilenceError, sync
-    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
+    >>> from lodestream_client import Client, SilenceError
+    >>> client = Client("http://127.0.0.1:8000")
+    >>> surface = client.upload("terrain.npy")
     >>> try:
-    ...     with sync.connect(url, silence=10, deadline=0) as stream:
+    ...     with client.connect(surface.id, silence=10, deadline=0) as stream:
     ...         views = list(stream)
     ... except SilenceError:
     ...     print("ten seconds without a word")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-from contextlib import ExitStack
 from typing import Any
 
 from lodestream.errors import RemoteProtocolError
 from lodestream.opening.byte_sources import AT_ONCE
 
-from . import sync
-from .requests import addresses, api, calls
+from .client import Client
+from .requests import addresses
 
 __all__ = ["RemoteSource"]
 
@@ -36,27 +35,24 @@ class RemoteSource:
     """
 
     def __init__(self, url: str, token: str | None = None) -> None:
-        import httpx
-
-        url = sync.locate(url, token=token)
-        identity = sync.identify(url, token=token)
+        self._client = Client(url, token=token)
+        url = self._client.locate(url)
+        identity = self._client.identify(url)
         if identity.size is None or identity.name is None:
             raise RemoteProtocolError(f"expected the length and the version of {url}, got neither")
-        self.name = _name(url, token) or url.rstrip("/").rpartition("/")[2].removesuffix(".lode")
+        self.name = self._told_name(url) or url.rstrip("/").rpartition("/")[2].removesuffix(".lode")
         self.size = identity.size
         self.tag = identity.name
         self.gap = 1 << 14
         self.place, self._token, self._identity = url, token, identity
         self._lock = threading.Lock()
-        self._open = ExitStack()
-        self._client = self._open.enter_context(httpx.Client(**calls.client_options(url, calls.TIMEOUT)))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return RemoteSource, (self.place, self._token)
 
     def close(self) -> None:
         """Close the connection."""
-        self._open.close()
+        self._client.close()
 
     def read(self, offset: int, length: int) -> bytes:
         """Return at most ``length`` bytes from ``offset`` on.
@@ -68,14 +64,12 @@ class RemoteSource:
             there than before.
         """
         wanted = min(length, AT_ONCE, self.size - offset)
-        with self._lock:
-            call = api.fetch_range(self.place, offset, wanted, self._identity)
-            return sync.run(self._client, call, self.place, self._token)
+        with self._lock:  # one at a time, as some servers want it
+            return self._client.fetch_range(self.place, offset, wanted, identity=self._identity)
 
-
-def _name(url: str, token: str | None) -> str | None:
-    """Return the name that a server has for a surface."""
-    if not addresses.is_surface(url):
-        return None
-    name = sync.describe(url, token=token).details.get("name")
-    return name if isinstance(name, str) else None
+    def _told_name(self, url: str) -> str | None:
+        """Return the name that a server has for a surface."""
+        if not addresses.is_surface(url):
+            return None
+        name = self._client.get(url).details.get("name")
+        return name if isinstance(name, str) else None

@@ -206,9 +206,9 @@ class NotFoundError(LodestreamError, LookupError):
     Examples
     --------
     >>> import lodestream
-    >>> from lodestream_client import sync
+    >>> from lodestream_client import Client
     >>> try:
-    ...     sync.describe("http://127.0.0.1:8000/v1/surfaces/00000000000000000000")
+    ...     Client("http://127.0.0.1:8000").get("00000000000000000000")
     ... except lodestream.NotFoundError:
     ...     print("no such surface")
     no such surface
@@ -287,9 +287,9 @@ class ProtocolError(LodestreamError):
     Examples
     --------
     >>> import lodestream
-    >>> from lodestream_client import sync
+    >>> from lodestream_client import Client
     >>> try:
-    ...     found = sync.list("http://127.0.0.1:8000")
+    ...     found = Client("http://127.0.0.1:8000").list()
     ... except lodestream.ProtocolError:
     ...     print("not a server of Lodestream")
     """
@@ -314,9 +314,9 @@ class RemoteError(LodestreamError):
     Examples
     --------
     >>> import lodestream
-    >>> from lodestream_client import sync
+    >>> from lodestream_client import Client
     >>> try:
-    ...     description = sync.upload("http://127.0.0.1:8000", "terrain.npy")
+    ...     description = Client("http://127.0.0.1:8000").upload("terrain.npy")
     ... except lodestream.RemoteError as error:
     ...     print(error.code)  # waiting, busy, disk-full, ...
     """

@@ -18,12 +18,7 @@ PATH = ROOT / "docs" / "api.md"
 PACKAGES = (
     ("lodestream", "lodestream", "Surfaces, files, containers; no network."),
     ("lodestream.maps", "lodestream.maps", "Tiles of heights for maps and globes ([maps.md](maps.md)); no network."),
-    ("lodestream_client.sync", "lodestream_client.sync", "A server's surfaces, for programs without an event loop."),
-    (
-        "lodestream_client",
-        "lodestream_client",
-        "The same for asyncio: coroutines, also in `lodestream_client.aio`. What both return and raise.",
-    ),
+    ("lodestream_client", "lodestream_client", "A server's surfaces: `Client`, and `AsyncClient` for asyncio."),
 )
 
 _INTRODUCTION = """\

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lodestream import page
+from lodestream_client import Client
 from lodestream_client.__main__ import main
-from lodestream_client.sync import upload
 from lodestream_server import running_server
 
 ROOT = Path(__file__).parents[2]
@@ -79,7 +79,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 @pytest.fixture(scope="session")
 def surface(server: str, terrain_file: Path) -> str:
-    return upload(server, terrain_file).url
+    return Client(server).upload(terrain_file).url
 
 
 Run = Callable[..., tuple[int, str, str]]

@@ -27,9 +27,3 @@ def test_every_public_name_is_there_with_an_example_that_runs(path: str) -> None
         assert thing.docstring is not None
         assert EXAMPLE.search(thing.docstring.value), f"{path}.{name} has no example that runs"
         assert thing.module.path in run
-
-
-def test_the_asyncio_module_has_no_name_that_is_not_on_the_page() -> None:
-    assert set(importlib.import_module("lodestream_client.aio").__all__) <= set(
-        importlib.import_module("lodestream_client").__all__
-    )

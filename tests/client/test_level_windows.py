@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.planning.planner import plan
 from lodestream.planning.window_errors import read_window_errors
-from lodestream_client import sync
+from lodestream_client import Client
 from tests.client import files
 from tests.core.surfaces import index_of, terrain
 from tests.links import Fault, linked
@@ -39,7 +39,7 @@ def container(original: ls.Surface) -> bytes:
 
 @pytest.fixture(scope="module")
 def address(server: str, container: bytes) -> str:
-    return sync.upload(server, container).url
+    return Client(server).upload(container).url
 
 
 @pytest.fixture(params=[False, True], ids=["sync", "async"])

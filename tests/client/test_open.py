@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 from tests.client import files
 from tests.core.surfaces import terrain
 
@@ -26,7 +26,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_surface_of_a_server(server: str, path: Path) -> None:
-    url = sync.upload(server, path, name="my hills").url
+    url = Client(server).upload(path, name="my hills").url
     with ls.open(url) as opened:
         assert opened.source.name == "my hills"
         assert opened.info == ls.open(path).info

@@ -10,12 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.container import read_index
 from lodestream.planning.planner import plan
 from lodestream.planning.selection import selection_of
 from lodestream.planning.window_errors import read_window_errors
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, linked
 
@@ -48,12 +47,12 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> ls.Surface:
 
 @pytest.fixture(scope="module")
 def address(server: str) -> str:
-    return sync.upload(server, cloud()).url
+    return Client(server).upload(cloud()).url
 
 
 @pytest.fixture(scope="module")
 def container(address: str) -> bytes:
-    return sync.fetch_range(address, 0, int(sync.describe(address).details["bytes"]))
+    return Client(address).fetch_range(address, 0, int(Client(address).get(address).details["bytes"]))
 
 
 @pytest.fixture(params=[False, True], ids=["sync", "async"])
@@ -68,13 +67,16 @@ def transport(request: pytest.FixtureRequest) -> str:
 
 def follow(url: str, asynchronous: bool, transport: Any, target: ls.Target, **options: Any) -> BaseStream:
     if not asynchronous:
-        with sync.connect(url, target=target, transport=transport, **options) as stream:
+        with Client(url).connect(url, target=target, transport=transport, **options) as stream:
             for _ in stream:
                 pass
             return stream
 
     async def loop() -> BaseStream:
-        async with client.connect(url, target=target, transport=transport, **options) as stream:
+        async with (
+            AsyncClient(url) as client,
+            client.connect(url, target=target, transport=transport, **options) as stream,
+        ):
             async for _ in stream:
                 pass
             return stream

@@ -11,7 +11,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.planning.planner import plan
-from lodestream_client import aio, sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.stream.reconnecting import Transport
 from tests.core.surfaces import index_of
 
@@ -40,7 +40,7 @@ def container(globe: ls.Surface, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="module")
 def served(server: str, globe: ls.Surface) -> str:
-    return sync.upload(server, globe).url
+    return Client(server).upload(globe).url
 
 
 def wrapped(array: Any, region: Any = REGION) -> Any:
@@ -67,13 +67,16 @@ def test_the_command_decodes_and_pulls_it(
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_streams_receive_it_alone(served: str, globe: ls.Surface, transport: Transport) -> None:
-    with sync.connect(served, target=ls.Target(region=REGION), transport=transport) as stream:
+    with Client(served).connect(served, target=ls.Target(region=REGION), transport=transport) as stream:
         views = list(stream)
     assert np.array_equal(views[-1].points, wrapped(globe.points))
     assert stream.received == plan(index_of(ls.encode(globe)), ls.Target(region=REGION)).bytes
 
     async def receive() -> ls.Surface:
-        async with aio.connect(served, target=ls.Target(region=REGION), transport=transport) as other:
+        async with (
+            AsyncClient(served) as client,
+            client.connect(served, target=ls.Target(region=REGION), transport=transport) as other,
+        ):
             async for _ in other:
                 pass
             return other.decoder.surface()
@@ -81,13 +84,13 @@ def test_streams_receive_it_alone(served: str, globe: ls.Surface, transport: Tra
     found = asyncio.run(receive())
     assert np.array_equal(found.points, wrapped(globe.points))
     assert np.array_equal(found.attributes["t"], wrapped(globe.attributes["t"]))
-    with sync.connect(served, transport=transport) as stream:
+    with Client(served).connect(served, transport=transport) as stream:
         stream.focus(REGION)
         views = list(stream)
     assert np.array_equal(views[-1].points, globe.points)
     wrong = ls.Target(region=((0, 9), (350, 711)))
     refused = pytest.raises(ls.OptionError, match="expected columns within")
-    with sync.connect(served, target=wrong, transport=transport) as stream, refused:
+    with Client(served).connect(served, target=wrong, transport=transport) as stream, refused:
         list(stream)
 
 

@@ -8,7 +8,7 @@ import httpx
 import numpy as np
 import pytest
 
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.demo import site
 from tests.client.files import ranged
 
@@ -25,7 +25,7 @@ def test_a_host_of_files_serves_five_surfaces_of_different_kinds(tmp_path: Path)
         assert [entry["name"] for entry in config["surfaces"]] == list(site.SURFACES)
         for entry in config["surfaces"]:
             assert (folder / entry["src"]).stat().st_size == entry["bytes"]
-            with sync.connect(f"{host.url}/#{entry['name']}") as stream:
+            with Client(f"{host.url}/#{entry['name']}").connect(f"{host.url}/#{entry['name']}") as stream:
                 views = list(stream)
             assert len(views) > 5
             assert views[-1].complete

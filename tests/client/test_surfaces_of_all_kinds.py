@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.errors import OptionError
-from lodestream_client import sync
+from lodestream_client import Client
 
 from .conftest import Run, make_terrain
 
@@ -85,11 +85,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def addresses(server: str, files: Path) -> dict[str, str]:
-    return {name: sync.upload(server, files / name).url for name in WRITERS}
+    return {name: Client(server).upload(files / name).url for name in WRITERS}
 
 
 def pulled(url: str) -> ls.Surface:
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         views = list(stream)
     return views[-1].surface(metadata=stream.decoder.metadata)
 
@@ -157,7 +157,7 @@ def test_infinities_are_told_and_come_back_from_a_server(run: Run, server: str, 
     # From memory too, where a mask says more than the values do.
     mask = np.ones(heights.shape, bool)
     mask[10, 10] = False
-    back = pulled(sync.upload(server, ls.Surface(heights, mask=mask)).url)
+    back = pulled(Client(server).upload(ls.Surface(heights, mask=mask)).url)
     heights[10, 10] = np.nan
     assert back.points.tobytes() == heights.tobytes()
 
@@ -179,7 +179,7 @@ def test_values_at_holes_are_told(run: Run, server: str, files: Path, tmp_path: 
     code, out, err = run("push", files / "scan.pcd", server)
     assert (code, err.count(f"lodestream: {note}\n")) == (0, 1)
     assert json.loads(run("info", out.strip(), "--json")[1])["metadata"]["notes"] == [note]
-    assert sync.upload(server, files / "scan.pcd").details["metadata"]["notes"] == [note]
+    assert Client(server).upload(files / "scan.pcd").details["metadata"]["notes"] == [note]
 
 
 def test_what_a_reader_notes_is_told_by_push_and_encode(run: Run, server: str, tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_a_level_is_a_grid_of_each_block(run: Run, addresses: dict[str, str], tm
     levels = json.loads(run("info", addresses["wing.fmt"], "--json")[1])["levels"]
     for level in (0, len(levels) // 2, len(levels) - 1):
         assert run("pull", addresses["wing.fmt"], tmp_path / "a.ply", "--level", str(level))[0] == 0
-        with sync.connect(addresses["wing.fmt"], target=ls.Target(level=level)) as stream:
+        with Client(addresses["wing.fmt"]).connect(addresses["wing.fmt"], target=ls.Target(level=level)) as stream:
             surface = list(stream)[-1].surface(level)
         assert len(surface.blocks) == 3
         ls.write(surface, tmp_path / "b.ply")
@@ -237,8 +237,8 @@ def test_blocks_go_into_formats_that_hold_several(
 
 
 def test_blocks_are_listed_and_removed(run: Run, server: str, files: Path) -> None:
-    url = sync.upload(server, files / "wing.fmt", name="to be removed").url
-    copy = sync.upload(server, files / "wing.fmt", name="again", precision=0.01).url
+    url = Client(server).upload(files / "wing.fmt", name="to be removed").url
+    copy = Client(server).upload(files / "wing.fmt", name="again", precision=0.01).url
     assert copy != url
     lines = [line for line in run("list", server)[1].splitlines() if copy in line]
     assert len(lines) == 1
@@ -280,6 +280,6 @@ def test_precisions_that_cannot_be(run: Run, server: str, files: Path, tmp_path:
         assert (found, says in err) == (code, True), err
         assert not out.exists()
     with pytest.raises(ls.RemoteError, match="colour"):
-        sync.upload(server, files / "scan.pcd", attribute_precision={"colour": 0.5})
+        Client(server).upload(files / "scan.pcd", attribute_precision={"colour": 0.5})
     with pytest.raises(OptionError):
-        sync.upload(server, files / "scan.pcd", attribute_precision={"ring": "much"})
+        Client(server).upload(files / "scan.pcd", attribute_precision={"ring": "much"})

@@ -13,7 +13,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.library import library_name
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_server import running_server
 from tests.patience import PATIENCE
 
@@ -83,10 +83,10 @@ def test_encode_is_refused_before_the_file_is_opened(bare: Bare, tmp_path: Path)
 
 def test_a_file_is_uploaded_and_what_is_in_memory_is_refused(bare: Bare, server: str, terrain_file: Path) -> None:
     assert bare.done("push", terrain_file, server, "--name", "uploaded without kernels") == ""
-    code = f"import numpy; from lodestream_client import sync; sync.upload({server!r}, numpy.ones((9, 9)))"
+    code = f"import numpy; from lodestream_client import Client; Client({server!r}).upload(numpy.ones((9, 9)))"
     told = bare.run("-c", code).stderr
     assert "UnavailableError: encoding is not possible here" in told
-    assert [each.details["name"] for each in sync.list(server)].count("uploaded without kernels") == 1
+    assert [each.details["name"] for each in Client(server).list()].count("uploaded without kernels") == 1
 
 
 @pytest.mark.long
@@ -102,7 +102,7 @@ def test_the_data_of_a_server_are_checked_and_nothing_of_them_is_damage(
 ) -> None:
     data = tmp_path / "data"
     with running_server(data, workers=1) as url:
-        sync.upload(url, terrain_file)
+        Client(url).upload(terrain_file)
     before = {path: path.read_bytes() for path in data.glob("*/*") if path.is_file()}
     assert any(path.suffix == ".lode" for path in before)
     done = bare.run("-m", "lodestream_client", "fsck", data, "--repair", "--collect", "--retry")

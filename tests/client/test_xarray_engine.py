@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.interop import lazy_xarray
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.xarray_engine import LodeBackend
 from tests.client import files
 from tests.core.surfaces import terrain, torus
@@ -212,7 +212,7 @@ def test_whatever_is_indexed_of_a_level_is_the_levels_own(path: Path, level: int
 
 
 def test_a_served_surface_with_and_without_a_level(server: str, original: ls.Surface, path: Path) -> None:
-    url = sync.upload(server, path).url
+    url = Client(server).upload(path).url
     wanted = original.to_xarray()
     assert isinstance(wanted, xr.Dataset)
     found = opened(url)

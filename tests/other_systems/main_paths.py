@@ -156,12 +156,12 @@ def commands(folder: Path, url: str) -> None:
 
 def streams(folder: Path, url: str) -> None:
     """Push a surface; pull a part of it, continue, pull a window, and delete it."""
-    from lodestream_client import sync
+    from lodestream_client import Client
 
     heights = terrain(200, 160)
     np.save(folder / "heights.npy", heights)
     run("push", folder / "heights.npy", url)
-    surface = sync.upload(url, folder / "heights.npy").url
+    surface = Client(url).upload(folder / "heights.npy").url
     run("pull", surface, folder / "rough.npy", "--until-rms", "20", "--resume")
     run("pull", surface, folder / "whole.npy", "--resume")
     assert np.array_equal(np.load(folder / "whole.npy"), heights)

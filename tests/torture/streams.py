@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import CorruptStreamError, LodestreamError
 from lodestream.target import Region
-from lodestream_client import aio, sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.stream import reconnecting
 from lodestream_server import running_server
 from tests.links import Link, faults_of
@@ -158,8 +158,8 @@ def run(count: int, seconds: float = 0.0, seed: int = 0, *, most: float | None =
     started = time.monotonic()
     last = started + (float("inf") if most is None else most)
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
-        url = sync.upload(server, ls.Surface(terrain())).url
-        container = sync.fetch_range(url, 0, int(sync.describe(url).details["bytes"]))
+        url = Client(server).upload(ls.Surface(terrain())).url
+        container = Client(url).fetch_range(url, 0, int(Client(url).get(url).details["bytes"]))
         with _hasty():
             asyncio.run(_all(url, container, count, (started + seconds, last), seed, report))
     report.seconds = time.monotonic() - started
@@ -182,7 +182,7 @@ async def _all(url: str, container: bytes, count: int, until: tuple[float, float
     silence = _SILENCE
     for target in _TARGETS:
         began = time.monotonic()
-        async with aio.connect(url, target=target) as stream:
+        async with AsyncClient(url) as client, client.connect(url, target=target) as stream:
             async for _ in stream:
                 pass
         expected[target] = stream.decoder.surface(target.level).points
@@ -222,9 +222,10 @@ async def _one(
     async with Link(url, faults_of(random, len(container))) as link:
         address = link.url if not path else link.url.partition("/v1/")[0] + path
         options |= {"silence": silence, "deadline": _DEADLINES * silence, "close_timeout": silence}
-        stream = aio.connect(address, target=target, **options)
+        client = AsyncClient(address)
+        stream = client.connect(address, target=target, **options)
         try:
-            async with stream:
+            async with client, stream:
                 async for _ in stream:
                     if turning and random.random() < 0.2:
                         await stream.focus(random.choice(_REGIONS))

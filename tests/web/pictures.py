@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 import lodestream as ls
-from lodestream_client.sync import upload
+from lodestream_client import Client
 from lodestream_server import running_server
 
 from .browser import Heard, Tab, chromium, tab
@@ -39,7 +39,7 @@ def terrain() -> ls.Surface:
 def main() -> None:
     """Draw a surface whole, and as it is after 2.8 kB."""
     with tempfile.TemporaryDirectory() as folder, running_server(Path(folder) / "data", workers=1) as server:
-        surface = upload(server, terrain())
+        surface = Client(server).upload(terrain())
         with chromium() as browser, tab(browser, Heard(), (1120, 680)) as shown:
             shown.go(f"{server}/#s={surface.id}")
             shown.everything("m")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 import lodestream as ls
-from lodestream_client.sync import upload
+from lodestream_client import Client
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from tests.client.files import plain, ranged
@@ -35,8 +35,8 @@ def main(folder: Path) -> None:
         plain(files) as whole,
     ):
         said = {
-            "surface": upload(server, container).url,
-            "closed": upload(closed, container, token=token).url,
+            "surface": Client(server).upload(container).url,
+            "closed": Client(closed, token=token).upload(container).url,
             "token": token,
             "static": f"{static.url}/terrain.lode",
             "whole": f"{whole}/terrain.lode",

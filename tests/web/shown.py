@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 import lodestream as ls
-from lodestream_client.sync import upload
+from lodestream_client import Client
 from tests.core.surfaces import terrain, torus
 
 __all__ = ["GOLDEN", "Shelf", "surface"]
@@ -66,7 +66,7 @@ class Shelf:
         """What the server says of a surface, see `surface`, or of a container of tests/golden."""
         if name not in self._uploaded:
             golden = GOLDEN / f"{name}.lode"
-            self._uploaded[name] = upload(self.server, golden if golden.exists() else surface(name))
+            self._uploaded[name] = Client(self.server).upload(golden if golden.exists() else surface(name))
         return self._uploaded[name]
 
     def decoded(self, name: str) -> ls.Surface:

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import expect
 
-from lodestream_client.sync import upload
+from lodestream_client import Client
 from lodestream_server.access.tokens import TokenFile
 from tests.client.files import ranged
 from tests.server.programs import server
@@ -63,7 +63,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str],
             if name not in kept:
                 path = folder / f"{name}.lode"
                 nodes = {"plane": plane, "bigtujunga": mountains}[name](path)
-                kept[name] = Served(upload(running.url, path, token=token).url, pages.url, folder, nodes)
+                kept[name] = Served(Client(running.url, token=token).upload(path).url, pages.url, folder, nodes)
             return kept[name]
 
         yield made

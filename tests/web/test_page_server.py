@@ -10,7 +10,7 @@ import pytest
 from playwright.sync_api import expect
 
 import lodestream as ls
-from lodestream_client.sync import upload
+from lodestream_client import Client
 
 from .browser import Heard, Tab
 from .conftest import Tabs
@@ -42,7 +42,7 @@ def test_a_file_is_uploaded_built_and_seen(tabs: Tabs, shelf: Shelf, file: Path)
 def test_a_name_opens_what_it_leads_to(tabs: Tabs, shelf: Shelf, tmp_path: Path) -> None:
     for number in range(2):
         np.save(tmp_path / "hills.npy", (HEIGHTS[: 30 + number, :40] + np.float32(number)).astype(np.float32))
-        upload(shelf.server, tmp_path / "hills.npy", name="dem", replace=True)
+        Client(shelf.server).upload(tmp_path / "hills.npy", name="dem", replace=True)
         tab = tabs(f"{shelf.server}/#n=dem")
         tab.everything()
         expect(tab.page.locator("header .facts")).to_contain_text(f"{30 + number} \N{MULTIPLICATION SIGN} 40 points")
@@ -52,7 +52,7 @@ def test_a_name_opens_what_it_leads_to(tabs: Tabs, shelf: Shelf, tmp_path: Path)
 
 def test_the_element_follows_a_name(tabs: Tabs, shelf: Shelf, tmp_path: Path) -> None:
     np.save(tmp_path / "hills.npy", HEIGHTS[:30, :40].astype(np.float32))
-    upload(shelf.server, tmp_path / "hills.npy", name="hills", replace=True)
+    Client(shelf.server).upload(tmp_path / "hills.npy", name="hills", replace=True)
     tab = tabs(shelf.server)
     tab.page.get_by_role("heading", name="Surfaces").wait_for()
     tab.page.evaluate(
@@ -154,7 +154,7 @@ def test_the_slider_goes_through_the_surfaces_of_a_series(tabs: Tabs, shelf: She
     def step(index: int, name: str) -> str:
         place = {"name": name, "along": "time", "index": index, "value": 6 * index, "unit": "h"}
         metadata = {"name": f"{name} at {6 * index} h", "series": place}
-        return upload(shelf.server, ls.Surface(HEIGHTS[:40, :30] + np.float32(index), metadata=metadata)).url
+        return Client(shelf.server).upload(ls.Surface(HEIGHTS[:40, :30] + np.float32(index), metadata=metadata)).url
 
     urls = [step(index, "slid") for index in (2, 0, 1)]
     tab = tabs(f"{shelf.server}/#s={urls[1].rsplit('/', 1)[1]}")
@@ -175,7 +175,7 @@ def test_the_slider_goes_through_the_surfaces_of_a_series(tabs: Tabs, shelf: She
 def test_a_token_is_asked_for_and_kept_to_oneself(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:
     heard.allow("status of 40[13]")
     server, token = closed
-    upload(server, surface("torus"), token=token)
+    Client(server, token=token).upload(surface("torus"))
     tab = tabs(server)
     dialog = tab.page.get_by_role("dialog")
     dialog.get_by_label("Token").fill("lode_wrong")
@@ -216,7 +216,7 @@ def test_what_a_token_does_not_allow_is_no_longer_offered(
 ) -> None:
     heard.allow("status of 40[13]")
     server, token = closed
-    upload(server, surface("torus"), token=token)
+    Client(server, token=token).upload(surface("torus"))
     tab = tabs(server)
     dialog = tab.page.get_by_role("dialog")
     dialog.get_by_label("Token").fill(reader)

@@ -19,8 +19,8 @@ import pytest
 from playwright.sync_api import expect
 
 import lodestream as ls
+from lodestream_client import Client
 from lodestream_client.program import main
-from lodestream_client.sync import upload
 from tests.client.files import ranged
 from tests.stores.emulators import BUCKET, Emulator
 
@@ -233,7 +233,7 @@ def test_view_encodes_a_file_and_shows_it(tabs: Tabs, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("interrupts")
 def test_view_keeps_a_token_to_itself(tabs: Tabs, closed: tuple[str, str], heard: Heard) -> None:
     server, token = closed
-    url = upload(server, surface("torus"), token=token).url
+    url = Client(server, token=token).upload(surface("torus")).url
     with viewing(url, LODESTREAM_TOKEN=token) as (address, _):
         tab = tabs(address)
         tab.everything()

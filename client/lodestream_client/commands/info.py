@@ -68,12 +68,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _of_url(options: InfoOptions) -> Mapping[str, Any]:
-    from .. import sync
+    from ..client import Client
 
     url = addresses.source_url(options.what)
-    if not addresses.is_served(url):
-        return sync.describe_file(url, token=options.token, max_vertices=options.max_vertices)
-    surface = sync.describe(url, token=options.token)
+    with Client(url, token=options.token) as client:
+        if not addresses.is_served(url):
+            return client.describe_file(url, max_vertices=options.max_vertices)
+        surface = client.get(url)
     return {**surface.details, "url": surface.url}
 
 

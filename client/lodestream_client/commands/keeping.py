@@ -15,8 +15,8 @@ from ..terminal.output import human_size, note
 
 if TYPE_CHECKING:
     from ..requests.api import Identity
+    from ..stream.blocking_stream import Stream
     from ..stream.cache import CacheFile
-    from ..sync import Stream
 
 __all__ = ["Kept"]
 

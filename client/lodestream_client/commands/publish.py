@@ -215,13 +215,10 @@ def _listed(store: str) -> Sequence[Mapping[str, Any]]:
     from lodestream.page import INDEX
 
     if is_url(store):
-        import httpx
+        from ..client import Client
 
-        from .. import sync
-        from ..requests import api, calls
-
-        with httpx.Client(**calls.client_options(store)) as client:
-            return sync.run(client, api.published_surfaces(store), store, None)
+        with Client(store) as client:
+            return client.list_published(store)
     from lodestream.stores import open_store
 
     from ..publishing.publisher import published

@@ -42,8 +42,9 @@ from .values import parse_seconds, parse_source
 from .watching import Watch, check_picture, check_watched
 
 if TYPE_CHECKING:
+    from ..client import Client
+    from ..stream.blocking_stream import Stream
     from ..stream.reconnecting import Transport
-    from ..sync import Stream
     from ..viewer.drawing import Drawing
 
 __all__ = ["PullOptions", "register", "run"]
@@ -204,14 +205,14 @@ def run(args: argparse.Namespace) -> int:
         check_watched(options.out)
     if options.picture is not None:
         check_picture(options.picture)
-    with interruptible(), Kept(options.resume) as kept:
-        if addresses.is_named(options.url):
-            from .. import sync
+    from ..client import Client
 
+    with interruptible(), Kept(options.resume) as kept, Client(options.url, token=options.token) as client:
+        if addresses.is_named(options.url):
             # Once: all requests are of one container, whatever the name leads to meanwhile.
-            options = replace(options, url=sync.locate(options.url, token=options.token))
+            options = replace(options, url=client.locate(options.url))
         with _drawing(options) as drawing:
-            return _pull(options, kept, drawing)
+            return _pull(client, options, kept, drawing)
 
 
 def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:
@@ -231,9 +232,9 @@ def _drawing(options: PullOptions) -> AbstractContextManager[Drawing | None]:
     return Drawing(options.picture, options.url, window=options.target.region is not None, layers=layers)
 
 
-def _pull(options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
+def _pull(client: Client, options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
     try:
-        outcome, broke = _written(options, kept, drawing)
+        outcome, broke = _written(client, options, kept, drawing)
     except KeyboardInterrupt as interrupt:
         raise type(interrupt)(f"{_words(interrupt)}: {options.name} is not written") from None
     outcome.report(options.json)
@@ -246,18 +247,16 @@ def _pull(options: PullOptions, kept: Kept, drawing: Drawing | None) -> int:
 
 
 def _written(
-    options: PullOptions, kept: Kept, drawing: Drawing | None
+    client: Client, options: PullOptions, kept: Kept, drawing: Drawing | None
 ) -> tuple[Outcome, KeyboardInterrupt | LodestreamError | None]:
     """Write OUT; return the outcome, and the error or interrupt that ended the stream early."""
     import lodestream.decoding.decoder  # noqa: F401  (what it brings takes a second, which is none of the stream's)
 
-    from .. import sync
-
     started = time.monotonic()
     if options.resume:
-        kept.use(sync.identify(options.url, token=options.token))
+        kept.use(client.identify(options.url))
     arrived = RangeSet()
-    stream, metadata, broke = _receive(options, kept, drawing, arrived)
+    stream, metadata, broke = _receive(client, options, kept, drawing, arrived)
     if broke is not None:
         if not stream.decoder.layers:
             if not isinstance(broke, KeyboardInterrupt | InputError | NotFoundError):
@@ -279,7 +278,7 @@ def _written(
 
 
 def _receive(
-    options: PullOptions, kept: Kept, drawing: Drawing | None, arrived: RangeSet
+    client: Client, options: PullOptions, kept: Kept, drawing: Drawing | None, arrived: RangeSet
 ) -> tuple[Stream, Metadata, KeyboardInterrupt | LodestreamError | None]:
     """Receive; return the stream at its end, its metadata, and the error or interrupt that ended it early.
 
@@ -288,7 +287,6 @@ def _receive(
     KeyboardInterrupt, LodestreamError
         Before there is a stream, or when what came is of no use, or not to be written.
     """
-    from .. import sync
 
     def take(offset: int, data: bytes) -> None:
         arrived.add(offset, len(data))
@@ -298,10 +296,9 @@ def _receive(
     broke: KeyboardInterrupt | LodestreamError | None = None
     identity = kept.identity
     with Progress(options.target) as bar:
-        stream = sync.connect(
+        stream = client.connect(
             options.url,
             target=options.target,
-            token=options.token,
             transport=options.transport,
             deadline=options.retry,
             silence=min(options.retry, _SILENCE) or _SILENCE,
@@ -316,7 +313,7 @@ def _receive(
         kept.follow(stream)
         if drawing is not None:
             drawing.when_done = stream.stop
-        metadata = Metadata(stream, kept, options.token, arrived)
+        metadata = Metadata(stream, kept, client, arrived)
         watch = Watch(options.out, drawing, options.target, metadata) if options.watch else None
         try:
             with watch or nullcontext(), stream:

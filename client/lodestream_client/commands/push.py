@@ -240,7 +240,7 @@ def _filename(options: PushOptions, path: Path) -> str | None:
 
 
 def _uploaded(options: PushOptions) -> Description:
-    from .. import sync
+    from ..client import Client
 
     wanted = options.surface
     with option_hints(options.files), input_files(options.files) as files, ExitStack() as stack, progress_bar() as bar:
@@ -259,8 +259,8 @@ def _uploaded(options: PushOptions) -> Description:
             figures = total if stages == {"sending"} else ""  # of a container that is made here the size is another
             bar.update(task, description=stage, completed=fraction, figures=figures)
 
-        return sync.upload(
-            options.url,
+        client = stack.enter_context(Client(options.url, token=options.token))
+        return client.upload(
             *sources,
             filename=_filename(options, files.paths[0]),
             precision=wanted.quality.precision,
@@ -274,6 +274,5 @@ def _uploaded(options: PushOptions) -> Description:
             options=wanted.format_options,
             wait=options.wait,
             progress=progress,
-            token=options.token,
             replace=options.name_url is not None,
         )

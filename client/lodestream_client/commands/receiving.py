@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from lodestream.planning.byte_ranges import RangeSet
     from lodestream.target import Target
 
-    from ..sync import Stream
+    from ..client import Client
+    from ..stream.blocking_stream import Stream
     from .keeping import Kept
 
 __all__ = ["Metadata", "Progress"]
@@ -56,8 +57,8 @@ class Metadata:
     stream : Stream
     kept : Kept
         Has them perhaps, or keeps them.
-    token : str or None
-        For the server.
+    client : Client
+        Of the server.
     arrived : RangeSet
         Bytes of the container that have come; those fetched are added.
 
@@ -69,12 +70,12 @@ class Metadata:
         Whether somebody waits for the end, or the server is gone.
     """
 
-    def __init__(self, stream: Stream, kept: Kept, token: str | None, arrived: RangeSet) -> None:
+    def __init__(self, stream: Stream, kept: Kept, client: Client, arrived: RangeSet) -> None:
         self.bytes = 0
         self.hurried = False
         self._stream = stream
         self._kept = kept
-        self._token = token
+        self._client = client
         self._arrived = arrived
         self._values: Mapping[str, Any] | None = None
 
@@ -97,7 +98,6 @@ class Metadata:
     def _fetched(self) -> Mapping[str, Any]:
         from lodestream.container import ByteRange, read_metadata
 
-        from .. import sync
         from ..requests.calls import TIMEOUT
 
         place = self._stream.metadata_place
@@ -108,7 +108,7 @@ class Metadata:
             return read_metadata(data, ByteRange(*place))
         timeout = _HURRY if self.hurried else TIMEOUT
         try:
-            data = sync.fetch_range(self._stream.url, *place, token=self._token, timeout=timeout)
+            data = self._client.fetch_range(self._stream.url, *place, timeout=timeout)
         except LodestreamError as error:
             if isinstance(error, NotFoundError) and not self.hurried:
                 raise

@@ -30,15 +30,14 @@ def register(subparsers: Subparsers) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask the server, wait, and print the URL."""
-    from .. import sync
+    from ..client import Client
 
-    with progress_bar() as bar:
+    with Client(args.url, token=token_of(args)) as client, progress_bar() as bar:
         task = bar.add_task("building", total=1.0, figures="")
-        surface = sync.retry(
+        surface = client.retry(
             args.url,
             wait=not args.no_wait,
             progress=lambda stage, fraction: bar.update(task, description=stage, completed=fraction),
-            token=token_of(args),
         )
     note_details(surface.details, words=option_words)
     if args.json:

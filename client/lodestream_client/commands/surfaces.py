@@ -60,11 +60,12 @@ def register(subparsers: Subparsers) -> None:
 
 def run_list(args: argparse.Namespace) -> int:
     """Print one line for each surface: address, state, shape, bytes, name, series, owner, and why it is not ready."""
-    from .. import sync
+    from ..client import Client
 
     if args.names:
         return _run_names(args)
-    surfaces = _chosen(sync.list_surfaces(args.url, token=token_of(args)), args)
+    with Client(args.url, token=token_of(args)) as client:
+        surfaces = _chosen(client.list(), args)
     if args.json:
         print_json({"surfaces": [{**surface.details, "url": surface.url} for surface in surfaces]})
         return 0
@@ -79,14 +80,16 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def _run_names(args: argparse.Namespace) -> int:
-    from .. import sync
+    from ..client import Client
 
     if args.state or args.sort or args.reverse:
         args.parser.error("argument --names: not allowed with --state, --sort or --reverse")
     text = (args.search or "").casefold()
+    with Client(args.url, token=token_of(args)) as client:
+        listed = client.list_names()
     names = [
         name
-        for name in sync.list_names(args.url, token=token_of(args))
+        for name in listed
         if any(text in str(name.get(key) or "").casefold() for key in ("name", "surface", "owner"))
     ]
     if args.json:
@@ -179,9 +182,10 @@ def _words(surface: Description) -> list[str]:
 
 def run_rm(args: argparse.Namespace) -> int:
     """Delete a surface, or a name."""
-    from .. import sync
+    from ..client import Client
 
-    sync.delete(args.url, token=token_of(args))
+    with Client(args.url, token=token_of(args)) as client:
+        client.delete(args.url)
     if args.json:
         print_json({"removed": args.url})
     else:

@@ -19,7 +19,7 @@ import lodestream as ls
 from lodestream.errors import LodestreamError
 from lodestream.page import assets
 
-from .. import sync
+from ..client import Client
 from ..terminal.output import cell, console, human_size, note, print_json, progress_bar
 from . import picture, plain
 from .service import own_server
@@ -94,9 +94,10 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
         bar.remove_task(task)
         heights = _made(shape, file, bar)
         ls.decode(ls.encode(heights[:16, :16]))  # loads the decoder before the clock runs
-        surface = _uploaded(url, file, bar)
+        client = stack.enter_context(Client(url))
+        surface = _uploaded(client, file, bar)
         whole = int(surface.details["levels"][-1]["bytes"])
-        arrivals = _streamed(surface, bar)
+        arrivals = _streamed(client, surface, bar)
     moments = [_moment(seconds, view, heights) for seconds, view in _chosen(arrivals)]
     last = moments[-1]
     plain_bytes = file.stat().st_size
@@ -136,24 +137,24 @@ def _made(shape: tuple[int, int], file: Path, bar: Progress) -> NDArray[np.int16
     return heights
 
 
-def _uploaded(url: str, file: Path, bar: Progress) -> Description:
+def _uploaded(client: Client, file: Path, bar: Progress) -> Description:
     task = bar.add_task("sending", total=1.0, figures=human_size(file.stat().st_size))
 
     def progress(stage: str, fraction: float) -> None:
         bar.update(task, description=f"{stage} on the server" if stage == "building" else stage, completed=fraction)
 
-    surface = sync.upload(url, file, progress=progress)
+    surface = client.upload(file, progress=progress)
     bar.remove_task(task)
     return surface
 
 
-def _streamed(surface: Description, bar: Progress) -> list[tuple[float, View]]:
+def _streamed(client: Client, surface: Description, bar: Progress) -> list[tuple[float, View]]:
     layers = surface.details["layers"]
     total = next((layer["bytes"] for layer in layers if layer["rms"] <= _STOP), layers[-1]["bytes"])
     task = bar.add_task("streaming", total=total, figures="")
     arrivals: list[tuple[float, View]] = []
     started = time.monotonic()
-    with sync.connect(surface.url, target=ls.Target(until_rms=ls.Tolerance(_STOP)), limit_rate=_LINK) as stream:
+    with client.connect(surface.id, target=ls.Target(until_rms=ls.Tolerance(_STOP)), limit_rate=_LINK) as stream:
         for view in stream:
             arrivals.append((time.monotonic() - started, view))
             bar.update(task, completed=view.bytes, figures=f"{human_size(view.bytes)}, RMS error {view.rms:.3g} m")

@@ -22,10 +22,12 @@ __all__ = [
     "names_url",
     "origin",
     "page_url",
+    "place_url",
     "published_name",
     "resolved",
     "same_origin",
     "served_url",
+    "server_url",
     "source_url",
     "stream_url",
     "surface_url",
@@ -34,6 +36,8 @@ __all__ = [
 
 _SURFACES = "/v1/surfaces"
 _NAMES = "/v1/names"
+_BELOW = re.compile(f"({_SURFACES}|{_NAMES})(/.*)?$")
+_ID = re.compile(r"[0-9A-Za-z_-]{1,100}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 _SCHEMES = {"http": "http", "https": "https", "ws": "http", "wss": "https"}
@@ -45,6 +49,17 @@ _ADDRESS = re.compile("https?://[!-~]+", re.IGNORECASE)
 def is_url(text: str) -> bool:
     """Return whether a text is a URL, not a file name."""
     return text.lower().startswith(("http://", "https://"))
+
+
+def server_url(url: str) -> str:
+    """Return the URL of a server, without a slash at its end, from its URL or from that of anything on it.
+
+    Raises
+    ------
+    OptionError
+        If this is not an ``http`` or ``https`` URL.
+    """
+    return _BELOW.sub("", _clean(url))
 
 
 def surfaces_url(url: str) -> str:
@@ -77,6 +92,23 @@ def surface_url(url: str) -> str:
     if not collection.endswith(_SURFACES) or not name:
         raise OptionError(f"expected a surface's address such as http://HOST/v1/surfaces/ID, got {url}")
     return base
+
+
+def place_url(url: str, place: str) -> str:
+    """Return the URL of a surface on the server at `url`, given its id; a URL as it is.
+
+    Raises
+    ------
+    OptionError
+        If `place` is neither.
+    """
+    if is_url(place):
+        return place
+    if not _ID.fullmatch(place):
+        raise OptionError(
+            f"expected the id of a surface, or an address such as http://HOST/v1/surfaces/ID, got {place}"
+        )
+    return f"{surfaces_url(url)}/{place}"
 
 
 def names_url(url: str) -> str:

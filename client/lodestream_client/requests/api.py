@@ -1,7 +1,7 @@
 """HTTP requests to a server, without I/O.
 
 Each function here is a generator. It yields a `Call` and is sent the answer, or yields a `Pause` and is resumed after
-it; its return value is the result. `lodestream_client.sync` and `lodestream_client.aio` run the same generators.
+it; its return value is the result. `AsyncClient` carries them out.
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ class Identity:
 
     Examples
     --------
-    >>> from lodestream_client import sync
-    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
-    >>> identity = sync.identify(url)
+    >>> from lodestream_client import Client
+    >>> client = Client("http://127.0.0.1:8000")
+    >>> identity = client.identify(client.upload("terrain.npy").id)
     >>> identity.name == identity.container_sha256, identity.size > 6000
     (True, True)
     """
@@ -106,9 +106,9 @@ class Description:
     Attributes
     ----------
     url : str
-        The surface's URL, as `connect` and `delete` take it.
+        The surface's URL.
     id : str
-        Id of the surface on its server.
+        Id of the surface on its server, as `Client.connect` and `Client.delete` take it.
     state : str
         ``queued``, ``building``, ``ready``; ``failed``: the reader rejected the file; ``waiting``: it could not be
         built for a reason on the server. For the last two see `retry`.
@@ -117,8 +117,8 @@ class Description:
 
     Examples
     --------
-    >>> from lodestream_client import sync
-    >>> description = sync.upload("http://127.0.0.1:8000", "terrain.npy")
+    >>> from lodestream_client import Client
+    >>> description = Client("http://127.0.0.1:8000").upload("terrain.npy")
     >>> description.ready, description.details["shape"]
     (True, [97, 70])
     """

@@ -22,6 +22,10 @@ T = TypeVar("T")
 #: Seconds for each step of a request: connecting, one chunk sent, one chunk received.
 TIMEOUT = 30.0
 
+# Seconds that a connection stays open for the next request: less than a server allows (uvicorn: 5), or a request meets
+# its end.
+_KEPT = 4.0
+
 
 @dataclass(frozen=True)
 class Call:
@@ -53,34 +57,32 @@ class Pause:
 Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
 
 
-def client_options(url: str, timeout: float = TIMEOUT, *, asynchronous: bool = False) -> dict[str, Any]:
-    """Return the arguments of an httpx client of the server at `url`.
+def client_options(url: str, *, direct: bool) -> dict[str, Any]:
+    """Return the arguments of the asyncio client of httpx.
 
     Parameters
     ----------
     url : str
-    timeout : float
-        Seconds for each step.
-    asynchronous : bool
-        Whether it is an asyncio client.
+        URL of the server to which a token may be sent.
+    direct : bool
+        Whether the proxies of the environment are not used.
     """
 
-    def guard(request: httpx.Request) -> None:
+    async def guard(request: httpx.Request) -> None:
         # httpx itself lets a token go on from a host's port 80 to its port 443; here an origin is an origin.
         if not addresses.same_origin(str(request.url), url):
             request.headers.pop("Authorization", None)
 
-    async def guard_later(request: httpx.Request) -> None:
-        guard(request)
+    import httpx
 
     return {
         "follow_redirects": True,
-        "timeout": timeout,
+        "timeout": TIMEOUT,
         "verify": _trusted(),
-        # No proxy of the environment comes between two programs on one machine.
-        "trust_env": not addresses.is_loopback(url),
+        "trust_env": not direct,
         "headers": {"Accept-Encoding": "identity"},
-        "event_hooks": {"request": [guard_later if asynchronous else guard]},
+        "event_hooks": {"request": [guard]},
+        "limits": httpx.Limits(max_connections=None, max_keepalive_connections=20, keepalive_expiry=_KEPT),
     }
 
 

@@ -33,7 +33,7 @@ _ARRAYS = ("__array__", "__array_interface__", "__array_struct__")
 
 @dataclass(frozen=True)
 class Asked:
-    """The options of an upload, see `lodestream_client.sync.upload`."""
+    """The options of an upload, see `Client.upload`."""
 
     precision: Tolerance | float | str | None = None
     rms: Tolerance | float | str | None = None

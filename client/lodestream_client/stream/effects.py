@@ -1,6 +1,6 @@
 """Effects of a stream as values, which its core yields, and the results that it is given.
 
-The core decides; `sync_stream` and `aio_stream` only carry out. Where an effect fails, the core is given the error as
+The core decides; `EffectIO` only carries out. Where an effect fails, the core is given the error as
 the library raised it, and decides what it means.
 """
 

@@ -1,4 +1,4 @@
-"""The options of `connect`."""
+"""The options of a stream."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ Received: TypeAlias = Callable[[int, "int | None"], None]
 
 @dataclass(frozen=True, kw_only=True)
 class ConnectOptions:
-    """The options of `connect`, where they are described, with their defaults."""
+    """The options of `Client.connect`, where they are described, with their defaults; and the token."""
 
     target: Target | None = None
-    token: str | None = None
     transport: Transport = "auto"
     silence: float = 30.0
     deadline: float = 60.0
@@ -36,13 +35,13 @@ class ConnectOptions:
     progress: Received | None = None
     sink: Sink | None = None
     max_vertices: int | None = None
+    token: str | None = None
 
 
 class ConnectKeywords(TypedDict, total=False):
-    """The options of `connect` as keywords, for type checkers."""
+    """The options of `Client.connect` as keywords, for type checkers."""
 
     target: Target | None
-    token: str | None
     transport: Transport
     silence: float
     deadline: float

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-import lodestream_client as client
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from tests.core.surfaces import terrain
 
 from ..conftest import Run
@@ -31,7 +30,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def served(server: str, file: Path) -> str:
-    return sync.upload(server, file).url
+    return Client(server).upload(file).url
 
 
 def described(run: Run, what: object) -> dict[str, Any]:
@@ -150,10 +149,10 @@ def test_both_clients_take_numbers(served: str) -> None:
     target = ls.Target(until_rms={"speed": 0.05, "wind": 3})
 
     async def received() -> Any:
-        async with client.connect(served, target=target) as stream:
+        async with AsyncClient(served) as client, client.connect(served, target=target) as stream:
             return [view async for view in stream], stream.ended
 
-    with sync.connect(served, target=target) as stream:
+    with Client(served).connect(served, target=target) as stream:
         views = list(stream)
     others, ended = asyncio.run(received())
     assert (stream.ended, ended) == ("channels", "channels")

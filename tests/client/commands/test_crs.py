@@ -10,7 +10,7 @@ import rasterio
 
 import lodestream as ls
 from lodestream.maps import HeightField, crs_wkt
-from lodestream_client import sync
+from lodestream_client import Client
 
 from ..conftest import Run
 
@@ -54,7 +54,8 @@ def test_push(run: Run, file: Path, server: str, each: tuple[str, ...]) -> None:
         "push", *each, file, server, "--crs", "EPSG:32611", "--precision", "0.5", "--name", "Hill"
     )
     assert code == 0, stderr
-    with sync.connect(stdout.split()[0]) as stream:
+    url = stdout.split()[0]
+    with Client(url).connect(url) as stream:
         *_, view = stream
     surface = view.surface()
     assert (surface.metadata["crs"], surface.metadata["name"]) == (UTM, "Hill")

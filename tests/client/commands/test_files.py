@@ -15,14 +15,14 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.errors import RemoteError, RemoteProtocolError
 from lodestream.transfer.receiver_state import ReceiverState
-from lodestream_client import sync
+from lodestream_client import AsyncClient, AsyncStream, Client
 from lodestream_client.stream.reconnecting import Transport
 from lodestream_server import running_server
 from tests.links import Fault, linked
 
+from ..asked import asked
 from ..conftest import Run
 from ..files import Ranged, nginx, plain, ranged
 
@@ -57,18 +57,18 @@ TARGETS = [
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
 @pytest.mark.parametrize("target", TARGETS, ids=repr)
 def test_a_file_is_the_same_surface_as_a_stream(surface: str, url: str, target: ls.Target, asynchronous: bool) -> None:
-    with sync.connect(surface, target=target, transport="ws") as stream:
+    with Client(surface).connect(surface, target=target, transport="ws") as stream:
         by_socket = list(stream)
 
-    async def loop() -> tuple[list[ls.View], client.Stream]:
-        async with client.connect(url, target=target) as stream:
+    async def loop() -> tuple[list[ls.View], AsyncStream]:
+        async with AsyncClient(url) as client, client.connect(url, target=target) as stream:
             return [view async for view in stream], stream
 
     if asynchronous:
         views, followed = asyncio.run(loop())
         reception: ReceiverState = followed._reception
     else:
-        with sync.connect(url, target=target) as stream_of_file:
+        with Client(url).connect(url, target=target) as stream_of_file:
             views = list(stream_of_file)
         reception = stream_of_file._reception
     assert [view.bytes for view in views] == [view.bytes for view in by_socket]
@@ -79,13 +79,13 @@ def test_a_file_is_the_same_surface_as_a_stream(surface: str, url: str, target: 
 
 
 def test_few_requests_are_made(web: Ranged, url: str, terrain: Terrain) -> None:
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         views = list(stream)
     assert np.array_equal(views[-1].points, terrain)
     assert (stream.ended, stream.transport) == ("complete", "http")
     assert [method for method, _ in web.requests] == ["GET"]
     assert stream.connections == 1
-    with sync.connect(url, target=ls.Target(until_rms=ls.Tolerance(1e-2, True))) as stream:
+    with Client(url).connect(url, target=ls.Target(until_rms=ls.Tolerance(1e-2, True))) as stream:
         list(stream)
     assert stream.ended == "rms"
     assert stream.decoder.metadata is not None
@@ -94,32 +94,32 @@ def test_few_requests_are_made(web: Ranged, url: str, terrain: Terrain) -> None:
 
 
 def test_the_surface_of_a_server_by_range(surface: str, terrain: Terrain) -> None:
-    with sync.connect(surface, transport="http") as stream:
+    with Client(surface).connect(surface, transport="http") as stream:
         views = list(stream)
     assert np.array_equal(views[-1].points, terrain)
     assert stream.transport == "http"
-    assert stream._reception.container == sync.describe(surface).details["container_sha256"]
+    assert stream._reception.container == Client(surface).get(surface).details["container_sha256"]
 
 
 def test_stop_and_seconds_and_leaving(url: str) -> None:
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         next(stream)
         stream.stop()
         assert list(stream) == []
     assert stream.ended == "stopped"
-    with sync.connect(url, target=ls.Target(seconds=0.3), limit_rate=8000.0) as stream:
+    with Client(url).connect(url, target=ls.Target(seconds=0.3), limit_rate=8000.0) as stream:
         views = list(stream)
     assert stream.ended == "seconds"
     assert not stream.decoder.complete
     assert len(views) < len(stream.decoder.layers) + 1
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         first = next(stream)
     assert stream.ended == "stopped"
     assert first.number == 0
 
 
 def test_a_query_may_be_part_of_a_files_address(web: Ranged, url: str) -> None:
-    with sync.connect(f"{url}?signature=a%2Fb", target=ls.Target(max_bytes=1500)) as stream:
+    with Client(f"{url}?signature=a%2Fb").connect(f"{url}?signature=a%2Fb", target=ls.Target(max_bytes=1500)) as stream:
         list(stream)
     assert stream.ended == "bytes"
 
@@ -134,7 +134,7 @@ def test_progress_is_told(url: str, surface: str) -> None:
         told.clear()
         with (
             linked(address, Fault(rate=200_000.0)) as link,
-            sync.connect(link.url, progress=progress, window=4096) as stream,
+            Client(link.url).connect(link.url, progress=progress, window=4096) as stream,
         ):
             list(stream)
         assert told[-1] == (stream.planned, stream.planned)
@@ -148,7 +148,7 @@ def test_a_server_that_ignores_range_is_reported_and_not_obeyed(
     with plain(folder) as server:
         address = f"{server}/{container_file.name}"
         with pytest.raises(RemoteProtocolError, match="does not support Range"):
-            sync.connect(address)
+            Client(address).connect(address)
         for command in (("pull", address, tmp_path / "o.npy"), ("info", address)):
             code, stdout, stderr = run(*command)
             assert (code, stdout) == (1, "")
@@ -166,7 +166,7 @@ def test_a_file_that_changes_meanwhile(tmp_path: Path, container_file: Path, asy
     target = ls.Target(order="level")  # takes more than one request
 
     async def loop(address: str) -> None:
-        async with client.connect(address, target=target) as stream:
+        async with AsyncClient(address) as client, client.connect(address, target=target) as stream:
             path.write_bytes(other)
             async for _ in stream:
                 pass
@@ -175,7 +175,7 @@ def test_a_file_that_changes_meanwhile(tmp_path: Path, container_file: Path, asy
         if asynchronous:
             asyncio.run(loop(address))
             return
-        with sync.connect(address, target=target) as stream:
+        with Client(address).connect(address, target=target) as stream:
             path.write_bytes(other)
             list(stream)
 
@@ -187,10 +187,13 @@ def test_a_file_that_changes_meanwhile(tmp_path: Path, container_file: Path, asy
 def test_what_is_no_container_and_what_is_not_there(web: Ranged, folder: Path, terrain_file: Path) -> None:
     (folder / "empty.lode").write_bytes(b"")
     for name, words in ((terrain_file.name, "expected"), ("empty.lode", "shorter file")):
-        with pytest.raises(ls.StreamError, match=words), sync.connect(f"{web.url}/{name}", deadline=0) as stream:
+        with (
+            pytest.raises(ls.StreamError, match=words),
+            Client(f"{web.url}/{name}").connect(f"{web.url}/{name}", deadline=0) as stream,
+        ):
             list(stream)
     with pytest.raises(ls.NotFoundError, match="404"):
-        sync.connect(f"{web.url}/nothing.lode")
+        Client(f"{web.url}/nothing.lode").connect(f"{web.url}/nothing.lode")
 
 
 def test_info_of_a_file_elsewhere_is_that_of_the_file_here(
@@ -199,9 +202,8 @@ def test_info_of_a_file_elsewhere_is_that_of_the_file_here(
     here = json.loads(run("info", container_file, "--json")[1])
     assert json.loads(run("info", url, "--json")[1]) == here
     assert "97 x 70" in run("info", url)[1]
-    asked = [text for _, text in web.requests if text]
-    assert len(asked) == len(web.requests)
-    assert asyncio.run(client.describe_file(url)) == here
+    assert all(text for _, text in web.requests)
+    assert asyncio.run(asked(url, lambda it: it.describe_file(url))) == here
 
 
 def test_pull_by_either_transport_writes_the_same(
@@ -226,7 +228,7 @@ def test_a_file_has_no_stream(run: Run, url: str, tmp_path: Path) -> None:
     assert code == 2
     assert "the URL of a file has no WebSocket" in stderr
     with pytest.raises(ls.OptionError, match="surface's address for a WebSocket"):
-        sync.connect(url, transport="ws")
+        Client(url).connect(url, transport="ws")
 
 
 WITHOUT_NGINX = shutil.which("nginx") is None and not Path("/usr/sbin/nginx").exists()
@@ -240,10 +242,10 @@ def test_a_server_below_a_path_behind_a_proxy(terrain_file: Path, terrain: Terra
         running_server(tmp_path / "data", **options) as server,
         nginx(tmp_path, tmp_path / "work", server) as front,
     ):
-        url = sync.upload(f"{front}/maps", terrain_file).url
+        url = Client(f"{front}/maps").upload(terrain_file).url
         transports: tuple[Transport, ...] = ("ws", "http")
         for transport in transports:
-            with sync.connect(url, transport=transport) as stream:
+            with Client(url).connect(url, transport=transport) as stream:
                 views = list(stream)
             assert (stream.ended, stream.transport) == ("complete", transport)
             assert np.array_equal(views[-1].points, terrain)
@@ -258,11 +260,11 @@ def test_another_web_server(folder: Path, container_file: Path, terrain: Terrain
     with nginx(tmp_path / "files", tmp_path / "work") as server:
         address = f"{server}/terrain.lode"
         assert httpx.head(address, trust_env=False).headers["accept-ranges"] == "bytes"
-        with sync.connect(address) as stream:
+        with Client(address).connect(address) as stream:
             views = list(stream)
         assert stream.ended == "complete"
         assert np.array_equal(views[-1].points, terrain)
         assert stream._reception.data_bytes == stream._reception.cached.total
-        with sync.connect(address, target=ls.Target(level=3)) as stream:
+        with Client(address).connect(address, target=ls.Target(level=3)) as stream:
             list(stream)
         assert stream.ended == "level"

@@ -10,7 +10,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.errors import FormatWarning, OptionError
-from lodestream_client import sync
+from lodestream_client import Client
 
 from ..conftest import Run
 
@@ -63,11 +63,12 @@ def test_what_is_no_number(run: Run, file: Path, server: str, value: str) -> Non
 def test_push(run: Run, file: Path, server: str) -> None:
     code, stdout, stderr = run("push", file, server, "--nodata", "-3.4028235e+38")
     assert (code, NOTE in stderr) == (0, True), stderr
-    with sync.connect(stdout.strip()) as stream:
+    url = stdout.strip()
+    with Client(url).connect(url) as stream:
         *_, view = stream
     np.testing.assert_array_equal(view.surface().mask, VALID)
-    assert sync.upload(server, file, nodata=-3.4028235e38).url == stdout.strip()
-    assert sync.upload(server, file).url != stdout.strip()
+    assert Client(server).upload(file, nodata=-3.4028235e38).url == stdout.strip()
+    assert Client(server).upload(file).url != stdout.strip()
 
 
 def test_the_query_of_an_upload(file: Path, server: str) -> None:
@@ -78,14 +79,14 @@ def test_the_query_of_an_upload(file: Path, server: str) -> None:
 
 def test_a_surface_in_memory(server: str) -> None:
     with pytest.warns(FormatWarning, match=r"masks 9 of 60 points"):
-        surface = sync.upload(server, HEIGHTS, nodata="-3.4028235e38")
-    with sync.connect(surface.url) as stream:
+        surface = Client(server).upload(HEIGHTS, nodata="-3.4028235e38")
+    with Client(surface.url).connect(surface.url) as stream:
         *_, view = stream
     np.testing.assert_array_equal(view.surface().mask, VALID)
 
 
 def test_a_container_takes_none(server: str, container_file: Path, run: Run, tmp_path: Path) -> None:
     with pytest.raises(OptionError, match="expected no nodata for a container"):
-        sync.upload(server, container_file, nodata=0)
+        Client(server).upload(container_file, nodata=0)
     code, _, stderr = run("convert", container_file, tmp_path / "a.npy", "--nodata", "0")
     assert (code, "expected no --closed, --nodata, --crs, --format and -o" in stderr) == (2, True), stderr

@@ -54,8 +54,7 @@ HEAVY = ("fastapi", "uvicorn", "rasterio", "matplotlib")
 def test_importing_the_client_is_light() -> None:
     statements = (
         "import lodestream_client",
-        "from lodestream_client import connect, upload, list, delete, SilenceError",
-        "from lodestream_client.sync import connect, upload, list, delete",
+        "from lodestream_client import Client, AsyncClient, Stream, AsyncStream, SilenceError",
     )
     assert loaded_after("\n".join(statements), HEAVY) == []
 
@@ -76,18 +75,9 @@ def test_a_command_on_files_loads_no_more_than_it_uses(container_file: Path, tmp
 
 
 def test_all_names_are_there() -> None:
-    from lodestream_client import sync
-
     for name in lodestream_client.__all__:
         assert getattr(lodestream_client, name) is not None
     assert list(lodestream_client.__all__) == sorted(lodestream_client.__all__, key=lambda name: (name.islower(), name))
-    assert set(sync.__all__) == set(lodestream_client.__all__) - {
-        "Description",
-        "Identity",
-        "SilenceError",
-        "UnreachableError",
-        "Widget",
-    }
     with pytest.raises(AttributeError, match="no attribute 'juggle'"):
         _ = lodestream_client.juggle
 

@@ -22,7 +22,7 @@ import lodestream as ls
 from lodestream.decoding.view import View
 from lodestream.formats import write
 from lodestream.grid.layout import Layout
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.commands import watching
 from lodestream_client.commands.outcome import write_surface
 from lodestream_client.terminal.interrupts import Terminated
@@ -66,7 +66,7 @@ def test_what_is_written_early_has_its_place_and_notes_come_once(run: Run, serve
     place = {"geotransform": [5e5, 30.0, 0.0, 4.2e6, 0.0, -30.0], "unit": "m", "name": "hill"}
     rows, columns = np.mgrid[0:90, 0:80]
     hill = ls.Surface((100 * np.sin(rows / 20) * np.cos(columns / 9)).astype("f4"), metadata=place)
-    url = sync.upload(server, hill).url
+    url = Client(server).upload(hill).url
     out, early = tmp_path / "hill.npz", []
 
     with pytest.MonkeyPatch.context() as patch:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.viewer.pictures import Picture
 from tests.core.remesh import scenes
 
@@ -47,7 +47,8 @@ def test_whatever_tells_of_it_says_complete_never_exact_or_lossless(run: Run, fi
     assert run("encode", file, out, "--remesh", "--blocks", 12, "--remesh-error", "1e-2")[0] == 0
     code, stdout, stderr = run("push", out, server)
     assert code == 0, stderr
-    with sync.connect(stdout.strip()) as stream:
+    url = stdout.strip()
+    with Client(url).connect(url) as stream:
         *_, view = stream
     words = {
         "info": run("info", out)[1],

@@ -12,7 +12,7 @@ import xarray
 from numpy.typing import NDArray
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 
 from ..conftest import Run
 
@@ -265,12 +265,12 @@ def test_steps_are_pushed_and_listed_together(
     assert code == 0, stderr
     lines = stdout.splitlines()
     assert [line.split(" ", 1)[1] for line in lines] == [f"{file.stem} air {date}" for date in DATES]
-    listed = {it.url: it for it in sync.list_surfaces(server)}
+    listed = {it.url: it for it in Client(server).list()}
     for index, line in enumerate(lines):
         surface = listed[line.split(" ")[0]]
         assert (surface.details["series"]["index"], surface.details["series"]["name"]) == (index, f"{file.stem} air")
         assert surface.details["name"] == f"{file.stem} air {DATES[index]}"
-        assert sync.describe(surface.url).details["series"] == surface.details["series"]
+        assert Client(surface.url).get(surface.url).details["series"] == surface.details["series"]
     _, stdout, _ = run("list", server, "--search", f"{file.stem} air, time")
     assert [line.split()[0] for line in stdout.splitlines()] == [line.split()[0] for line in lines]
 

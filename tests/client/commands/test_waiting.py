@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import lodestream_client as client
 from lodestream.errors import NotFoundError, RemoteError, RemoteProtocolError
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.requests.api import Description
 from lodestream_server import running_server
 
+from ..asked import asked
 from ..conftest import Run
 from ..files import running
 
@@ -77,8 +77,16 @@ def fake(*states: str) -> Iterator[Fake]:
 
 def ask(what: str, server: Fake, asynchronous: bool) -> Description:
     if what == "upload":
-        return asyncio.run(client.upload(server.url, b"file")) if asynchronous else sync.upload(server.url, b"file")
-    return asyncio.run(client.retry(server.surface)) if asynchronous else sync.retry(server.surface)
+        return (
+            asyncio.run(asked(server.url, lambda it: it.upload(b"file")))
+            if asynchronous
+            else Client(server.url).upload(b"file")
+        )
+    return (
+        asyncio.run(asked(server.surface, lambda it: it.retry(server.surface)))
+        if asynchronous
+        else Client(server.surface).retry(server.surface)
+    )
 
 
 @pytest.mark.parametrize("state", ["waiting", "failed"])
@@ -107,25 +115,25 @@ def test_retry_waits_until_the_surface_is_ready(asynchronous: bool) -> None:
 
     with fake("queued", "building", "ready") as server:
         if asynchronous:
-            made = asyncio.run(client.retry(server.surface, progress=progress))
+            made = asyncio.run(asked(server.surface, lambda it: it.retry(server.surface, progress=progress)))
         else:
-            made = sync.retry(server.surface, progress=progress)
+            made = Client(server.surface).retry(server.surface, progress=progress)
         assert (made.ready, made.url, made.id) == (True, server.surface, "ab")
         assert told == [("building", 0.5)] * 2
     with fake("queued") as server:
-        assert sync.retry(server.surface, wait=False).state == "queued"
+        assert Client(server.surface).retry(server.surface, wait=False).state == "queued"
         assert server.requests == [("POST", "/v1/surfaces/ab/retry")]
         with pytest.raises(NotFoundError, match="no such surface"):
-            sync.retry(f"{server.url}/v1/surfaces/none")
+            Client(f"{server.url}/v1/surfaces/none").retry(f"{server.url}/v1/surfaces/none")
     with fake("asleep") as server, pytest.raises(RemoteProtocolError, match="'asleep'"):
-        sync.retry(server.surface)
+        Client(server.surface).retry(server.surface)
 
 
 def test_states_are_told_to_those_who_only_look() -> None:
     with fake("waiting") as server:
-        found = sync.describe(server.surface)
+        found = Client(server.surface).get(server.surface)
         assert (found.state, found.ready, found.details["reason"]) == ("waiting", False, REASON)
-        assert sync.upload(server.url, np.eye(4), wait=False).state == "waiting"
+        assert Client(server.url).upload(np.eye(4), wait=False).state == "waiting"
 
 
 def test_the_command_retry(run: Run) -> None:
@@ -154,15 +162,15 @@ def test_a_server_whose_limit_was_raised(run: Run, tmp_path: Path) -> None:
     points = np.arange(30.0).reshape(5, 6)
     with running_server(tmp_path / "data", workers=1, max_vertices=29) as server:
         with pytest.raises(RemoteError, match="at most 29 vertices") as caught:
-            sync.upload(server, points)
+            Client(server).upload(points)
         assert caught.value.code == "waiting"
-        (waiting,) = sync.list_surfaces(server)
+        (waiting,) = Client(server).list()
         assert waiting.url in str(caught.value)
         code, out, err = run("retry", waiting.url)
         assert (code, out, err.count("\n")) == (1, "", 1)
         assert f"{waiting.url} is waiting: " in err
     with running_server(tmp_path / "data", workers=1) as server:
-        (still,) = sync.list_surfaces(server)
+        (still,) = Client(server).list()
         assert still.state == "waiting"
         assert run("retry", still.url) == (0, f"{still.url}\n", "")
-        assert sync.retry(still.url).details["errors"] == "checked"
+        assert Client(still.url).retry(still.url).details["errors"] == "checked"

@@ -85,9 +85,9 @@ def test_a_mesh_that_was_resampled_is_shown_with_what_was_measured(fake_page: Pa
 
 
 def test_a_served_surface_is_read_by_the_kernel(server: str, terrain: ls.Surface, fake_page: Page) -> None:
-    from lodestream_client import sync
+    from lodestream_client import Client
 
-    url = sync.upload(server, terrain).url
+    url = Client(server).upload(terrain).url
     shown = widget(url)
     assert np.array_equal(ls.decode(whole(fake_page, shown)).points, terrain.points)
 
@@ -107,9 +107,9 @@ def test_a_served_surface_is_read_by_the_kernel(server: str, terrain: ls.Surface
 
 
 def test_closing_ends_what_is_under_way(server: str, terrain: ls.Surface, fake_page: Page) -> None:
-    from lodestream_client import sync
+    from lodestream_client import Client
 
-    shown = widget(sync.upload(server, terrain).url)
+    shown = widget(Client(server).upload(terrain).url)
 
     async def closed_meanwhile() -> None:
         fake_page.ask(shown, {"kind": "read", "id": "1:1", "offset": 0, "length": 64})
@@ -249,7 +249,7 @@ def test_without_the_page_it_says_how_to_build_it(
 def test_what_is_refused_is_closed_again(
     container: bytes, monkeypatch: pytest.MonkeyPatch, server: str, terrain: ls.Surface
 ) -> None:
-    from lodestream_client import sync
+    from lodestream_client import Client
     from lodestream_client.remote_source import RemoteSource
 
     closed: list[RemoteSource] = []
@@ -260,7 +260,7 @@ def test_what_is_refused_is_closed_again(
         close(self)
 
     monkeypatch.setattr(RemoteSource, "close", noted)
-    url = sync.upload(server, terrain).url
+    url = Client(server).upload(terrain).url
     with pytest.raises(OptionError):
         widget(url, field="snow")
     assert len(closed) == 1

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lodestream.stores import open_store
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.program import main
 from lodestream_client.publishing.publisher import published
 from tests.stores.emulators import Emulator
@@ -33,10 +33,10 @@ def test_a_bucket_of_s3_is_enough(tmp_path: Path, s3: Emulator, capsys: pytest.C
     answer = httpx.get(page, trust_env=False)
     assert answer.headers["content-type"].startswith("text/html")
     assert "no-cache" in answer.headers["cache-control"]
-    with sync.connect(f"{page}#hills") as stream:
+    with Client(f"{page}#hills").connect(f"{page}#hills") as stream:
         *_, last = stream
     assert np.array_equal(last.surface().points, HILLS)
-    container = httpx.head(sync.locate(f"{page}#hills"), trust_env=False)
+    container = httpx.head(Client(f"{page}#hills").locate(f"{page}#hills"), trust_env=False)
     assert "immutable" in container.headers["cache-control"]
     assert main(["publish", str(tmp_path / "hills.npy"), address]) == 0
     assert "0 B of containers and levels sent" in capsys.readouterr().err

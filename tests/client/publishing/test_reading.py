@@ -16,13 +16,14 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-import lodestream_client
 from lodestream.errors import NotFoundError, OptionError, RemoteProtocolError
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.errors import SilenceError
 from lodestream_client.program import main
 from lodestream_client.requests.addresses import published_name
 from tests.client.files import Ranged, ranged, running
+
+from ..asked import asked
 
 HILLS = np.add.outer(np.sin(np.arange(60) / 9), np.cos(np.arange(80) / 7)).astype(np.float32)
 
@@ -67,34 +68,34 @@ def test_pull_goes_on_with_what_it_has(tmp_path: Path, host: Ranged, monkeypatch
 
 def test_a_stream_ends_on_the_container_that_it_began(tmp_path: Path, host: Ranged) -> None:
     url = f"{host.url}/#{NAME}"
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         first = next(iter(stream))
         assert not first.complete
         assert main(["publish", write(tmp_path, 2.0), str(tmp_path / "store")]) == 0
         *_, last = stream
     assert last.complete
     assert np.array_equal(last.surface().points, HILLS)
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         *_, last = stream
     assert np.array_equal(last.surface().points, HILLS * np.float32(2))
 
 
 def test_the_asyncio_client_reads_names_too(host: Ranged) -> None:
     async def received() -> Any:
-        async with lodestream_client.connect(f"{host.url}/#plain") as stream:
+        async with AsyncClient(f"{host.url}/#plain") as client, client.connect(f"{host.url}/#plain") as stream:
             views = [view async for view in stream]
         return views[-1].surface().points
 
     assert np.array_equal(asyncio.run(received()), HILLS[:9, :9])
-    located = asyncio.run(lodestream_client.locate(f"{host.url}/#plain"))
-    assert located == sync.locate(f"{host.url}/#plain")
+    located = asyncio.run(asked(f"{host.url}/#plain", lambda it: it.locate(f"{host.url}/#plain")))
+    assert located == Client(f"{host.url}/#plain").locate(f"{host.url}/#plain")
 
 
 def test_info_and_pictures(tmp_path: Path, host: Ranged, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", f"{host.url}/#plain", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["shape"] == [9, 9]
     with ls.open(f"{host.url}/#plain") as opened:
-        assert opened.source.place == sync.locate(f"{host.url}/#plain")
+        assert opened.source.place == Client(f"{host.url}/#plain").locate(f"{host.url}/#plain")
         assert np.array_equal(opened.window((2, 5), (3, 9)).points, HILLS[2:5, 3:9])
 
 
@@ -109,7 +110,7 @@ def test_xarray_opens_a_name_and_stays_with_its_container(tmp_path: Path, host: 
 
 
 def test_a_whole_read_takes_few_requests(tmp_path: Path, host: Ranged) -> None:
-    with sync.connect(f"{host.url}/#{NAME}") as stream:
+    with Client(f"{host.url}/#{NAME}").connect(f"{host.url}/#{NAME}") as stream:
         list(stream)
     assert len(host.requests) <= 3, "the list, the beginning, and the rest"
 
@@ -125,8 +126,11 @@ def test_what_is_published_is_listed(tmp_path: Path, host: Ranged, capsys: pytes
 
 def test_a_name_that_is_not_there(host: Ranged) -> None:
     with pytest.raises(NotFoundError, match="got 'dales'; there are: 'hills & dales', 'plain'"):
-        sync.locate(f"{host.url}/#dales")
-    with pytest.raises(NotFoundError, match="dales"), sync.connect(f"{host.url}/#dales") as stream:
+        Client(f"{host.url}/#dales").locate(f"{host.url}/#dales")
+    with (
+        pytest.raises(NotFoundError, match="dales"),
+        Client(f"{host.url}/#dales").connect(f"{host.url}/#dales") as stream,
+    ):
         list(stream)
 
 
@@ -144,20 +148,23 @@ def test_a_name_that_is_not_there(host: Ranged) -> None:
 def test_a_list_that_cannot_be_followed(tmp_path: Path, host: Ranged, text: str, words: str) -> None:
     (tmp_path / "store" / "view.json").write_text(text)
     with pytest.raises(RemoteProtocolError, match=words):
-        sync.locate(f"{host.url}/#plain")
-    with pytest.raises(RemoteProtocolError, match=words), sync.connect(f"{host.url}/#plain") as stream:
+        Client(f"{host.url}/#plain").locate(f"{host.url}/#plain")
+    with (
+        pytest.raises(RemoteProtocolError, match=words),
+        Client(f"{host.url}/#plain").connect(f"{host.url}/#plain") as stream,
+    ):
         list(stream)
 
 
 @pytest.mark.parametrize("url", ["http://host/", "http://host/a/", "http://host/a/index.html", "http://host/#v=1"])
 def test_a_page_without_a_name_is_told(url: str) -> None:
     with pytest.raises(OptionError, match="expected a name after"):
-        sync.connect(url)
+        Client(url).connect(url)
 
 
 def test_a_page_that_is_no_published_one(tmp_path: Path, host: Ranged) -> None:
     with pytest.raises(NotFoundError):
-        sync.locate(f"{host.url}/elsewhere/#plain")
+        Client(f"{host.url}/elsewhere/#plain").locate(f"{host.url}/elsewhere/#plain")
 
 
 class _Dripping(BaseHTTPRequestHandler):
@@ -192,10 +199,10 @@ def test_a_list_that_drips_ends_with_the_time_of_the_target() -> None:
     server.daemon_threads = True
     with running(server):
         url = f"http://127.0.0.1:{server.server_port}/#plain"
-        with sync.connect(url, target=ls.Target(seconds=0.5)) as stream:
+        with Client(url).connect(url, target=ls.Target(seconds=0.5)) as stream:
             assert list(stream) == []
         assert stream.ended == "stopped" or stream.ended == "seconds"
-        with pytest.raises(SilenceError), sync.connect(url, silence=0.5, deadline=0) as stream:
+        with pytest.raises(SilenceError), Client(url).connect(url, silence=0.5, deadline=0) as stream:
             list(stream)
 
 
@@ -213,7 +220,7 @@ def test_a_token_is_for_the_host_of_the_page_alone(host: Ranged) -> None:
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(host.RequestHandlerClass, "_serve", listening)
-            sync.locate(page_url, token="secret")
+            Client(page_url, token="secret").locate(page_url)
     assert [token for _, token in _Dripping.told] == ["Bearer secret"]
     assert heard == [None]
 

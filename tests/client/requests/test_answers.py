@@ -13,21 +13,21 @@ from typing import Any
 import pytest
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.errors import RemoteProtocolError
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client, Description
 from lodestream_client.requests import answers, api, calls
 
+from ..asked import asked
 from ..conftest import Run
 from ..scripted import Answer, Asked, document, scripted
 
 READY = {"id": "ab", "state": "ready"}
 
 
-def describe(answer: Answer, asynchronous: bool) -> client.Description:
+def describe(answer: Answer, asynchronous: bool) -> Description:
     with scripted(lambda _: answer) as server:
         url = f"{server.url}/v1/surfaces/ab"
-        return asyncio.run(client.describe(url)) if asynchronous else sync.describe(url)
+        return asyncio.run(asked(url, lambda it: it.get(url))) if asynchronous else Client(url).get(url)
 
 
 @pytest.fixture(params=[False, True], ids=["sync", "async"])
@@ -71,7 +71,7 @@ def test_nothing_is_decompressed(asynchronous: bool, coding: str) -> None:
 def test_nothing_compressed_is_asked_for(asynchronous: bool) -> None:
     with scripted(lambda _: document(READY)) as server:
         url = f"{server.url}/v1/surfaces/ab"
-        asyncio.run(client.describe(url)) if asynchronous else sync.describe(url)
+        asyncio.run(asked(url, lambda it: it.get(url))) if asynchronous else Client(url).get(url)
     assert [asked.headers["Accept-Encoding"] for asked in server.asked] == ["identity"]
 
 
@@ -149,12 +149,12 @@ def test_a_list_without_an_end_ends(small: int, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(api, "_MOST_PAGES", 5)
     with scripted(pages(lambda number: {"surfaces": [], "next": f"?page={number}"})) as server:
         with pytest.raises(RemoteProtocolError, match="expected at most 5 pages"):
-            sync.list_surfaces(server.url)
+            Client(server.url).list()
         assert len(server.asked) == 5
     long = {"surfaces": [{**READY, "name": "a" * 8000}]}
     with scripted(pages(lambda number: {**long, "next": f"?page={number}"})) as server:
         with pytest.raises(RemoteProtocolError, match=r"expected at most [0-9]+ bytes of http"):
-            sync.list_surfaces(server.url)
+            Client(server.url).list()
         assert len(server.asked) <= 4
 
 
@@ -164,7 +164,7 @@ def test_the_next_page_is_on_the_same_server() -> None:
         scripted(lambda _: document({"surfaces": [], "next": f"{other.url}/v1/surfaces"})) as server,
         pytest.raises(RemoteProtocolError, match="pages of"),
     ):
-        sync.list_surfaces(server.url)
+        Client(server.url).list()
     assert other.asked == []
 
 
@@ -172,23 +172,23 @@ def test_more_than_the_part_that_was_asked_for() -> None:
     answer = Answer(206, bytes(300_000), {"Content-Range": "bytes 0-9/300000"})
     with scripted(lambda _: answer) as server:
         with pytest.raises(RemoteProtocolError, match="expected at most 10 bytes"):
-            sync.fetch_range(f"{server.url}/v1/surfaces/ab", 0, 10)
+            Client(f"{server.url}/v1/surfaces/ab").fetch_range(f"{server.url}/v1/surfaces/ab", 0, 10)
         with pytest.raises(RemoteProtocolError, match="expected at most 4096 bytes"):
-            sync.describe_file(f"{server.url}/a.lode")
+            Client(f"{server.url}/a.lode").describe_file(f"{server.url}/a.lode")
 
 
 def test_a_refused_part_is_bounded_too(asynchronous: bool) -> None:
     answer = Answer(500, gzip.compress(bytes(10_000_000)), {"Content-Encoding": "gzip"})
 
     async def loop(url: str) -> None:
-        async with client.connect(url, deadline=0):
+        async with AsyncClient(url) as client, client.connect(url, deadline=0):
             raise AssertionError("it is refused")
 
     def ask(url: str) -> None:
         if asynchronous:
             asyncio.run(loop(url))
         else:
-            sync.connect(url, deadline=0)
+            Client(url).connect(url, deadline=0)
 
     with scripted(lambda _: answer) as server, pytest.raises(ls.RemoteError, match="500"):
         ask(f"{server.url}/a.lode")

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.encoding.reading import read_into
 from lodestream.errors import FormatError, FormatWarning, OptionError, RemoteError
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.requests import local
 from lodestream_client.requests.api import Description
 from lodestream_client.requests.bodies import Source
@@ -23,6 +22,7 @@ from lodestream_server import running_server
 from tests.core.remesh import scenes
 from tests.server.routes.test_switched_off import off, vmec
 
+from ..asked import asked
 from ..conftest import Run
 
 HEIGHTS = np.round(np.random.default_rng(4).normal(size=(9, 7)), 3)
@@ -44,7 +44,7 @@ def text(tmp_path: Path) -> Path:
 
 
 def values_of(url: str) -> ls.Surface:
-    with sync.connect(url) as stream:
+    with Client(url).connect(url) as stream:
         *_, view = stream
     return view.surface()
 
@@ -69,8 +69,8 @@ def test_a_file_of_a_format_that_is_switched_off(plain: str, text: Path, kind: s
     def upload(source: Source) -> Description:
         filename = None if kind == "path" else "hill.txt"
         if asynchronous:
-            return asyncio.run(client.upload(plain, source, filename=filename, progress=progress))
-        return sync.upload(plain, source, filename=filename, progress=progress)
+            return asyncio.run(asked(plain, lambda it: it.upload(source, filename=filename, progress=progress)))
+        return Client(plain).upload(source, filename=filename, progress=progress)
 
     words = rf"{NOTE} text: .*hill\.txt is encoded here and sent as a container"
     with text.open("rb") as file:
@@ -86,14 +86,16 @@ def test_a_file_of_a_format_that_is_switched_off(plain: str, text: Path, kind: s
 
 def test_a_server_that_reads_it_gets_the_file(server: str, text: Path) -> None:
     stages: list[str] = []
-    surface = sync.upload(server, text, progress=lambda stage, fraction: stages.append(stage))
+    surface = Client(server).upload(text, progress=lambda stage, fraction: stages.append(stage))
     assert "encoding" not in stages
     np.testing.assert_array_equal(values_of(surface.url).points, HEIGHTS)
 
 
 def test_by_request(server: str, text: Path) -> None:
     stages: list[str] = []
-    surface = sync.upload(server, text, local=True, name="here", progress=lambda stage, fraction: stages.append(stage))
+    surface = Client(server).upload(
+        text, local=True, name="here", progress=lambda stage, fraction: stages.append(stage)
+    )
     assert "encoding" in stages
     assert surface.details["metadata"]["name"] == "here"
     np.testing.assert_array_equal(values_of(surface.url).points, HEIGHTS)
@@ -101,8 +103,8 @@ def test_by_request(server: str, text: Path) -> None:
 
 def test_all_options_are_kept(plain: str, text: Path) -> None:
     with pytest.warns(FormatWarning) as caught:
-        surface = sync.upload(
-            plain, text, precision=0.1, closed="rows", nodata=float(HEIGHTS[0, 0]), options={"layout": "heights"}
+        surface = Client(plain).upload(
+            text, precision=0.1, closed="rows", nodata=float(HEIGHTS[0, 0]), options={"layout": "heights"}
         )
     assert any("masks 1 of 63 points" in str(warning.message) for warning in caught)
     values = values_of(surface.url)
@@ -112,9 +114,9 @@ def test_all_options_are_kept(plain: str, text: Path) -> None:
     assert np.abs(values.points - HEIGHTS)[values.mask].max() <= 0.1
     assert surface.details["exact"] is False
     with pytest.raises(OptionError, match="expected an option of format text"):
-        sync.upload(plain, text, options={"band": "1"})
+        Client(plain).upload(text, options={"band": "1"})
     with pytest.raises(OptionError, match="room is not an option of any format"):
-        sync.upload(plain, text, options={"room": "1"})
+        Client(plain).upload(text, options={"room": "1"})
 
 
 def test_no_parameter_of_a_reader_is_an_option_of_a_format() -> None:
@@ -129,7 +131,7 @@ def test_several_files_are_one_surface(plain: str, tmp_path: Path) -> None:
     for name, values in {"x": columns + rows, "y": rows, "z": rows * columns}.items():
         np.savetxt(tmp_path / f"{name}.dat", values)
     with pytest.warns(FormatWarning, match=NOTE):
-        surface = sync.upload(plain, *(tmp_path / f"{name}.dat" for name in "xyz"))
+        surface = Client(plain).upload(*(tmp_path / f"{name}.dat" for name in "xyz"))
     assert values_of(surface.url).points.shape == (5, 6, 3)
 
 
@@ -137,28 +139,28 @@ def test_what_is_known_only_to_the_reader(plain: str, tmp_path: Path) -> None:
     path = tmp_path / "w7x.nc"
     path.write_bytes(vmec())
     with pytest.warns(FormatWarning, match=rf"{NOTE} vmec"):
-        surface = sync.upload(plain, path, options={"resolution": "8x16"})
+        surface = Client(plain).upload(path, options={"resolution": "8x16"})
     assert surface.details["shape"] == [8, 16]
     with warnings.catch_warnings():
         warnings.simplefilter("error", FormatWarning)
-        assert sync.upload(plain, path, options={"variable": "rmnc"}).state == "ready"  # a NetCDF like any other
+        assert Client(plain).upload(path, options={"variable": "rmnc"}).state == "ready"  # a NetCDF like any other
 
 
 def test_what_cannot_be_read_is_refused(plain: str, text: Path, tmp_path: Path) -> None:
     text.write_text("1 2 3\n4 5\n")
     with pytest.raises(FormatError, match=r"hill\.txt: expected 3 numbers in each line, .* got 2 in line 2"):
-        sync.upload(plain, text)
+        Client(plain).upload(text)
     (tmp_path / "a.tif").write_bytes(b"nothing")
     with pytest.raises(FormatError, match=r"a\.tif: expected a file of format"):
-        sync.upload(plain, tmp_path / "a.tif")
+        Client(plain).upload(tmp_path / "a.tif")
     (tmp_path / "a.nc").write_bytes(b"CDF\x01 and no more")
     with pytest.raises(RemoteError, match=r"a\.nc: expected"):
-        sync.upload(plain, tmp_path / "a.nc")
+        Client(plain).upload(tmp_path / "a.nc")
 
 
 def test_containers_go_as_they_are(plain: str, container_file: Path) -> None:
-    surface = sync.upload(plain, container_file, local=True)
-    assert sync.fetch_range(surface.url, 0, surface.details["bytes"]) == container_file.read_bytes()
+    surface = Client(plain).upload(container_file, local=True)
+    assert Client(surface.url).fetch_range(surface.url, 0, surface.details["bytes"]) == container_file.read_bytes()
 
 
 def test_push(run: Run, plain: str, text: Path) -> None:
@@ -185,7 +187,7 @@ def test_attributes_of_an_upload_are_a_list_or_a_text(plain: str, tmp_path: Path
     options = {"variable": "z", "attributes": given}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FormatWarning)  # of the rest
-        remote = sync.upload(plain, tmp_path / "a.nc", options=options, local=local)  # type: ignore[arg-type]
+        remote = Client(plain).upload(tmp_path / "a.nc", options=options, local=local)  # type: ignore[arg-type]
     surface = values_of(remote.url)
     assert list(surface.attributes) == ["speed", "kind"]
     np.testing.assert_array_equal(surface.attributes["kind"], values + 2)
@@ -205,7 +207,7 @@ def test_a_confined_build_converts_units_to_those_of_the_crs(plain: str, tmp_pat
     values = np.add.outer(np.arange(9.0), np.arange(7.0))
     data = xarray.Dataset({"z": (("y", "x"), values, {"grid_mapping": "crs"}), "crs": crs}, place)
     data.to_netcdf(tmp_path / "a.nc", engine="h5netcdf")
-    surface = values_of(sync.upload(plain, tmp_path / "a.nc").url)
+    surface = values_of(Client(plain).upload(tmp_path / "a.nc").url)
     assert surface.metadata["geotransform"] == [-1000.0, 2000.0, 0.0, -1000.0, 0.0, 2000.0]
     assert any("x and y are converted from 'km'" in note for note in surface.metadata["notes"])
 
@@ -218,8 +220,7 @@ def test_a_mesh_is_resampled_where_that_is_switched_on(plain: str, server: str, 
     stages: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        surface = sync.upload(
-            server if there else plain,
+        surface = Client(server if there else plain).upload(
             path,
             options={"remesh": "yes", "blocks": "12", "remesh_error": "1e-2"},
             progress=lambda stage, _: stages.append(stage),

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.container.digest import DIGEST
 from lodestream.container.metadata import MAX_BYTES, packed
 from lodestream.errors import FormatWarning, InputError, OptionError, RemoteError
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.requests.api import Description
 from tests.core.container.forgery import index_of, with_layer_errors
 
+from ..asked import asked
 from ..commands.test_program import HEAVY, loaded_after
 from ..conftest import Run, make_terrain
 from ..test_surfaces_of_all_kinds import pulled, values
@@ -72,7 +72,7 @@ SURFACES: dict[str, Callable[[], ls.Surface]] = {
 
 
 def container_of(surface: Description) -> bytes:
-    return sync.fetch_range(surface.url, 0, int(surface.details["bytes"]))
+    return Client(surface.url).fetch_range(surface.url, 0, int(surface.details["bytes"]))
 
 
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
@@ -87,9 +87,9 @@ def test_a_surface_in_memory_goes_whole(server: str, kind: str, asynchronous: bo
         told.append((stage, fraction))
 
     if asynchronous:
-        made = asyncio.run(client.upload(server, given, progress=progress))
+        made = asyncio.run(asked(server, lambda it: it.upload(given, progress=progress)))
     else:
-        made = sync.upload(server, given, progress=progress)
+        made = Client(server).upload(given, progress=progress)
     local = ls.encode(given)
     assert container_of(made) == local
     back = pulled(made.url)
@@ -107,14 +107,8 @@ def test_a_surface_in_memory_goes_whole(server: str, kind: str, asynchronous: bo
 
 def test_what_is_asked_for_is_done_before_it_is_sent(server: str) -> None:
     given = ls.Surface(blocks=[block(4, (False, False))], metadata={"name": "given"})
-    made = sync.upload(
-        server,
-        given,
-        precision="0.1%",
-        attribute_precision={"heat": 0.5},
-        effort="small",
-        name="asked for",
-        closed="cols",
+    made = Client(server).upload(
+        given, precision="0.1%", attribute_precision={"heat": 0.5}, effort="small", name="asked for", closed="cols"
     )
     before = given.blocks[0]
     closed = ls.Block(before.points, (False, True), mask=before.mask, attributes=before.attributes)
@@ -123,7 +117,7 @@ def test_what_is_asked_for_is_done_before_it_is_sent(server: str) -> None:
     assert (made.details["name"], made.details["errors"]) == ("asked for", "told")
     assert (made.details["options"], made.details["closed"]) == ({}, [False, True])
     assert (given.metadata, given.closed) == ({"name": "given"}, (False, False))
-    made = sync.upload(server, given, rms=0.01)
+    made = Client(server).upload(given, rms=0.01)
     assert container_of(made) == ls.encode(given, rms=0.01)
 
 
@@ -136,14 +130,14 @@ def test_values_at_holes_are_told_in_the_container(server: str, before: Any, asy
     metadata = dict(given.metadata)
     note = "values of attributes at 3 holes of the points left out: slope"
     with pytest.warns(FormatWarning, match=f"^{note}$"):
-        made = asyncio.run(client.upload(server, given)) if asynchronous else sync.upload(server, given)
+        made = asyncio.run(asked(server, lambda it: it.upload(given))) if asynchronous else Client(server).upload(given)
     # What somebody says under this name is left alone.
     notes = before if isinstance(before, str) else [*(before or ()), note]
-    assert sync.describe(made.url).details["metadata"]["notes"] == made.details["metadata"]["notes"] == notes
+    assert Client(made.url).get(made.url).details["metadata"]["notes"] == made.details["metadata"]["notes"] == notes
     assert given.metadata == metadata
     # The note is not repeated: nothing is lost again.
     back = pulled(made.url)
-    assert container_of(sync.upload(server, back)) == container_of(made)
+    assert container_of(Client(server).upload(back)) == container_of(made)
 
 
 def test_a_note_that_has_no_room_is_a_warning_only(server: str) -> None:
@@ -151,7 +145,7 @@ def test_a_note_that_has_no_room_is_a_warning_only(server: str) -> None:
     given.attributes["slope"][12, 30:33] = 4
     given.metadata["long"] = "x" * (MAX_BYTES - len(packed({**given.metadata, "long": "", DIGEST: "0" * 64})) - 10)
     with pytest.warns(FormatWarning, match="at 3 holes"):
-        made = sync.upload(server, given)
+        made = Client(server).upload(given)
     assert "notes" not in made.details["metadata"]
 
 
@@ -170,7 +164,7 @@ ARRAYS: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("kind", ARRAYS)
 def test_arrays(server: str, kind: str) -> None:
     array = ARRAYS[kind]()
-    made = sync.upload(server, array, name=kind)
+    made = Client(server).upload(array, name=kind)
     assert container_of(made) == ls.encode(ls.Surface(array, metadata={"name": kind}))
     assert made.details["name"] == kind
     assert np.ma.allequal(pulled(made.url).points, np.ma.asarray(array))
@@ -184,7 +178,7 @@ def test_the_bytes_of_a_file_are_a_file(server: str) -> None:
     file = io.BytesIO()
     np.save(file, make_terrain(11, 12))
     data = file.getvalue()
-    ids = {sync.upload(server, source).id for source in (data, bytearray(data), memoryview(data), io.BytesIO(data))}
+    ids = {Client(server).upload(source).id for source in (data, bytearray(data), memoryview(data), io.BytesIO(data))}
     assert len(ids) == 1
 
 
@@ -208,7 +202,7 @@ def test_the_bytes_of_a_file_are_a_file(server: str) -> None:
 def test_other_sources_are_refused_in_words(source: Any, words: str, asynchronous: bool) -> None:
     def upload() -> Description:
         url = "http://127.0.0.1:9"
-        return asyncio.run(client.upload(url, source)) if asynchronous else sync.upload(url, source)
+        return asyncio.run(asked(url, lambda it: it.upload(source))) if asynchronous else Client(url).upload(source)
 
     with pytest.raises(InputError, match=f"expected.*{words}"):
         upload()
@@ -234,7 +228,7 @@ def test_options_that_have_no_place(terrain_file: Path) -> None:
         (InputError, "MessagePack", [ls.Surface(heights, metadata={"a": object()})], {}),
     ):
         with pytest.raises(error, match=words):
-            sync.upload(url, *sources, **options)
+            Client(url).upload(*sources, **options)
 
 
 def test_nothing_is_imported_for_files_that_only_memory_needs() -> None:
@@ -259,7 +253,7 @@ def test_who_gives_up_does_not_wait_for_the_encoder() -> None:
             here.call_soon_threadsafe(began.set)
 
         surface = ls.Surface(np.random.default_rng(3).normal(size=(900, 900, 3)))
-        task = asyncio.create_task(client.upload("http://127.0.0.1:9", surface, progress=progress))
+        task = asyncio.create_task(AsyncClient("http://127.0.0.1:9").upload(surface, progress=progress))
         await began.wait()
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -277,13 +271,13 @@ def test_push_sends_a_container_as_it_is(run: Run, server: str, container_file: 
     code, out, err = run("push", container_file, server, "--name", "as it is")
     assert (code, err) == (0, "")
     url = out.strip()
-    made = sync.describe(url)
+    made = Client(url).get(url)
     assert container_of(made) == container_file.read_bytes()
     assert (made.details["name"], made.details["metadata"]["name"]) == ("as it is", "terrain")
     assert made.details["filenames"] == [container_file.name]
     out = run("info", url)[1]
     assert "checked by the server" in out
-    assert sync.upload(server, container_file.read_bytes(), name="as it is").id == made.id
+    assert Client(server).upload(container_file.read_bytes(), name="as it is").id == made.id
 
 
 def test_info_says_whose_word_the_errors_are(run: Run, server: str, tmp_path: Path) -> None:
@@ -292,7 +286,7 @@ def test_info_says_whose_word_the_errors_are(run: Run, server: str, tmp_path: Pa
     code, out, _ = run("push", tmp_path / "near.lode", server)
     assert code == 0
     assert "stated by the uploader, not checked" in run("info", out.strip())[1]
-    shown = sync.describe(out.strip()).details["layers"][0]["max"]
+    shown = Client(server).get(out.strip()).details["layers"][0]["max"]
     assert shown == pytest.approx(3 * index_of(honest).layers[0].max_error, rel=1e-6)
 
 
@@ -324,7 +318,7 @@ def test_push_of_a_damaged_container(run: Run, server: str, container_file: Path
     assert "cut short (at byte" in err
     assert err.startswith("lodestream: cut.lode: expected ")
     with pytest.raises(RemoteError, match="at byte") as caught:
-        sync.upload(server, data[:3000] + b"?" + data[3001:])
+        Client(server).upload(data[:3000] + b"?" + data[3001:])
     assert caught.value.code == "failed"
     code, _, err = run("push", container_file, tmp_path / "cut.lode", server)
     assert code == 1
@@ -337,10 +331,10 @@ def test_what_was_pulled_can_be_uploaded_again(server: str) -> None:
     points = z.points.copy()
     points[3, 3] = np.inf
     given = ls.Surface(blocks=[ls.Block(points, z.closed, mask=z.mask, attributes=z.attributes)])
-    first = sync.upload(server, given)
+    first = Client(server).upload(given)
     back = pulled(first.url)
     assert back.joints is not None
-    again = sync.upload(server, back, name="again")
+    again = Client(server).upload(back, name="again")
     local = ls.decode(container_of(first))
     local.metadata["name"] = "again"
     assert container_of(again) == ls.encode(local)

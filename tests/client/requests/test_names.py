@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-import lodestream_client
 from lodestream.errors import LodestreamError, NotFoundError, OptionError, RemoteError, RemoteProtocolError
-from lodestream_client import UnreachableError, sync
+from lodestream_client import Client, UnreachableError
 from lodestream_client.program import main
 from lodestream_client.requests import addresses, calls
-from lodestream_client.requests.calls import client_options
 from tests.client.scripted import Answer, Asked, document, problem, redirect, scripted
+
+from ..asked import asked
 
 ID = "0123456789abcdef0123"
 SURFACE: dict[str, Any] = {"id": ID, "url": f"/maps/v1/surfaces/{ID}", "state": "ready"}
@@ -51,10 +51,10 @@ def test_addresses() -> None:
 def test_a_name_leads_to_its_surface_in_one_request() -> None:
     with scripted(lambda asked: document(SURFACE)) as server:
         surface = server.url + SURFACE["url"]
-        described = sync.describe(server.url + NAME, token="secret")
+        described = Client(server.url + NAME, token="secret").get(server.url + NAME)
         assert (described.url, described.id) == (surface, ID)
-        assert sync.locate(server.url + NAME) == surface
-        assert asyncio.run(lodestream_client.locate(server.url + NAME)) == surface
+        assert Client(server.url + NAME).locate(server.url + NAME) == surface
+        assert asyncio.run(asked(server.url + NAME, lambda it: it.locate(server.url + NAME))) == surface
         assert [(asked.method, asked.path) for asked in server.asked] == [("GET", NAME)] * 3
         assert server.tokens == {"Bearer secret", None}
 
@@ -66,17 +66,21 @@ def test_an_answer_that_leads_elsewhere_is_not_followed(url: Any) -> None:
     with scripted(lambda asked: document({**SURFACE, "url": url})) as server:
         if url == "":  # it says its id, which is no id of a surface of this server
             server.script = lambda asked: document({"id": 3, "state": "ready"})
-        for ask in (sync.describe, sync.locate, sync.identify):
+        client = Client(server.url)
+        for ask in (client.get, client.locate, client.identify):
             with pytest.raises(RemoteProtocolError):
                 ask(server.url + NAME)
-        with pytest.raises(RemoteProtocolError), sync.connect(server.url + NAME) as stream:
+        with pytest.raises(RemoteProtocolError), Client(server.url + NAME).connect(server.url + NAME) as stream:
             list(stream)
         assert {asked.path for asked in server.asked} == {NAME}
 
 
 def test_a_name_that_leads_nowhere_is_told_once(capsys: pytest.CaptureFixture[str], tmp_path: Any) -> None:
     with scripted(lambda asked: problem(404, "not-found", "expected a name on this server, got dem")) as server:
-        with pytest.raises(NotFoundError, match="a name on this server"), sync.connect(server.url + NAME) as stream:
+        with (
+            pytest.raises(NotFoundError, match="a name on this server"),
+            Client(server.url + NAME).connect(server.url + NAME) as stream,
+        ):
             list(stream)
         assert main(["pull", server.url + NAME, str(tmp_path / "out.npy")]) == 1
         assert capsys.readouterr().err.count("a name on this server") == 1
@@ -103,9 +107,9 @@ class Uploads:
 def test_an_upload_that_replaces_what_a_name_leads_to() -> None:
     with scripted(Uploads(document(SURFACE))) as server:
         url = f"{server.url}/maps"
-        surface = sync.upload(url, b"data", name="dem", replace=True, token="secret")
+        surface = Client(url, token="secret").upload(b"data", name="dem", replace=True)
         assert surface.url == server.url + SURFACE["url"]
-        asyncio.run(lodestream_client.upload(url, b"data", name="dem", replace=True))
+        asyncio.run(asked(url, lambda it: it.upload(b"data", name="dem", replace=True)))
         posts = [place for place, asked in enumerate(server.asked) if asked.method == "POST"]
         assert json.loads(server.asked[posts[0] - 1].body) == {"surface": None}, "whether it may"
         puts = [place for place, asked in enumerate(server.asked) if asked.method == "PUT" and ID in str(asked.body)]
@@ -117,32 +121,39 @@ def test_an_upload_that_replaces_what_a_name_leads_to() -> None:
         for wrong in ({"name": None}, {"name": "a b"}, {"wait": False}):
             given: dict[str, Any] = {"name": "dem", "replace": True, **wrong}
             with pytest.raises(OptionError):
-                sync.upload(url, b"data", **given)
+                Client(url).upload(b"data", **given)
         assert not [asked for asked in server.asked if asked.method != "GET"], "nothing is sent before"
+
+
+def _replaced(url: str, asynchronous: bool) -> None:
+    if asynchronous:
+        asyncio.run(asked(url, lambda it: it.upload(b"data", name="dem", replace=True)))
+    else:
+        Client(url).upload(b"data", name="dem", replace=True)
 
 
 @pytest.mark.long
 def test_a_name_of_another_owner_and_a_redirect_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
     # For the answer that never comes whole.
-    monkeypatch.setattr(calls, "client_options", lambda url, _, **more: client_options(url, 2.0, **more))
+    monkeypatch.setattr(calls, "TIMEOUT", 2.0)
     refusal = problem(403, "not-owner", "expected the owner of the name dem")
     with scripted(Uploads(refusal, refusal)) as server:
         url = f"{server.url}/maps"
         with pytest.raises(RemoteError, match="owner of the name dem"):
-            sync.upload(url, b"data", name="dem", replace=True)
+            Client(url).upload(b"data", name="dem", replace=True)
         assert "POST" not in {asked.method for asked in server.asked}, "nothing is left behind"
         # If it was changed meanwhile, or there is no connection any more, what is stored is told.
         stored = f"; the surface is stored, as {server.url}{SURFACE['url']}"
         for answer in (refusal, Answer(200, b"", {"Content-Length": "9"})):
             server.script = Uploads(answer)
-            for upload in (sync.upload, lambda *given, **more: asyncio.run(lodestream_client.upload(*given, **more))):
+            for asynchronous in (False, True):
                 with pytest.raises(LodestreamError) as caught:
-                    upload(url, b"data", name="dem", replace=True)
+                    _replaced(url, asynchronous)
                 assert str(caught.value).endswith(stored)
             assert isinstance(caught.value, RemoteError if answer is refusal else UnreachableError)
         server.script = Uploads(redirect("http://127.0.0.1:1/v1/names/dem"))
         with pytest.raises(RemoteProtocolError, match="which is not followed"):
-            sync.upload(f"{server.url}/maps", b"data", name="dem", replace=True)
+            Client(f"{server.url}/maps").upload(b"data", name="dem", replace=True)
 
 
 def test_the_command_prints_the_address_that_stays(
@@ -188,7 +199,7 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["list", url, "--names", "--json", "--search", "HILL"]) == 0
         told = {**names[1], "url": f"{url}/v1/names/hills"}
         assert json.loads(capsys.readouterr().out) == {"names": [told]}
-        assert asyncio.run(lodestream_client.list_names(url))[1] == told
+        assert asyncio.run(asked(url, lambda it: it.list_names()))[1] == told
         assert main(["list", url, "--names", "--search", "valley"]) == 0
         assert "no such names" in capsys.readouterr().err
         with pytest.raises(SystemExit):
@@ -196,7 +207,7 @@ def test_names_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         for wrong in ({}, {"name": "a"}, {"name": "a", "url": NAME, "surface": 3}, 3):
             server.script = lambda asked, wrong=wrong: document({"names": [wrong]})  # type: ignore[misc]
             with pytest.raises(RemoteProtocolError, match="names"):
-                sync.list_names(url)
+                Client(url).list_names()
 
 
 def test_rm_deletes_a_name() -> None:

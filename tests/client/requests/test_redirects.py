@@ -12,11 +12,11 @@ import httpx
 import pytest
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.errors import RemoteProtocolError
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.requests import addresses, calls
 
+from ..asked import asked
 from ..conftest import Run
 from ..files import ranged
 from ..scripted import Answer, Asked, Script, Scripted, document, problem, redirect, scripted
@@ -41,15 +41,16 @@ def to(other: Callable[[], Scripted]) -> Script:
 
 
 def ask(url: str, asynchronous: bool, **options: Any) -> None:
-    options = {"close_timeout": 0.2, "deadline": 0, "token": TOKEN, **options}
+    token = options.pop("token", TOKEN)
+    options = {"close_timeout": 0.2, "deadline": 0, **options}
     if not asynchronous:
-        with sync.connect(url, **options) as stream:
+        with Client(url, token=token).connect(url, **options) as stream:
             for _ in stream:
                 pass
         return
 
     async def loop() -> None:
-        async with client.connect(url, **options) as stream:
+        async with AsyncClient(url, token=token) as client, client.connect(url, **options) as stream:
             async for _ in stream:
                 pass
 
@@ -80,12 +81,14 @@ def test_a_stream_takes_no_token_to_another_origin(asynchronous: bool, transport
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2"], ids=["another port", "another host"])
 def test_nor_does_any_other_question(host: str) -> None:
     calls: list[Callable[[str], Any]] = [
-        lambda url: sync.describe(f"{url}/v1/surfaces/ab", token=TOKEN),
-        lambda url: asyncio.run(client.describe(f"{url}/v1/surfaces/ab", token=TOKEN)),
-        lambda url: sync.identify(f"{url}/v1/surfaces/ab", token=TOKEN),
-        lambda url: sync.fetch_range(f"{url}/v1/surfaces/ab", 0, 10, token=TOKEN),
-        lambda url: sync.list_surfaces(url, token=TOKEN),
-        lambda url: sync.describe_file(f"{url}/a.lode", token=TOKEN),
+        lambda url: Client(f"{url}/v1/surfaces/ab", token=TOKEN).get(f"{url}/v1/surfaces/ab"),
+        lambda url: asyncio.run(
+            asked(f"{url}/v1/surfaces/ab", lambda it: it.get(f"{url}/v1/surfaces/ab"), token=TOKEN)
+        ),
+        lambda url: Client(f"{url}/v1/surfaces/ab", token=TOKEN).identify(f"{url}/v1/surfaces/ab"),
+        lambda url: Client(f"{url}/v1/surfaces/ab", token=TOKEN).fetch_range(f"{url}/v1/surfaces/ab", 0, 10),
+        lambda url: Client(url, token=TOKEN).list(),
+        lambda url: Client(f"{url}/a.lode", token=TOKEN).describe_file(f"{url}/a.lode"),
     ]
     uses = ["/v1/surfaces/ab"] * 4 + ["", "/a.lode"]
     for call, use in zip(calls, uses, strict=True):
@@ -146,9 +149,13 @@ def test_a_token_for_http_is_not_one_for_https(landed: str) -> None:
 
     given = "http://localhost"
     call = calls.Call("GET", f"{given}/v1/surfaces")
-    options = {**calls.client_options(given), "transport": httpx.MockTransport(answer)}
-    with httpx.Client(**options) as http:
-        http.request(**calls.request_options(call, given, TOKEN))
+    options = {**calls.client_options(given, direct=True), "transport": httpx.MockTransport(answer)}
+
+    async def request() -> None:
+        async with httpx.AsyncClient(**options) as http:
+            await http.request(**calls.request_options(call, given, TOKEN))
+
+    asyncio.run(request())
     assert shown == [SHOWN, None]
 
 
@@ -194,9 +201,9 @@ def test_addresses_that_are_none(location: str) -> None:
 
     with scripted(script) as server:
         with pytest.raises(RemoteProtocolError, match="expected an address from"):
-            sync.list_surfaces(server.url)
+            Client(server.url).list()
         with pytest.raises(RemoteProtocolError, match="expected an address from"):
-            sync.upload(server.url, b"x")
+            Client(server.url).upload(b"x")
 
 
 @pytest.mark.parametrize(

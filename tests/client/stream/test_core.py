@@ -397,7 +397,7 @@ def test_while_somebody_looks_at_a_view_the_server_is_not_silent() -> None:
 
 
 def test_the_keywords_of_connect_are_its_options() -> None:
-    assert list(ConnectKeywords.__annotations__) == [field.name for field in fields(ConnectOptions)]
+    assert [*ConnectKeywords.__annotations__, "token"] == [field.name for field in fields(ConnectOptions)]
     assert len(fields(ConnectOptions)) == 14
 
 

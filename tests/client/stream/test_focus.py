@@ -16,7 +16,7 @@ import lodestream as ls
 from lodestream.errors import OptionError
 from lodestream.target import Region
 from lodestream.transfer.receiver_state import MemoryStore
-from lodestream_client import aio, sync
+from lodestream_client import AsyncClient, AsyncStream, Client, Stream
 from lodestream_client.stream import reconnecting
 from tests.links import Fault, linked
 
@@ -41,14 +41,14 @@ def heights() -> Heights:
 
 @pytest.fixture(scope="module")
 def surface(server: str, heights: Heights) -> str:
-    return sync.upload(server, ls.Surface(heights)).url
+    return Client(server).upload(ls.Surface(heights)).url
 
 
 def container(surface: str) -> bytes:
     return httpx.get(f"{surface}/container", follow_redirects=True).content
 
 
-def check(stream: sync.Stream | aio.Stream, surface: str, heights: Heights) -> None:
+def check(stream: Stream | AsyncStream, surface: str, heights: Heights) -> None:
     assert stream.ended == "complete"
     assert np.array_equal(stream.decoder.surface().points, heights)
     assert stream.received == stream.planned == stream.decoder.bytes
@@ -65,9 +65,9 @@ def near_first(views: list[ls.View], region: Region, heights: Heights) -> float:
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_what_is_looked_at_comes_first(surface: str, heights: Heights, transport: reconnecting.Transport) -> None:
-    with sync.connect(surface, transport=transport) as plain:
+    with Client(surface).connect(surface, transport=transport) as plain:
         assert near_first(list(plain), NEAR, heights) > 0.8
-    with sync.connect(surface, transport=transport, window=4096) as stream:
+    with Client(surface).connect(surface, transport=transport, window=4096) as stream:
         stream.focus(NEAR)
         views = list(stream)
     check(stream, surface, heights)
@@ -79,8 +79,8 @@ def test_what_is_looked_at_comes_first(surface: str, heights: Heights, transport
 def test_what_is_looked_at_comes_first_for_asyncio(
     surface: str, heights: Heights, transport: reconnecting.Transport
 ) -> None:
-    async def run() -> tuple[aio.Stream, list[ls.View]]:
-        async with aio.connect(surface, transport=transport, window=4096) as stream:
+    async def run() -> tuple[AsyncStream, list[ls.View]]:
+        async with AsyncClient(surface) as client, client.connect(surface, transport=transport, window=4096) as stream:
             views = [await anext(stream)]
             await stream.focus(FAR)
             views += [view async for view in stream]
@@ -102,7 +102,7 @@ def test_looking_here_and_there_over_a_link_that_breaks(
     def fault(number: int) -> Fault:
         return Fault(cut_down=lengths[number]) if number < len(lengths) else Fault()
 
-    with linked(surface, fault) as link, sync.connect(link.url, transport=transport, window=4096) as stream:
+    with linked(surface, fault) as link, Client(link.url).connect(link.url, transport=transport, window=4096) as stream:
         for number, _ in enumerate(stream):
             if number % 3 == 0:
                 stream.focus(random.choice([NEAR, FAR, None]))
@@ -112,7 +112,7 @@ def test_looking_here_and_there_over_a_link_that_breaks(
 
 
 def test_looking_elsewhere_from_another_thread(surface: str, heights: Heights) -> None:
-    with sync.connect(surface, window=4096) as stream:
+    with Client(surface).connect(surface, window=4096) as stream:
         over = threading.Event()
 
         def look() -> None:
@@ -135,16 +135,20 @@ def test_what_is_kept_on_disk_is_not_sent_again(surface: str, heights: Heights) 
         def used(self, offset: int, length: int) -> None:
             """Forget nothing."""
 
-    store, known = Kept(), sync.identify(surface)
+    store, known = Kept(), Client(surface).identify(surface)
     assert known.size is not None
-    with sync.connect(surface, window=4096, store=store, container=known.container_sha256, size=known.size) as first:
+    with Client(surface).connect(
+        surface, window=4096, store=store, container=known.container_sha256, size=known.size
+    ) as first:
         for view in first:
             first.focus(FAR)
             if view.number > 9:
                 break
     held = store.ranges.total
     assert 0 < held < known.size / 2
-    with sync.connect(surface, window=4096, store=store, container=known.container_sha256, size=known.size) as second:
+    with Client(surface).connect(
+        surface, window=4096, store=store, container=known.container_sha256, size=known.size
+    ) as second:
         second.focus(NEAR)
         for _ in second:
             pass
@@ -154,7 +158,7 @@ def test_what_is_kept_on_disk_is_not_sent_again(surface: str, heights: Heights) 
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_a_region_that_is_not_there(surface: str, transport: reconnecting.Transport) -> None:
-    with sync.connect(surface, transport=transport, window=4096) as stream:
+    with Client(surface).connect(surface, transport=transport, window=4096) as stream:
         next(stream)
         with pytest.raises(OptionError, match="expected rows within 0:420"):
             stream.focus(((0, 421), (0, 1)))
@@ -164,8 +168,8 @@ def test_a_region_that_is_not_there(surface: str, transport: reconnecting.Transp
 def test_a_surface_of_several_blocks_has_no_regions(server: str, tmp_path: Path) -> None:
     sheet = np.random.default_rng(1).normal(size=(30, 30, 3))
     ls.write(ls.Surface(blocks=[ls.Block(sheet), ls.Block(sheet + 9)]), tmp_path / "sheets.obj")
-    blocks = sync.upload(server, tmp_path / "sheets.obj").url
-    with sync.connect(blocks, window=500) as stream:
+    blocks = Client(server).upload(tmp_path / "sheets.obj").url
+    with Client(blocks).connect(blocks, window=500) as stream:
         next(stream)
         with pytest.raises(OptionError, match="expected a surface of one block for a region, got 2 blocks"):
             stream.focus(NEAR)

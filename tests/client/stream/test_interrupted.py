@@ -23,8 +23,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-import lodestream_client as client
-from lodestream_client import sync
+from lodestream_client import AsyncClient, AsyncStream, Client, Stream
 from lodestream_client.__main__ import main
 from lodestream_client.stream import cache
 from lodestream_client.stream.reconnecting import Transport
@@ -92,7 +91,7 @@ def relief_file(relief: Terrain, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="session")
 def relief_surface(server: str, relief_file: Path) -> str:
-    return sync.upload(server, relief_file, name="relief").url
+    return Client(server).upload(relief_file, name="relief").url
 
 
 @pytest.fixture
@@ -227,7 +226,7 @@ def test_a_server_that_is_killed(relief_file: Path, folder: Path, tmp_path: Path
     out = tmp_path / "o.npy"
     server = Server(tmp_path / "data")
     try:
-        url = sync.upload(server.url, relief_file).url
+        url = Client(server.url).upload(relief_file).url
         with command("pull", url, out, "--json", "--limit-rate", RATE, "--retry", "1") as process:
             until(lambda: kept(folder) > CAME, process)
             server.kill()
@@ -263,7 +262,7 @@ def test_below_the_first_layer_nothing_is_written(
     after = 400
     if transport == "http":
         with linked(relief_surface, Fault()) as link:
-            sync.fetch_range(link.url, 0, 10)
+            Client(link.url).fetch_range(link.url, 0, 10)
         after = link.down + 20
     with linked(relief_surface, lost(after)) as link:
         code, stdout, stderr = run("pull", link.url, out, "--json", "--retry", "0", "--transport", transport)
@@ -415,7 +414,7 @@ def test_a_disk_that_is_full(
 
 
 def test_two_pulls_of_one_surface(surface: str, terrain: Terrain, folder: Path, tmp_path: Path, run: Run) -> None:
-    identity = sync.identify(surface)
+    identity = Client(surface).identify(surface)
     assert identity.name is not None
     assert identity.size is not None
     out = tmp_path / "o.npy"
@@ -458,8 +457,8 @@ def test_a_stream_that_lost_its_server_has_what_came(
     errors: list[ls.LodestreamError] = []
     options: dict[str, Any] = {"transport": transport, "deadline": 0, "window": 4000}
 
-    def follow(url: str) -> sync.Stream:
-        with sync.connect(url, **options) as stream:
+    def follow(url: str) -> Stream:
+        with Client(url).connect(url, **options) as stream:
             try:
                 for view in stream:
                     views.append(view)  # noqa: PERF402  (what came before the error counts)
@@ -467,8 +466,8 @@ def test_a_stream_that_lost_its_server_has_what_came(
                 errors.append(error)
         return stream
 
-    async def follow_async(url: str) -> client.Stream:
-        async with client.connect(url, **options) as stream:
+    async def follow_async(url: str) -> AsyncStream:
+        async with AsyncClient(url) as client, client.connect(url, **options) as stream:
             try:
                 async for view in stream:
                     views.append(view)  # noqa: PERF401  (as above)
@@ -500,11 +499,14 @@ def test_what_a_stream_gives_to_a_sink(surface: str, container_file: Path) -> No
 
         with (
             linked(surface, lambda number: Fault(cut_down=9000 if number == 0 else None)) as link,
-            sync.connect(link.url, transport=transport, sink=take) as stream,
+            Client(link.url).connect(link.url, transport=transport, sink=take) as stream,
         ):
             list(stream)
             identity = stream.identity
-        assert (identity.container_sha256, identity.size) == (sync.identify(surface).container_sha256, len(content))
+        assert (identity.container_sha256, identity.size) == (
+            Client(surface).identify(surface).container_sha256,
+            len(content),
+        )
         covered = sum(length for _, length in seen)
         assert covered == len(set().union(*(range(o, o + n) for o, n in seen))), "nothing twice"
         assert all(found[o : o + n] == content[o : o + n] for o, n in seen)

@@ -17,7 +17,7 @@ from lodestream.protocol.flow_control import FIRST_WINDOW
 from lodestream.protocol.handshake import from_address
 from lodestream.protocol.messages import BASE_CREDIT, Open
 from lodestream.protocol.wire import parse
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_client.errors import SilenceError
 from lodestream_client.requests import addresses
 from lodestream_client.stream import known_windows, session
@@ -43,7 +43,7 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> KnownWindows:
 @pytest.fixture(scope="module")
 def large(server: str) -> str:
     """A surface of several windows."""
-    return sync.upload(server, Surface(make_terrain(400, 300))).url
+    return Client(server).upload(Surface(make_terrain(400, 300))).url
 
 
 @pytest.fixture
@@ -187,15 +187,15 @@ def test_a_server_that_falls_silent_is_met_with_a_small_window(
     large: str, windows: KnownWindows, credits: list[int]
 ) -> None:
     with linked(large, lambda number: Fault(delay=0.05, cut_down=20_000 if number == 1 else None, vanish=True)) as link:
-        with sync.connect(link.url, transport="ws") as stream:
+        with Client(link.url).connect(link.url, transport="ws") as stream:
             assert [view.complete for view in stream][-1]
         with (
             pytest.raises(SilenceError),
-            sync.connect(link.url, transport="ws", silence=0.5, deadline=0.0) as stream,
+            Client(link.url).connect(link.url, transport="ws", silence=0.5, deadline=0.0) as stream,
         ):
             for _ in stream:
                 pass
-        with sync.connect(link.url, transport="ws") as stream:
+        with Client(link.url).connect(link.url, transport="ws") as stream:
             assert [view.complete for view in stream][-1]
     assert credits[0] == credits[2] == FIRST_WINDOW
     assert credits[1] > FIRST_WINDOW
@@ -205,7 +205,7 @@ def test_a_fixed_window_is_neither_remembered_nor_replaced(
     large: str, windows: KnownWindows, credits: list[int]
 ) -> None:
     windows.remember(large, 200_000, time.monotonic())
-    with sync.connect(large, transport="ws", window=20_000) as stream:
+    with Client(large).connect(large, transport="ws", window=20_000) as stream:
         assert [view.complete for view in stream][-1]
     assert credits == [20_000]
     assert windows.first(large, time.monotonic()) == 200_000

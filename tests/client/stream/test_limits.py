@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-import lodestream_client as client
-from lodestream_client import sync
+from lodestream_client import Client
 
+from ..asked import asked
 from ..conftest import Run
 from ..files import ranged
 from .test_resume import Terrain, follow
@@ -65,7 +65,12 @@ def test_info_needs_no_memory_for_a_surface(tmp_path: Path, run: Run) -> None:
             code, stdout, stderr = run("info", what, "--max-vertices", 1_000_000)
             assert (code, stderr) == (0, "")
             assert "2000 x 2000" in stdout
-        assert sync.describe_file(f"{web.url}/{path.name}", max_vertices=10)["shape"] == [2000, 2000]
-        found = asyncio.run(client.describe_file(f"{web.url}/{path.name}", max_vertices=10))
+        assert Client(f"{web.url}/{path.name}").describe_file(f"{web.url}/{path.name}", max_vertices=10)["shape"] == [
+            2000,
+            2000,
+        ]
+        found = asyncio.run(
+            asked(f"{web.url}/{path.name}", lambda it: it.describe_file(f"{web.url}/{path.name}", max_vertices=10))
+        )
         assert found["shape"] == [2000, 2000]
         assert run("pull", f"{web.url}/{path.name}", tmp_path / "o.npy", "--max-vertices", 1_000_000)[0] == 1

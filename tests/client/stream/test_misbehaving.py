@@ -15,11 +15,12 @@ from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.errors import ProtocolError, RemoteProtocolError
 from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, SUBPROTOCOL, Bye, End, Error, Opened, Segments
 from lodestream.protocol.wire import serialize
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client, SilenceError
+
+from ..asked import asked
 
 Behaviour = Callable[[ServerConnection], None]
 HEADER = serialize(Opened("ab" * 32, 10_000, 5000, 1.0, (6000, 100), (5000, 100), True))
@@ -68,13 +69,13 @@ def tcp_server(answer: bytes) -> Iterator[str]:
 def follow(url: str, asynchronous: bool, **chosen: Any) -> None:
     options: dict[str, Any] = {"close_timeout": 0.2, "deadline": 0, "transport": "ws", **chosen}
     if not asynchronous:
-        with sync.connect(url, **options) as stream:
+        with Client(url).connect(url, **options) as stream:
             for _ in stream:
                 pass
         return
 
     async def loop() -> None:
-        async with client.connect(url, **options) as stream:
+        async with AsyncClient(url) as client, client.connect(url, **options) as stream:
             async for _ in stream:
                 pass
 
@@ -109,7 +110,7 @@ def asynchronous(request: pytest.FixtureRequest) -> bool:
 
 @pytest.mark.parametrize("first", [(), (HEADER,)])
 def test_silence(asynchronous: bool, first: tuple[bytes, ...]) -> None:
-    with websocket_server(says(*first)) as url, pytest.raises(client.SilenceError, match=r"nothing for 0\.2 seconds"):
+    with websocket_server(says(*first)) as url, pytest.raises(SilenceError, match=r"nothing for 0\.2 seconds"):
         follow(url, asynchronous, silence=0.2)
 
 
@@ -271,9 +272,9 @@ def test_what_is_no_lodestream_server(asynchronous: bool, answer: bytes, kind: t
 def test_http_answers_that_are_none(answer: bytes, kind: type[Exception], words: str) -> None:
     with tcp_server(answer) as url:
         with pytest.raises(kind, match=words):
-            sync.list_surfaces(url)
+            Client(url).list()
         with pytest.raises(kind, match=words):
-            asyncio.run(client.list_surfaces(url))
+            asyncio.run(asked(url, lambda it: it.list()))
 
 
 def test_a_range_that_is_ignored_is_not_obeyed() -> None:
@@ -281,11 +282,11 @@ def test_a_range_that_is_ignored_is_not_obeyed() -> None:
         tcp_server(b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nwhole") as url,
         pytest.raises(RemoteProtocolError, match="Range is not supported"),
     ):
-        sync.fetch_range(f"{url}/v1/surfaces/ab", 0, 2)
+        Client(f"{url}/v1/surfaces/ab").fetch_range(f"{url}/v1/surfaces/ab", 0, 2)
 
 
 def test_silence_is_settable_and_positive() -> None:
-    stream = client.connect("http://127.0.0.1:9/v1/surfaces/ab", silence=5.0)
+    stream = AsyncClient("http://127.0.0.1:9").connect("ab", silence=5.0)
     stream.silence = 0.5
     assert stream.silence == 0.5
     with pytest.raises(ValueError, match="positive"):

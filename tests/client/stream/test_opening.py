@@ -18,16 +18,14 @@ from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.protocol.handshake import from_address
 from lodestream.protocol.messages import BASE_CREDIT, SUBPROTOCOL, Bye, End, Event, Open, Opened, Segments
 from lodestream.protocol.wire import parse, serialize
 from lodestream.transfer.receiver_state import MemoryStore
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.stream import effects, reconnecting
-from lodestream_client.stream.aio_io import AsyncIO
+from lodestream_client.stream.effect_io import EffectIO
 from lodestream_client.stream.stream import BaseStream
-from lodestream_client.stream.sync_io import SyncIO
 from tests.links import Fault, Link, linked
 
 Terrain = NDArray[np.float32]
@@ -56,20 +54,16 @@ class Dialled:
 def dialled(monkeypatch: pytest.MonkeyPatch) -> list[Dialled]:
     """All handshakes of a test's streams."""
     found: list[Dialled] = []
-    plain, other = SyncIO._dial, AsyncIO._dial
+    plain = EffectIO._dial
 
     def note(asked: effects.Dial, answer: effects.Dialled) -> effects.Dialled:
         found.append(Dialled(opening_of(asked.url), answer.subprotocol))
         return answer
 
-    def dial(self: SyncIO, asked: effects.Dial) -> effects.Dialled:
-        return note(asked, plain(self, asked))
+    async def dial(self: EffectIO, asked: effects.Dial) -> effects.Dialled:
+        return note(asked, await plain(self, asked))
 
-    async def dial_later(self: AsyncIO, asked: effects.Dial) -> effects.Dialled:
-        return note(asked, await other(self, asked))
-
-    monkeypatch.setattr(SyncIO, "_dial", dial)
-    monkeypatch.setattr(AsyncIO, "_dial", dial_later)
+    monkeypatch.setattr(EffectIO, "_dial", dial)
     return found
 
 
@@ -85,11 +79,11 @@ def opening_of(url: str) -> Open | None:
 def follow(url: str, asynchronous: bool, **options: Any) -> tuple[list[ls.View], BaseStream]:
     options = {"close_timeout": 0.5, "transport": "ws", **options}
     if not asynchronous:
-        with sync.connect(url, **options) as stream:
+        with Client(url).connect(url, **options) as stream:
             return list(stream), stream
 
     async def loop() -> tuple[list[ls.View], BaseStream]:
-        async with client.connect(url, **options) as stream:
+        async with AsyncClient(url) as client, client.connect(url, **options) as stream:
             return [view async for view in stream], stream
 
     return asyncio.run(loop())
@@ -165,8 +159,8 @@ def test_what_is_held_goes_with_it_after_a_break(
 def test_what_is_too_long_for_an_address_goes_as_a_message(
     surface: str, terrain: Terrain, asynchronous: bool, dialled: list[Dialled]
 ) -> None:
-    details = sync.describe(surface).details
-    stored, known = sync.fetch_range(surface, 0, int(details["bytes"])), str(details["container_sha256"])
+    details = Client(surface).get(surface).details
+    stored, known = Client(surface).fetch_range(surface, 0, int(details["bytes"])), str(details["container_sha256"])
     store = MemoryStore()
     for offset in range(0, 12_000, 20):
         store.write(offset, stored[offset : offset + 10])
@@ -182,7 +176,11 @@ def test_a_stop_while_a_connection_is_being_made_is_obeyed(surface: str, asynchr
         return Fault(cut_down=5000) if number == 0 else Fault(delay=0.4)
 
     async def loop() -> BaseStream:
-        async with Link(surface, fault) as link, client.connect(link.url, window=2000, transport="ws") as stream:
+        async with (
+            Link(surface, fault) as link,
+            AsyncClient(link.url) as client,
+            client.connect(link.url, window=2000, transport="ws") as stream,
+        ):
             views = aiter(stream)
             await anext(views)
 
@@ -199,7 +197,7 @@ def test_a_stop_while_a_connection_is_being_made_is_obeyed(surface: str, asynchr
             return stream
 
     def plain() -> BaseStream:
-        with linked(surface, fault) as link, sync.connect(link.url, window=2000, transport="ws") as stream:
+        with linked(surface, fault) as link, Client(link.url).connect(link.url, window=2000, transport="ws") as stream:
             next(stream)
 
             def stop() -> None:

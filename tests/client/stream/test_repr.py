@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import lodestream as ls
-from lodestream_client import sync
+from lodestream_client import Client
 
 
 def test_a_stream_shows_what_has_come_and_its_last_view(surface: str) -> None:
-    with sync.connect(surface, target=ls.Target(level=3)) as stream:
+    with Client(surface).connect(surface, target=ls.Target(level=3)) as stream:
         before = stream._repr_html_()
         for _ in stream:
             pass

@@ -20,9 +20,8 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.transfer.receiver_state import MemoryStore
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client, UnreachableError
 from lodestream_client.stream import cache, reconnecting
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, Link, linked
@@ -47,11 +46,11 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 def follow(url: str, asynchronous: bool, **options: Any) -> tuple[list[ls.View], BaseStream]:
     options = {"close_timeout": 0.5, **options}
     if not asynchronous:
-        with sync.connect(url, **options) as stream:
+        with Client(url).connect(url, **options) as stream:
             return list(stream), stream
 
     async def loop() -> tuple[list[ls.View], BaseStream]:
-        async with client.connect(url, **options) as stream:
+        async with AsyncClient(url) as client, client.connect(url, **options) as stream:
             return [view async for view in stream], stream
 
     return asyncio.run(loop())
@@ -99,7 +98,7 @@ def test_another_address_goes_on_with_what_is_held(surface: str, terrain: Terrai
     store = MemoryStore()
     with linked(surface, breaks_after(5000)) as one, pytest.raises(ls.TruncatedStreamError):
         follow(one.url, asynchronous, window=2000, store=store, deadline=0, transport="ws")
-    details = sync.describe(surface).details
+    details = Client(surface).get(surface).details
     container, size = str(details["container_sha256"]), int(details["bytes"])
     with linked(surface, Fault()) as other:
         views, stream = follow(other.url, asynchronous, store=store, container=container, size=size)
@@ -119,7 +118,7 @@ def test_a_connection_that_falls_silent_is_replaced(surface: str, terrain: Terra
 def test_after_the_deadline_the_last_error_is_raised(surface: str, asynchronous: bool, transport: str) -> None:
     with (
         linked(surface, lambda number: Fault(cut_down=5000) if number == 0 else LATER) as link,
-        pytest.raises((client.UnreachableError, ls.TruncatedStreamError, ls.LodestreamError)),
+        pytest.raises((UnreachableError, ls.TruncatedStreamError, ls.LodestreamError)),
     ):
         follow(link.url, asynchronous, deadline=0.5, transport=transport)
     assert link.connections > 1
@@ -135,27 +134,32 @@ def test_without_a_deadline_nothing_is_replaced(surface: str, asynchronous: bool
 
 
 def test_where_nobody_listens_it_is_told_soon(asynchronous: bool) -> None:
-    with pytest.raises(client.UnreachableError, match="no connection"):
+    with pytest.raises(UnreachableError, match="no connection"):
         follow("http://127.0.0.1:9/v1/surfaces/ab", asynchronous)
 
 
 def test_stopping_while_there_is_no_connection(surface: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("random.uniform", lambda least, most: 500.0)
     with linked(surface, lambda number: Fault(cut_down=5000) if number == 0 else LATER) as link:
-        with sync.connect(link.url, deadline=1000, window=2000, close_timeout=0.2, transport="ws") as stream:
+        with Client(link.url).connect(
+            link.url, deadline=1000, window=2000, close_timeout=0.2, transport="ws"
+        ) as stream:
             next(stream)
             stopping = threading.Timer(0.5, stream.stop)
             stopping.start()
             list(stream)
             stopping.join()
         assert stream.ended == "stopped"
-        with sync.connect(surface, target=ls.Target(seconds=0.3), limit_rate=4000.0, deadline=1000) as stream:
+        with Client(surface).connect(
+            surface, target=ls.Target(seconds=0.3), limit_rate=4000.0, deadline=1000
+        ) as stream:
             list(stream)
         assert stream.ended == "seconds"
 
     async def late() -> str | None:
         async with (
             Link(surface, lambda number: Fault(cut_down=5000) if number == 0 else LATER) as link,
+            AsyncClient(link.url) as client,
             client.connect(link.url, target=ls.Target(seconds=0.6), window=2000, deadline=1000) as stream,
         ):
             async for _ in stream:
@@ -202,7 +206,7 @@ def test_a_wish_that_cannot_be_met_is_told_at_once(surface: str, asynchronous: b
 )
 def test_options_that_do_not_exist(surface: str, options: dict[str, Any], words: str) -> None:
     with pytest.raises(ls.OptionError, match=words):
-        sync.connect(**{"url": surface, **options})
+        Client(surface).connect(surface, **options)
 
 
 # On disk.
@@ -296,7 +300,7 @@ def test_a_pull_that_is_killed_is_gone_on_with(
 
 
 def test_two_pulls_do_not_write_the_same_file(run: Run, surface: str, folder: Path, tmp_path: Path) -> None:
-    identity = sync.identify(surface)
+    identity = Client(surface).identify(surface)
     assert identity.name is not None
     assert identity.size is not None
     part = cache.CacheFile(folder, identity.name, identity.size)
@@ -321,7 +325,7 @@ def test_damage_on_disk_is_met_once(run: Run, surface: str, folder: Path, tmp_pa
 def test_bytes_that_no_checksum_of_ours_covers_are_not_met_twice(
     run: Run, surface: str, folder: Path, tmp_path: Path, terrain: Terrain
 ) -> None:
-    identity = sync.identify(surface)
+    identity = Client(surface).identify(surface)
     assert identity.name is not None
     assert identity.size is not None
     part = cache.CacheFile(folder, identity.name, identity.size)
@@ -390,7 +394,7 @@ def test_resume_at_another_address_and_retry_of_the_command(
         assert run("pull", link.url, tmp_path / "o.npy", "--resume", "--retry", "0.5")[0] == 1
     code, stdout, stderr = run("pull", surface, tmp_path / "o.npy", "--resume", "--json")
     assert code == 0, stderr
-    assert json.loads(stdout)["wire_bytes"] < int(sync.describe(surface).details["bytes"]) - 2000
+    assert json.loads(stdout)["wire_bytes"] < int(Client(surface).get(surface).details["bytes"]) - 2000
     assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)
     for retry in ("-1", "soon", "inf"):
         assert run("pull", surface, tmp_path / "o.npy", "--retry", retry)[0] == 2
@@ -425,7 +429,7 @@ def test_nor_one_of_a_size_that_none_has(run: Run, folder: Path, tmp_path: Path,
 def test_a_link_in_the_folder_is_not_followed(
     run: Run, surface: str, folder: Path, tmp_path: Path, terrain: Terrain
 ) -> None:
-    identity = sync.identify(surface)
+    identity = Client(surface).identify(surface)
     victim = tmp_path / "victim"
     victim.write_bytes(b"of somebody else")
     folder.mkdir()

@@ -13,7 +13,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.decoding import segments
-from lodestream_client import aio, sync
+from lodestream_client import AsyncClient, Client
 from tests.client import files
 from tests.core.decoding.test_damaged_residual import with_chunk
 from tests.core.surfaces import index_of, terrain
@@ -33,7 +33,7 @@ def container() -> bytes:
 def test_a_stream_whose_bytes_are_saved_decodes_nothing(
     server: str, container: bytes, asynchronous: bool, transport: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    url = sync.upload(server, container).url
+    url = Client(server).upload(container).url
     calls: Counter[str] = Counter()
     for name in ("rounds_of", "values_of", "restore"):
         original = getattr(segments, name)
@@ -49,7 +49,7 @@ def test_a_stream_whose_bytes_are_saved_decodes_nothing(
         saved[offset : offset + len(data)] = data
 
     async def receive() -> ls.Decoder:
-        async with aio.connect(url, transport=transport, sink=save) as stream:
+        async with AsyncClient(url) as client, client.connect(url, transport=transport, sink=save) as stream:
             async for _ in stream:
                 pass
         assert stream.ended == "complete"
@@ -61,7 +61,7 @@ def test_a_stream_whose_bytes_are_saved_decodes_nothing(
     if asynchronous:
         decoder = asyncio.run(receive())
     else:
-        with sync.connect(url, transport=transport, sink=save) as stream:
+        with Client(url).connect(url, transport=transport, sink=save) as stream:
             assert [view.complete for view in stream][-1]
         assert stream.ended == "complete"
         assert not calls
@@ -76,7 +76,7 @@ def test_a_damaged_end_is_told_and_nothing_is_written(run: Run, container: bytes
     (tmp_path / "a.lode").write_bytes(with_chunk(container, random.Random(0), 255))
     before = ls.Decoder().feed(container)[-2]
     with files.ranged(tmp_path) as web:
-        with sync.connect(f"{web.url}/a.lode", transport="http") as stream:
+        with Client(f"{web.url}/a.lode").connect(f"{web.url}/a.lode", transport="http") as stream:
             last = list(stream)[-1]
         with pytest.raises(ls.CorruptStreamError):
             _ = last.points

@@ -11,10 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 import lodestream as ls
-import lodestream_client as client
 from lodestream.errors import LodestreamError
-from lodestream_client import sync
+from lodestream_client import AsyncClient, AsyncStream, Client
 from tests.links import Fault, linked
+
+from ..asked import asked
 
 Terrain = NDArray[np.float32]
 
@@ -24,7 +25,7 @@ def rms(points: Terrain, terrain: Terrain) -> float:
 
 
 def test_a_stream_ends_with_the_original(surface: str, terrain: Terrain) -> None:
-    with sync.connect(surface) as stream:
+    with Client(surface).connect(surface) as stream:
         views = list(stream)
     assert stream.ended == "complete"
     assert views[-1].complete
@@ -34,7 +35,7 @@ def test_a_stream_ends_with_the_original(surface: str, terrain: Terrain) -> None
 
 
 def test_every_view_has_the_error_that_it_tells(surface: str, terrain: Terrain) -> None:
-    with sync.connect(surface) as stream:
+    with Client(surface).connect(surface) as stream:
         found = [(view.rms, rms(view.points, terrain)) for view in stream]
     assert len(found) > 10
     for told, measured in found:
@@ -52,7 +53,7 @@ def test_every_view_has_the_error_that_it_tells(surface: str, terrain: Terrain) 
     ],
 )
 def test_limits(surface: str, target: ls.Target, ended: str) -> None:
-    with sync.connect(surface, target=target) as stream:
+    with Client(surface).connect(surface, target=target) as stream:
         views = list(stream)
     assert stream.ended == ended
     assert stream.decoder.bytes == views[-1].bytes
@@ -64,7 +65,7 @@ def test_limits(surface: str, target: ls.Target, ended: str) -> None:
 
 def test_stop_takes_effect_at_once(surface: str) -> None:
     seen = 0
-    with sync.connect(surface, window=1024) as stream:
+    with Client(surface).connect(surface, window=1024) as stream:
         for _ in stream:
             seen += 1
             if seen == 3:
@@ -77,7 +78,7 @@ def test_stop_takes_effect_at_once(surface: str) -> None:
 
 
 def test_leaving_the_block_stops(surface: str) -> None:
-    with sync.connect(surface, window=1024) as stream:
+    with Client(surface).connect(surface, window=1024) as stream:
         first = next(stream)
     assert stream.ended == "stopped"
     assert first.number == 0
@@ -86,7 +87,7 @@ def test_leaving_the_block_stops(surface: str) -> None:
 
 
 def test_an_exception_inside_the_block_is_not_hidden(surface: str) -> None:
-    stream = sync.connect(surface, window=1024)
+    stream = Client(surface).connect(surface, window=1024)
 
     def fail() -> None:
         with stream:
@@ -99,7 +100,7 @@ def test_an_exception_inside_the_block_is_not_hidden(surface: str) -> None:
 
 
 def test_stop_from_another_thread(surface: str) -> None:
-    with sync.connect(surface, window=1024, limit_rate=2000.0) as stream:
+    with Client(surface).connect(surface, window=1024, limit_rate=2000.0) as stream:
         next(stream)
         thread = threading.Thread(target=stream.stop)
         thread.start()
@@ -111,7 +112,7 @@ def test_stop_from_another_thread(surface: str) -> None:
 
 
 def test_seconds(surface: str) -> None:
-    with sync.connect(surface, target=ls.Target(seconds=1.0), limit_rate=4000.0) as stream:
+    with Client(surface).connect(surface, target=ls.Target(seconds=1.0), limit_rate=4000.0) as stream:
         views = list(stream)
     assert stream.ended == "seconds"
     assert views
@@ -119,15 +120,15 @@ def test_seconds(surface: str) -> None:
 
 
 def test_a_limited_rate_limits_what_is_under_way(surface: str) -> None:
-    with sync.connect(surface, target=ls.Target(max_bytes=1500), limit_rate=8000.0) as stream:
+    with Client(surface).connect(surface, target=ls.Target(max_bytes=1500), limit_rate=8000.0) as stream:
         views = list(stream)
     assert stream.ended == "bytes"
     assert views[-1].bytes <= 1500
 
 
 def test_streams_for_asyncio(surface: str, terrain: Terrain) -> None:
-    async def whole() -> tuple[list[ls.View], client.Stream]:
-        async with client.connect(surface) as stream:
+    async def whole() -> tuple[list[ls.View], AsyncStream]:
+        async with AsyncClient(surface) as client, client.connect(surface) as stream:
             views = [view async for view in stream]
         return views, stream
 
@@ -137,8 +138,8 @@ def test_streams_for_asyncio(surface: str, terrain: Terrain) -> None:
 
 
 def test_stop_for_asyncio(surface: str, terrain: Terrain) -> None:
-    async def some() -> tuple[ls.View, client.Stream]:
-        async with client.connect(surface, window=1024) as stream:
+    async def some() -> tuple[ls.View, AsyncStream]:
+        async with AsyncClient(surface) as client, client.connect(surface, window=1024) as stream:
             async for view in stream:
                 if view.rms < 20.0:
                     await stream.stop()
@@ -152,13 +153,16 @@ def test_stop_for_asyncio(surface: str, terrain: Terrain) -> None:
 
 def test_leaving_early_and_seconds_for_asyncio(surface: str) -> None:
     async def early() -> str | None:
-        async with client.connect(surface, window=1024) as stream:
+        async with AsyncClient(surface) as client, client.connect(surface, window=1024) as stream:
             async for _ in stream:
                 break
         return stream.ended
 
     async def late() -> str | None:
-        async with client.connect(surface, target=ls.Target(seconds=0.3), limit_rate=4000.0) as stream:
+        async with (
+            AsyncClient(surface) as client,
+            client.connect(surface, target=ls.Target(seconds=0.3), limit_rate=4000.0) as stream,
+        ):
             async for _ in stream:
                 pass
         return stream.ended
@@ -168,8 +172,8 @@ def test_leaving_early_and_seconds_for_asyncio(surface: str) -> None:
 
 
 def test_a_cancelled_stream_closes_its_connection(surface: str) -> None:
-    async def cancelled() -> client.Stream:
-        stream = client.connect(surface, limit_rate=1000.0)
+    async def cancelled() -> AsyncStream:
+        stream = AsyncClient(surface).connect(surface, limit_rate=1000.0)
 
         async def follow() -> None:
             async with stream:
@@ -190,9 +194,12 @@ def test_a_cancelled_stream_closes_its_connection(surface: str) -> None:
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_an_iteration_that_is_cancelled_may_be_continued(surface: str, terrain: Terrain, transport: Any) -> None:
-    async def impatient() -> tuple[list[ls.View], client.Stream, int]:
+    async def impatient() -> tuple[list[ls.View], AsyncStream, int]:
         views, cancelled = [], 0
-        async with client.connect(surface, transport=transport, window=1024, limit_rate=100_000.0) as stream:
+        async with (
+            AsyncClient(surface) as client,
+            client.connect(surface, transport=transport, window=1024, limit_rate=100_000.0) as stream,
+        ):
             while stream.ended is None:
                 try:
                     async with asyncio.timeout(0.02):
@@ -211,44 +218,45 @@ def test_an_iteration_that_is_cancelled_may_be_continued(surface: str, terrain: 
 
 def test_upload_tells_progress_and_list_and_delete_follow(server: str, terrain_file: Path) -> None:
     stages: list[tuple[str, float]] = []
-    surface = sync.upload(
-        server, terrain_file, precision="0.1%", name="Hills", progress=lambda *stage: stages.append(stage)
+    surface = Client(server).upload(
+        terrain_file, precision="0.1%", name="Hills", progress=lambda *stage: stages.append(stage)
     )
     assert surface.ready
     assert surface.details["exact"] is False
     assert ("sending", 1.0) in stages
-    assert [it.details["name"] for it in sync.list(server) if it.url == surface.url] == ["Hills"]
-    assert sync.describe(surface.url).details["levels"]
-    sync.delete(surface.url)
-    assert surface.url not in [it.url for it in sync.list_surfaces(server)]
+    assert [it.details["name"] for it in Client(server).list() if it.url == surface.url] == ["Hills"]
+    assert Client(surface.url).get(surface.url).details["levels"]
+    Client(surface.url).delete(surface.url)
+    assert surface.url not in [it.url for it in Client(server).list()]
     with pytest.raises(ls.NotFoundError):
-        sync.describe(surface.url)
+        Client(surface.url).get(surface.url)
 
 
 def test_upload_of_bytes_and_of_a_surface(server: str, terrain_file: Path) -> None:
     points = np.random.default_rng(3).normal(size=(8, 12, 3))
-    surface = sync.upload(server, ls.Surface(points, (True, True), metadata={"name": "Ring"}))
+    surface = Client(server).upload(ls.Surface(points, (True, True), metadata={"name": "Ring"}))
     assert surface.details["closed"] == [True, True]
     assert surface.details["name"] == "Ring"
-    assert sync.upload(server, terrain_file.read_bytes()).ready
+    assert Client(server).upload(terrain_file.read_bytes()).ready
 
 
 def test_upload_for_asyncio(server: str, terrain_file: Path) -> None:
     async def everything() -> tuple[bool, bool]:
-        surface = await client.upload(server, terrain_file, precision=2.0)
-        there = surface.url in [it.url for it in await client.list(server)]
-        await client.delete(surface.url)
-        return there, surface.url in [it.url for it in await client.list_surfaces(server)]
+        async with AsyncClient(server) as client:
+            surface = await client.upload(terrain_file, precision=2.0)
+            there = surface.url in [it.url for it in await client.list()]
+            await client.delete(surface.id)
+            return there, surface.url in [it.url for it in await client.list()]
 
     assert asyncio.run(everything()) == (True, False)
 
 
 def test_uploads_for_a_root_mean_square_error(server: str, terrain_file: Path) -> None:
     wanted = 0.01 * float(np.ptp(np.load(terrain_file).astype(float)))
-    surface = sync.upload(server, terrain_file, rms="1%")
+    surface = Client(server).upload(terrain_file, rms="1%")
     assert surface.details["exact"] is False
     assert 0 < surface.details["layers"][-1]["rms"] <= wanted
-    again = asyncio.run(client.upload(server, terrain_file, rms=ls.Tolerance(0.01, relative=True)))
+    again = asyncio.run(asked(server, lambda it: it.upload(terrain_file, rms=ls.Tolerance(0.01, relative=True))))
     assert again.url == surface.url
     assert again.details["options"] == {"rms": "1%"}
 
@@ -256,26 +264,28 @@ def test_uploads_for_a_root_mean_square_error(server: str, terrain_file: Path) -
 def test_an_upload_has_one_error_at_most() -> None:
     nowhere = "http://127.0.0.1:1"  # refused before anything is sent
     with pytest.raises(ls.OptionError, match="got both"):
-        sync.upload(nowhere, b"", precision=1.0, rms=1.0)
+        Client(nowhere).upload(b"", precision=1.0, rms=1.0)
     with pytest.raises(ls.OptionError, match="got both"):
-        asyncio.run(client.upload(nowhere, b"", precision="1", rms="1"))
+        asyncio.run(asked(nowhere, lambda it: it.upload(b"", precision="1", rms="1")))
     with pytest.raises(ls.OptionError, match="expected a number"):
-        sync.upload(nowhere, b"", rms="much")
+        Client(nowhere).upload(b"", rms="much")
     with pytest.raises(ls.OptionError, match="rms is not an option of a format"):
-        sync.upload(nowhere, b"", options={"rms": "1"})
+        Client(nowhere).upload(b"", options={"rms": "1"})
 
 
 def test_a_bad_upload_is_the_core_s_error(server: str) -> None:
     with pytest.raises(ls.FormatError, match="expected a file of format"):
-        sync.upload(server, b"not a surface")
+        Client(server).upload(b"not a surface")
     with pytest.raises(ls.OptionError, match="nonsense"):
-        sync.upload(server, ls.Surface(np.eye(5)), options={"nonsense": "1"})
+        Client(server).upload(ls.Surface(np.eye(5)), options={"nonsense": "1"})
 
 
 def test_no_such_surface(server: str) -> None:
     with (
         pytest.raises(ls.NotFoundError, match="There is no such thing"),
-        sync.connect(f"{server}/v1/surfaces/0123456789abcdef0123") as stream,
+        Client(f"{server}/v1/surfaces/0123456789abcdef0123").connect(
+            f"{server}/v1/surfaces/0123456789abcdef0123"
+        ) as stream,
     ):
         next(stream)
 
@@ -283,7 +293,7 @@ def test_no_such_surface(server: str) -> None:
 def test_a_level_that_does_not_exist(surface: str) -> None:
     with (
         pytest.raises(ls.OptionError, match="expected a level of 0 to"),
-        sync.connect(surface, target=ls.Target(level=99)) as stream,
+        Client(surface).connect(surface, target=ls.Target(level=99)) as stream,
     ):
         next(stream)
 
@@ -301,9 +311,9 @@ def test_the_client_of_the_manual_works(surface: str, terrain: Terrain) -> None:
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_the_latest_view_is_that_of_all_that_has_come(surface: str, terrain: Terrain, transport: Any) -> None:
-    with sync.connect(surface, transport=transport, window=1 << 18) as stream:
+    with Client(surface).connect(surface, transport=transport, window=1 << 18) as stream:
         everything = len(list(stream))
-    with sync.connect(surface, transport=transport, window=1 << 18) as stream:
+    with Client(surface).connect(surface, transport=transport, window=1 << 18) as stream:
         views = []
         for view in stream.latest():
             views.append(view)
@@ -317,7 +327,10 @@ def test_the_latest_view_is_that_of_all_that_has_come(surface: str, terrain: Ter
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_the_latest_view_is_awaited_too(surface: str, terrain: Terrain, transport: Any) -> None:
     async def follow() -> list[Any]:
-        async with client.connect(surface, transport=transport, window=1 << 18) as stream:
+        async with (
+            AsyncClient(surface) as client,
+            client.connect(surface, transport=transport, window=1 << 18) as stream,
+        ):
             views = []
             async for view in stream.latest():
                 views.append(view)
@@ -331,7 +344,10 @@ def test_the_latest_view_is_awaited_too(surface: str, terrain: Terrain, transpor
 
 
 def test_what_came_before_an_error_is_seen_before_it(surface: str) -> None:
-    with linked(surface, Fault(cut_down=4000)) as link, sync.connect(link.url, transport="ws", deadline=0.0) as stream:
+    with (
+        linked(surface, Fault(cut_down=4000)) as link,
+        Client(link.url).connect(link.url, transport="ws", deadline=0.0) as stream,
+    ):
         views = []
 
         def draw() -> None:

@@ -23,7 +23,7 @@ from lodestream.errors import RemoteError
 from lodestream.protocol.handshake import to_address
 from lodestream.protocol.messages import CODES, End, Error, Open, Opened, Stop
 from lodestream.protocol.wire import serialize
-from lodestream_client import sync
+from lodestream_client import Client
 from lodestream_server import running_server
 from lodestream_server.access.tokens import SCOPES, TokenFile
 from lodestream_server.routes import streams
@@ -260,24 +260,24 @@ def test_the_client_sends_its_token_everywhere(served: Served, tmp_path: Path) -
     read, write = served.keys.tokens["read"], served.keys.tokens["write"]
     points = hills(12, 9, seed=3)
     with pytest.raises(RemoteError, match="the scope write"):
-        sync.upload(served.url, io.BytesIO(npy(points)), token=read)
-    made = sync.upload(served.url, io.BytesIO(npy(points)), token=write)
-    assert sync.describe(made.url, token=read).ready
-    assert made.url in {surface.url for surface in sync.list_surfaces(served.url, token=read)}
+        Client(served.url, token=read).upload(io.BytesIO(npy(points)))
+    made = Client(served.url, token=write).upload(io.BytesIO(npy(points)))
+    assert Client(made.url, token=read).get(made.url).ready
+    assert made.url in {surface.url for surface in Client(served.url, token=read).list()}
 
     def whole(token: str | None) -> Any:
-        with sync.connect(made.url, token=token) as stream:
+        with Client(made.url, token=token).connect(made.url) as stream:
             for _ in stream:
                 pass
             return stream.decoder.surface().points
 
     assert np.array_equal(whole(read), points)
-    assert len(sync.fetch_range(made.url, 0, 10, token=read)) == 10
+    assert len(Client(made.url, token=read).fetch_range(made.url, 0, 10)) == 10
     for call in (
-        lambda token: sync.describe(made.url, token=token),
-        lambda token: sync.list_surfaces(served.url, token=token),
-        lambda token: sync.fetch_range(made.url, 0, 10, token=token),
-        lambda token: sync.delete(made.url, token=token),
+        lambda token: Client(made.url, token=token).get(made.url),
+        lambda token: Client(served.url, token=token).list(),
+        lambda token: Client(made.url, token=token).fetch_range(made.url, 0, 10),
+        lambda token: Client(made.url, token=token).delete(made.url),
         whole,
     ):
         for token, code in ((None, "no-token"), (served.keys.tokens["wrong"], "bad-token")):
@@ -285,11 +285,11 @@ def test_the_client_sends_its_token_everywhere(served: Served, tmp_path: Path) -
                 call(token)
             assert caught.value.code == code
     with pytest.raises(RemoteError) as caught:
-        sync.delete(made.url, token=read)
+        Client(made.url, token=read).delete(made.url)
     assert caught.value.code == "small-scope"
-    sync.delete(made.url, token=write)
+    Client(made.url, token=write).delete(made.url)
     with pytest.raises(ls.LodestreamError):
-        sync.describe(made.url, token=read)
+        Client(made.url, token=read).get(made.url)
 
 
 def test_a_body_that_may_not_come_is_not_stored(served: Served, http: httpx.Client) -> None:

@@ -17,9 +17,8 @@ import numpy as np
 import pytest
 
 import lodestream as ls
-import lodestream_client
 from lodestream.errors import NotFoundError
-from lodestream_client import sync
+from lodestream_client import AsyncClient, Client
 from lodestream_client.program import main
 from lodestream_client.remote_source import RemoteSource
 from lodestream_server import running_server
@@ -299,7 +298,7 @@ def dem(http: httpx.Client, server: str, pushed: list[dict[str, Any]]) -> Iterat
 def test_a_stream_ends_on_the_surface_that_it_began(
     http: httpx.Client, dem: str, pushed: list[dict[str, Any]], transport: Any
 ) -> None:
-    with sync.connect(dem, transport=transport) as stream:
+    with Client(dem).connect(dem, transport=transport) as stream:
         first = next(iter(stream))
         assert not first.complete
         put(http, "dem", pushed[1]["id"])
@@ -307,7 +306,7 @@ def test_a_stream_ends_on_the_surface_that_it_began(
     assert np.array_equal(last.surface().points, hills(seed=1))
 
     async def received() -> Any:
-        async with lodestream_client.connect(dem, transport=transport) as stream:
+        async with AsyncClient(dem) as client, client.connect(dem, transport=transport) as stream:
             views = [view async for view in stream]
         return views[-1].surface().points
 
@@ -336,12 +335,12 @@ def test_the_commands_follow_a_name(
         assert source.read(1, 4) == b"LODE"
     finally:
         source.close()
-    assert sync.identify(dem).container_sha256 == told["container_sha256"]
-    assert sync.fetch_range(dem, 1, 4) == b"LODE"
+    assert Client(dem).identify(dem).container_sha256 == told["container_sha256"]
+    assert Client(dem).fetch_range(dem, 1, 4) == b"LODE"
     assert main(["rm", dem]) == 0
     with pytest.raises(NotFoundError, match="No name 'dem' on this server"):
-        sync.describe(dem)
-    assert sync.describe(told["url"]).ready
+        Client(dem).get(dem)
+    assert Client(told["url"]).get(told["url"]).ready
 
 
 def test_xarray_opens_a_name_and_stays_with_its_surface(
@@ -355,5 +354,5 @@ def test_xarray_opens_a_name_and_stays_with_its_surface(
 
 
 def test_levels_and_the_surface_in_memory(server: str, dem: str) -> None:
-    surface = sync.upload(server, ls.Surface(hills(seed=8)), name="dem", replace=True)
-    assert sync.locate(dem) == surface.url
+    surface = Client(server).upload(ls.Surface(hills(seed=8)), name="dem", replace=True)
+    assert Client(dem).locate(dem) == surface.url

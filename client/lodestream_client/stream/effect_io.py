@@ -1,13 +1,13 @@
-"""Carries out the effects of a `Core`, and awaits them."""
+"""Carries out the effects of a `Core` on an event loop."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, assert_never
 
-from ..requests import calls
 from ..requests.answers import Head
 from .effects import WAITS, Ahead, Dial, DialError, Dialled, Effect, Get, HangUp, Hear, Read, Send, Wait
 from .websocket_options import socket_options
@@ -18,52 +18,67 @@ if TYPE_CHECKING:
 
     from .session import Session
 
-__all__ = ["AsyncIO"]
+__all__ = ["EffectIO"]
+
+# Messages that are taken from a WebSocket in one turn of the loop. Credit bounds their bytes.
+_AT_ONCE = 64
 
 
-class AsyncIO:
+class EffectIO:
     """One WebSocket or one answer over HTTP at a time, and the answer after that.
 
     Parameters
     ----------
     session : Session
         Whose messages are sent.
+    http : callable
+        Returns the client of httpx that makes the requests, on the loop.
 
     Attributes
     ----------
-    wake : Event
-        Ends a `Wait` when it is set.
+    arrived : deque of bytes
+        Messages or chunks that have arrived and not been taken: only whoever takes one removes it, so that none is lost
+        by an interrupt.
     """
 
-    def __init__(self, session: Session) -> None:
-        self.wake = asyncio.Event()
+    def __init__(self, session: Session, http: Callable[[], httpx.AsyncClient]) -> None:
+        self.arrived: deque[bytes] = deque()
+        self._wake = asyncio.Event()
         self._session = session
+        self._http = http
         self._socket: ClientConnection | None = None
-        self._client: httpx.AsyncClient | None = None
         self._response: httpx.Response | None = None
         self._body: AsyncIterator[bytes] | None = None
         self._ahead: tuple[Get, asyncio.Task[httpx.Response]] | None = None
 
+    @property
+    def open(self) -> bool:
+        """Whether there is anything to close."""
+        return any(it is not None for it in (self._socket, self._response, self._ahead))
+
     async def perform(self, effect: Effect) -> Any:
-        """Carry out one effect, and return its result, or the library's error, as the effect's class documents."""
+        """Carry out one effect, and return its result, or the library's error, as the effect's class documents.
+
+        What `Hear` and `Read` result in is left in `arrived`.
+        """
         match effect:
             case Dial():
                 return await self._dial(effect)
             case Hear(until):
-                return await self._hear(self._left(until))
+                await self._hear(self._left(until))
             case Send():
-                return await self.send()
+                await self.send(self._session.messages())
             case Get():
                 return await self._get(effect)
             case Ahead(get):
-                return await self._ask_ahead(get)
+                await self._ask_ahead(get)
             case Read():
                 assert self._body is not None, "a body is read of an open answer"
-                return await anext(self._body, b"")
+                self.arrived.append(await anext(self._body, b""))
             case Wait(until):
                 with suppress(TimeoutError):
                     async with asyncio.timeout(self._left(until)):
-                        await self.wake.wait()
+                        await self._wake.wait()
             case HangUp():
                 await self.hang_up(effect)
             case _:
@@ -74,18 +89,15 @@ class AsyncIO:
         """Carry out one effect like `perform` if that needs no waiting; otherwise return `WAITS`."""
         await asyncio.sleep(0)  # what has come is taken by the event loop, which had no turn while a view was drawn
         match effect:
-            case Send():
-                return await self.send()
-            case Ahead(get):
-                return await self._ask_ahead(get)
-            case Hear():
-                message = await self._hear(0.0)
-                return WAITS if message is None else message
-            case Read() if self._arrived():
+            case Send() | Ahead():
                 return await self.perform(effect)
+            case Hear():
+                await self._hear(0.0)
+            case Read() if self._readable():
+                await self.perform(effect)
         return WAITS
 
-    def _arrived(self) -> bool:
+    def _readable(self) -> bool:
         """Return whether more of the answer has arrived."""
         stream = None if self._response is None else self._response.extensions.get("network_stream")
         return stream is not None and bool(stream.get_extra_info("is_readable"))
@@ -105,25 +117,33 @@ class AsyncIO:
             raise DialError(landed[-1]) from error
         return Dialled(self._socket.subprotocol, landed[-1])
 
-    async def _hear(self, seconds: float) -> bytes | None:
-        assert self._socket is not None, "a message is expected of an open connection"
-        try:
-            async with asyncio.timeout(seconds):
-                return await self._socket.recv(decode=False)
-        except TimeoutError:
-            return None
-
-    async def send(self) -> None:
-        """Carry out `Send`."""
+    async def _hear(self, seconds: float) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        for message in self._session.messages():
+        assert self._socket is not None, "a message is expected of an open connection"
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds) as patience:
+                self.arrived.append(await self._socket.recv(decode=False))
+                patience.reschedule(0.0)  # what has come with it is taken too, and nothing is waited for
+                with suppress(ConnectionClosed):  # which is told when all that came before has been taken
+                    while len(self.arrived) < _AT_ONCE:
+                        self.arrived.append(await self._socket.recv(decode=False))
+
+    async def send(self, messages: Sequence[bytes]) -> None:
+        """Send messages, if there is an open WebSocket."""
+        from websockets.exceptions import ConnectionClosed
+
+        for message in messages:
             with suppress(ConnectionClosed):
                 if self._socket is not None:
                     await self._socket.send(message)
 
-    async def _get(self, get: Get) -> Head:
+    async def stop(self, messages: Sequence[bytes]) -> None:
+        """End a `Wait` at once, and all later ones; and send messages."""
+        self._wake.set()
+        await self.send(messages)
 
+    async def _get(self, get: Get) -> Head:
         ahead = self._ahead
         if ahead is None or not ahead[0].asks_as(get):
             await self.hang_up(HangUp())
@@ -140,12 +160,9 @@ class AsyncIO:
         return Head.of(self._response)
 
     async def _ask(self, get: Get) -> httpx.Response:
-        import httpx
-
-        if self._client is None:
-            self._client = httpx.AsyncClient(**calls.client_options(self._session.url, asynchronous=True))
-        request = self._client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
-        return await self._client.send(request, stream=True)
+        client = self._http()
+        request = client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
+        return await client.send(request, stream=True)
 
     async def _ask_ahead(self, get: Get) -> None:
         if self._ahead is None or not self._ahead[0].asks_as(get):
@@ -169,6 +186,7 @@ class AsyncIO:
 
     async def _leave(self, how: HangUp) -> None:
         """Close all that is open, except the request that was made ahead."""
+        self.arrived.clear()
         if self._socket is not None and how.abort:
             self._socket.transport.abort()
         elif self._socket is not None and how.over:
@@ -182,7 +200,5 @@ class AsyncIO:
             await response.aclose()
 
     async def close(self) -> None:
-        """Close everything, for good."""
-        await self.hang_up(HangUp())
-        if self._client is not None:
-            await self._client.aclose()
+        """Close everything at once, since nobody receives any more."""
+        await self.hang_up(HangUp(abort=True))

@@ -1,49 +1,56 @@
-"""Streams for asyncio; `lodestream_client` exports the names."""
+"""Streams for asyncio."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import LodestreamError
 from lodestream.target import Region
 
-from .aio_io import AsyncIO
-from .effects import WAITS
+from .effect_io import EffectIO
+from .effects import WAITS, Effect, HangUp, Hear, Read
 from .options import ConnectOptions
 from .stream import BaseStream
 
 if TYPE_CHECKING:
+    import httpx
+
     from lodestream.decoding.decoder import View
 
-__all__ = ["Stream"]
+__all__ = ["AsyncStream"]
 
 
-class Stream(BaseStream):
-    """A surface being received, as `lodestream_client.sync.Stream`; iterate over it for a `View` of each layer.
+class AsyncStream(BaseStream):
+    """A surface being received, as `Stream` for asyncio; iterate over it for a `View` of each layer.
 
-    It is an asynchronous context manager, made by `connect`. Entering it opens the connection; leaving it stops the
-    stream. An iteration that is cancelled, for example by a timeout, may be continued.
+    It is an asynchronous context manager, made by `AsyncClient.connect`. Entering it opens the connection; leaving it
+    stops the stream. An iteration that is cancelled, for example by a timeout, may be continued.
+
+    The event loop only takes bytes apart, at most 64 KiB at a time. Values are decoded where they are asked for: use
+    ``await asyncio.to_thread(view.surface)`` for a large surface, and ``asyncio.to_thread(stream.decoder.view)`` for
+    its end, which is verified when it is first asked for.
 
     Examples
     --------
     >>> import asyncio, lodestream_client
-    >>> url = asyncio.run(lodestream_client.upload("http://127.0.0.1:8000", "terrain.npy")).url
     >>> async def receive():
-    ...     async with lodestream_client.connect(url, limit_rate=4000) as stream:  # bytes a second
-    ...         async for view in stream:
-    ...             if view.rms < 5:
-    ...                 await stream.stop()
+    ...     async with lodestream_client.AsyncClient("http://127.0.0.1:8000") as client:
+    ...         surface = await client.upload("terrain.npy")
+    ...         async with client.connect(surface.id, limit_rate=4000) as stream:  # bytes a second
+    ...             async for view in stream:
+    ...                 if view.rms < 5:
+    ...                     await stream.stop()
     ...     return stream.ended, view.points.shape
     >>> asyncio.run(receive())
     ('stopped', (97, 70))
     """
 
-    def __init__(self, url: str, options: ConnectOptions) -> None:
+    def __init__(self, url: str, options: ConnectOptions, http: Callable[[], httpx.AsyncClient]) -> None:
         super().__init__(url, options)
-        self._io = AsyncIO(self._session)
+        self._io = EffectIO(self._session, http)
 
     def __aiter__(self) -> AsyncIterator[View]:
         return self
@@ -54,7 +61,7 @@ class Stream(BaseStream):
                 raise StopAsyncIteration
         return view
 
-    async def __aenter__(self) -> Stream:
+    async def __aenter__(self) -> AsyncStream:
         try:
             while not self._core.met and await self._step():
                 pass
@@ -94,11 +101,10 @@ class Stream(BaseStream):
         May be called from another task than the one that iterates.
         """
         self._session.stop()
-        self._io.wake.set()
-        await self._io.send()
+        await self._io.stop(self._session.messages())
 
     async def focus(self, region: Region | None) -> None:
-        """Receive the data of a region before the rest, see `lodestream_client.sync.Stream.focus`.
+        """Receive the data of a region before the rest, see `Stream.focus`.
 
         Raises
         ------
@@ -107,13 +113,12 @@ class Stream(BaseStream):
             raises it.
         """
         self._session.focus(region)
-        await self._io.send()
+        await self._io.send(self._session.messages())
 
     async def close(self) -> None:
         """Stop and close the connection, within `close_timeout`."""
         self._session.close()
-        self._io.wake.set()
-        await self._io.send()
+        await self._io.stop(self._session.messages())
         # Whoever closes has what they want; how the other side takes it is no concern of theirs.
         with suppress(LodestreamError):
             while await self._step():
@@ -122,14 +127,14 @@ class Stream(BaseStream):
 
     async def _abandon(self) -> None:
         self._session.abandon()
-        await self._io.close()
+        await self._io.hang_up(HangUp())
 
     async def _step(self, *, wait: bool = True) -> bool:
         """Carry out the next effect, optionally only if it needs no waiting; return whether that was done."""
         if (effect := self._core.effect) is None:
             return False
         try:
-            result = await (self._io.perform(effect) if wait else self._io.poll(effect))
+            result = await self._performed(effect, wait=wait)
             if result is WAITS:
                 return False
         except Exception as error:
@@ -137,3 +142,9 @@ class Stream(BaseStream):
         else:
             self._core.done(result)
         return True
+
+    async def _performed(self, effect: Effect, *, wait: bool) -> Any:
+        result = None
+        if not isinstance(effect, Hear | Read) or not self._io.arrived:
+            result = await (self._io.perform(effect) if wait else self._io.poll(effect))
+        return self._io.arrived.popleft() if isinstance(effect, Hear | Read) and self._io.arrived else result

@@ -1,21 +1,26 @@
-"""Streams for programs without an event loop; `lodestream_client.sync` exports the names."""
+"""Streams for programs without an event loop."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from contextlib import suppress
+from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lodestream.errors import LodestreamError
 from lodestream.target import Region
 
-from .effects import WAITS, HangUp
+from .. import loop_thread
+from .effect_io import EffectIO
+from .effects import WAITS, Effect, HangUp, Hear, Read, Send
 from .options import ConnectOptions
 from .stream import BaseStream
-from .sync_io import SyncIO
 
 if TYPE_CHECKING:
+    import httpx
+
     from lodestream.decoding.decoder import View
 
 __all__ = ["Stream"]
@@ -24,7 +29,7 @@ __all__ = ["Stream"]
 class Stream(BaseStream):
     """A surface being received; iterate over it for a `View` of each layer.
 
-    It is a context manager, made by `connect`. Leaving it stops the stream.
+    It is a context manager, made by `Client.connect`. Leaving it stops the stream.
 
     If the iteration raises an error, for example because the server is gone, the stream ends but keeps what it has:
     earlier views stay usable, `decoder` has all received data (``decoder.view()`` is the last complete layer), and
@@ -32,9 +37,10 @@ class Stream(BaseStream):
 
     Examples
     --------
-    >>> from lodestream_client import sync
-    >>> url = sync.upload("http://127.0.0.1:8000", "terrain.npy").url
-    >>> with sync.connect(url, limit_rate=4000) as stream:  # bytes a second
+    >>> from lodestream_client import Client
+    >>> client = Client("http://127.0.0.1:8000")
+    >>> surface = client.upload("terrain.npy")
+    >>> with client.connect(surface.id, limit_rate=4000) as stream:  # bytes a second
     ...     for view in stream:
     ...         if view.rms < 5:
     ...             stream.stop()
@@ -42,14 +48,20 @@ class Stream(BaseStream):
     ('stopped', (97, 70))
     """
 
-    def __init__(self, url: str, options: ConnectOptions) -> None:
+    # Only what waits for the network is done on the loop. The policy, the decoder, and whatever the caller has given
+    # (sink, store, progress) run in the caller's thread.
+    def __init__(self, url: str, options: ConnectOptions, http: Callable[[], httpx.AsyncClient], owner: object) -> None:
         super().__init__(url, options)
-        self._io = SyncIO(self._session)
+        self._owner = owner  # whose connections are closed when nobody refers to it
+        self._loop = loop_thread.current()
+        self._io = EffectIO(self._session, http)
+        self._loop.hold(self._io)
+        weakref.finalize(self, loop_thread.release, self._io).atexit = False
         try:
             while not self._core.met and self._step():
                 pass
-        except BaseException:
-            self._abandon()
+        except BaseException as error:
+            self._abandon(abort=isinstance(error, KeyboardInterrupt))
             raise
 
     def __iter__(self) -> Iterator[View]:
@@ -96,8 +108,7 @@ class Stream(BaseStream):
         May be called from another thread than the one that iterates.
         """
         self._session.stop()
-        self._io.wake.set()
-        self._io.send()
+        self._send(stop=True)
 
     def focus(self, region: Region | None) -> None:
         """Receive the data of a region before the rest. Allowed at any time, any number of times.
@@ -118,13 +129,16 @@ class Stream(BaseStream):
             raises it.
         """
         self._session.focus(region)
-        self._io.send()
+        self._send()
 
     def close(self) -> None:
         """Stop and close the connection, within `close_timeout`."""
+        if not self._loop.alive:
+            return  # the process was forked; the other one has the connection
+        over = self.ended is not None
         self._session.close()
-        self._io.wake.set()
-        self._io.send()
+        if not over:
+            self._send(stop=True)
         # Whoever closes has what they want; how the other side takes it is no concern of theirs.
         with suppress(LodestreamError):
             while self._step():
@@ -133,14 +147,25 @@ class Stream(BaseStream):
 
     def _abandon(self, *, abort: bool = False) -> None:
         self._session.abandon()
-        self._io.close(HangUp(abort=abort))
+        if self._loop.alive:
+            if self._io.open:
+                self._loop.run(partial(self._io.hang_up, HangUp(abort=abort)))
+            loop_thread.release(self._io)
+
+    def _send(self, *, stop: bool = False) -> None:
+        # Messages are handed over in the order in which they are made; so is their sending begun. Nobody waits for it.
+        with self._session.lock:
+            messages = self._session.messages()
+            if not messages and not stop:
+                return
+            self._loop.begin(partial(self._io.stop if stop else self._io.send, messages))
 
     def _step(self, *, wait: bool = True) -> bool:
         """Carry out the next effect, optionally only if it needs no waiting; return whether that was done."""
         if (effect := self._core.effect) is None:
             return False
         try:
-            result = self._io.perform(effect) if wait else self._io.poll(effect)
+            result = self._performed(effect, wait=wait)
             if result is WAITS:
                 return False
         except Exception as error:
@@ -148,3 +173,11 @@ class Stream(BaseStream):
         else:
             self._core.done(result)
         return True
+
+    def _performed(self, effect: Effect, *, wait: bool) -> Any:
+        if isinstance(effect, Send):
+            return self._send()
+        result = None
+        if not isinstance(effect, Hear | Read) or not self._io.arrived:
+            result = self._loop.run(partial(self._io.perform if wait else self._io.poll, effect))
+        return self._io.arrived.popleft() if isinstance(effect, Hear | Read) and self._io.arrived else result
