@@ -39,7 +39,8 @@ def register(subparsers: Subparsers) -> None:
     parser.add_argument(
         "what",
         metavar="FILE|URL",
-        help="a container; - for standard input; or the URL of a surface, or of a container on any web server",
+        help="a container; - for standard input; or the URL of a surface, or of a container on any web server; or its "
+        "address in a bucket",
     )
     add_size_option(parser, decodes=False)
     add_token_option(parser)
@@ -48,7 +49,7 @@ def register(subparsers: Subparsers) -> None:
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Options from the command line: `what` is a file, ``-`` or a URL."""
+    """Options from the command line: `what` is a file, ``-``, a URL or an address in a bucket."""
 
     what: str
     max_vertices: int | None
@@ -80,7 +81,14 @@ def _of_url(options: InfoOptions) -> Mapping[str, Any]:
 
 def _of_file(options: InfoOptions) -> Mapping[str, Any]:
     from lodestream.opening import container
+    from lodestream.opening.open_source import is_address
 
+    if is_address(options.what):
+        try:
+            with container.open(options.what, max_vertices=options.max_vertices) as opened:
+                return opened.info
+        except (StreamError, TooLargeError) as error:
+            raise named(error, options.what) from None
     with input_files([options.what]) as files, files.paths[0].open("rb") as file:
         try:
             return container.open(files.paths[0], max_vertices=options.max_vertices).info

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 import lodestream as ls
 from lodestream.stores import AbsentError, open_store
+from lodestream_client.program import main
 from tests.core.surfaces import terrain
 from tests.stores.emulators import Emulator, azure, azurite, ministack, s3
 
@@ -20,7 +22,9 @@ HEIGHTS = (terrain((900, 1100), 3) * 200).round().astype("i2")
 
 @pytest.mark.parametrize("place", ["s3", "azure"])
 @pytest.mark.long
-def test_an_object_is_read_in_blocks(place: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+def test_an_object_is_read_in_blocks(
+    place: str, request: pytest.FixtureRequest, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     emulator: Emulator = request.getfixturevalue(place)
     address = emulator.address()
     (tmp_path / "a.lode").write_bytes(ls.encode(HEIGHTS))
@@ -31,6 +35,9 @@ def test_an_object_is_read_in_blocks(place: str, request: pytest.FixtureRequest,
         assert opened.view(rms=20).bytes < 0.6 * opened.source.size
         assert np.array_equal(opened.view().points, HEIGHTS)
         assert pickle.loads(pickle.dumps(opened)).info == opened.info
+        capsys.readouterr()
+        assert main(["info", "--json", f"{address}/maps/hills.lode"]) == 0
+        assert json.loads(capsys.readouterr().out) == opened.info
     with pytest.raises(AbsentError, match=r"there is no none\.lode"):
         ls.open(f"{address}/maps/none.lode")
     (tmp_path / "a.lode").write_bytes(ls.encode(HEIGHTS[::-1]))
