@@ -74,6 +74,7 @@ class Container:
         self._max_vertices = max_vertices
         self._kept: list[tuple[int, Bytes]] = []  # header, index and metadata, which every call needs
         self._open = weakref.finalize(self, source.close)
+        self._open.atexit = False  # the system closes connections of a process that ends
         try:
             with named(source.place):
                 self.index: Index = read_index(self._first, source.size, Capacity(max_vertices))
