@@ -156,6 +156,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         openapi_url=None,
         # A path with a slash too many is answered 404; a redirect would make a client send an upload twice.
         redirect_slashes=False,
+        # Names for generated clients: list_surfaces, get_surface.
+        generate_unique_id_function=lambda route: route.name,
     )
     problems.install(app)
     for status in (404, 405):  # of the framework; routes raise errors of ours

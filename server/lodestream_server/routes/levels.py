@@ -39,7 +39,7 @@ router = APIRouter(prefix="/v1", tags=["files"])
         **responses(404, 409, 413, 416, 422, 429, 501, 503, 507),
     },
 )
-async def level(
+async def get_level(
     caller: Reader,
     request: Request,
     parts: Parts,

@@ -74,6 +74,7 @@ def _mapped(path: str, summary: str, description: str, content: dict[str, Any]) 
             readable(
                 router,
                 f"{place}/{{surface}}{path}",
+                name=f"get_{place[1:-1]}_{route.__name__}",
                 summary=f"{summary} of {whose}",
                 response_class=Response,
                 responses={200: {"description": description, "content": content}, **_ERRORS},

@@ -50,7 +50,7 @@ class _Pointing(BaseModel):
         **responses(403, 404, 408, 409, 413, 422, 503, 507),
     },
 )
-async def point(caller: Writer, request: Request, parts: Parts, name: _Name) -> Response:
+async def point_name(caller: Writer, request: Request, parts: Parts, name: _Name) -> Response:
     """Make a name lead to a surface that is ready; the name is made if there is none.
 
     `surface` is its id, or its `url`. With null nothing is changed, and the answer says whether the caller may.
@@ -84,7 +84,7 @@ async def point(caller: Writer, request: Request, parts: Parts, name: _Name) -> 
         **responses(422),
     },
 )
-async def page(
+async def list_names(
     caller: Reader,
     request: Request,
     parts: Parts,
@@ -108,7 +108,7 @@ async def page(
         **responses(404, 422, 429, 503),
     },
 )
-async def look(caller: Reader, request: Request, parts: Parts, name: _Name, wait: Wait = 0.0) -> Response:
+async def get_name(caller: Reader, request: Request, parts: Parts, name: _Name, wait: Wait = 0.0) -> Response:
     """Return what is told of the surface to which a name leads now; its `url` is that of the surface."""
     await settled(request, parts, caller, leads_to(parts, name).id, wait)
     return described(request, parts, await description(leads_to(parts, name), caller, parts, request))
@@ -128,7 +128,7 @@ async def get_name_container(request: Request, parts: Parts, name: _Name) -> Res
 
 
 @router.delete("/{name}", status_code=204, summary="Delete a name", responses=responses(403, 404, 422, 503))
-async def delete(caller: Writer, parts: Parts, name: _Name) -> Response:
+async def delete_name(caller: Writer, parts: Parts, name: _Name) -> Response:
     """Delete a name. The surface to which it leads stays, and so do those that it has replaced.
 
     Only its owner and an admin may do this.

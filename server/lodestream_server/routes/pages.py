@@ -81,7 +81,7 @@ async def interface(request: Request) -> Response:
 
 
 @readable(router, "/healthz", summary="Alive", responses={200: examples.answer("It answers", {"status": "ok"})})
-async def healthz() -> Response:
+async def get_health() -> Response:
     """Answer at once, while the event loop runs."""
     return JSONResponse({"status": "ok", "version": lodestream.__version__})
 
@@ -113,7 +113,7 @@ async def healthz() -> Response:
         ),
     },
 )
-async def readyz(parts: Parts) -> Response:
+async def get_readiness(parts: Parts) -> Response:
     """Return whether processes can start and all surfaces are known. Before that uploads wait, and all else works.
 
     ``index`` is ``current``; ``being brought up to date`` with the data folder, so that what was stored or deleted
@@ -143,7 +143,7 @@ async def readyz(parts: Parts) -> Response:
     summary="File formats",
     responses={200: examples.answer("Names of formats", {"formats": ["npy", "geotiff", "netcdf", "lode"]})},
 )
-async def formats(parts: Parts) -> Response:
+async def list_formats(parts: Parts) -> Response:
     """Return the file formats that this server reads; lode are containers. Clients encode other formats themselves."""
     return JSONResponse({"formats": list(parts.settings.formats)})
 
@@ -156,7 +156,7 @@ async def formats(parts: Parts) -> Response:
     response_class=Response,
     responses={200: {"description": "The figures", "content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-async def metrics(parts: Parts) -> Response:
+async def get_metrics(parts: Parts) -> Response:
     """Return all metrics of the server since it started."""
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
 

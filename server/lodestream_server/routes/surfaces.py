@@ -63,7 +63,7 @@ Wait = Annotated[
         **responses(408, 413, 422, 429, 503, 507),
     },
 )
-async def upload(caller: Writer, request: Request, parts: AnyQuery) -> Response:
+async def upload_surface(caller: Writer, request: Request, parts: AnyQuery) -> Response:
     """Upload a file, as a raw body or as parts called ``file`` of a form; the surface is built in the background.
 
     Options are parameters of the query, or fields of the form. Those other than precision, rms, effort, closed, nodata,
@@ -105,7 +105,7 @@ async def upload(caller: Writer, request: Request, parts: AnyQuery) -> Response:
         **responses(422),
     },
 )
-async def page(
+async def list_surfaces(
     caller: Reader,
     request: Request,
     parts: Parts,
@@ -131,7 +131,7 @@ async def page(
         **responses(404, 429, 503),
     },
 )
-async def look(
+async def get_surface(
     caller: Reader, request: Request, parts: Parts, surface: str, thumbnails: Thumbnails = False, wait: Wait = 0.0
 ) -> Response:
     """Return the state of a surface and, once it is ready, what ``lodestream info --json`` prints.
@@ -167,7 +167,7 @@ async def look(
         **responses(403, 404, 429, 503, 507),
     },
 )
-async def retry(caller: Writer, request: Request, parts: Parts, surface: str) -> Response:
+async def retry_surface(caller: Writer, request: Request, parts: Parts, surface: str) -> Response:
     """Build a surface again that waits or failed; does nothing if it is ready or queued.
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.
@@ -180,7 +180,7 @@ async def retry(caller: Writer, request: Request, parts: Parts, surface: str) ->
 
 
 @router.delete("/{surface}", status_code=204, summary="Delete a surface", responses=responses(403, 404))
-async def delete(caller: Writer, parts: Parts, surface: str) -> Response:
+async def delete_surface(caller: Writer, parts: Parts, surface: str) -> Response:
     """Delete a surface and stop its build. Open streams of it continue to their end.
 
     Only its owner (the name of the token that it was uploaded with) and an admin may do this.

@@ -346,6 +346,15 @@ def test_problems_have_one_shape(http: httpx.Client) -> None:
     assert http.put("/v1/surfaces").headers["allow"] == "GET, HEAD, POST"
 
 
+def test_operations_have_names_for_generated_clients(http: httpx.Client) -> None:
+    paths = http.get("/openapi.json").json()["paths"]
+    names = [operation["operationId"] for operations in paths.values() for operation in operations.values()]
+    assert len(names) == len(set(names))
+    assert all(re.fullmatch("[a-z]+_[a-z_]+", name) for name in names), names
+    ours = {"upload_surface", "list_surfaces", "get_surface", "delete_surface", "get_name", "get_surface_map_json"}
+    assert ours <= set(names)
+
+
 def test_openapi_describes_every_route_with_examples(http: httpx.Client) -> None:
     schema = http.get("/openapi.json").json()
     assert set(schema["paths"]) == {
