@@ -238,7 +238,11 @@ class AsyncClient:
                 return result
             if isinstance(step, calls.Pause):
                 await asyncio.sleep(step.seconds)
-                answer = None
+                answer, failure = None, None
+                continue
+            if isinstance(step, calls.Aside):
+                await asyncio.to_thread(step.work)
+                answer, failure = None, None
                 continue
             content = _chunks(step.body) if step.body is not None and len(step.body.files) == 1 else None
             request = calls.request_options(step, url, token)
@@ -251,7 +255,7 @@ class AsyncClient:
                         async for chunk in response.aiter_raw():
                             if not incoming.take(chunk):
                                 break
-                answer = incoming.answer()
+                answer, failure = incoming.answer(), None
             except httpx.HTTPError as error:
                 failure = problems.from_connection(error, url)
                 failure.__cause__ = error

@@ -32,10 +32,12 @@ __all__ = [
     "stream_url",
     "surface_url",
     "surfaces_url",
+    "uploads_url",
 ]
 
 _SURFACES = "/v1/surfaces"
 _NAMES = "/v1/names"
+_UPLOADS = "/v1/uploads"
 _BELOW = re.compile(f"({_SURFACES}|{_NAMES})(/.*)?$")
 _ID = re.compile(r"[0-9A-Za-z_-]{1,100}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -92,6 +94,11 @@ def surface_url(url: str) -> str:
     if not collection.endswith(_SURFACES) or not name:
         raise OptionError(f"expected a surface's address such as http://HOST/v1/surfaces/ID, got {url}")
     return base
+
+
+def uploads_url(url: str) -> str:
+    """Return the URL where a server begins uploads that can be resumed."""
+    return surfaces_url(url).removesuffix(_SURFACES) + _UPLOADS
 
 
 def place_url(url: str, place: str) -> str:

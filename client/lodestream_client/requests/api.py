@@ -23,10 +23,10 @@ from lodestream.errors import (
 )
 from lodestream.target import Target
 
-from . import addresses, problems
+from . import addresses, problems, resuming
 from .answers import LONGEST_ANSWER, Answer, check_figures, parse
 from .bodies import Body
-from .calls import Call, Flow, Pause
+from .calls import Aside, Call, Flow, Pause
 from .states import ENDS, STATES
 
 __all__ = [
@@ -161,11 +161,9 @@ def upload(
 
     Whether the caller may do that is asked before, since an upload that no name leads to takes room on the server.
     """
-    collection = addresses.surfaces_url(url)
     if name is not None:
         _refuse((yield Call("PUT", name, json={"surface": None})), name)
-    answer = yield Call("POST", collection, _named(parameters, body), body=body)
-    surface = _described(_checked(answer, collection), _location(answer, collection))
+    surface = yield from _sent(url, parameters, body)
     surface = yield from _followed(surface, wait, progress)
     if name is not None:
         try:
@@ -174,6 +172,21 @@ def upload(
             error.args = (f"{error}; the surface is stored, as {surface.url}", *error.args[1:])
             raise
     return surface
+
+
+def _sent(url: str, parameters: Mapping[str, str | list[str]], body: Body) -> Flow[Description]:
+    """Send files: a large one so that it goes on after a lost connection, where the server can do that."""
+    named = _named(parameters, body)
+    if len(body.files) == 1 and body.size >= resuming.LEAST:
+        yield Aside(body.hash)
+        uploads = addresses.uploads_url(url)
+        begun = yield Call("POST", uploads, named, headers=resuming.beginning(body))
+        if begun is not None and begun.status not in resuming.ABSENT:
+            surface = yield from resuming.completed(uploads, _location(begun, uploads), body)
+            return _described(_checked((yield Call("GET", surface)), surface), surface)
+    collection = addresses.surfaces_url(url)
+    answer = yield Call("POST", collection, named, body=body)
+    return _described(_checked(answer, collection), _location(answer, collection))
 
 
 def formats_read(url: str) -> Flow[frozenset[str] | None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import tempfile
@@ -28,6 +29,7 @@ File: TypeAlias = "str | os.PathLike[str] | BinaryIO | bytes"
 Source: TypeAlias = "File | Surface | ArrayLike"
 
 _CHUNK = 64 * 1024
+_HASHED = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -47,13 +49,39 @@ class Body:
     files : sequence of (name, file)
     sent : callable or None
         Called as ``sent(fraction)`` while the files are read.
+
+    Attributes
+    ----------
+    size : int
+        Bytes of all files.
+    sha256 : str
+        Of the one file, once it was computed.
     """
 
     def __init__(self, files: Sequence[tuple[str, BinaryIO]], sent: Callable[[float], None] | None = None) -> None:
         self.files = files
         self.size = sum(_length(file) for _, file in files)
+        self.sha256 = ""
         self._sent = sent
         self._done = 0
+
+    @property
+    def left(self) -> int:
+        """Bytes that were not read yet."""
+        return self.size - self._done
+
+    def hash(self) -> None:
+        """Compute the SHA-256 of the one file, as `sha256` in hexadecimal digits; it is at its start then."""
+        (_, file), digest = self.files[0], hashlib.sha256()
+        while block := file.read(_HASHED):
+            digest.update(block)
+        file.seek(0)
+        self.sha256 = digest.hexdigest()
+
+    def go_to(self, offset: int) -> None:
+        """Go to a byte of the one file, from which on it is read."""
+        self.files[0][1].seek(offset)
+        self._done = offset
 
     def count(self, size: int) -> None:
         """Count `size` more bytes as read."""

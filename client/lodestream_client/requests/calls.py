@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import ssl
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -15,7 +15,7 @@ from .bodies import Body
 if TYPE_CHECKING:
     import httpx
 
-__all__ = ["TIMEOUT", "Call", "Flow", "Pause", "client_options", "request_options"]
+__all__ = ["TIMEOUT", "Aside", "Call", "Flow", "Pause", "client_options", "request_options"]
 
 T = TypeVar("T")
 
@@ -54,7 +54,14 @@ class Pause:
     seconds: float
 
 
-Flow: TypeAlias = Generator[Call | Pause, Answer | None, T]
+@dataclass(frozen=True)
+class Aside:
+    """Work that takes long, such as reading a file, to be done where nobody else waits for it."""
+
+    work: Callable[[], None]
+
+
+Flow: TypeAlias = Generator[Call | Pause | Aside, Answer | None, T]
 
 
 def client_options(url: str, *, direct: bool) -> dict[str, Any]:
@@ -112,6 +119,6 @@ def request_options(call: Call, url: str, token: str | None) -> dict[str, Any]:
     if call.body is not None and len(call.body.files) > 1:
         options["files"] = call.body.form()
     elif call.body is not None:
-        headers["Content-Length"] = str(call.body.size)
-        headers["Content-Type"] = "application/octet-stream"
+        headers["Content-Length"] = str(call.body.left)
+        headers.setdefault("Content-Type", "application/octet-stream")
     return options

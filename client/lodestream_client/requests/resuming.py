@@ -1,0 +1,113 @@
+"""Uploads that go on after a lost connection: the requests of tus 1.0.0, without I/O."""
+
+from __future__ import annotations
+
+import base64
+import random
+from collections.abc import Mapping
+
+from lodestream.errors import LodestreamError, RemoteProtocolError
+
+from . import addresses, problems
+from .answers import Answer
+from .bodies import Body
+from .calls import Call, Flow, Pause
+
+__all__ = ["ABSENT", "LEAST", "beginning", "completed"]
+
+#: Bytes from which on an upload is sent in this way: sending less again costs little more than asking does.
+LEAST = 8 << 20
+
+#: Statuses of servers that know no such uploads.
+ABSENT = (404, 405)
+
+_VERSION = {"Tus-Resumable": "1.0.0"}
+_TYPE = "application/offset+octet-stream"
+
+# Requests in a row that bring the upload no further, and the seconds between two of them: at random within twice as
+# long each time, so that clients that lost the same server do not come back all at once.
+_ATTEMPTS = 12
+_FIRST_PAUSE = 0.2
+_LONGEST_PAUSE = 30.0
+
+# Statuses of `_NoFurtherError`.
+_ELSEWHERE = (409, 423)
+
+
+def beginning(body: Body) -> Mapping[str, str]:
+    """Return the headers of the request that begins the upload of a body, which has been hashed."""
+    metadata = f"sha256 {base64.b64encode(body.sha256.encode()).decode()}"
+    return {**_VERSION, "Upload-Length": str(body.size), "Upload-Metadata": metadata}
+
+
+def completed(uploads: str, address: str, body: Body) -> Flow[str]:
+    """Send a body to an upload at `address`, which has begun at `uploads`, and return the URL of its surface.
+
+    After a lost connection, or an answer that may be another one soon, the server is asked how far it is, and the
+    upload goes on there.
+
+    Raises
+    ------
+    LodestreamError
+        If the server refuses the upload, or it comes no further although it was tried again and again.
+    """
+    offset, asks, failures = 0, False, 0
+    _own(address, uploads)
+    while True:
+        wait = 0.0
+        try:
+            answer = yield (_question(address) if asks else _part(address, body, offset))
+            assert answer is not None
+            wait = _asked(answer)
+            _refuse(answer, address)
+            if location := answer.headers.get("location"):
+                return _own(addresses.resolved(address, location), uploads)
+            reached = _offset(answer, address, body.size)
+            if reached == offset and not asks:
+                raise _NoFurtherError(f"{address} took no more of the upload, and did not say why")
+            failures = 0 if reached > offset else failures
+            offset, asks = reached, False
+        except LodestreamError as error:
+            failures += 1
+            if failures == _ATTEMPTS or not (problems.passes(error) or isinstance(error, _NoFurtherError)):
+                raise
+            yield Pause(max(wait, random.uniform(0.0, min(_FIRST_PAUSE * 2**failures, _LONGEST_PAUSE))))
+            asks = True
+
+
+class _NoFurtherError(RemoteProtocolError):
+    """The server goes on elsewhere in the upload, still takes the request that was lost, or took nothing."""
+
+
+def _own(address: str, uploads: str) -> str:
+    if not addresses.same_origin(address, uploads):
+        raise RemoteProtocolError(f"expected an address on {addresses.origin(uploads)}, got {address!a:.300}")
+    return address
+
+
+def _question(address: str) -> Call:
+    return Call("HEAD", address, headers=_VERSION)
+
+
+def _part(address: str, body: Body, offset: int) -> Call:
+    body.go_to(offset)
+    return Call("PATCH", address, headers={**_VERSION, "Upload-Offset": str(offset), "Content-Type": _TYPE}, body=body)
+
+
+def _refuse(answer: Answer, address: str) -> None:
+    if not 200 <= answer.status < 300:
+        error = problems.from_response(answer.status, answer.reason, answer.content, address)
+        raise _NoFurtherError(str(error)) if answer.status in _ELSEWHERE else error
+
+
+def _asked(answer: Answer) -> float:
+    """Return the seconds for which the server asks to wait."""
+    text = answer.headers.get("retry-after", "")
+    return min(float(text), _LONGEST_PAUSE) if text.isascii() and text.isdecimal() else 0.0
+
+
+def _offset(answer: Answer, address: str, size: int) -> int:
+    text = answer.headers.get("upload-offset", "")
+    if not (text.isascii() and text.isdecimal() and len(text) < 19 and int(text) <= size):
+        raise RemoteProtocolError(f"expected how far the upload is from {address}, got {text[:80]!a}")
+    return int(text)
