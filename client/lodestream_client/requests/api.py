@@ -7,7 +7,6 @@ it; its return value is the result. `AsyncClient` carries them out.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,7 +25,7 @@ from lodestream.target import Target
 from . import addresses, problems, resuming
 from .answers import LONGEST_ANSWER, Answer, check_figures, parse
 from .bodies import Body
-from .calls import Aside, Call, Flow, Pause
+from .calls import Aside, Call, Flow
 from .states import ENDS, STATES
 
 __all__ = [
@@ -52,9 +51,8 @@ __all__ = [
 #: Called as ``progress(stage, fraction)``; the stages are ``encoding``, ``sending`` and ``building``.
 Progress: TypeAlias = Callable[[str, float], None]
 
-# Seconds between looks at a surface that is being built: soon at first, since most builds are short, then rarely.
-_LOOKS = (0.05, 0.1, 0.2, 0.4, 0.8)
-_LOOKS_AFTER = 1.5
+# For how many seconds the server may wait for the end of a build before it answers: less where progress is shown.
+_WAIT, _WAIT_WITH_PROGRESS = "20", "1"
 
 # What a container is called becomes the name of a file.
 _CONTAINER = re.compile(r"[0-9a-f]{64}")
@@ -212,7 +210,7 @@ def retry(url: str, wait: bool, progress: Progress | None) -> Flow[Description]:
 
 def _followed(surface: Description, wait: bool, progress: Progress | None) -> Flow[Description]:
     """Wait until a surface is ready, or will not become ready by itself."""
-    looks = itertools.chain(_LOOKS, itertools.repeat(_LOOKS_AFTER))
+    seconds = {"wait": _WAIT if progress is None else _WAIT_WITH_PROGRESS}
     while wait and not surface.ready:
         if surface.state in ENDS:
             reason = str(_reason(surface.details))
@@ -221,8 +219,7 @@ def _followed(surface: Description, wait: bool, progress: Progress | None) -> Fl
             raise RemoteError(surface.state, reason)
         if progress is not None:
             progress("building", _fraction(surface.details))
-        yield Pause(next(looks))
-        answer = yield Call("GET", surface.url)
+        answer = yield Call("GET", surface.url, seconds)
         surface = _described(_checked(answer, surface.url), surface.url)
     return surface
 

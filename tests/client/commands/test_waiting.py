@@ -33,9 +33,11 @@ class Fake:
     states: list[str]
     url: str = ""
     requests: list[tuple[str, str]] = field(default_factory=list)
+    waits: set[str] = field(default_factory=set)
 
     def answer(self, method: str, path: str) -> tuple[int, dict[str, Any]]:
         self.requests.append((method, path.partition("?")[0]))
+        self.waits |= {path.partition("?")[2]} if method == "GET" else set()
         if path.startswith(("/v1/surfaces/none", "/v1/formats")):  # it does not say what it reads, as an older server
             return 404, {"code": "not-found", "detail": "no such surface", "status": 404}
         state = self.states.pop(0) if len(self.states) > 1 else self.states[0]
@@ -104,6 +106,7 @@ def test_upload_and_retry_end_with_the_reason(
         upload = [("GET", "/v1/formats"), ("POST", "/v1/surfaces")]
         first = upload if what == "upload" else [("POST", "/v1/surfaces/ab/retry")]
         assert server.requests == first + [("GET", "/v1/surfaces/ab")] * len(states)
+        assert server.waits <= {"", "wait=20"}
 
 
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])
@@ -120,6 +123,7 @@ def test_retry_waits_until_the_surface_is_ready(asynchronous: bool) -> None:
             made = Client(server.surface).retry(server.surface, progress=progress)
         assert (made.ready, made.url, made.id) == (True, server.surface, "ab")
         assert told == [("building", 0.5)] * 2
+        assert server.waits == {"wait=1"}, "the progress is asked for every second"
     with fake("queued") as server:
         assert Client(server.surface).retry(server.surface, wait=False).state == "queued"
         assert server.requests == [("POST", "/v1/surfaces/ab/retry")]

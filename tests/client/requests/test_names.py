@@ -114,7 +114,7 @@ def test_an_upload_that_replaces_what_a_name_leads_to() -> None:
         assert json.loads(server.asked[posts[0] - 1].body) == {"surface": None}, "whether it may"
         puts = [place for place, asked in enumerate(server.asked) if asked.method == "PUT" and ID in str(asked.body)]
         assert len(puts) == len(posts) == 2
-        assert server.asked[puts[0] - 1].path == SURFACE["url"], "it was ready before"
+        assert server.asked[puts[0] - 1].path == f"{SURFACE['url']}?wait=20", "it was ready before"
         put = server.asked[puts[0]]
         assert (put.path, json.loads(put.body), put.token) == (NAME, {"surface": ID}, "Bearer secret")
         server.asked.clear()
