@@ -41,7 +41,9 @@ def test_an_object_is_read_in_blocks(
     with pytest.raises(AbsentError, match=r"there is no none\.lode"):
         ls.open(f"{address}/maps/none.lode")
     (tmp_path / "a.lode").write_bytes(ls.encode(HEIGHTS[::-1]))
-    copy = pickle.dumps(opened)
+    copy, before = pickle.dumps(opened), ls.open(f"{address}/maps/hills.lode")
     open_store(address).put_file("maps/hills.lode", tmp_path / "a.lode")
     with pytest.raises(ls.LodestreamError, match="as it was when it was opened first"):
         pickle.loads(copy)
+    with pytest.raises(ls.StreamError):
+        before.view()
