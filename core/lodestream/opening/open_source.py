@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError, OptionError, UnavailableError
-from .byte_sources import ByteSource, FileSource, MemorySource
+
+if TYPE_CHECKING:
+    from .byte_sources import ByteSource
 
 __all__ = ["GROUP", "is_address", "open_source"]
 
@@ -42,6 +44,8 @@ def open_source(
     LodestreamError, OSError
         If it cannot be reached or read, or is not there.
     """
+    from .byte_sources import FileSource, MemorySource  # commands that open nothing start without it
+
     if isinstance(source, bytes | bytearray | memoryview):
         _refuse_token(token, "bytes")
         return MemorySource(bytes(source))
