@@ -82,7 +82,7 @@ def test_encode_is_refused_before_the_file_is_opened(bare: Bare, tmp_path: Path)
 
 
 def test_a_file_is_uploaded_and_what_is_in_memory_is_refused(bare: Bare, server: str, terrain_file: Path) -> None:
-    assert bare.done("push", terrain_file, server, "--name", "uploaded without kernels") == ""
+    assert bare.done("push", "--quiet", terrain_file, server, "--name", "uploaded without kernels") == ""
     code = f"import numpy; from lodestream_client import Client; Client({server!r}).upload(numpy.ones((9, 9)))"
     told = bare.run("-c", code).stderr
     assert "UnavailableError: encoding is not possible here" in told

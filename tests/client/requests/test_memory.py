@@ -268,7 +268,7 @@ def test_who_gives_up_does_not_wait_for_the_encoder() -> None:
 
 
 def test_push_sends_a_container_as_it_is(run: Run, server: str, container_file: Path) -> None:
-    code, out, err = run("push", container_file, server, "--name", "as it is")
+    code, out, err = run("push", "--quiet", container_file, server, "--name", "as it is")
     assert (code, err) == (0, "")
     url = out.strip()
     made = Client(url).get(url)
