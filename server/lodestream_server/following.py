@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 from lodestream.errors import LodestreamError
@@ -19,6 +20,9 @@ from .store.surfaces import Surfaces
 __all__ = ["Following"]
 
 _log = logging.getLogger(__name__)
+
+# Seconds that the end of a server waits for looks that are under way.
+_FAREWELL = 5.0
 
 
 class Following:
@@ -54,10 +58,11 @@ class Following:
             thread.start()
 
     def close(self) -> None:
-        """End, after the looks that are under way."""
+        """End, and wait a little for the looks that are under way: what they would find is found by the next server."""
         self._ending.set()
+        end = time.monotonic() + _FAREWELL
         for thread in self._threads:
-            thread.join()
+            thread.join(max(end - time.monotonic(), 0.0))
 
     def _repeat(self, what: str, seconds: float, look: Callable[[], object]) -> None:
         failing = False
@@ -66,7 +71,7 @@ class Following:
                 look()
                 failing = False
             except LodestreamError as error:
-                if not failing:
+                if not failing and not self._ending.is_set():
                     _log.error("%s could not be looked at, which is tried again: %s", what, error)
                 failing = True
             except Exception:  # whatever it is, nobody else would do this work

@@ -40,6 +40,9 @@ _RENEWED, _WATCHED, _TRUSTED = 1 / 3, 1 / 15, 4 / 5
 
 _LONGEST_NAME = 100
 
+# Seconds that the end of a server waits for a request that is under way.
+_FAREWELL = 5.0
+
 
 def _clock() -> float:
     """Return seconds that go on while the machine sleeps: then others take over."""
@@ -176,7 +179,10 @@ class Lease:
         """Give it up, so that others need not wait."""
         self._ending.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(_FAREWELL)
+            if self._thread.is_alive():  # the store does not answer: others take over when the lease is over
+                self._until = -math.inf
+                return
         if self._ours:
             with suppress(LodestreamError), self._one_at_a_time:
                 self._write(self._clock(), self.number, released=True)

@@ -14,6 +14,8 @@ from lodestream.stores import Store, StoreError, UnacknowledgedError, open_store
 from lodestream_server.store.lease import LEASE_SECONDS, Lease
 from tests.server.helpers import eventually
 
+from .conftest import Place
+
 SECONDS = 15.0
 
 
@@ -28,8 +30,17 @@ class Clock:
 
 
 @pytest.fixture
-def store(memory: str) -> Store:
-    return open_store(memory)
+def in_memory(memory: str) -> Place:
+    return lambda: open_store(memory)
+
+
+PLACES = ["in_memory", *(pytest.param(name, marks=pytest.mark.long) for name in ("bucket_of_s3", "bucket_of_azure"))]
+
+
+@pytest.fixture(params=PLACES)
+def store(request: pytest.FixtureRequest) -> Store:
+    make: Place = request.getfixturevalue(request.param)
+    return make()
 
 
 @pytest.fixture
