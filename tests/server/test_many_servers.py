@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,6 +100,31 @@ def test_a_reader_serves_what_the_writer_built_and_changes_nothing(site: Site) -
     first.delete(location).raise_for_status()
     within(5.0, lambda: states(reader) == {}, "the reader to see that it is gone")
     assert reader.get(location).status_code == 404
+
+
+def test_a_reader_answers_whoever_waits_once_the_writer_has_built(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "build", slow.wait)
+    first = writer(site)
+    reader = site.start("reader", read_only=True)
+    location = first.post("/v1/surfaces", content=npy(hills())).headers["location"]
+    within(5.0, lambda: states(reader), "the reader to see it")
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(reader.get, location, params={"wait": "60"})
+        time.sleep(LOOK)
+        (site.folder / "writer" / "go").touch()
+        settled(first, location)
+        within(10.0, waiting.done, "the reader to answer")
+        assert waiting.result().json()["state"] == "ready"
+
+
+def test_a_container_that_the_bucket_has_lost_is_built_again_when_it_is_fetched(site: Site) -> None:
+    http = writer(site)
+    uploaded = push(http, npy(hills()))
+    place = f"/v1/containers/{uploaded['container_sha256']}.lode"
+    open_store(site.address).delete([place.removeprefix("/v1/")])
+    assert problem(http.get(place)) == (503, "busy")
+    assert settled(http, uploaded["url"])["state"] == "ready"
+    assert len(http.get(place).content) == uploaded["bytes"]
 
 
 def test_another_server_waits_says_for_whom_and_takes_over(site: Site) -> None:

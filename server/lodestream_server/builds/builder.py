@@ -82,6 +82,9 @@ _ROOM = "space on the server's disk"
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
 
+# How often a server that does not build looks whether a build has ended.
+_LOOK_SECONDS = 1.0
+
 # Of the points of a surface, in the largest type.
 _BYTES = 24
 
@@ -261,9 +264,13 @@ class Builder:
         waiting = self._awaited.setdefault(surface, set())
         waiting.add(heard)
         try:
-            known = self._find(surface)  # it may have ended before somebody listened
-            if known is not None and known.state in ("queued", "building") and not self._leaving:
-                await asyncio.wait((heard,), timeout=seconds)
+            end = time.monotonic() + seconds
+            while not heard.done() and not self._leaving and (left := end - time.monotonic()) > 0:
+                known = self._find(surface)  # it may have ended before somebody listened
+                if known is None or known.state not in ("queued", "building"):
+                    break
+                # Of a build of another server nothing is heard.
+                await asyncio.wait((heard,), timeout=left if self._surfaces.writes else min(left, _LOOK_SECONDS))
         finally:
             waiting.discard(heard)
             if not waiting and self._awaited.get(surface) is waiting:
@@ -728,7 +735,8 @@ def _identities(files: Sequence[Path]) -> list[tuple[int, int, int]] | None:
         statuses = [os.stat(path) for path in files]
     except OSError:
         return None
-    return [(status.st_dev, status.st_ino, status.st_ctime_ns) for status in statuses]
+    # Not when they were changed: a file that came in parts has another name for a moment, see `partial_uploads`.
+    return [(status.st_dev, status.st_ino, status.st_mtime_ns) for status in statuses]
 
 
 def _not_now(error: OSError) -> worker.Refused:

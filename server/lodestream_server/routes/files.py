@@ -11,7 +11,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from lodestream.stores import Blob
+from lodestream.stores import AbsentError, Blob
 
 from ..access.scopes import READ
 from ..problems import BusyError, responses
@@ -83,7 +83,7 @@ async def _sent(request: Request, parts: State, sha256: str, headers: dict[str, 
     sort_out(request, size, etag)
     if isinstance(place, tuple):
         return _Container(parts.containers, sha256, place, request, headers)
-    return SentBlob(place, request, headers, examples.CONTAINER_TYPE)
+    return _Object(parts.containers, sha256, place, request, headers)
 
 
 def _place(containers: Containers, sha256: str) -> tuple[tuple[Path, os.stat_result] | Blob, int]:
@@ -121,6 +121,24 @@ class _Container(SentFile):
         except FileNotFoundError:
             place, _ = await asyncio.to_thread(_place, self._containers, self._sha256)  # or it says why
             if not isinstance(place, tuple):  # the file was one of the cache, and had to make room
-                await SentBlob(place, self._request, self._given, examples.CONTAINER_TYPE)(scope, receive, send)
+                sent = _Object(self._containers, self._sha256, place, self._request, self._given)
+                await sent(scope, receive, send)
                 return
             raise BusyError(f"The container {self._sha256} was deleted and stored again; try again") from None
+
+
+class _Object(SentBlob):
+    """A container in a bucket, which only its first read finds not to be there."""
+
+    def __init__(
+        self, containers: Containers, sha256: str, blob: Blob, request: Request, headers: dict[str, str]
+    ) -> None:
+        super().__init__(blob, request, headers, examples.CONTAINER_TYPE)
+        self._containers = containers
+        self._sha256 = sha256
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        except AbsentError:
+            await asyncio.to_thread(self._containers.gone, self._sha256)

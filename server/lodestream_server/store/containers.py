@@ -164,7 +164,7 @@ class Containers:
                 try:
                     path = stack.enter_context(self._surfaces.store.local(layout.container_key(sha256)))
                 except AbsentError:
-                    self._gone(sha256)
+                    self.gone(sha256)
             yield path
 
     def is_used(self, sha256: str) -> bool:
@@ -197,7 +197,7 @@ class Containers:
         try:
             return self._surfaces.store.open(layout.container_key(sha256), size), size
         except AbsentError:
-            self._gone(sha256)
+            self.gone(sha256)
 
     def _check(self, sha256: str) -> int:
         """Return the bytes of a container that some surface has; raise an error if none has it."""
@@ -208,7 +208,16 @@ class Containers:
             raise BusyError(f"The container {sha256} was not there, and is built again; try again later")
         return size
 
-    def _gone(self, sha256: str) -> NoReturn:
+    def gone(self, sha256: str) -> NoReturn:
+        """Have a container built again that is not in the store, as a read has shown.
+
+        Raises
+        ------
+        NotFoundError
+            If no surface has it any more.
+        BusyError
+            Otherwise.
+        """
         lost = self._surfaces.lose(sha256)
         if not lost and not self._surfaces.index.uses_container(sha256):
             raise NotFoundError(f"No container {sha256[:80]!a} on this server")
@@ -254,7 +263,7 @@ class Containers:
             raise
         except AbsentError:  # of a bucket the first read says so
             blob.close()
-            self._gone(sha256)
+            self.gone(sha256)
         except BaseException:
             blob.close()
             raise

@@ -319,7 +319,8 @@ class PartialUploads:
 
     async def _remove(self, uploads: list[PartialUpload]) -> None:
         for upload in uploads:
-            if not upload.is_locked:
+            # While another one was being removed, somebody else may have removed this one.
+            if upload.id in self._all and not upload.is_locked:
                 async with upload.settled():
                     await self.remove(upload)
 

@@ -516,3 +516,19 @@ print(*sorted(set(sys.modules) - before), "fastapi" in sys.modules)
     command = [sys.executable, "-c", program]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_an_upload_is_the_same_as_long_as_nobody_puts_another_in_its_place(tmp_path: Path) -> None:
+    file, part = tmp_path / "upload", tmp_path / "part"
+    file.write_bytes(b"abc")
+    begun = builder._identities([file])
+    # What came in parts keeps its name there until it is a surface.
+    part.hardlink_to(file)
+    part.unlink()
+    assert builder._identities([file]) == begun
+    other = tmp_path / "other"
+    other.write_bytes(b"abc")
+    other.replace(file)
+    assert builder._identities([file]) != begun
+    file.unlink()
+    assert builder._identities([file]) is None

@@ -219,6 +219,17 @@ def test_what_is_finished_is_remembered_up_to_a_number(tmp_path: Path) -> None:
     run(tmp_path, test)
 
 
+def test_several_may_remove_the_same_ones_at_once(tmp_path: Path) -> None:
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        others = [it, *[await uploads.create(DECLARED) for _ in range(5)]]
+        for upload in others:
+            upload.touched = 0.0
+        await asyncio.gather(*[uploads.expire() for _ in range(3)])
+        assert list(tmp_path.iterdir()) == []
+
+    run(tmp_path, test)
+
+
 @pytest.mark.parametrize("step", range(8))
 def test_on_a_full_disk_nothing_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     async def begin() -> None:
