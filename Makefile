@@ -123,7 +123,7 @@ lint: $(STAMP) ## ruff, mypy --strict, which package may import which, clang-for
 	for check in "ruff check" "ruff format --check" "lint-imports --no-logo"; do $(BIN)/$$check || status=1; done; \
 	$(CLANG_FORMAT) --dry-run -Werror $(LAID_OUT) || status=1; \
 	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml || status=1; \
-	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker/compose.yaml || status=1; \
+	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker/compose.yaml docker/compose.scale.yaml || status=1; \
 	for compiler in gcc clang; do \
 		if command -v $$compiler > /dev/null; then \
 			for file in $(filter %.c,$(C)); do $$compiler $(C_WARNINGS) -c $$file -o /dev/null || status=1; done; \

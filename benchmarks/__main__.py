@@ -30,7 +30,7 @@ SECTIONS = (
 )
 
 #: Sections that take long: only when they are named.
-LONG = ("scale", "scale_blocks", "small", "remeshing", "pixels", "stops", "map_bytes")
+LONG = ("scale", "scale_blocks", "small", "remeshing", "pixels", "stops", "map_bytes", "bucket")
 
 # Before numpy is loaded: every figure is of one core, but where another number of threads is named.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "LODESTREAM_THREADS"):

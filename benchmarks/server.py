@@ -41,12 +41,12 @@ _PACKAGES = ("uvicorn", "websockets", "starlette", "fastapi")
 
 
 class Server:
-    """``lodestream serve`` on a folder of its own."""
+    """``lodestream serve`` on a folder of its own, or with other options and variables."""
 
-    def __init__(self, folder: Path) -> None:
-        command = [sys.executable, "-m", "lodestream_client", "serve", "--port", "0", "--data", str(folder / "data")]
-        command += ["--unconfined"]  # on any machine
-        environment = {**os.environ, "LODESTREAM_LOG_LEVEL": "warning", "LODESTREAM_WORKERS": "1"}
+    def __init__(self, folder: Path, *options: str, **variables: str) -> None:
+        command = [sys.executable, "-m", "lodestream_client", "serve", "--port", "0"]
+        command += ["--unconfined", *(options or ("--data", str(folder / "data")))]  # on any machine
+        environment = {**os.environ, "LODESTREAM_LOG_LEVEL": "warning", "LODESTREAM_WORKERS": "1", **variables}
         self._process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
         assert self._process.stderr is not None
         lines = iter(self._process.stderr.readline, "")

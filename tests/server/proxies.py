@@ -17,7 +17,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-__all__ = ["SECONDS", "Front", "caddy", "caddy_of_image", "configuration", "missing", "nginx"]
+__all__ = ["SECONDS", "Front", "caddy", "caddy_of_image", "caddy_of_many", "configuration", "missing", "nginx"]
 
 #: Seconds after which something of a proxy hangs: a start, a request, a command.
 SECONDS = 120.0
@@ -147,6 +147,17 @@ def caddy_of_image(folder: Path, behind: str) -> Iterator[Front]:
     names = {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_UPSTREAM": behind}
     names["LODESTREAM_HTTP_PORT"] = str(_free())
     with _caddy(folder, _ROOT / "docker/Caddyfile", names, port) as front:
+        yield front
+
+
+@contextlib.contextmanager
+def caddy_of_many(folder: Path, writers: list[str], readers: list[str]) -> Iterator[Front]:
+    """Caddy with the Caddyfile of docker/ for several servers."""
+    folder.mkdir()
+    port = _free()
+    names = {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_HTTP_PORT": str(_free())}
+    names |= {"LODESTREAM_WRITERS": " ".join(writers), "LODESTREAM_READERS": " ".join(readers)}
+    with _caddy(folder, _ROOT / "docker/Caddyfile.scale", names, port) as front:
         yield front
 
 

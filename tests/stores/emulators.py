@@ -30,7 +30,7 @@ import pytest
 from lodestream.operating_system import lock, open_own
 from tests.patience import PATIENCE
 
-__all__ = ["Emulator", "azure", "azurite", "ministack", "s3"]
+__all__ = ["Emulator", "azure", "azurite", "ministack", "running_ministack", "s3"]
 
 HERE = Path(__file__).parent
 INSTALLED = HERE.parents[1] / "build" / "emulators"
@@ -158,8 +158,14 @@ def _make(port: int, path: str, headers: dict[str, str]) -> None:
 @pytest.fixture(scope="session")
 def ministack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
     """S3 on this machine."""
-    folder = _installed("ministack", [HERE / "ministack.txt"], _install_ministack)
-    work, port = tmp_path_factory.mktemp("ministack"), _free_port()
+    with running_ministack(tmp_path_factory.mktemp("ministack")) as emulator:
+        yield emulator
+
+
+@contextmanager
+def running_ministack(work: Path) -> Iterator[Emulator]:
+    """Run S3 on this machine, with a bucket, for the length of a block; it writes into a folder."""
+    folder, port = _installed("ministack", [HERE / "ministack.txt"], _install_ministack), _free_port()
     own = {
         "PATH": os.environ["PATH"],
         "HOME": str(work),

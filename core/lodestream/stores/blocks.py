@@ -1,4 +1,4 @@
-"""Reads of objects in buckets: in blocks, joined to few requests, one block ahead, within bounded memory."""
+"""Reads of objects in buckets: in blocks, joined to few requests, some in advance, within bounded memory."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ BLOCK = 256 << 10
 _JOINED = 8
 #: Blocks of one read that are asked for at once.
 _AT_ONCE = 16
-#: Bytes of blocks that are kept.
-_KEPT = 64 << 20
+#: Bytes of blocks that are kept: with what requests take beside them, 64 MiB of memory.
+_KEPT = 60 << 20
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Blocks:
     """Blocks of objects in memory; who wants one that is on its way waits for it.
 
     A request costs a round trip, whatever it brings: by slices of a stream, a whole container takes twenty times as
-    long. So a read asks for whole blocks, neighbours in one request, and for the block behind them. The least recently
-    used blocks go first.
+    long. So a read asks for whole blocks, neighbours in one request, and for the block behind them; of one that goes on
+    behind another for two. The least recently used blocks go first.
 
     Parameters
     ----------
@@ -112,18 +112,16 @@ class Blocks:
         """Return the blocks from one to before another; what is not there is on its way, and so is the one behind."""
         with self._lock:
             missing = [number for number in range(first, behind) if (extent, number) not in self._blocks]
-            ahead = behind * BLOCK < extent.size and (extent, behind) not in self._blocks
-            for number in [*missing, *([behind] if ahead else [])]:
+            ahead = self._ahead(extent, first, behind)
+            for number in [*missing, *ahead]:
                 self._blocks[extent, number] = Future()
                 self._bytes += extent.length(number)
             wanted = [self._blocks[extent, number] for number in range(first, behind)]
             for number in range(first, behind):
                 self._blocks.move_to_end((extent, number))
-            requests = [[self._blocks[extent, number] for number in run] for run in _runs(missing)]
-            starts = [run[0] for run in _runs(missing)]
-            if ahead:
-                requests.append([self._blocks[extent, behind]])
-                starts.append(behind)
+            runs = [*_runs(missing), *([ahead] if ahead else [])]
+            requests = [[self._blocks[extent, number] for number in run] for run in runs]
+            starts = [run[0] for run in runs]
             self._evict()
         # The first one here, where somebody waits for it; all others meanwhile.
         own = bool(missing)
@@ -135,6 +133,14 @@ class Blocks:
         if own:
             self._bring(extent, starts[0], requests[0])
         return wanted
+
+    def _ahead(self, extent: Extent, first: int, behind: int) -> list[int]:
+        """Return the blocks to ask for in advance: one of whoever begins, two of whoever goes on."""
+        most = behind + (2 if (extent, first - 1) in self._blocks else 1)
+        if (extent, behind) in self._blocks:
+            return []
+        numbers = range(behind, min(most, -(-extent.size // BLOCK)))
+        return [number for number in numbers if (extent, number) not in self._blocks]
 
     def _bring(self, extent: Extent, first: int, blocks: list[Future[bytes]]) -> None:
         """Fetch neighbours in one request; who waits for them is told if that fails, and it may be tried again."""
