@@ -1,7 +1,8 @@
 """The command ``lodestream token``: create, list and revoke the tokens of a server; found through the entry points.
 
 It edits the token file, or the object in a bucket, and does not contact the server. So everybody who can write it can
-use it, and a running server notices the change.
+use it, and a running server notices the change. What it stands on is imported where it runs, since every command
+imports this module.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..access.tokens import SCOPES, TokenList, tokens_of
 from ..linux import require_linux
 from .serve import add_option, asked_for, chosen_settings
 
 if TYPE_CHECKING:
+    from ..access.tokens import TokenList
     from ..operation.settings import Choice
 
 __all__ = ["create", "list_tokens", "register", "revoke"]
@@ -77,6 +78,8 @@ def register(subparsers: Any, argv: Sequence[str] = ()) -> None:
 
 
 def _list(args: argparse.Namespace) -> TokenList:
+    from ..access.tokens import tokens_of
+
     require_linux()
     return tokens_of(chosen_settings(args))
 
@@ -155,6 +158,8 @@ def _name(text: str) -> str:
 
 
 def _scopes(text: str) -> tuple[str, ...]:
+    from ..access.tokens import SCOPES
+
     scopes = tuple(part.strip() for part in text.split(","))
     if not set(scopes) <= set(SCOPES):
         raise argparse.ArgumentTypeError(f"expected {', '.join(SCOPES)}, got {text!r}")
