@@ -106,6 +106,7 @@ class PartialUpload:
         self.folder = folder
         self._lock = asyncio.Lock()
         self._clock: asyncio.Timeout | None = None
+        self._asking = 0  # requests that look or delete, or wait for that
         self._gone = False
 
     @property
@@ -152,8 +153,12 @@ class PartialUpload:
         if self._clock is not None:
             self._clock.reschedule(asyncio.get_running_loop().time())
             self._clock = None  # which cannot be done twice
-        async with self._held():
-            yield
+        self._asking += 1
+        try:
+            async with self._held():
+                yield
+        finally:
+            self._asking -= 1
 
     @asynccontextmanager
     async def _held(self) -> AsyncIterator[None]:
@@ -173,7 +178,7 @@ class PartialUpload:
             If the bytes cannot be written.
         """
         arrived = self.offset
-        self._clock = clock = asyncio.timeout(None)
+        self._clock = clock = asyncio.timeout(0.0 if self._asking else None)
         try:
             async with clock:
                 async for block in blocks:

@@ -195,6 +195,29 @@ def test_a_request_that_waits_is_ended_by_one_that_asks(tmp_path: Path) -> None:
     run(tmp_path, test)
 
 
+def test_one_that_has_not_begun_to_wait_is_ended_too(tmp_path: Path) -> None:
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        async def look() -> None:
+            async with it.settled():
+                pass
+
+        async def silent() -> AsyncIterator[bytes]:
+            await asyncio.Event().wait()
+            yield b""
+
+        async with asyncio.timeout(30):
+            async with it.continued(0):
+                looking = asyncio.create_task(look())
+                await asyncio.sleep(0)  # as while its limits are checked
+                with pytest.raises(LockedError):
+                    await it.append(silent())
+            await looking
+        await sent(it, 0, BODY)
+        assert it.is_complete
+
+    run(tmp_path, test)
+
+
 def test_another_owner_finds_nothing(tmp_path: Path) -> None:
     async def test(uploads: PartialUploads, it: PartialUpload) -> None:
         for owner in ("bert", None):
