@@ -59,6 +59,7 @@ def check(history: History) -> list[Finding]:
         *history.findings,
         *_answers(history, surfaces),
         *surfaces.findings(),
+        *_of_those_who_wait(history),
         *_orders(history, surfaces),
         *_names(history),
     ]
@@ -71,6 +72,15 @@ def _answers(history: History, surfaces: _Surfaces) -> list[Finding]:
             # A server that is wrong is wrong again and again: the first time tells it.
             found.setdefault((rule, text), Finding(rule, text, (operation,)))
     return list(found.values())
+
+
+def _of_those_who_wait(history: History) -> Iterator[Finding]:
+    """What was acknowledged by a server that did not write at that time."""
+    for operation in history.operations:
+        status = None if operation.answer is None else operation.answer.status
+        if status in _DONE.get(operation.kind, ()) and any(span.holds(operation) for span in history.waiting):
+            text = f"{operation.subject or operation.name}: expected 503 from {operation.server}, got {status}"
+            yield Finding("not the writer", text, (operation,))
 
 
 def _wrong(operation: Operation, admins: frozenset[str], surfaces: _Surfaces) -> Iterator[tuple[str, str]]:
@@ -184,14 +194,14 @@ def _orders(history: History, surfaces: _Surfaces) -> Iterator[Finding]:
         if operation.kind in _OF_NAMES:
             for seen in operation.answer.seen if operation.answer is not None else ():
                 if (of := surfaces.only(seen.id)) is not None:
-                    steps[of].append(_seen_as(operation, seen.state))
+                    steps[of].append(_seen_as(operation, seen.state, history))
         elif operation.subject is not None:
             steps.setdefault(operation.subject, []).extend(_steps(operation, history))
         elif operation.answer is not None and operation.answer.status == 200:
             listed = {seen.id: seen.state for seen in operation.answer.seen}
             for subject, ids in surfaces.ids.items():
                 state = next((listed[surface] for surface in ids if surface in listed), ABSENT)
-                steps[subject].append(_seen_as(operation, state))
+                steps[subject].append(_seen_as(operation, state, history))
     for subject, own in steps.items():
         found = unexplained(own, history.marks)
         if found is not None:
@@ -207,7 +217,7 @@ def _names(history: History) -> Iterator[Finding]:
             if operation.answer is not None and operation.answer.status == 200:
                 found = dict(operation.answer.names)
                 for name, own in steps.items():
-                    own.append(_read(operation, {found.get(name, ABSENT)}))
+                    own.append(_read(operation, {found.get(name, ABSENT)}, history))
         elif operation.name is not None:
             steps[operation.name].extend(_steps_of_name(operation, history))
     for name, own in steps.items():
@@ -222,14 +232,16 @@ def _steps_of_name(operation: Operation, history: History) -> Iterator[Step]:
     if kind == "follow":
         # That it leads to a surface that was deleted meanwhile is told with 404 too.
         for seen in answer.seen if answer is not None else ():
-            yield _read(operation, {seen.id})
+            yield _read(operation, {seen.id}, history)
+    elif _did_nothing(operation, history):
+        return
     elif status in _DONE[kind] or status is None or status in _UNKNOWN:
         done = status in _DONE[kind]
         ended, latest = (operation.ended, None) if done else (None, history.ends.get(operation.server))
         as_: Literal["point", "delete"] = "point" if kind == "point" else "delete"
         yield Step(as_, operation.begun, ended, latest, operation=operation, value=operation.surface)
     elif kind == "unpoint" and status == 404:
-        yield _read(operation, {ABSENT})
+        yield _read(operation, {ABSENT}, history)
 
 
 def _steps(operation: Operation, history: History) -> Iterator[Step]:
@@ -239,19 +251,21 @@ def _steps(operation: Operation, history: History) -> Iterator[Step]:
     if kind in _DONE:
         if status in _DONE[kind]:
             yield _write(operation, operation.ended, None)
+        elif _did_nothing(operation, history):
+            return
         elif status is None or status in _UNKNOWN:
             yield _write(operation, None, history.ends.get(operation.server))
         elif kind != "upload" and status in (403, 404, 409):
-            yield _read(operation, {ABSENT} if status == 404 else PRESENT)
+            yield _read(operation, {ABSENT} if status == 404 else PRESENT, history)
     elif kind in ("fetch", "values") and answer is not None:
         if answer.status in _BYTES and not answer.seen:
-            yield _read(operation, _BYTES[answer.status])
+            yield _read(operation, _BYTES[answer.status], history)
     elif status == 404:
-        yield _read(operation, {ABSENT})
+        yield _read(operation, {ABSENT}, history)
     # Apart from what it did: the answer may be older than the end of it.
     for seen in answer.seen if answer is not None else ():
         # Whoever has pushed and is told that it is ready does not push again.
-        yield _read(operation, {seen.state}) if kind == "upload" else _seen_as(operation, seen.state)
+        yield _read(operation, {seen.state}, history) if kind == "upload" else _seen_as(operation, seen.state, history)
 
 
 def _write(operation: Operation, ended: float | None, latest: float | None) -> Step:
@@ -259,12 +273,21 @@ def _write(operation: Operation, ended: float | None, latest: float | None) -> S
     return Step(operation.kind, operation.begun, ended, latest, operation=operation)
 
 
-def _read(operation: Operation, observed: Iterable[str]) -> Step:
-    return Step("read", operation.begun, operation.ended, observed=frozenset(observed), operation=operation)
+def _read(operation: Operation, observed: Iterable[str], history: History) -> Step:
+    since = history.since(operation)
+    return Step(
+        "read", operation.begun, operation.ended, observed=frozenset(observed), operation=operation, since=since
+    )
 
 
-def _seen_as(operation: Operation, state: str) -> Step:
-    return _read(operation, {state, BARE} if state == "ready" else {state})
+def _seen_as(operation: Operation, state: str, history: History) -> Step:
+    return _read(operation, {state, BARE} if state == "ready" else {state}, history)
+
+
+def _did_nothing(operation: Operation, history: History) -> bool:
+    """Whether a change was refused by a server that was known not to write."""
+    refused = operation.answer is not None and operation.answer.status == 503
+    return refused and any(span.holds(operation) for span in history.waiting)
 
 
 def _out_of_order(subject: Subject | str, found: Unexplained, steps: list[Step]) -> Finding:

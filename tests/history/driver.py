@@ -20,6 +20,8 @@ __all__ = ["Client", "Crowd", "Goods", "Server"]
 
 _SETTLED = ("ready", "failed", "waiting")
 
+_CHANGES = ("upload", "delete", "retry", "point", "unpoint")
+
 # What is asked of a surface by its id.
 _OF_ONE = ("delete", "retry", "look", "fetch", "values", "point")
 
@@ -33,10 +35,13 @@ class Server:
     name : str
         Of this process; after a restart it is another.
     url : str
+    only_reads : bool
+        It is not asked for any change.
     """
 
     name: str
     url: str
+    only_reads: bool = False
 
 
 #: The servers that can be asked now; none while they are down.
@@ -134,16 +139,11 @@ class Client:
         return self._of_surface("look", "GET", "", subject, caller or subject.owner)
 
     def fetch(self, subject: Subject) -> Answer | None:
-        """Ask for its container: where it is, then its bytes."""
+        """Ask for its container."""
 
         def ask(url: str, headers: dict[str, str]) -> Answer:
-            found = self._http.get(f"{url}/v1/surfaces/{self._ids[subject]}/container", headers=headers)
-            if found.status_code != 307:
-                return _entry(found)
-            place = found.headers["location"]
-            answer = self._http.get(f"{url}{place}", headers=headers)
-            named = place.rpartition("/")[2].removesuffix(".lode")
-            return _file(answer, named)
+            answer = self._http.get(f"{url}/v1/surfaces/{self._ids[subject]}/container", headers=headers)
+            return _file(answer, answer.headers.get("etag", "").strip('"'))
 
         return self._do("fetch", subject.owner, subject, self._ids.get(subject), ask)
 
@@ -254,7 +254,7 @@ class Client:
         ask: Callable[[str, dict[str, str]], Answer],
         name: str | None = None,
     ) -> Answer | None:
-        servers = self._servers()
+        servers = [each for each in self._servers() if not (each.only_reads and kind in _CHANGES)]
         if not servers or (kind in _OF_ONE and surface is None):
             time.sleep(0.02)
             return None
@@ -262,6 +262,9 @@ class Client:
         token = self._goods.tokens.get(caller or "")
         headers = {} if token is None else {"authorization": f"Bearer {token}"}
         operation = self._history.begin(self._name, server.name, kind, caller, subject, surface, name)
+        if server.name in self._history.ends:  # between the choice and the beginning
+            self._history.forget(operation)
+            return None
         answer = self._asked(operation, lambda: ask(server.url, headers))
         if answer is not None:
             self._history.end(operation, answer)
@@ -275,6 +278,7 @@ class Client:
             self._history.forget(operation)
             time.sleep(0.02)
         except httpx.TransportError:
+            self._history.cut(operation)
             time.sleep(0.02)
         return None
 

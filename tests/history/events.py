@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-__all__ = ["Answer", "Finding", "History", "Kind", "Mark", "Operation", "Seen", "Subject"]
+__all__ = ["Answer", "Finding", "History", "Kind", "Mark", "Operation", "Seen", "Span", "Subject"]
 
 Kind: TypeAlias = Literal[
     "upload", "delete", "retry", "look", "list", "fetch", "values", "point", "unpoint", "follow", "names"
@@ -142,6 +143,21 @@ class Mark:
 
 
 @dataclass(frozen=True)
+class Span:
+    """A time, of one server or of all."""
+
+    begun: float
+    ended: float
+    server: str | None = None
+
+    def holds(self, operation: Operation) -> bool:
+        """Whether an operation was asked and answered within it, at its server."""
+        if operation.ended is None or self.server not in (None, operation.server):
+            return False
+        return self.begun <= operation.begun and operation.ended <= self.ended
+
+
+@dataclass(frozen=True)
 class Finding:
     """Something that must not be.
 
@@ -179,6 +195,12 @@ class History:
         When another server was ready after each of them: what it had not answered has happened by then, or never.
     findings : list of Finding
         What was seen to be wrong while it was recorded.
+    lag : float or None
+        Seconds after which servers that follow another one show what it has acknowledged; None: they do so at once.
+    troubles : list of Span
+        Times of which that is not so, one after another.
+    waiting : list of Span
+        When a server was known not to be the one that writes: it acknowledges nothing then, and does nothing.
     """
 
     clock: Callable[[], float] = time.monotonic
@@ -187,6 +209,10 @@ class History:
     marks: list[Mark] = field(default_factory=list)
     ends: dict[str, float] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
+    lag: float | None = None
+    troubles: list[Span] = field(default_factory=list)
+    waiting: list[Span] = field(default_factory=list)
+    _open: Counter[str] = field(default_factory=Counter, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def begin(
@@ -203,6 +229,7 @@ class History:
         with self._lock:
             operation = Operation(client, server, kind, caller, subject, surface, self.clock(), name=name)
             self.operations.append(operation)
+            self._open[server] += 1
             return operation
 
     def end(self, operation: Operation, answer: Answer) -> None:
@@ -210,11 +237,48 @@ class History:
         with self._lock:
             operation.ended = self.clock()
             operation.answer = answer
+            self._open[operation.server] -= 1
+
+    def cut(self, operation: Operation) -> None:
+        """Note that no answer will come."""
+        with self._lock:
+            self._open[operation.server] -= 1
 
     def forget(self, operation: Operation) -> None:
         """Take back what was never sent."""
         with self._lock:
             self.operations.remove(operation)
+            self._open[operation.server] -= 1
+
+    def open(self, server: str) -> int:
+        """How many answers of a server are still to come."""
+        with self._lock:
+            return self._open[server]
+
+    def trouble(self, span: Span) -> None:
+        """Note a time in which servers need not follow in time; it is the latest one."""
+        with self._lock:
+            self.troubles.append(span)
+
+    def waits(self, span: Span) -> None:
+        """Note when a server did not write."""
+        with self._lock:
+            self.waiting.append(span)
+
+    def since(self, operation: Operation) -> float | None:
+        """From which moment on an answer may tell the state; None: from when it was asked for.
+
+        What was acknowledged is told by the server that writes.
+        """
+        if self.lag is None or operation.ended is None or operation.answer is None:
+            return None
+        if operation.kind in ("upload", "retry") and operation.answer.status in (200, 202):
+            return None
+        since = operation.begun - self.lag
+        for span in reversed(self.troubles):
+            if span.begun <= operation.ended and span.ended >= since:
+                since = min(since, span.begun - self.lag)
+        return since
 
     def refused(self) -> int:
         """How often it was answered until now that there is no room."""
@@ -225,6 +289,13 @@ class History:
         """Note that a server has ended, and that all it was doing has happened by now, or never will."""
         with self._lock:
             self.ends.setdefault(server, self.clock())
+
+    def ended_if_quiet(self, server: str) -> bool:
+        """Note the same of a server that has given every answer; whether it has."""
+        with self._lock:
+            if not self._open[server]:
+                self.ends.setdefault(server, self.clock())
+            return not self._open[server]
 
     def mark(self, kind: MarkKind) -> None:
         """Note that a backup begins or has ended, or that a server is about to start in what was restored from it."""

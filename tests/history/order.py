@@ -8,6 +8,9 @@ objects", 1990). All orders are tried at once, answer by answer (Lowe, "Testing 
 kept are the ways in which everything up to now can have happened, and an operation is put in order only when its own
 answer, or another one, asks for it.
 
+Of several servers one writes and the others follow it: what they tell may be of a moment some seconds ago. Such a read
+must be explained by a state that the surface may have had since then, each by itself.
+
 A name that stays is a register too: it leads nowhere, or to one surface, whose id is its state.
 
 A backup is not a moment: files are copied one after another. It holds what the surface was at any moment of it, and if
@@ -17,6 +20,7 @@ the surface was deleted or uploaded meanwhile, perhaps half of it.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
@@ -78,6 +82,8 @@ class Step:
         Where it comes from.
     value : str or None
         To which surface a name leads from then on.
+    since : float or None
+        Of a read at a server that follows another one: it may tell the state of any moment from this one on.
     """
 
     kind: Literal["read", "upload", "delete", "retry", "point"]
@@ -87,6 +93,7 @@ class Step:
     observed: States = frozenset()
     operation: Operation | None = None
     value: str | None = None
+    since: float | None = None
 
 
 @dataclass(frozen=True)
@@ -160,9 +167,17 @@ def unexplained(steps: Sequence[Step], marks: Iterable[Mark] = ()) -> Unexplaine
         When something is restored of which there is no backup.
     """
     ways = {_Way(frozenset({ABSENT}), None, False, frozenset())}
-    for what in _in_time(steps, marks):
+    past = [(-math.inf, frozenset({ABSENT}))] if any(step.since is not None for step in steps) else None
+    for moment, what in _in_time(steps, marks):
         if isinstance(what, Mark):
             ways = {_marked(way, what) for way in _all_orders(ways, steps)}
+        elif what.action == "looks":
+            assert past is not None
+            step = steps[what.number]
+            possible = _from(past, step.since if step.since is not None else moment)
+            if not possible & step.observed:
+                return Unexplained(step, possible)
+            continue
         elif what.action == "begins":
             ways = {way._replace(pending=way.pending | {what.number}) for way in ways}
         else:
@@ -174,29 +189,43 @@ def unexplained(steps: Sequence[Step], marks: Iterable[Mark] = ()) -> Unexplaine
                 if step.ended is None:
                     following.add(way._replace(pending=way.pending - {what.number}))
             if not following:
-                possible = (later(way.states) for way in _all_orders(ways, steps, without=what.number))
-                return Unexplained(step, frozenset().union(*possible))
+                return Unexplained(step, _possible(_all_orders(ways, steps, without=what.number)))
             ways = following
+        if past is not None:
+            past.append((moment, _possible(_all_orders(ways, steps))))
     return None
 
 
+def _possible(ways: Iterable[_Way]) -> States:
+    return frozenset().union(*(later(way.states) for way in ways))
+
+
+def _from(past: Sequence[tuple[float, States]], since: float) -> States:
+    """The states of some moment from one on, given those from each moment to the next."""
+    first = max(0, bisect_right(past, since, key=lambda each: each[0]) - 1)
+    return frozenset().union(*(states for _, states in past[first:]))
+
+
 class _Moment(NamedTuple):
-    action: Literal["begins", "ends"]
+    action: Literal["begins", "looks", "ends"]
     number: int
 
 
-def _in_time(steps: Sequence[Step], marks: Iterable[Mark]) -> Iterator[_Moment | Mark]:
+def _in_time(steps: Sequence[Step], marks: Iterable[Mark]) -> Iterator[tuple[float, _Moment | Mark]]:
     # At the same moment beginnings come first: then the two overlap, and either order may explain them.
     moments: list[tuple[float, int, _Moment | Mark]] = [(mark.moment, 1, mark) for mark in marks]
     for number, step in enumerate(steps):
         end = step.latest if step.ended is None else step.ended
         if end is not None and end < step.begun:
             continue  # nobody was there any more
+        if step.since is not None and end is not None:
+            moments.append((end, 2, _Moment("looks", number)))
+            continue
         moments.append((step.begun, 0, _Moment("begins", number)))
         if end is not None:
             moments.append((end, 2, _Moment("ends", number)))
-    for _, _, what in sorted(moments, key=lambda moment: moment[:2]):
-        yield what
+    for moment, _, what in sorted(moments, key=lambda moment: moment[:2]):
+        yield moment, what
 
 
 def _until(way: _Way, number: int, steps: Sequence[Step]) -> set[_Way]:

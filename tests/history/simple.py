@@ -14,7 +14,7 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.datastructures import UploadFile
 from starlette.requests import Request
-from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from tests.server.helpers import eventually
@@ -116,13 +116,8 @@ class _Simple:
             return found
         if found.state != "ready":
             return _problem(409, "not-ready")
-        return RedirectResponse(f"/v1/containers/{hashlib.sha256(found.container).hexdigest()}.lode")
-
-    async def file(self, request: Request) -> Response:
-        for surface in self._surfaces.values():
-            if request.path_params["sha256"] == hashlib.sha256(surface.container).hexdigest():
-                return Response(surface.container + b"!" * self.wrong("other bytes"))
-        return _problem(404, "not-found")
+        etag = f'"{hashlib.sha256(found.container).hexdigest()}"'
+        return Response(found.container + b"!" * self.wrong("other bytes"), headers={"etag": etag})
 
     async def level(self, request: Request) -> Response:
         found = self.find(request)
@@ -158,7 +153,6 @@ def simple_server(tokens: dict[str, str], fault: Fault | None = None) -> Iterato
             Route(surface, simple.delete, methods=["DELETE"]),
             Route(f"{surface}/container", simple.container),
             Route(f"{surface}/levels/{{level:int}}", simple.level),
-            Route("/v1/containers/{sha256}.lode", simple.file),
         ]
     )
     server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, ws="none", lifespan="off"))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from tests.history.checker import check
-from tests.history.events import Answer, Finding, History, Kind, Operation, Seen, Subject
+from tests.history.events import Answer, Finding, History, Kind, Operation, Seen, Span, Subject
 
 ANN = Subject("ann", "one", "a" * 64)
 BEN = Subject("ben", "one", "a" * 64)
@@ -568,3 +568,73 @@ def test_of_two_backups_the_last_one_is_restored(story: Story) -> None:
     story.mark("restored")
     story.look(state=None)
     assert story.rules == ["lost"]
+
+
+def test_a_server_that_follows_may_be_late_for_so_long(story: Story) -> None:
+    story.history.lag = 5.0
+    story.upload()
+    story.look(state=None, at=(3, 4), server="reader")
+    story.look(at=(4, 5), server="reader")
+    story.look(state=None, at=(6, 7), server="reader")  # the upload was asked for at 1, and answered at 2
+    assert story.findings == []
+    story.look(state=None, at=(7.5, 8), server="reader")
+    assert story.rules == ["lost"]
+
+
+def test_a_deleted_surface_that_a_server_shows_for_too_long(story: Story) -> None:
+    story.history.lag = 5.0
+    story.upload()
+    story("delete", ANN, 204)  # from 3 to 4
+    story.look(at=(8, 9), server="reader")
+    story.listed()
+    assert story.findings == []
+    story.look(at=(9.5, 10), server="reader")
+    assert story.rules == ["came back"]
+
+
+def test_what_failed_explains_that_a_server_is_later(story: Story) -> None:
+    story.history.lag = 5.0
+    story.upload()
+    story.look(state=None, at=(20, 21), server="reader")
+    assert story.rules == ["lost"]
+    story.history.trouble(Span(3, 16))
+    assert story.findings == []
+    story.look(state=None, at=(21.5, 22), server="reader")
+    assert story.rules == ["lost"]
+
+
+def test_what_the_server_that_writes_acknowledges_is_never_late(story: Story) -> None:
+    story.history.lag = 5.0
+    story.upload(state="ready")
+    story.look(state="queued")
+    assert story.findings == []
+    story.upload(state="queued")
+    assert story.rules == ["went back"]
+
+
+def test_names_may_be_late_too(story: Story) -> None:
+    story.history.lag = 5.0
+    story.upload()
+    story("point", ANN, 201, name="latest")  # from 3 to 4
+    story("names", None, 200, server="reader", at=(8, 9))
+    assert story.findings == []
+    story("names", None, 200, server="reader", at=(9.5, 10))
+    assert story.rules == ["lost"]
+
+
+def test_a_server_that_waits_acknowledges_nothing(story: Story) -> None:
+    story.history.waits(Span(2, 9, "second"))
+    story("upload", ANN, 202, "queued", server="second", at=(1, 3))
+    assert story.findings == []
+    story("delete", ANN, 204, server="second", at=(4, 5))
+    assert story.rules == ["not the writer"]
+
+
+def test_a_server_that_waits_does_nothing_that_it_refuses(story: Story) -> None:
+    story.history.waits(Span(3, 9, "second"))
+    story.upload()
+    story("delete", ANN, 503, server="second", at=(4, 5))
+    story.look(state=None, at=(6, 7))
+    assert story.rules == ["lost"]
+    story.history.waiting.clear()
+    assert story.findings == []

@@ -30,7 +30,7 @@ import pytest
 from lodestream.operating_system import lock, open_own
 from tests.patience import PATIENCE
 
-__all__ = ["Emulator", "azure", "azurite", "ministack", "running_ministack", "s3"]
+__all__ = ["Emulator", "azure", "azurite", "ministack", "reach", "running_ministack", "s3"]
 
 HERE = Path(__file__).parent
 INSTALLED = HERE.parents[1] / "build" / "emulators"
@@ -215,7 +215,8 @@ def azurite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
         yield Emulator(port, "az", "AZURE_STORAGE_ENDPOINT", environment)
 
 
-def _set(environment: dict[str, str], patch: pytest.MonkeyPatch) -> None:
+def reach(environment: dict[str, str], patch: pytest.MonkeyPatch) -> None:
+    """Let the environment lead to an emulator, and to no other store."""
     for name in os.environ:
         if name.startswith(("AWS_", "AZURE_")):
             patch.delenv(name)
@@ -226,12 +227,12 @@ def _set(environment: dict[str, str], patch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def s3(ministack: Emulator, monkeypatch: pytest.MonkeyPatch) -> Emulator:
     """S3, to which the environment of this test and of the programs that it starts leads."""
-    _set(ministack.environment, monkeypatch)
+    reach(ministack.environment, monkeypatch)
     return ministack
 
 
 @pytest.fixture
 def azure(azurite: Emulator, monkeypatch: pytest.MonkeyPatch) -> Emulator:
     """Azure Blob Storage, to which the environment of this test and of the programs that it starts leads."""
-    _set(azurite.environment, monkeypatch)
+    reach(azurite.environment, monkeypatch)
     return azurite

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from .parts import Part, Result
+from .parts import PROGRESS, Part, Result
 
 __all__ = ["STAGES", "Lanes", "Wish"]
 
@@ -25,7 +25,7 @@ STAGES = (
     (("throughput", "crowds", "proxied"),),
     (
         ("streams",),
-        ("kills", "disk", "history", "faults"),
+        ("kills", "disk", "history", "takeovers", "faults"),
         ("fuzz", "kernels", "decoders", "layouts", "tests", "mutants"),
     ),
 )
@@ -115,7 +115,7 @@ class Lanes:
                 process = subprocess.Popen(
                     command, stdout=output, stderr=subprocess.STDOUT, env=environment, process_group=0
                 )
-            self._await(process)
+            self._await(process, said)
             result = Result.of_json(file.read_text()) if file.exists() else None
             if self._over.is_set() and (result is None or result.failure is not None):
                 return None  # what fails because it was ended has not failed
@@ -124,10 +124,13 @@ class Lanes:
             words = f"the process ended with {process.returncode}\n{said.read_text(errors='replace')[-4000:]}"
             return Result(wish.part, wish.count, 0, (), time.monotonic() - started, words)
 
-    def _await(self, process: subprocess.Popen[bytes]) -> None:
-        with contextlib.suppress(ProcessLookupError):
+    def _await(self, process: subprocess.Popen[bytes], said: Path) -> None:
+        """Wait for a part, and repeat the lines in which it says how far it is."""
+        with contextlib.suppress(ProcessLookupError), said.open(errors="replace") as output:
             while process.poll() is None and not self._over.wait(0.2):
-                pass
+                for line in output:
+                    if line.startswith(PROGRESS):
+                        print(line, end="", flush=True)
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGINT)
                 with contextlib.suppress(subprocess.TimeoutExpired):

@@ -14,6 +14,7 @@ import json
 import math
 import os
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -27,7 +28,10 @@ from pathlib import Path
 
 from tests.examples import EXAMPLES
 
-__all__ = ["PARTS", "Part", "Result", "sent"]
+__all__ = ["PARTS", "PROGRESS", "Part", "Result", "sent"]
+
+#: So begins a line in which a part says how far it is.
+PROGRESS = "progress: "
 
 #: So many schedules, and at least an hour of them; fewer of them take less of an hour.
 _SCHEDULES = 10_000
@@ -238,6 +242,41 @@ def _history(folder: Path, count: int, seconds: float | None) -> tuple[int, tupl
     return cases, facts
 
 
+def _takeovers(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
+    import pytest
+
+    from . import takeovers
+
+    def tell(told: str) -> None:
+        print(f"{PROGRESS}takeovers, {told}", flush=True)
+
+    times = takeovers.Times()
+    try:
+        done = takeovers.run(folder, count, seconds, times=times, seed=time.time_ns() % 2**32, progress=tell)
+    except pytest.skip.Exception as skipped:
+        return 0, (f"skipped: {skipped}",)
+    facts = (
+        f"{done.operations:,} operations of {takeovers.CLIENTS} clients and of one that watches each reader: "
+        f"{done.uploads:,} uploads, {done.deletes:,} deletes and {done.pointed:,} changes of names acknowledged, "
+        f"{done.reads:,} reads answered, {done.refused:,} answered 503, {done.unanswered:,} without an answer",
+        ", ".join(f"{kind} {number}" for kind, number in sorted(done.disasters.items()))
+        + f"; {done.faults:,} requests to the bucket failed; the lease changed hands by itself {done.restless} times",
+        f"leases of {times.lease:.0f} s; {len(done.takeovers)} takeovers: {_spread(done.takeovers)}",
+        f"while nothing failed: {len(done.lags):,} uploads seen by readers after {_spread(done.lags)}; "
+        f"{len(done.revoked):,} tokens ended at readers after {_spread(done.revoked)}",
+        f"at the end {done.ready} surfaces ready; findings: {len(done.findings)}",
+    )
+    assert not done.findings, "\n".join((*facts, *map(str, done.findings[:20])))
+    return done.disasters.total(), facts
+
+
+def _spread(seconds: list[float]) -> str:
+    """The middle and the latest of some times."""
+    if not seconds:
+        return "none"
+    return f"median {statistics.median(seconds):.1f} s, at most {max(seconds):.1f} s"
+
+
 def _faults(folder: Path, count: int, seconds: float | None) -> tuple[int, tuple[str, ...]]:
     import tests.faults.run as faults
     from tests.faults.shim import CannotError
@@ -363,6 +402,7 @@ PARTS = {
         Part("kills", "Kill -9 under upload, build, stream and delete", "kills", 200, _kills),
         Part("disk", "A disk that is full most of the time", "requests", 2000, _disk),
         Part("history", "One history through disasters, every acknowledged state in order", "disasters", 200, _history),
+        Part("takeovers", "Servers of one bucket, behind a network that fails", "disasters", 120, _takeovers),
         Part("faults", "Each call of the storage fails once", "per cent of the cases", 100, _faults, continues=True),
         Part(
             "fuzz", "Any bytes for containers, messages and uploads", "cases of each", 1_000_000, _fuzz, continues=True

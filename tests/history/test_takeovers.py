@@ -1,0 +1,22 @@
+"""A minute of `tests.torture.takeovers`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.torture import takeovers
+
+
+@pytest.mark.long
+def test_servers_of_one_bucket_that_are_killed_and_stopped_behind_a_network_that_fails(tmp_path: Path) -> None:
+    times = takeovers.Times(lease=3.0, look=0.5, list_=15.0)
+    done = takeovers.run(tmp_path, 100, 60.0, times=times, seed=int(os.environ.get("LODESTREAM_SEED", "1")))
+    if done.findings:
+        pytest.fail("\n".join(map(str, done.findings)))
+    assert done.disasters.total() >= 2
+    assert done.uploads >= 10
+    assert done.deletes
+    assert done.ready
