@@ -20,7 +20,7 @@ the surface was deleted or uploaded meanwhile, perhaps half of it.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, TypeAlias
@@ -202,7 +202,7 @@ def _possible(ways: Iterable[_Way]) -> States:
 
 def _from(past: Sequence[tuple[float, States]], since: float) -> States:
     """The states of some moment from one on, given those from each moment to the next."""
-    first = max(0, bisect_right(past, since, key=lambda each: each[0]) - 1)
+    first = max(0, bisect_left(past, since, key=lambda each: each[0]) - 1)
     return frozenset().union(*(states for _, states in past[first:]))
 
 

@@ -55,7 +55,7 @@ class Story:
     def upload(self, subject: Subject = ANN, state: str = "queued", **more: tuple[float, float]) -> None:
         self("upload", subject, 200 if state == "ready" else 202, state, **more)  # type: ignore[arg-type]
 
-    def look(self, subject: Subject = ANN, state: str | None = "ready", **more: tuple[float, float]) -> None:
+    def look(self, subject: Subject = ANN, state: str | None = "ready", **more: tuple[float, float] | str) -> None:
         self("look", subject, 404 if state is None else 200, state, **more)  # type: ignore[arg-type]
 
     def listed(self, *seen: Seen) -> None:

@@ -180,3 +180,20 @@ def test_an_answer_that_cannot_be_is_found(steps: list[Step], data: st.DataObjec
     assert found is not None
     assert found.step is steps[number]
     assert state not in found.possible
+
+
+@given(any_steps(), st.integers(0, 3))
+def test_what_is_explained_at_once_is_explained_when_it_may_be_late(steps: list[Step], lag: int) -> None:
+    late = [replace(step, since=step.begun - lag) if step.kind == "read" else step for step in steps]
+    if unexplained(steps) is None:
+        assert unexplained(late) is None
+
+
+@given(any_steps())
+def test_a_late_read_of_what_never_was_is_found(steps: list[Step]) -> None:
+    writes = [step for step in steps if step.kind != "read"]
+    read = Step("read", 9, 10, observed=PRESENT, since=-1)
+    found = unexplained([*writes, read])
+    if unexplained(writes) is None and not any(step.kind == "upload" for step in writes):
+        assert found is not None
+        assert found.step is read
