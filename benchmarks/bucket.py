@@ -33,7 +33,7 @@ TOGETHER = 50
 SIDE = 1537
 
 #: More bytes of containers than the server keeps blocks of.
-NOISE, NOISE_SIDE = 8, 1800
+NOISE, NOISE_SIDE = 7, 1800
 
 
 def main() -> None:
