@@ -6,7 +6,7 @@ import asyncio
 import logging
 import shutil
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -89,61 +89,60 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         # A server has opened it before, so that it can say in one line why it does not start.
         opened: Data | None = getattr(app.state, "data", None)
         data = await asyncio.to_thread(open_data, chosen) if opened is None else opened
-        surfaces, loop = data.surfaces, asyncio.get_running_loop()
+        async with AsyncExitStack() as ending:  # whatever has begun ends, also if the rest cannot begin
+            ending.push_async_callback(asyncio.to_thread, data.close)
+            surfaces, loop = data.surfaces, asyncio.get_running_loop()
 
-        def queue_again(lost: list[Surface]) -> None:
-            for surface in lost:
-                loop.call_soon_threadsafe(builder.submit, surface)
+            def queue_again(lost: list[Surface]) -> None:
+                for surface in lost:
+                    loop.call_soon_threadsafe(builder.submit, surface)
 
-        def count(owner: str | None) -> tuple[int, int]:
-            named, named_by_owner = surfaces.index.count_names(owner)
-            return len(surfaces.index) + named, surfaces.index.count_of(owner) + named_by_owner
+            def count(owner: str | None) -> tuple[int, int]:
+                named, named_by_owner = surfaces.index.count_names(owner)
+                return len(surfaces.index) + named, surfaces.index.count_of(owner) + named_by_owner
 
-        def kept(owner: str | None) -> int:
-            return surfaces.index.kept(owner) + partial_uploads.kept(owner)
+            def kept(owner: str | None) -> int:
+                return surfaces.index.kept(owner) + partial_uploads.kept(owner)
 
-        partial_uploads = await asyncio.to_thread(
-            PartialUploads, data.partial, chosen.max_partial_uploads, chosen.partial_seconds
-        )
-        limits = Limits(chosen, data.disks, count, kept, lambda: access.alone, endless=data.is_endless)
-        cache = await asyncio.to_thread(_container_cache, chosen, data, limits)
-        containers = Containers(surfaces, lost=queue_again, cache=cache)
-        builder = Builder(surfaces, Work(data.work), chosen, limits, metrics.built)
-        metrics.watch(data.disks[0], lambda: len(surfaces.index), lambda: builder.pending)
-        files_of_levels = await asyncio.to_thread(_level_files, chosen, data, limits)
-        levels = LevelMaker(chosen, containers, files_of_levels, builder.fork_server, limits)
-        tiles = TileMaker(chosen, containers, builder.fork_server, limits)
-        upkeep = Upkeep(surfaces, builder, levels, partial_uploads)
-        following = Following(chosen, surfaces, access)
-        app.state.parts = State(
-            settings=chosen,
-            data=data,
-            surfaces=surfaces,
-            partial_uploads=partial_uploads,
-            upkeep=upkeep,
-            builder=builder,
-            containers=containers,
-            access=access,
-            limits=limits,
-            metrics=metrics,
-            levels=levels,
-            tiles=tiles,
-            pace=pace,
-        )
-        try:
+            partial_uploads = await asyncio.to_thread(
+                PartialUploads, data.partial, chosen.max_partial_uploads, chosen.partial_seconds
+            )
+            limits = Limits(chosen, data.disks, count, kept, lambda: access.alone, endless=data.is_endless)
+            cache = await asyncio.to_thread(_container_cache, chosen, data, limits)
+            containers = Containers(surfaces, lost=queue_again, cache=cache)
+            ending.push_async_callback(asyncio.to_thread, containers.close)
+            builder = Builder(surfaces, Work(data.work), chosen, limits, metrics.built)
+            ending.push_async_callback(builder.close)
+            metrics.watch(data.disks[0], lambda: len(surfaces.index), lambda: builder.pending)
+            files_of_levels = await asyncio.to_thread(_level_files, chosen, data, limits)
+            levels = LevelMaker(chosen, containers, files_of_levels, builder.fork_server, limits)
+            ending.push_async_callback(levels.close)
+            tiles = TileMaker(chosen, containers, builder.fork_server, limits)
+            ending.push_async_callback(tiles.close)
+            upkeep = Upkeep(surfaces, builder, levels, partial_uploads)
+            ending.push_async_callback(upkeep.close)
+            following = Following(chosen, surfaces, access)
+            ending.push_async_callback(asyncio.to_thread, following.close)
+            app.state.parts = State(
+                settings=chosen,
+                data=data,
+                surfaces=surfaces,
+                partial_uploads=partial_uploads,
+                upkeep=upkeep,
+                builder=builder,
+                containers=containers,
+                access=access,
+                limits=limits,
+                metrics=metrics,
+                levels=levels,
+                tiles=tiles,
+                pace=pace,
+            )
             await builder.start()
             upkeep.start()
             data.start()
             following.start()
             yield
-        finally:
-            await asyncio.to_thread(following.close)
-            await upkeep.close()
-            await tiles.close()
-            await levels.close()
-            await builder.close()
-            await asyncio.to_thread(containers.close)
-            await asyncio.to_thread(data.close)
 
     app = FastAPI(
         title="Lodestream",

@@ -80,9 +80,13 @@ class ChangeLog:
             try:
                 self.write()
                 failing = False
-            except LodestreamError as error:
+            except Exception as error:  # whatever it is, nobody else would tell readers
                 if not failing:
-                    _log.error("what has changed could not be told to readers, which is tried again: %s", error)
+                    _log.error(
+                        "what has changed could not be told to readers, which is tried again: %s",
+                        error,
+                        exc_info=not isinstance(error, LodestreamError),
+                    )
                 failing = True
                 self._wake.set()
                 self._ending.wait(_AGAIN)

@@ -194,9 +194,13 @@ class Lease:
             try:
                 self.tend()
                 self._failing = False
-            except StoreError as error:
+            except Exception as error:  # whatever it is, without this thread the server would never write again
                 if not self._failing:
-                    _log.error("the lease of the bucket could not be looked at: %s", error)
+                    _log.error(
+                        "the lease of the bucket could not be looked at: %s",
+                        error,
+                        exc_info=not isinstance(error, StoreError),
+                    )
                 self._failing = True
             self._tell()
             pause = self._seconds * (_RENEWED if self._ours and not self._failing else _WATCHED)

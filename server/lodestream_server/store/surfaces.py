@@ -813,6 +813,7 @@ class Surfaces:
                     for entry in found[first : first + _REMOVED_AT_ONCE]
                     if not self._coming[entry.key] and not self._is_used(entry.key)
                 ]
+                self.check_writer()  # the next writer may refer to them
                 self.store.delete([entry.key for entry in unused])
             removed += unused
         return removed
@@ -841,8 +842,13 @@ class _Writing:
         self._lock = lock
 
     def __enter__(self) -> None:
-        self._surfaces.check_writer()
+        self._surfaces.check_writer()  # so that nobody waits to be refused
         self._lock.__enter__()
+        try:
+            self._surfaces.check_writer()
+        except BaseException:
+            self._lock.__exit__()
+            raise
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._lock.__exit__()

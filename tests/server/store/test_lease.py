@@ -235,15 +235,16 @@ def test_threads_take_over_from_each_other_and_tell(store: Store) -> None:
     assert not first.held
 
 
+@pytest.mark.parametrize("error", [StoreError("no network"), RuntimeError("no network")], ids=["store", "fault"])
 def test_a_store_that_does_not_answer_ends_a_lease_and_is_told_once(
-    store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     lease = Lease(store, 0.3)
     lease.start()
     eventually(lambda: lease.held, "it to be taken")
 
     def fail(*_: object) -> Any:
-        raise StoreError("no network")
+        raise error
 
     with monkeypatch.context() as broken:
         broken.setattr(store, "replace", fail)

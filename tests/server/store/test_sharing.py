@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -202,6 +204,28 @@ def test_a_writer_that_is_stopped_during_a_change_acknowledges_nothing(
         assert manifest.id in second.states()
         with pytest.raises(StandbyError):
             changed["accept"]()
+
+
+def test_what_waited_for_its_turn_until_the_lease_was_over_deletes_nothing(
+    server: Make, clock: Clock, tmp_path: Path
+) -> None:
+    first, second = server("first"), server("second")
+    first.tend()
+    second.tend()
+    manifest, files = upload(tmp_path, 0)
+    first.surfaces.accept(manifest, files)
+    with ThreadPoolExecutor(1) as pool:
+        with first.surfaces._lock:
+            deletion = pool.submit(first.surfaces.delete, manifest.id)
+            while not deletion.running():
+                time.sleep(0.001)
+            time.sleep(0.05)  # by then it waits for the lock
+            clock.now += SECONDS + 1
+            second.tend()
+        with pytest.raises(StandbyError):
+            deletion.result()
+    second.surfaces.sync()
+    assert manifest.id in second.states()
 
 
 def test_two_that_both_believe_to_write_do_not_overwrite_each_other(server: Make, clock: Clock, tmp_path: Path) -> None:
