@@ -127,7 +127,9 @@ class Lanes:
     def _await(self, process: subprocess.Popen[bytes], said: Path) -> None:
         """Wait for a part, and repeat the lines in which it says how far it is."""
         with contextlib.suppress(ProcessLookupError), said.open(errors="replace") as output:
-            while process.poll() is None and not self._over.wait(0.2):
+            over = False
+            while not over:
+                over = process.poll() is not None or self._over.wait(0.2)
                 for line in output:
                     if line.startswith(PROGRESS):
                         print(line, end="", flush=True)

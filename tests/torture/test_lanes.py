@@ -18,7 +18,7 @@ import pytest
 from tests.server.helpers import eventually
 from tests.torture import streams
 from tests.torture.lanes import STAGES, Lanes, Wish
-from tests.torture.parts import PARTS, Part, Result
+from tests.torture.parts import PARTS, PROGRESS, Part, Result
 
 MIB = 1 << 20
 
@@ -121,3 +121,12 @@ def test_a_part_that_dies_is_a_result() -> None:
 
 def test_every_part_has_a_lane() -> None:
     assert sorted(name for stage in STAGES for lane in stage for name in lane) == sorted(PARTS)
+
+
+def test_a_part_says_how_far_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = tmp_path / "said"
+    with said.open("wb") as output:
+        words = f"print('a word'); print('{PROGRESS}half')"
+        process = subprocess.Popen([sys.executable, "-c", words], stdout=output, process_group=0)
+    Lanes(print, print)._await(process, said)
+    assert capsys.readouterr().out == f"{PROGRESS}half\n"
