@@ -34,7 +34,6 @@ from .codes import MEANINGS, address
 
 __all__ = [
     "MEDIA_TYPE",
-    "PROBLEM_EXAMPLE",
     "BadTokenError",
     "BuildFailedError",
     "BusyError",
@@ -250,15 +249,6 @@ _USUAL: Mapping[int, Mapping[str, str]] = {
 #: Codes of what the framework refuses by itself.
 _OF_THE_FRAMEWORK = {404: "not-found", 405: "bad-method", 416: "requested-range-not-satisfiable"}
 
-PROBLEM_EXAMPLE = {
-    "type": address("not-found", ""),
-    "title": MEANINGS["not-found"].title,
-    "status": MEANINGS["not-found"].status,
-    "code": "not-found",
-    "detail": "No surface '0123' on this server",
-    "instance": "/v1/surfaces/0123",
-}
-
 
 def install(app: FastAPI) -> None:
     """Answer every error of an application with a problem document."""
@@ -285,12 +275,7 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     return {
         status: {
             "description": http.HTTPStatus(status).phrase,
-            "content": {
-                MEDIA_TYPE: {
-                    "schema": {"$ref": "#/components/schemas/Problem"},
-                    **({"example": PROBLEM_EXAMPLE} if status == 404 else {}),
-                }
-            },
+            "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
         }
         for status in statuses
     }

@@ -10,7 +10,7 @@ from typing import Any
 
 from ..codes import MEANINGS
 
-__all__ = ["render", "render_codes"]
+__all__ = ["render", "render_codes", "told_answer", "told_content", "told_parameter", "told_type"]
 
 _CODE = re.compile(r"(`{1,2})([^`]+)\1")
 
@@ -31,6 +31,7 @@ def render(document: Mapping[str, Any], address: str) -> str:
             f"<h1>{escape(info['title'])} {escape(info['version'])}</h1>\n{_text(info['description'])}",
             f'<p>For programs: <a href="{escape(address)}">OpenAPI</a>.</p>\n',
             *_sections(document["paths"]),
+            *_models(document["components"]["schemas"]),
         )
     )
 
@@ -62,39 +63,81 @@ def _operation(method: str, path: str, operation: Mapping[str, Any]) -> str:
     )
 
 
+def told_type(schema: Mapping[str, Any]) -> str:
+    """Return the type of a value in words, as of a list of numbers or null."""
+    if "$ref" in schema:
+        return str(schema["$ref"]).rpartition("/")[2]
+    if "anyOf" in schema:
+        return " or ".join(told_type(each) for each in schema["anyOf"])
+    if "const" in schema or "enum" in schema:
+        return " or ".join(json.dumps(value) for value in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        return f"list of {told_type(schema['items'])}"
+    if schema.get("type") == "object":
+        values = schema.get("additionalProperties")
+        return f"object of {told_type(values)}" if isinstance(values, Mapping) else "object"
+    return " ".join(filter(None, (schema.get("type"), schema.get("format"))))
+
+
+def told_parameter(parameter: Mapping[str, Any]) -> str:
+    """Return what is told of a parameter beside its name and place."""
+    schema = parameter.get("schema", {})
+    facts = [parameter.get("description", "")]
+    if "enum" in schema:
+        facts.append(f"one of {', '.join(schema['enum'])}")
+    if "default" in schema:
+        facts.append(f"default {json.dumps(schema['default'])}")
+    if "example" in parameter:
+        facts.append(f"such as {parameter['example']}")
+    return "; ".join(filter(None, facts))
+
+
+def told_content(content: Mapping[str, Any]) -> list[str]:
+    """Return the types of a body, each with its model, if it has one."""
+    return [
+        f"{kind} ({told_type(it['schema'])})" if "$ref" in it.get("schema", {}) else kind
+        for kind, it in content.items()
+    ]
+
+
+def told_answer(answer: Mapping[str, Any]) -> str:
+    """Return what is told of an answer, with its headers."""
+    headers = (f"{name}: {it['description']}" for name, it in answer.get("headers", {}).items())
+    return "; ".join((answer["description"], *headers))
+
+
 def _parameters(parameters: Any) -> str:
-    rows = []
-    for parameter in parameters:
-        schema = parameter.get("schema", {})
-        facts = [parameter.get("description", "")]
-        if "enum" in schema:
-            facts.append(f"one of {', '.join(schema['enum'])}")
-        if "default" in schema:
-            facts.append(f"default {schema['default']}")
-        if "example" in parameter:
-            facts.append(f"such as {parameter['example']}")
-        rows.append((f"<code>{escape(parameter['name'])}</code>", parameter["in"], "; ".join(filter(None, facts))))
+    rows = [(f"<code>{escape(it['name'])}</code>", it["in"], told_parameter(it)) for it in parameters]
     return _table(("parameter", "in", ""), rows)
 
 
 def _body(body: Any) -> str:
-    if body is None:
-        return ""
-    types = " or ".join(f"<code>{escape(kind)}</code>" for kind in body["content"])
-    return f"<p>Body: {types}</p>\n"
+    return "" if body is None else f"<p>Body: {escape(' or '.join(told_content(body['content'])))}</p>\n"
 
 
-def _answers(responses: Mapping[str, Any]) -> str:
-    rows, examples = [], []
-    for status in sorted(responses):
-        response = responses[status]
-        content = response.get("content", {})
-        rows.append((f"<code>{escape(status)}</code>", ", ".join(content), response["description"]))
-        example = content.get("application/json", {}).get("example")
-        if example is not None:
-            text = escape(json.dumps(example, indent=2), quote=False)
-            examples.append(f"<p>Example of <code>{escape(status)}</code>:</p>\n<pre>{text}</pre>\n")
-    return _table(("status", "type", ""), rows) + "".join(examples)
+def _answers(answers: Mapping[str, Any]) -> str:
+    rows = [
+        (f"<code>{escape(status)}</code>", " or ".join(told_content(it.get("content", {}))), told_answer(it))
+        for status, it in sorted(answers.items())
+    ]
+    return _table(("status", "type", ""), rows)
+
+
+def _models(schemas: Mapping[str, Any]) -> Iterator[str]:
+    yield "<h2>Models</h2>\n"
+    for name, schema in sorted(schemas.items()):
+        fields = [
+            (f"<code>{escape(key)}</code>", told_type(it), it.get("description", ""))
+            for key, it in schema["properties"].items()
+        ]
+        examples = (
+            f"<pre>{escape(json.dumps(example, indent=2), quote=False)}</pre>\n"
+            for example in schema.get("examples", ())
+        )
+        yield (
+            f"<details>\n<summary><code>{escape(name)}</code></summary>\n{_text(schema['description'])}"
+            f"{_table(('key', 'type', ''), fields)}{''.join(examples)}</details>\n"
+        )
 
 
 def _table(head: tuple[str, ...], rows: list[tuple[str, str, str]]) -> str:

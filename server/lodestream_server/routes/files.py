@@ -17,7 +17,7 @@ from ..access.scopes import READ
 from ..problems import BusyError, responses
 from ..store.containers import Containers
 from ..store.index import Surface
-from . import examples
+from . import descriptions
 from .byte_ranges import sort_out
 from .routing import Parts, State, caching, matches, readable
 from .sending import SentBlob, SentFile, ready, still_there
@@ -29,7 +29,10 @@ router = APIRouter(prefix="/v1", tags=["files"])
 
 #: What OpenAPI says of answers with a container.
 CONTAINER: dict[int | str, dict[str, Any]] = {
-    200: {"description": "The whole container", "content": {examples.CONTAINER_TYPE: {"schema": examples.BINARY}}},
+    200: {
+        "description": "The whole container",
+        "content": {descriptions.CONTAINER_TYPE: {"schema": descriptions.BINARY}},
+    },
     206: {"description": "The range asked for"},
     304: {"description": "The client has it"},
 }
@@ -109,7 +112,7 @@ class _Container(SentFile):
         headers: dict[str, str],
     ) -> None:
         path, status = place
-        super().__init__(path, headers=headers, media_type=examples.CONTAINER_TYPE, stat_result=status)
+        super().__init__(path, headers=headers, media_type=descriptions.CONTAINER_TYPE, stat_result=status)
         self._containers = containers
         self._sha256 = sha256
         self._request = request
@@ -133,7 +136,7 @@ class _Object(SentBlob):
     def __init__(
         self, containers: Containers, sha256: str, blob: Blob, request: Request, headers: dict[str, str]
     ) -> None:
-        super().__init__(blob, request, headers, examples.CONTAINER_TYPE)
+        super().__init__(blob, request, headers, descriptions.CONTAINER_TYPE)
         self._containers = containers
         self._sha256 = sha256
 

@@ -1,4 +1,4 @@
-"""The OpenAPI document: the routes with their errors and tokens."""
+"""The OpenAPI document: the routes with their models, errors and tokens."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fastapi.openapi.utils import get_openapi
 
 from .. import problems
 from ..access.scopes import SCHEME
-from . import examples
+from . import models
 
 __all__ = ["describe"]
 
@@ -18,14 +18,12 @@ def describe(app: FastAPI) -> dict[str, Any]:
     """Return the OpenAPI document of an application; computed once."""
     if app.openapi_schema is None:
         schema = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
-        schemas = schema["components"].setdefault("schemas", {})
-        # What the framework assumes of validation errors is not what is answered.
-        for name in ("HTTPValidationError", "ValidationError"):
-            schemas.pop(name, None)
+        # Those of the framework lack the nulls of examples, and what is only referred to; and what it assumes of
+        # validation errors is not what is answered.
+        schema["components"]["schemas"] = models.schemas()
         for operations in schema["paths"].values():
             for operation in operations.values():
                 _complete(operation)
-        schemas["Problem"] = examples.PROBLEM_SCHEMA
         app.openapi_schema = schema
     return app.openapi_schema
 

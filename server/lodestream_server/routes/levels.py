@@ -17,7 +17,7 @@ from ..builds.level_maker import Loan
 from ..builds.levels import MEDIA_TYPES, written_by
 from ..problems import BusyError, responses
 from ..store.index import Surface
-from . import examples
+from . import descriptions
 from .byte_ranges import sort_out
 from .routing import Parts, caching, matches, readable
 from .sending import SentFile, ready, still_there, while_there
@@ -33,7 +33,7 @@ router = APIRouter(prefix="/v1", tags=["files"])
     summary="Fetch one level as a file",
     response_class=Response,
     responses={
-        200: examples.LEVEL,
+        200: descriptions.LEVEL,
         206: {"description": "The range asked for"},
         304: {"description": "The client has it"},
         **responses(404, 409, 413, 416, 422, 429, 501, 503, 507),

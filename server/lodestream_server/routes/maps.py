@@ -11,7 +11,8 @@ from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import APIRouter, Depends, Path, Query, Request
-from fastapi.responses import Response
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel
 
 from lodestream.errors import NotFoundError
 
@@ -20,6 +21,7 @@ from ..access.scopes import Reader
 from ..builds.tiles import REVISION, TileOrder
 from ..problems import responses
 from ..store.index import Surface
+from . import descriptions, models
 from .names import leads_to
 from .routing import Parts, State, caching, matches, readable
 from .sending import ready, still_there, while_there
@@ -66,8 +68,19 @@ async def _found(request: Request, parts: Parts, surface: str) -> Surface:
 _Found = Annotated[Surface, Depends(_found)]
 
 
-def _mapped(path: str, summary: str, description: str, content: dict[str, Any]) -> Callable[[_Route], _Route]:
-    """Decorator for routes that surfaces have, and names of the surfaces to which they lead."""
+def _mapped(
+    path: str, summary: str, description: str, content: type[BaseModel] | tuple[str, ...]
+) -> Callable[[_Route], _Route]:
+    """Decorator for routes that surfaces have, and names of the surfaces to which they lead.
+
+    ``content`` is a model, or the types of bytes.
+    """
+    answer = (
+        {"description": description, "content": {kind: {"schema": descriptions.BINARY} for kind in content}}
+        if isinstance(content, tuple)
+        else descriptions.answer(description, content)
+    )
+    response_class = Response if isinstance(content, tuple) else JSONResponse
 
     def register(route: _Route) -> _Route:
         for place, whose in (("/surfaces", "a surface"), ("/names", "what a name leads to")):
@@ -76,15 +89,15 @@ def _mapped(path: str, summary: str, description: str, content: dict[str, Any]) 
                 f"{place}/{{surface}}{path}",
                 name=f"get_{place[1:-1]}_{route.__name__}",
                 summary=f"{summary} of {whose}",
-                response_class=Response,
-                responses={200: {"description": description, "content": content}, **_ERRORS},
+                response_class=response_class,
+                responses={200: answer, **_ERRORS},
             )(route)
         return route
 
     return register
 
 
-@_mapped("/map.json", "Describe the tiles", "TileJSON 3.0.0", {_JSON: {}})
+@_mapped("/map.json", "Describe the tiles", "TileJSON 3.0.0", models.TileJson)
 async def map_json(
     caller: Reader,
     request: Request,
@@ -110,7 +123,7 @@ async def map_json(
     return await _made(request, parts, caller, found, order, _JSON, version=None)
 
 
-@_mapped("/tiles/{z}/{x}/{y}.{image}", "Fetch a tile", "An image", {"image/png": {}, "image/webp": {}})
+@_mapped("/tiles/{z}/{x}/{y}.{image}", "Fetch a tile", "An image", ("image/png", "image/webp"))
 async def tile(
     caller: Reader,
     request: Request,
@@ -135,7 +148,7 @@ async def tile(
     return await _made(request, parts, caller, found, order, f"image/{image}", version=v)
 
 
-@_mapped("/terrain/layer.json", "Describe the meshes", "A layer.json", {_JSON: {}})
+@_mapped("/terrain/layer.json", "Describe the meshes", "A layer.json", models.LayerJson)
 async def layer_json(
     caller: Reader,
     request: Request,
@@ -157,7 +170,7 @@ async def layer_json(
     return await _made(request, parts, caller, found, order, _JSON, version=None)
 
 
-@_mapped("/terrain/{z}/{x}/{y}.terrain", "Fetch a mesh", "quantized-mesh-1.0", {_MESH: {}})
+@_mapped("/terrain/{z}/{x}/{y}.terrain", "Fetch a mesh", "quantized-mesh-1.0", (_MESH,))
 async def mesh(
     caller: Reader,
     request: Request,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import FileResponse, Response
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from lodestream.errors import InputError, NotFoundError, TooLargeError
 
@@ -18,7 +18,7 @@ from ..access.scopes import READ, Reader, Writer
 from ..problems import SlowUploadError, responses
 from ..store.index import Named, Surface
 from ..store.layout import NAME
-from . import examples, files
+from . import descriptions, files, models
 from .routing import Parts, State, described, readable
 from .sending import ready
 from .surfaces import Wait, base, description, owned, settled
@@ -33,19 +33,13 @@ _LONGEST_BODY = 1024
 _DAY = 86400.0
 
 
-class _Pointing(BaseModel):
-    """What is asked of a name: to lead to a surface, by its id or address; None: nothing but whether it may."""
-
-    surface: str | None
-
-
 @router.put(
     "/{name}",
     summary="Make a name lead to a surface",
-    openapi_extra=examples.POINTING,
+    openapi_extra=descriptions.POINTING,
     responses={
-        200: examples.answer("It leads to this surface", examples.READY),
-        201: examples.answer("There was no such name", examples.READY),
+        200: descriptions.answer("It leads to this surface", models.Surface),
+        201: descriptions.answer("There was no such name", models.Surface),
         204: {"description": "`surface` is null, and the caller may change the name"},
         **responses(403, 404, 408, 409, 413, 422, 503, 507),
     },
@@ -79,7 +73,7 @@ async def point_name(caller: Writer, request: Request, parts: Parts, name: _Name
     "",
     summary="List names",
     responses={
-        200: examples.answer("A page of names", examples.NAMES),
+        200: descriptions.answer("A page of names", models.NamePage),
         304: {"description": "The client has it"},
         **responses(422),
     },
@@ -103,7 +97,7 @@ async def list_names(
     "/{name}",
     summary="Describe the surface to which a name leads",
     responses={
-        200: examples.answer("The surface to which it leads now", examples.READY),
+        200: descriptions.answer("The surface to which it leads now", models.Surface),
         304: {"description": "The client has it"},
         **responses(404, 422, 429, 503),
     },
@@ -149,7 +143,7 @@ async def _asked(request: Request, parts: State) -> str | None:
     except TimeoutError:
         raise SlowUploadError(f"The body was not complete within {seconds:g} s") from None
     try:
-        surface = _Pointing.model_validate_json(bytes(body)).surface
+        surface = models.Pointing.model_validate_json(bytes(body)).surface
     except ValidationError:
         raise InputError(f'The body must be {{"surface": ID}} in JSON, and is {bytes(body[:80])!r}') from None
     return None if surface is None else surface.removeprefix(f"{base(request)}/")

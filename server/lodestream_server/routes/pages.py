@@ -12,7 +12,7 @@ from lodestream.errors import NotFoundError
 from ..access.scopes import ADMIN, WRITE
 from ..codes import PAGE
 from ..store.surfaces import Surfaces
-from . import examples
+from . import descriptions, models
 from .documentation import render, render_codes
 from .html_page import html_page
 from .routing import Parts, matches, readable
@@ -80,7 +80,7 @@ async def interface(request: Request) -> Response:
     return JSONResponse(request.app.openapi() | ({"servers": [{"url": root}]} if root else {}))
 
 
-@readable(router, "/healthz", summary="Alive", responses={200: examples.answer("It answers", {"status": "ok"})})
+@readable(router, "/healthz", summary="Alive", responses={200: descriptions.answer("It answers", models.Health)})
 async def get_health() -> Response:
     """Answer at once, while the event loop runs."""
     return JSONResponse({"status": "ok", "version": lodestream.__version__})
@@ -91,41 +91,12 @@ async def get_health() -> Response:
     "/readyz",
     summary="Ready",
     responses={
-        200: examples.answer(
-            "Builds can begin",
-            {
-                "status": "ready",
-                "index": "current",
-                "role": "writer",
-                "confinement": "landlock+seccomp",
-                "missing": [],
-            },
-        ),
-        503: examples.answer(
-            "Not yet",
-            {
-                "status": "starting",
-                "index": "being brought up to date",
-                "role": "writer",
-                "confinement": None,
-                "missing": [],
-            },
-        ),
+        200: descriptions.answer("Builds can begin", models.Readiness),
+        503: descriptions.answer("Not yet", models.Readiness),
     },
 )
 async def get_readiness(parts: Parts) -> Response:
-    """Return whether processes can start and all surfaces are known. Before that uploads wait, and all else works.
-
-    ``index`` is ``current``; ``being brought up to date`` with the data folder, so that what was stored or deleted
-    there while no server ran is not told right yet; or ``being made again`` because it was lost, while whatever is
-    about surfaces is answered 503.
-
-    ``role`` is ``writer``; ``reader`` for a server that only reads; or ``waiting`` for one that shares a bucket and
-    answers uploads 503 because another one writes, which ``writer`` names.
-
-    ``confinement`` says how the kernel confines builds: ``landlock+seccomp``, one of the two, or ``none``; ``missing``
-    says for each mechanism that this machine lacks what a build may do.
-    """
+    """Return whether processes can start and all surfaces are known. Before that uploads wait, and all else works."""
     surfaces = parts.surfaces
     index = "current" if surfaces.is_current else "being brought up to date"
     index = "being made again" if surfaces.is_lost else index
@@ -141,7 +112,7 @@ async def get_readiness(parts: Parts) -> Response:
     "/v1/formats",
     dependencies=[WRITE],
     summary="File formats",
-    responses={200: examples.answer("Names of formats", {"formats": ["npy", "geotiff", "netcdf", "lode"]})},
+    responses={200: descriptions.answer("Names of formats", models.Formats)},
 )
 async def list_formats(parts: Parts) -> Response:
     """Return the file formats that this server reads; lode are containers. Clients encode other formats themselves."""

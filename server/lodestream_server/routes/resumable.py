@@ -27,7 +27,7 @@ from ..builds import options
 from ..problems import WrongTypeError, WrongVersionError, responses
 from ..store import layout, uploads
 from ..store.partial_uploads import Declared, PartialUpload
-from . import examples, surfaces
+from . import descriptions, surfaces
 from .routing import AnyQuery, Parts, State
 
 __all__ = ["ANSWER_HEADERS", "REQUEST_HEADERS", "router"]
@@ -98,9 +98,11 @@ async def offer_uploads(parts: Parts) -> Response:
     status_code=201,
     summary="Begin a resumable upload",
     response_class=Response,
-    openapi_extra=examples.RESUMABLE,
+    openapi_extra=descriptions.RESUMABLE,
     responses={
-        201: examples.headed("It has begun", **{"Location": "the upload", "Upload-Expires": "until when it is kept"}),
+        201: descriptions.headed(
+            "It has begun", **{"Location": "the upload", "Upload-Expires": "until when it is kept"}
+        ),
         **responses(412, 413, 422, 429, 503, 507),
     },
 )
@@ -127,9 +129,9 @@ async def begin_upload(caller: Writer, request: Request, parts: AnyQuery, _: _Tu
     status_code=200,
     summary="How far a resumable upload is",
     response_class=Response,
-    openapi_extra=examples.VERSIONED,
+    openapi_extra=descriptions.VERSIONED,
     responses={
-        200: examples.headed(
+        200: descriptions.headed(
             "So many bytes are on disk",
             **{
                 "Upload-Offset": "bytes that are there",
@@ -160,9 +162,9 @@ async def show_upload(caller: Writer, request: Request, parts: Parts, upload: st
     status_code=204,
     summary="Continue a resumable upload",
     response_class=Response,
-    openapi_extra=examples.CONTINUED,
+    openapi_extra=descriptions.CONTINUED,
     responses={
-        204: examples.headed(
+        204: descriptions.headed(
             "The bytes are on disk",
             **{
                 "Upload-Offset": "bytes that are there",
@@ -199,7 +201,7 @@ async def continue_upload(caller: Writer, request: Request, parts: Parts, upload
     status_code=204,
     summary="Give up a resumable upload",
     response_class=Response,
-    openapi_extra=examples.VERSIONED,
+    openapi_extra=descriptions.VERSIONED,
     responses=responses(404, 412),
 )
 async def give_up_upload(caller: Writer, parts: Parts, upload: str, _: _Tus) -> Response:
@@ -215,7 +217,7 @@ async def give_up_upload(caller: Writer, parts: Parts, upload: str, _: _Tus) -> 
     status_code=204,
     summary="Continue a resumable upload, for clients that can send no PATCH",
     response_class=Response,
-    openapi_extra=examples.OVERRIDDEN,
+    openapi_extra=descriptions.OVERRIDDEN,
     responses=responses(404, 408, 409, 412, 413, 415, 422, 423, 429, 503, 507),
 )
 async def override_method(caller: Writer, request: Request, parts: Parts, upload: str, _: _Tus) -> Response:

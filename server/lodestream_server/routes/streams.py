@@ -73,7 +73,7 @@ _PATH = "/v1/surfaces/{surface}/stream"
     response_class=Response,
     responses={101: {"description": "The subprotocol lodestream.v1"}, **responses(404, 426)},
 )
-async def stream_surface(parts: AnyQuery) -> Response:
+async def stream_surface(parts: AnyQuery, surface: str) -> Response:
     """Open a stream: messages in MessagePack, see `docs/protocol.md`. A request that opens no WebSocket is 426.
 
     A token is in the handshake, or in `open` as the first message. Other refusals are messages in the stream.

@@ -24,7 +24,7 @@ from ..store import layout, uploads
 from ..store.durable import discard
 from ..store.index import Position, Surface
 from ..store.layout import Manifest
-from . import examples
+from . import descriptions, models
 from .routing import AnyQuery, Parts, State, described, readable
 from .sending import while_there
 
@@ -56,10 +56,10 @@ Wait = Annotated[
     status_code=202,
     summary="Upload a surface",
     response_description="The surface will be built; Location is its address",
-    openapi_extra=examples.UPLOAD,
+    openapi_extra=descriptions.UPLOAD,
     responses={
-        202: examples.answer("The surface will be built", examples.QUEUED, location=True),
-        200: examples.answer("The same surface is there already", examples.READY, location=True),
+        202: descriptions.answer("The surface will be built", models.Surface, location=True),
+        200: descriptions.answer("The same surface is there already", models.Surface, location=True),
         **responses(408, 413, 422, 429, 503, 507),
     },
 )
@@ -100,7 +100,7 @@ async def upload_surface(caller: Writer, request: Request, parts: AnyQuery) -> R
     "",
     summary="List surfaces",
     responses={
-        200: examples.answer("A page of surfaces, oldest first", examples.PAGE),
+        200: descriptions.answer("A page of surfaces, oldest first", models.SurfacePage),
         304: {"description": "The client has it"},
         **responses(422),
     },
@@ -126,7 +126,7 @@ async def list_surfaces(
     "/{surface}",
     summary="Describe a surface",
     responses={
-        200: examples.answer("Its state and, once it is ready, its description", examples.READY),
+        200: descriptions.answer("Its state and, once it is ready, its description", models.Surface),
         304: {"description": "The client has it"},
         **responses(404, 429, 503),
     },
@@ -162,8 +162,8 @@ async def get_surface(
     summary="Retry the build of a surface",
     response_description="The surface will be built",
     responses={
-        202: examples.answer("The surface will be built", examples.QUEUED, location=True),
-        200: examples.answer("The surface is ready", examples.READY, location=True),
+        202: descriptions.answer("The surface will be built", models.Surface, location=True),
+        200: descriptions.answer("The surface is ready", models.Surface, location=True),
         **responses(403, 404, 429, 503, 507),
     },
 )
