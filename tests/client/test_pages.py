@@ -39,6 +39,7 @@ RUN = {
         "indented",
     ): "not run: the address is an example; tests/server/routes/test_gis.py requests the same",
     ("docs/gis.md", "python"): "not run: the address is an example; tests/server/routes/test_gis.py reads the same",
+    ("docs/http.md", "json"): "not run: examples of the models, which tests/server/routes/test_models.py checks",
     ("docs/installing.md", "console"): "not run: pip needs the network; `make release-rehearsal` installs the same",
     ("docs/large.md", "bash"): "not run: the files are examples; tests/client/commands/test_large_surfaces.py has"
     " these options",

@@ -1,17 +1,22 @@
-"""Writes docs/settings.md and docs/errors.md from what they describe: ``python -m tests.server.manual``."""
+"""Writes docs/settings.md, errors.md and http.md from what they describe: ``python -m tests.server.manual``."""
 
 from __future__ import annotations
 
+import json
 import textwrap
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from lodestream.protocol.messages import CODES
+from lodestream_server import Settings, create_app
 from lodestream_server.codes import MEANINGS
 from lodestream_server.operation.bounds import Bounds
 from lodestream_server.operation.settings import GROUPS, Choice, choices
+from lodestream_server.routes.documentation import told_answer, told_content, told_parameter, told_type
 
 _DOCS = Path(__file__).parents[2] / "docs"
-PATH, ERRORS_PATH = _DOCS / "settings.md", _DOCS / "errors.md"
+PATH, ERRORS_PATH, HTTP_PATH = _DOCS / "settings.md", _DOCS / "errors.md", _DOCS / "http.md"
 
 _INTRODUCTION = """\
 # Settings of the server
@@ -102,6 +107,77 @@ def render_errors() -> str:
     return _ERRORS + "".join(rows) + "\n## What each means, and what to do\n" + "".join(paragraphs)
 
 
+_HTTP = """\
+# The HTTP interface
+
+Every operation of a server, and every model of what it answers. A server tells the same at `/docs` for people, and at
+`/openapi.json` as OpenAPI 3.1, from which programs make clients; [operating.md](operating.md) has examples with curl.
+
+- A scope is that of a token, sent as `Authorization: Bearer ...`. Where the settings let anybody in, none is needed.
+- What is wrong is told as a [Problem](#problem), whatever the status; [errors.md](errors.md) has its codes.
+- Whatever answers GET answers HEAD. Unknown parameters are refused.
+- Answers may have more keys later: a client ignores those that it does not know.
+
+This page is written by `python -m tests.server.manual` from the OpenAPI document; a test checks it.
+"""
+
+
+def render_http() -> str:
+    """The page of operations and models."""
+    document = create_app(Settings(data=Path("nowhere"))).openapi()
+    tags: dict[str, list[str]] = {}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            tags.setdefault(operation["tags"][0], []).append(_operation(method.upper(), path, operation))
+    shown = "".join(f"\n## {tag.capitalize()}\n{''.join(parts)}" for tag, parts in tags.items())
+    models = "".join(_model(name, schema) for name, schema in sorted(document["components"]["schemas"].items()))
+    return f"{_HTTP}{shown}\n## Models\n{models}"
+
+
+def _operation(method: str, path: str, operation: Mapping[str, Any]) -> str:
+    body = operation.get("requestBody")
+    parameters = [(f"`{it['name']}`", it["in"], told_parameter(it)) for it in operation.get("parameters", ())]
+    answers = [
+        (status, _types(it.get("content", {})), told_answer(it))
+        for status, it in sorted(operation["responses"].items())
+    ]
+    return "".join(
+        (
+            f"\n### {operation['summary']}\n\n`{method} {path}` (`{operation['operationId']}`)\n",
+            f"\n{_filled(operation['description'])}\n",
+            *(_table(("parameter", "in", "meaning"), parameters) if parameters else ()),
+            "" if body is None else f"\nBody: {_types(body['content'])}\n",
+            *_table(("status", "body", "meaning"), answers),
+        )
+    )
+
+
+def _model(name: str, schema: Mapping[str, Any]) -> str:
+    needed = schema.get("required", ())
+    rows = [
+        (f"`{key}`", f"{told_type(it)}{'' if key in needed else '; may be absent'}", it.get("description", ""))
+        for key, it in schema["properties"].items()
+    ]
+    examples = (f"\n```json\n{json.dumps(each, indent=2)}\n```\n" for each in schema.get("examples", ()))
+    table = "".join(_table(("key", "type", "meaning"), rows))
+    return f"\n### {name}\n\n{_filled(schema['description'])}\n{table}{''.join(examples)}"
+
+
+def _types(content: Mapping[str, Any]) -> str:
+    return " or ".join(f"`{kind}`" for kind in told_content(content))
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> Iterator[str]:
+    yield f"\n| {' | '.join(head)} |\n|{' --- |' * len(head)}\n"
+    for row in rows:
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |\n"
+
+
+def _filled(text: str) -> str:
+    return "\n\n".join(textwrap.fill(part, 120, break_on_hyphens=False) for part in text.split("\n\n"))
+
+
 if __name__ == "__main__":
     PATH.write_text(render())
     ERRORS_PATH.write_text(render_errors())
+    HTTP_PATH.write_text(render_http())

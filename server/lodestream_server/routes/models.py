@@ -203,18 +203,20 @@ class Surface(SurfaceSummary):
         "levels again, which an exact one allows, or tells them as whoever uploaded it"
     )
     blocks: list[Block] = _absent("its grids")
-    channels: int = _absent("coordinates and attributes of a vertex that are not constant")
+    channels: int = _absent("numbers at a vertex: coordinates, and those of attributes")
     channel_names: list[str] = _absent("of the channels, if there are several")
     attributes: list[str] = _absent("names of the attributes")
-    holes: int = _absent("vertices without a value")
-    non_finite: int = _absent("values that are NaN or infinite")
+    holes: int = _absent("vertices that are not valid")
+    non_finite: int = _absent("of the holes, those whose values come back, such as NaN and infinite ones")
     dtype: str = _absent("type of the points, such as float32")
-    extent: _Error = _absent("the largest difference of two values of one coordinate; null if it is not finite")
+    extent: _Error = _absent(
+        "range of the heights, or diagonal of the box of the points, to which `0.1%` refers; null if it is not finite"
+    )
     levels: list[Level] = _absent("of the hierarchy, the coarsest first")
     layers: list[Layer] = _absent("steps of quality, in the order of the file")
     exact: bool = _absent("whether the end of the stream restores every value bit for bit")
     complete: bool = _absent("in place of `exact`, of a surface that was made of another mesh")
-    values_sha256: str | None = _absent("of all values, by which a receiver checks an exact surface")
+    values_sha256: str | None = _absent("of all values; null where the container does not say")
     metadata: dict[str, Any] = _absent("of the file, such as its CRS, units and the name")
 
 

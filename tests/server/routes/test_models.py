@@ -19,6 +19,7 @@ from lodestream_server import Settings, create_app, problems, running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.codes import MEANINGS
 from lodestream_server.routes.models import schemas
+from tests.server import manual
 from tests.server.helpers import PATIENCE, hills, npy, push
 
 DOCUMENT = create_app(Settings(data=Path("nowhere"))).openapi()
@@ -73,6 +74,10 @@ def http(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
 
 def test_the_document_is_one_of_openapi() -> None:
     OpenAPIV31SpecValidator(DOCUMENT).validate()
+
+
+def test_the_page_is_made_from_the_document() -> None:
+    assert manual.HTTP_PATH.read_text() == manual.render_http(), "run python -m tests.server.manual"
 
 
 def test_every_answer_in_json_has_a_model() -> None:
