@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import http
 import logging
 from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
@@ -274,7 +273,7 @@ def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return OpenAPI responses of routes that answer with these problems."""
     return {
         status: {
-            "description": http.HTTPStatus(status).phrase,
+            "description": " or ".join(f"`{code}`" for code, it in sorted(MEANINGS.items()) if it.status == status),
             "content": {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}},
         }
         for status in statuses

@@ -114,7 +114,8 @@ Every operation of a server, and every model of what it answers. A server tells 
 `/openapi.json` as OpenAPI 3.1, from which programs make clients; [operating.md](operating.md) has examples with curl.
 
 - A scope is that of a token, sent as `Authorization: Bearer ...`. Where the settings let anybody in, none is needed.
-- What is wrong is told as a [Problem](#problem), whatever the status; [errors.md](errors.md) has its codes.
+- What is wrong is told as a [Problem](#problem), whatever the status; [errors.md](errors.md) explains its codes. An
+  answer lists all codes that have its status, of which an operation may have only some.
 - Whatever answers GET answers HEAD. Unknown parameters are refused.
 - Answers may have more keys later: a client ignores those that it does not know.
 
