@@ -63,6 +63,9 @@ PRESENT = frozenset(SPONTANEOUS) - {ABSENT}
 
 States: TypeAlias = frozenset[str]
 
+# So many steps that are pending have subsets enough.
+_MANY = 8
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -190,7 +193,7 @@ def unexplained(steps: Sequence[Step], marks: Iterable[Mark] = ()) -> Unexplaine
                     following.add(way._replace(pending=way.pending - {what.number}))
             if not following:
                 return Unexplained(step, _possible(_all_orders(ways, steps, without=what.number)))
-            ways = following
+            ways = {way._replace(pending=way.pending - {what.number}) for way in following}
         if past is not None:
             past.append((moment, _possible(_all_orders(ways, steps))))
     return None
@@ -271,6 +274,10 @@ def _happened(way: _Way, number: int, steps: Sequence[Step]) -> _Way | None:
     if not states or (steps[number].ended is None and states == way.states):
         return None  # it cannot happen, or it need not
     saved = way.saved | states if way.saving and way.saved is not None else way.saved
+    if steps[number].kind == "point" and steps[number].ended is None and len(way.pending) > _MANY:
+        # Many without an answer may be pending, each to another surface, and their subsets could not be counted: each
+        # may happen more than once.
+        return _Way(states, saved, way.saving, way.pending)
     return _Way(states, saved, way.saving, way.pending - {number})
 
 

@@ -197,3 +197,13 @@ def test_a_late_read_of_what_never_was_is_found(steps: list[Step]) -> None:
     if unexplained(writes) is None and not any(step.kind == "upload" for step in writes):
         assert found is not None
         assert found.step is read
+
+
+def test_many_changes_of_a_name_without_an_answer_are_judged_soon() -> None:
+    points = [Step("point", number, None, 100, value=f"surface {number}") for number in range(60)]
+    reads = [Step("read", 60 + number, 61 + number, observed=frozenset({f"surface {number}"})) for number in range(30)]
+    assert unexplained([*points, *reads]) is None
+    never = Step("read", 95, 96, observed=frozenset({"another"}))
+    found = unexplained([*points, *reads, never])
+    assert found is not None
+    assert found.step is never
