@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import threading
 import weakref
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
@@ -10,6 +11,7 @@ from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
+from lodestream.errors import OptionError
 from lodestream.target import Tolerance
 
 from .requests import addresses, api, calls, problems
@@ -30,6 +32,8 @@ __all__ = ["AsyncClient"]
 
 T = TypeVar("T")
 
+_TOKEN = re.compile("[!-~]*")
+
 
 class AsyncClient:
     """A client of a server, as `Client` for asyncio: the same methods, as coroutines.
@@ -39,7 +43,7 @@ class AsyncClient:
     Parameters
     ----------
     url : str
-        URL of the server, or of anything on it.
+        URL of the server, or of a surface or name on it.
     token : str or None
         Token, if the server needs one; it is sent only to this server.
 
@@ -51,7 +55,8 @@ class AsyncClient:
     Raises
     ------
     OptionError
-        If this is not an ``http`` or ``https`` URL.
+        If this is not an ``http`` or ``https`` URL, or the token has spaces, line ends or other characters that no
+        token has.
 
     Examples
     --------
@@ -68,6 +73,9 @@ class AsyncClient:
 
     def __init__(self, url: str, *, token: str | None = None) -> None:
         self.url = addresses.server_url(url)
+        # Whoever reads a token from a file gets its line end too; what sends it would show it in an error.
+        if token is not None and not _TOKEN.fullmatch(token):
+            raise OptionError("expected a token without spaces, line ends and characters that are not ASCII")
         self._token = token
         # By loop, since a connection belongs to one; and by whether proxies are left out.
         self._kept: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, dict[bool, httpx.AsyncClient]] = (

@@ -38,7 +38,7 @@ class Client:
     Parameters
     ----------
     url : str
-        URL of the server, or of anything on it.
+        URL of the server, or of a surface or name on it.
     token : str or None
         Token, if the server needs one; it is sent only to this server.
 
@@ -50,7 +50,8 @@ class Client:
     Raises
     ------
     OptionError
-        If this is not an ``http`` or ``https`` URL.
+        If this is not an ``http`` or ``https`` URL, or the token has spaces, line ends or other characters that no
+        token has.
 
     Examples
     --------

@@ -36,7 +36,7 @@ class RemoteSource:
 
     def __init__(self, url: str, token: str | None = None) -> None:
         self._client = Client(url, token=token)
-        url = self._client.locate(url)
+        url = self._client.locate(addresses.source_url(url))
         identity = self._client.identify(url)
         if identity.size is None or identity.name is None:
             raise RemoteProtocolError(f"expected the length and the version of {url}, got neither")

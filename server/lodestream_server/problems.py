@@ -299,7 +299,8 @@ async def refused(request: Request, error: Exception) -> Response:
     detail, headers = error.detail, dict(error.headers or {})
     if error.status_code == 404:
         path = request.url.path
-        hint = "without the slash at its end there may be one" if path.endswith("/") else "/docs lists what there is"
+        docs = f"{request.scope.get('root_path', '')}/docs lists what there is"
+        hint = "without the slash at its end there may be one" if path.endswith("/") else docs
         detail = f"No such address on this server: {path[:100]!r}; {hint}"
     if error.status_code == 405:
         # The framework names the methods of the first route of this path only.

@@ -249,3 +249,15 @@ print(client.get(sys.argv[1]).state, stream.ended)
 """
     refused = "expected a stream of this process, got one that was opened before a fork"
     assert said_by(script, surface).splitlines() == ["ready complete", refused, "ready complete"]
+
+
+@pytest.mark.parametrize("token", ["secret\n", "sec ret", "secr\u00e9t"])
+def test_a_token_that_no_header_can_hold_is_not_shown(token: str) -> None:
+    with pytest.raises(ls.OptionError, match="expected a token without spaces, line ends") as failure:
+        Client("http://127.0.0.1:9", token=token)
+    assert "sec" not in str(failure.value)
+
+
+def test_what_is_no_text_is_no_surface() -> None:
+    with pytest.raises(ls.OptionError, match="expected the id or the URL of a surface, which are texts, got bytes"):
+        Client("http://127.0.0.1:9").get(b"ab")  # type: ignore[arg-type]

@@ -39,6 +39,7 @@ _SURFACES = "/v1/surfaces"
 _NAMES = "/v1/names"
 _UPLOADS = "/v1/uploads"
 _BELOW = re.compile(f"({_SURFACES}|{_NAMES})(/.*)?$")
+_SHOWN = re.compile(r"([sn])=([0-9A-Za-z._-]+)")
 _ID = re.compile(r"[0-9A-Za-z_-]{1,100}")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -109,6 +110,8 @@ def place_url(url: str, place: str) -> str:
     OptionError
         If `place` is neither.
     """
+    if not isinstance(place, str):
+        raise OptionError(f"expected the id or the URL of a surface, which are texts, got {type(place).__name__}")
     if is_url(place):
         return place
     if not _ID.fullmatch(place):
@@ -178,6 +181,12 @@ def source_url(url: str) -> str:
         return base
     if published_name(url) is not None:
         return url
+    shown = _SHOWN.match(urlsplit(url).fragment)
+    if shown is not None:
+        raise OptionError(
+            f"expected the address of a surface, got that of the page that shows it: the surface's is "
+            f"{base}{_NAMES if shown[1] == 'n' else _SURFACES}/{shown[2]}"
+        )
     path = urlsplit(base).path
     if urlsplit(url).path.endswith(("/", ".html")):
         raise OptionError(
@@ -312,5 +321,5 @@ def _clean(url: str) -> str:
     except ValueError as error:
         raise OptionError(f"expected an address such as http://HOST:PORT, got {url}: {error}") from None
     if parts.scheme.lower() not in ("http", "https") or not parts.hostname:
-        raise OptionError(f"expected an address that begins with http:// or https://, got {url}")
+        raise OptionError(f"expected an address that begins with http:// or https://, got {url!r}")
     return urlunsplit((parts.scheme.lower(), parts.netloc, parts.path.rstrip("/"), "", ""))

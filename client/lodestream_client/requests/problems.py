@@ -78,8 +78,10 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
     """
     document = _document(body)
     detail = document.get("detail") or document.get("title")
-    message = str(detail)[:_LONGEST] if detail else f"the server answered {status} {reason} for {url}"
     code = document.get("code")
+    message = f"the server answered {status} {reason} for {url}"
+    if detail:
+        message = (str(detail) if isinstance(code, str) else f"{message}: {detail}")[:_LONGEST]
     if isinstance(code, str):
         if status >= 500 and detail and document.get("title") not in (None, detail):
             message = f"{document['title']}: {message}"[:_LONGEST]  # the detail may be no more than where to look

@@ -161,7 +161,9 @@ class Access:
             If there is no token, it is not known, or it does not allow reading.
         """
         if text is None or not self._tokens.used:
-            raise NoTokenError("This needs a token, in the handshake or in open as the first message")
+            raise NoTokenError(
+                "No token came with the handshake or the first message, and this server needs one for the scope read"
+            )
         return self._holder(text, "read")
 
     def check(self, caller: Caller) -> None:

@@ -212,7 +212,7 @@ class Lease:
         if now == before:
             return
         if held:
-            _log.info("this server has the lease of the bucket from now on, the %d. one, and writes", self.number)
+            _log.info("this server has the lease of the bucket (number %d) from now on, and writes", self.number)
         elif before is not None and before[0]:
             _log.error("this server has lost the lease of the bucket, and writes nothing; %s has it", self.holder)
         else:

@@ -162,6 +162,16 @@ def test_a_page_without_a_name_is_told(url: str) -> None:
         Client(url).connect(url)
 
 
+@pytest.mark.parametrize(
+    ("fragment", "address"), [("s=5f1c", "v1/surfaces/5f1c"), ("n=dem&v=1", "v1/names/dem")], ids=["surface", "name"]
+)
+def test_the_page_of_a_server_tells_the_address_of_what_it_shows(fragment: str, address: str) -> None:
+    url = f"http://host/maps/#{fragment}"
+    for open_it in (Client(url).connect, ls.open):
+        with pytest.raises(OptionError, match=f"the surface's is http://host/maps/{address}$"):
+            open_it(url)
+
+
 def test_a_page_that_is_no_published_one(tmp_path: Path, host: Ranged) -> None:
     with pytest.raises(NotFoundError):
         Client(f"{host.url}/elsewhere/#plain").locate(f"{host.url}/elsewhere/#plain")

@@ -54,6 +54,11 @@ def test_the_bounds_are_what_the_manual_says() -> None:
     assert api._LONGEST_LIST == 64 * 2**20
 
 
+def test_an_address_where_no_server_of_lodestream_is_is_named(asynchronous: bool) -> None:
+    with pytest.raises(ls.NotFoundError, match=r"answered 404 .* for http://127.0.0.1:\d+/v1/surfaces/ab: Not Found"):
+        describe(Answer(404, b'{"detail": "Not Found"}'), asynchronous)
+
+
 def test_a_problem_is_read_as_far_as_a_problem_goes(asynchronous: bool) -> None:
     with pytest.raises(ls.RemoteError, match="the server answered 500"):
         describe(Answer(500, b'{"detail": "' + b"a" * 1_000_000 + b'"}'), asynchronous)

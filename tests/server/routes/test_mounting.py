@@ -91,6 +91,7 @@ def test_all_addresses_have_the_path(url: str, http: httpx.Client, surface: dict
     tus = {"tus-resumable": "1.0.0", "upload-length": "10"}
     assert http.post("/v1/uploads", headers=tus).headers["location"].startswith("/surfaces/v1/uploads/")
     assert http.get("/openapi.json").json()["servers"] == [{"url": "/surfaces"}]
+    assert http.get("/nothing").json()["detail"].endswith("; /surfaces/docs lists what there is")
 
 
 def test_tiles_and_containers_are_found_under_the_path(url: str, http: httpx.Client) -> None:

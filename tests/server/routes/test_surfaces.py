@@ -385,6 +385,10 @@ def test_openapi_describes_every_route(http: httpx.Client) -> None:
             )
         ),
     }
+    for path, operations in schema["paths"].items():
+        for operation in operations.values():
+            parameters = {it["name"] for it in operation.get("parameters", ()) if it["in"] == "path"}
+            assert parameters == set(re.findall(r"{(\w+)}", path)), path
     post = schema["paths"]["/v1/surfaces"]["post"]
     assert {"application/octet-stream", "multipart/form-data"} == set(post["requestBody"]["content"])
     assert {parameter["name"] for parameter in post["parameters"]} >= {
