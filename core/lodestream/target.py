@@ -53,6 +53,8 @@ def check_spans(region: Region) -> None:
     except (TypeError, ValueError):
         raise OptionError(f"expected a region as ((row, end), (column, end)), got {region!r}") from None
     for start, stop in region:
+        for line in (start, stop):
+            check_integer("a row or column", line)
         if not 0 <= start < stop:
             raise OptionError(f"expected a region of at least one row and column, got {start}:{stop}")
 
@@ -205,6 +207,8 @@ class Target:
             object.__setattr__(self, "level", check_integer("a level", self.level))
         if self.level is not None and self.level < 0:
             raise OptionError(f"expected a level of 0 or more, got {self.level}")
+        if self.max_bytes is not None:
+            object.__setattr__(self, "max_bytes", check_integer("a limit of bytes", self.max_bytes))
         if self.max_bytes is not None and self.max_bytes < 1:
             raise OptionError(f"expected a limit of at least one byte, got {self.max_bytes}")
         if self.seconds is not None and not self.seconds > 0:

@@ -288,7 +288,8 @@ def answer(request: HTTPConnection, error: Exception) -> Response:
     """Return the problem document for an error."""
     code, detail = problem(error)
     status = MEANINGS[code].status
-    if status >= 500 and code != "damaged":  # whoever found the damage has told of it
+    # Whoever found a damage has told of it; and a server says once that it waits for another one.
+    if status >= 500 and code != "damaged" and not isinstance(error, StandbyError):
         _log.error("%s: %s", request.url.path, error, exc_info=error if status == 500 else None)
     return _document(request, code, detail, getattr(error, "headers", _USUAL.get(status, {})))
 
