@@ -389,7 +389,7 @@ def test_the_log_tells_of_requests_that_write_but_not_of_tokens(tmp_path: Path) 
         eventually(lambda: "r-7" in log.read_text(), "the line")
         text = log.read_text()
     line = next(line for line in text.splitlines() if "r-7" in line)
-    assert "method=DELETE path=/v1/surfaces/0 status=404" in line
+    assert "method=DELETE path=/v1/surfaces/0 status=422" in line
     assert "client=127.0.0.1" in line
     assert "secret" not in text
     assert "method=GET" not in text

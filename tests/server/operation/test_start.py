@@ -340,7 +340,7 @@ def test_a_server_starts_on_a_disk_whose_size_cannot_be_told(
     with running_server(tmp_path / "data", workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
         surface = push(http, npy(hills()))
         assert http.get(f"{surface['url']}/levels/0", params={"format": "npy"}).status_code == 200
-    assert "the size of the disk is unknown, so that few level files are kept: [Errno 116]" in caplog.text
+    assert "the size of the disk is unknown, so that few levels and containers are kept: [Errno 116]" in caplog.text
 
 
 @pytest.mark.parametrize(
