@@ -17,9 +17,9 @@ from fastapi import FastAPI
 
 import lodestream as ls
 from lodestream import maps, page
-from lodestream.protocol.messages import Open, Opened
+from lodestream_client import Client
 from lodestream_server import Settings, create_app
-from tests.server.helpers import PATIENCE, eventually, hills, npy, problem, raw_stream, settled
+from tests.server.helpers import PATIENCE, eventually, hills, npy, problem, settled
 
 PAGE = Path(__file__).parents[3] / "docs" / "mounting.md"
 
@@ -106,11 +106,9 @@ def test_tiles_and_containers_are_found_under_the_path(url: str, http: httpx.Cli
 
 
 def test_it_streams_by_websocket(url: str, surface: dict[str, Any]) -> None:
-    with raw_stream(url + surface["url"]) as stream:
-        stream.send(Open())
-        opened = stream.receive()
-        assert isinstance(opened, Opened)
-        assert opened.size == surface["bytes"]
+    with Client(f"{url}/surfaces") as client, client.connect(surface["id"], transport="ws") as stream:
+        *_, last = stream
+        assert (last.complete, last.rms) == (True, 0.0)
 
 
 def test_the_page_and_its_scripts_are_there(url: str, http: httpx.Client) -> None:
