@@ -48,6 +48,7 @@ if sys.platform != "linux":
 
 #: Files that take longest, in `make test` or in `make test-rest`: what begins last is not to be what takes longest.
 LONGEST = (
+    "tests/history/test_takeovers.py",
     "tests/server/builds/test_interrupted_builds.py",
     "tests/core/formats/test_cf_conventions.py",
     "tests/history/test_runs.py",
