@@ -118,6 +118,7 @@ def run(
     seconds: float | None = None,
     *,
     times: Times = Times(),
+    clients: int = CLIENTS,
     seed: int = 1,
     kinds: Sequence[str] = DISASTERS,
     progress: Callable[[str], None] = lambda _: None,
@@ -132,6 +133,7 @@ def run(
     seconds : float or None
         Without what it takes to start the servers, and to ask for everything at the end.
     times : Times
+    clients : int
     seed : int
         Of all that is left to chance but the moments at which processes run.
     kinds : sequence of str
@@ -152,7 +154,7 @@ def run(
         proxy = held.enter_context(fault_proxy(emulator.port))
         patch = held.enter_context(pytest.MonkeyPatch.context())
         reach(emulator.at(proxy.port), patch)
-        story = _Story(emulator.address(), folder, history, proxy, times, seed, done)
+        story = _Story(emulator.address(), folder, history, proxy, times, clients, seed, done)
         held.callback(story.site.close)
         try:
             story.tell(count, seconds, kinds, progress)
@@ -169,9 +171,18 @@ class _Story:
     """The servers, the clients, and what happens to them."""
 
     def __init__(
-        self, address: str, folder: Path, history: History, proxy: FaultProxy, times: Times, seed: int, done: Done
+        self,
+        address: str,
+        folder: Path,
+        history: History,
+        proxy: FaultProxy,
+        times: Times,
+        clients: int,
+        seed: int,
+        done: Done,
     ) -> None:
-        self._history, self._proxy, self._times, self._seed, self._done = history, proxy, times, seed, done
+        self._history, self._proxy, self._times, self._clients = history, proxy, times, clients
+        self._seed, self._done = seed, done
         self._random = random.Random(seed)
         self._store = open_store(address)
         self._tokens = TokenObject(self._store)
@@ -195,7 +206,7 @@ class _Story:
         goods = self._goods()
         site.open()
         started = time.monotonic()
-        crowd = Crowd(self._history, goods, site.servers, list(goods.bodies), seed=self._seed, size=CLIENTS)
+        crowd = Crowd(self._history, goods, site.servers, list(goods.bodies), seed=self._seed, size=self._clients)
         guests = _Guests(self._history, site, self._tokens, _REVOKED + self._times.slack)
         beside: list[_Watch | _Guests] = [
             *(_Watch(self._history, goods, site, name, crowd.ids) for name in READERS),
