@@ -113,7 +113,7 @@ def show(folder: Path, *, as_json: bool = False, shape: tuple[int, int] = _SHAPE
         paths.append(drawn)
     out.print(cell(f"Written: {', '.join(map(str, paths))}"))
     before = "" if assets() else "make page, and then "
-    out.print(cell(f"See it come into focus in a browser: {before}{_program()} view {file}"))
+    out.print(cell(f"See it come into focus in a browser: {before}{_program()} open {file}"))
     if as_json:
         print_json(
             {
