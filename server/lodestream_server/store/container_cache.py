@@ -98,9 +98,14 @@ class ContainerCache:
 
     def open(self, sha256: str, size: int) -> Blob | None:
         """Open the file of a container, if it is there; the second time that it is not, it is fetched meanwhile."""
+        blob = self._opened(sha256, size)
+        if blob is None:
+            self._count(sha256, size)
+        return blob
+
+    def _opened(self, sha256: str, size: int) -> Blob | None:
         lease = self._files.lend(sha256)
         if lease is None:
-            self._count(sha256, size)
             return None
         try:
             file = FileBlob(lease.path, lease.path.open("rb"))
@@ -118,7 +123,7 @@ class ContainerCache:
     @contextmanager
     def local(self, sha256: str, size: int) -> Iterator[Path | None]:
         """Give the file of a container for the length of a block, fetched if need be; None if there is no room."""
-        blob = self.open(sha256, size)
+        blob = self._opened(sha256, size)
         if blob is not None:
             with blob:
                 yield blob.path
