@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import gc
 import os
+import secrets
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -134,10 +136,19 @@ def _places(files: list[str]) -> dict[str, tuple[int, float]]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_cache_of_the_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """What `pull` keeps, in this process and in those that it starts, is not kept in the user's folder."""
+    folder = tmp_path_factory.mktemp("caches")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LODESTREAM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("LODESTREAM_CACHE", str(folder / "fixtures"))
+        yield folder
+
+
+@pytest.fixture(autouse=True)
+def _cache_of_its_own(_caches: Path) -> Iterator[None]:
+    """Many tests pull the same surface, and what one leaves for `pull --resume` is not there for another."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LODESTREAM_CACHE", str(_caches / secrets.token_hex(8)))
         yield
 
 
