@@ -192,10 +192,13 @@ _SEE_LOG = "the server's log says more"
 
 
 class _Kind(NamedTuple):
-    """The code of a class of errors, and what is told in place of their words, which would tell where data are."""
+    """The code of a class of errors, and the detail, a sentence that needs no title: ``{}`` are the error's own words.
+
+    It has none where they would tell where data are.
+    """
 
     code: str
-    told: str | None = None
+    detail: str = "{}"
 
 
 # A class that is not here is what its base is.
@@ -204,7 +207,7 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     OptionError: _Kind("bad-option"),
     FormatError: _Kind("bad-file"),
     InputError: _Kind("bad-input"),
-    UnavailableError: _Kind("unavailable"),
+    UnavailableError: _Kind("unavailable", "This server lacks a library that this needs: {}"),
     NotFoundError: _Kind("not-found"),
     SlowUploadError: _Kind("idle"),
     WrongOffsetError: _Kind("wrong-offset"),
@@ -226,16 +229,16 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     BuildFailedError: _Kind("failed"),
     PostponedError: _Kind("waiting"),
     DamagedNameError: _Kind("damaged-name"),
-    StreamError: _Kind("damaged"),
+    StreamError: _Kind("damaged", "The stored container is damaged: {}"),
     UnsupportedVersionError: _Kind("unsupported-version"),
     StandbyError: _Kind("busy"),
     ReadOnlyError: _Kind("read-only"),
-    stores.FullError: _Kind("disk-full", "Nothing was stored; delete surfaces or enlarge the disk"),
+    stores.FullError: _Kind("disk-full", "The disk is full, and nothing was stored; delete surfaces or enlarge it"),
     stores.UnacknowledgedError: _Kind("busy", f"It is not known whether that was done; {_SEE_LOG}"),
     stores.StoreError: _Kind("busy", f"The server's store cannot be used now; {_SEE_LOG}"),
     ClientDisconnect: _Kind("gone", "The body ended before it was complete"),
     # An unexpected error reveals nothing about the server.
-    Exception: _Kind("internal", _SEE_LOG),
+    Exception: _Kind("internal", f"The server failed; {_SEE_LOG}"),
 }
 
 # Headers of answers to errors that have none of their own.
@@ -265,8 +268,8 @@ def problem(error: Exception) -> tuple[str, str]:
         return error.code, str(error)
     full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
     kinds = (stores.FullError if full else type(error)).__mro__
-    code, told = next(_KINDS[kind] for kind in kinds if kind in _KINDS)
-    return code, str(error) if told is None else told
+    code, detail = next(_KINDS[kind] for kind in kinds if kind in _KINDS)
+    return code, detail.format(error)
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:

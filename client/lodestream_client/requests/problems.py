@@ -83,8 +83,6 @@ def from_response(status: int, reason: str, body: bytes, url: str) -> Lodestream
     if detail:
         message = (str(detail) if isinstance(code, str) else f"{message}: {detail}")[:_LONGEST]
     if isinstance(code, str):
-        if status >= 500 and detail and document.get("title") not in (None, detail):
-            message = f"{document['title']}: {message}"[:_LONGEST]  # the detail may be no more than where to look
         return from_code(code, message)
     return _BY_STATUS[status](message) if status in _BY_STATUS else RemoteError(f"http-{status}", message)
 

@@ -89,8 +89,8 @@ describe("a series", () => {
 
 describe("the server", () => {
   it("explains refusals by its problem documents, and those of proxies by their status", () => {
-    const problem = problemOf(401, '{"title": "A token is needed", "code": "no-token", "detail": "none came"}');
-    expect([problem.status, problem.code, problem.message]).toEqual([401, "no-token", "A token is needed: none came"]);
+    const problem = problemOf(401, '{"title": "A token is needed", "code": "no-token", "detail": "No token came"}');
+    expect([problem.status, problem.code, problem.message]).toEqual([401, "no-token", "No token came"]);
     expect(problemOf(502, "<html>").code).toBe("http-502");
   });
 

@@ -142,7 +142,7 @@ class Download:
             self._outbox.append(self._connection.send(Bye()))
             return [self.reception.end(event.why)]
         if isinstance(event, Error):
-            raise RemoteError(event.code, f"{event.title}: {event.detail}")
+            raise RemoteError(event.code, event.detail or event.title)
         return []
 
     def data_to_send(self) -> list[bytes]:
@@ -243,7 +243,7 @@ class Download:
         if words:
             # Where words share a code, the reason begins with the one that is meant.
             word = next((word for word in words if reason.startswith(word)), words[0])
-            raise RemoteError(word, reason or CODES[word].title)
+            raise RemoteError(word, reason.removeprefix(f"{word}: ") or CODES[word].title)
         closed = "was lost" if code is None else f"was closed with code {code} {reason}".rstrip()
         raise TruncatedStreamError(
             f"expected an end message, got {self.reception.data_bytes} bytes before the connection {closed}"

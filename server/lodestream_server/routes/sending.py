@@ -111,11 +111,12 @@ def ready(parts: State, surface: str) -> Surface:
     """
     found = parts.surfaces.get(surface)
     if found.state == "failed":
-        raise BuildFailedError(f"{surface} could not be built: {found.reason}")
+        raise BuildFailedError(f"The surface {surface} could not be built: {found.reason}")
     if found.state == "waiting":
-        raise PostponedError(f"{surface} could not be built and waits for a retry: {found.reason}")
+        raise PostponedError(f"The surface {surface} could not be built and waits for a retry: {found.reason}")
     if found.state != "ready":
-        raise NotReadyError(f"{surface} is {found.state} ({parts.builder.progress(found):.0%} done); try again soon")
+        done = parts.builder.progress(found)
+        raise NotReadyError(f"The surface {surface} is {found.state} ({done:.0%} done); try again soon")
     return found
 
 

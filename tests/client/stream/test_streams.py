@@ -282,7 +282,7 @@ def test_a_bad_upload_is_the_core_s_error(server: str) -> None:
 
 def test_no_such_surface(server: str) -> None:
     with (
-        pytest.raises(ls.NotFoundError, match="There is no such thing"),
+        pytest.raises(ls.NotFoundError, match=r"^No surface '0123456789abcdef0123' on this server$"),
         Client(f"{server}/v1/surfaces/0123456789abcdef0123").connect(
             f"{server}/v1/surfaces/0123456789abcdef0123"
         ) as stream,

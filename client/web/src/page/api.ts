@@ -54,10 +54,9 @@ export class ProblemError extends Error {
   constructor(
     readonly status: number,
     readonly code: string,
-    title: string,
-    detail: string,
+    message: string,
   ) {
-    super(detail === "" ? title : `${title}: ${detail}`);
+    super(message);
   }
 }
 
@@ -70,11 +69,11 @@ const THUMBNAILS = "thumbnails=true";
 export function problemOf(status: number, text: string): ProblemError {
   try {
     const { code, title, detail } = JSON.parse(text) as Record<string, unknown>;
-    if (typeof title === "string") return new ProblemError(status, String(code ?? ""), title, String(detail ?? ""));
+    if (typeof title === "string") return new ProblemError(status, String(code ?? ""), String(detail || title));
   } catch {
     // Not JSON: a proxy's own page.
   }
-  return new ProblemError(status, `http-${status}`, `The server answered ${status}`, "");
+  return new ProblemError(status, `http-${status}`, `The server answered ${status}`);
 }
 
 /** Requests to one server. */
@@ -143,7 +142,7 @@ export class Server {
   address(path: string): string {
     const url = new URL(path, this.base);
     if (url.origin !== new URL(this.base).origin)
-      throw new ProblemError(0, "origin", "The server named another host", url.host);
+      throw new ProblemError(0, "origin", `The server named another host: ${url.host}`);
     return url.href;
   }
 
@@ -175,8 +174,8 @@ export class Server {
           reject(problemOf(request.status, ""));
         }
       };
-      request.onerror = () => reject(new ProblemError(0, "network", "The server could not be reached", ""));
-      request.onabort = () => reject(new ProblemError(0, "cancelled", "Cancelled", ""));
+      request.onerror = () => reject(new ProblemError(0, "network", "The server could not be reached"));
+      request.onabort = () => reject(new ProblemError(0, "cancelled", "Cancelled"));
       signal.addEventListener("abort", () => request.abort());
       request.send(file);
     });
@@ -189,7 +188,7 @@ export class Server {
       answer = await fetch(this.address(path), { method, headers, credentials: "omit" });
     } catch (error) {
       if (error instanceof ProblemError) throw error;
-      throw new ProblemError(0, "network", "The server could not be reached", "");
+      throw new ProblemError(0, "network", "The server could not be reached");
     }
     if (!answer.ok) throw problemOf(answer.status, await answer.text());
     return answer.status === 204 ? null : answer.json();

@@ -72,7 +72,7 @@ function open(src: string, name: string, back: boolean, path: string | null): vo
   view.addEventListener("lodestream-progress", async (event) => {
     const { state, code, detail } = (event as CustomEvent<Progress>).detail;
     if (state !== "failed" || code === undefined || asking !== null) return;
-    if (await allowed(new ProblemError(401, code, detail, ""))) open(src, name, back, path);
+    if (await allowed(new ProblemError(401, code, detail))) open(src, name, back, path);
   });
   document.body.replaceChildren(header, html("main", {}, view));
 }

@@ -91,7 +91,7 @@ export class Download<View extends ViewInfo> {
         this.finish(event.why);
         return [];
       case "error":
-        throw new RemoteError(event.code, `${event.title}: ${event.detail}`);
+        throw new RemoteError(event.code, event.detail || event.title);
       default:
         return [];
     }
@@ -181,7 +181,8 @@ export class Download<View extends ViewInfo> {
     if (words.length > 0) {
       // Where words share a code, the reason begins with the one that is meant.
       const word = words.find((each) => reason.startsWith(each)) ?? words[0]!;
-      throw new RemoteError(word, reason || CODES[word]!.title);
+      const detail = reason.startsWith(`${word}: `) ? reason.slice(word.length + 2) : reason;
+      throw new RemoteError(word, detail || CODES[word]!.title);
     }
     const closed = code === undefined ? "was lost" : `was closed with code ${code} ${reason}`.trimEnd();
     throw new TruncatedStreamError(

@@ -55,15 +55,9 @@ export function fromCode(code: string, message: string): LodestreamError {
 export function fromResponse(status: number, reason: string, body: string, url: string): LodestreamError {
   const document = parsed(body);
   const detail = textOf(document.detail) ?? textOf(document.title);
-  let message = detail?.slice(0, LONGEST) ?? `the server answered ${status} ${reason} for ${url}`;
-  const { code, title } = document;
-  if (typeof code === "string") {
-    // The detail may be no more than where to look.
-    if (status >= 500 && detail !== undefined && typeof title === "string" && title !== detail) {
-      message = `${title}: ${message}`.slice(0, LONGEST);
-    }
-    return fromCode(code, message);
-  }
+  const message = detail?.slice(0, LONGEST) ?? `the server answered ${status} ${reason} for ${url}`;
+  const { code } = document;
+  if (typeof code === "string") return fromCode(code, message);
   const kind = BY_STATUS[status];
   return kind === undefined ? new RemoteError(`http-${status}`, message) : new kind(message);
 }
