@@ -127,6 +127,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 settings=chosen,
                 data=data,
                 surfaces=surfaces,
+                following=following,
                 partial_uploads=partial_uploads,
                 upkeep=upkeep,
                 builder=builder,

@@ -1,19 +1,26 @@
-"""What a server of a bucket looks at again and again: what others have changed, the tokens, and at times everything.
+"""What a server of a bucket looks at: again and again what others have changed, the tokens, and at times everything.
 
-Each look has a thread of its own: it waits for the store, and none may wait for another.
+Each look has a thread of its own: it waits for the store, and none may wait for another. What somebody asks for that
+this server does not know yet is looked for at once.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
+from typing import NamedTuple
 
 from lodestream.errors import LodestreamError
+from lodestream.stores.threads import Threads
 
 from .access.access import Access
 from .operation.settings import Settings
+from .problems import BusyError
+from .store import layout
 from .store.changes import ChangeReader
 from .store.surfaces import Surfaces
 
@@ -23,6 +30,19 @@ _log = logging.getLogger(__name__)
 
 # Seconds that the end of a server waits for looks that are under way.
 _FAREWELL = 5.0
+
+# A stranger may ask for anything, and each look at the bucket has its price: there are so many in a second, and so many
+# seconds between two for the same thing. Whoever asks waits for it for so long.
+_MOST_LOOKS = 16
+_BETWEEN = 0.5
+_PATIENCE = 5.0
+
+
+class _Look(NamedTuple):
+    """A look for one thing that has begun, and when."""
+
+    begun: float
+    answer: Future[None]
 
 
 class Following:
@@ -45,6 +65,9 @@ class Following:
             ("the bucket", settings.list_seconds, surfaces.sync),
         )
         self._threads: list[threading.Thread] = []
+        self._asked = Threads(1)
+        self._coming: dict[str, asyncio.Task[None]] = {}  # looks that have not begun
+        self._lately: dict[str, _Look] = {}
 
     def start(self) -> None:
         """Begin, if several servers share the data."""
@@ -80,3 +103,44 @@ class Following:
     def _follow(self) -> None:
         if not self._surfaces.writes:
             self._changes.look(lambda what: self._surfaces.sync() if what is None else self._surfaces.refresh(what))
+
+    async def look_for(self, what: str) -> None:
+        """Read a surface, by its id, or a name, by its key, from the bucket: somebody asks for what is not known here.
+
+        A server that writes knows everything. Whoever asks gets a look that begins after that, so it finds whatever was
+        acknowledged before. Where there are too many there is none: then this server sees it when it follows.
+
+        Raises
+        ------
+        StoreError
+            If the bucket cannot be read.
+        BusyError
+            If that takes long.
+        """
+        if self._surfaces.lease is None or self._surfaces.writes or not _is_key(what):
+            return
+        coming = self._coming.get(what)
+        if coming is None:
+            old = time.monotonic() - 1.0
+            self._lately = {key: it for key, it in self._lately.items() if it.begun > old or not it.answer.done()}
+            if len({what, *self._coming, *self._lately}) > _MOST_LOOKS:
+                return
+            coming = self._coming[what] = asyncio.create_task(self._look_for(what))
+        try:
+            async with asyncio.timeout(_PATIENCE):
+                await asyncio.shield(coming)
+        except TimeoutError:
+            raise BusyError("The bucket does not answer whether there is such a thing; try again soon") from None
+
+    async def _look_for(self, what: str) -> None:
+        last = self._lately.get(what)
+        if last is not None:
+            await asyncio.gather(asyncio.wrap_future(last.answer), return_exceptions=True)
+            await asyncio.sleep(last.begun + _BETWEEN - time.monotonic())
+        del self._coming[what]
+        look = self._lately[what] = _Look(time.monotonic(), self._asked.submit(self._surfaces.refresh, (what,)))
+        await asyncio.wrap_future(look.answer)
+
+
+def _is_key(what: str) -> bool:
+    return layout.id_of(layout.manifest_key(what)) is not None or layout.name_of(what) is not None

@@ -99,6 +99,7 @@ def test_one_writes_another_takes_over_and_readers_answer(s3: Emulator, tmp_path
         with front.client(token) as client:
             assert client.get("/metrics").status_code == 403
             stored(front, client, 1)
+            sent_in_parts(client)
             writer = started["writer"][1]
             writer.terminate()
             writer.wait(PATIENCE)
@@ -106,6 +107,15 @@ def test_one_writes_another_takes_over_and_readers_answer(s3: Emulator, tmp_path
             eventually(lambda: httpx.get(standby, trust_env=False).json()["role"] == "writer", "the other to take over")
             stored(front, client, 2)
             eventually(lambda: len(client.get("/v1/surfaces").json()["surfaces"]) == 2, "the readers to know both")
+
+
+def sent_in_parts(client: httpx.Client) -> None:
+    """Ask how far an upload is that is sent in parts: only the server that writes knows."""
+    begun = client.post("/v1/uploads", headers={"tus-resumable": "1.0.0", "upload-length": "7"})
+    assert begun.status_code == 201, begun.text
+    for _ in range(6):
+        told = client.head(begun.headers["location"], headers={"tus-resumable": "1.0.0"})
+        assert (told.status_code, told.headers["upload-offset"]) == (200, "0")
 
 
 def stored(front: Front, client: httpx.Client, seed: int) -> None:
@@ -116,7 +126,9 @@ def stored(front: Front, client: httpx.Client, seed: int) -> None:
         return answer if answer.status_code == 202 else None  # 503 until Caddy has seen who writes
 
     uploaded = eventually(upload, "a server to take it")
-    surface = settled(client, uploaded.headers["location"])
+    place = uploaded.headers["location"]
+    assert [client.get(place).status_code for _ in range(6)] == [200] * 6, "no reader has to follow before"
+    surface = settled(client, place)
     assert surface["state"] == "ready"
     for _ in range(6):
         answer = client.get(f"{surface['url']}/container")

@@ -15,16 +15,19 @@ import httpx
 import numpy as np
 import pytest
 
+from lodestream import Target
 from lodestream.errors import InputError, LodestreamError
-from lodestream.stores import ConflictError, open_store
+from lodestream.protocol.messages import Open
+from lodestream.stores import ConflictError, StoreError, open_store
 from lodestream_client.program import main
-from lodestream_server import running_server
+from lodestream_server import following, running_server
 from lodestream_server.access.tokens import TokenObject, Tokens
 from lodestream_server.builds import worker
 from lodestream_server.store.lease import Lease
+from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
 from tests.server.builds import slow
-from tests.server.helpers import eventually, hills, npy, problem, push, settled
+from tests.server.helpers import data_of, eventually, hills, npy, problem, push, raw_stream, settled
 from tests.stores.emulators import ministack, s3
 from tests.stores.memory import memory
 
@@ -100,6 +103,79 @@ def test_a_reader_serves_what_the_writer_built_and_changes_nothing(site: Site) -
     first.delete(location).raise_for_status()
     within(5.0, lambda: states(reader) == {}, "the reader to see that it is gone")
     assert reader.get(location).status_code == 404
+
+
+@pytest.fixture
+def gets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Whatever is read whole from a bucket, by the paths of the objects."""
+    import obstore
+
+    found: list[str] = []
+    get = obstore.get
+
+    def counted(store: Any, path: str, **named: Any) -> Any:
+        found.append(path)
+        return get(store, path, **named)
+
+    monkeypatch.setattr(obstore, "get", counted)
+    return found
+
+
+def test_a_reader_that_has_not_followed_yet_looks_for_what_it_is_asked_for(site: Site, gets: list[str]) -> None:
+    first = writer(site)
+    readers = [site.start(name, read_only=True, look_seconds=3600.0) for name in ("a", "b", "c")]
+    uploaded = push(first, npy(hills()))
+    place = f"/v1/surfaces/{uploaded['id']}"
+    first.put("/v1/names/hill", json={"surface": uploaded["id"]}).raise_for_status()
+    assert [states(reader) for reader in readers] == [{}] * 3
+    assert readers[0].get(place).json()["state"] == "ready"
+    assert readers[1].get("/v1/names/hill/container").status_code == 200
+    with raw_stream(f"{readers[2].base_url}{place}") as stream:
+        stream.send(Open(Target(level=0), credit=1 << 20))
+        assert data_of(stream.until_end())
+    assert [states(reader) for reader in readers] == [{uploaded["id"]: "ready"}] * 3
+    first.delete("/v1/names/hill").raise_for_status()
+    first.delete(place).raise_for_status()
+    gets.clear()
+    strange = [f"/v1/surfaces/{number:020x}" for number in range(100)]
+    asked = [*strange, "/v1/surfaces/nothing", "/v1/names/nobody"]
+    begun = time.monotonic()
+    assert {readers[0].get(path).status_code for path in asked} == {404}
+    seconds = int(time.monotonic() - begun) + 1
+    assert 0 < sum("/surfaces/" in path for path in gets) <= 16 * seconds, "each costs a request"
+    gets.clear()
+    with ThreadPoolExecutor(8) as threads:
+        assert set(threads.map(lambda path: readers[1].get(path).status_code, strange[:1] * 16)) == {404}
+    assert 0 < len(gets) < 16, "who asks for the same has one look"
+
+
+def test_a_reader_looks_whether_a_build_has_ended(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "build", slow.wait)
+    first = writer(site)
+    reader = site.start("reader", read_only=True, look_seconds=3600.0)
+    location = first.post("/v1/surfaces", content=npy(hills())).headers["location"]
+    assert reader.get(location).json()["state"] == "queued"
+    assert problem(reader.get(f"{location}/container")) == (409, "not-ready")
+    (site.folder / "writer" / "go").touch()
+    settled(first, location)
+    assert reader.get(f"{location}/container").status_code == 200
+
+
+def test_a_reader_that_cannot_reach_the_bucket_does_not_say_that_there_is_nothing(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = writer(site)
+    reader = site.start("reader", read_only=True, look_seconds=3600.0)
+    uploaded = push(first, npy(hills()))
+
+    def fail(*_: object) -> None:
+        raise StoreError("the bucket does not answer")
+
+    monkeypatch.setattr(Surfaces, "refresh", fail)
+    assert problem(reader.get(uploaded["url"])) == (503, "busy")
+    monkeypatch.setattr(following, "_PATIENCE", 0.1)
+    monkeypatch.setattr(Surfaces, "refresh", lambda *_: time.sleep(1))
+    assert problem(reader.get(f"/v1/surfaces/{'0' * 20}")) == (503, "busy")
 
 
 def test_a_reader_answers_whoever_waits_once_the_writer_has_built(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:

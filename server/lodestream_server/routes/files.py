@@ -51,7 +51,7 @@ async def get_surface_container(request: Request, parts: Parts, surface: str) ->
 
     Its strong ETag is the SHA-256 of its contents. Content-Location is its own address, where it may be kept for ever.
     """
-    return await container_of(request, parts, ready(parts, surface))
+    return await container_of(request, parts, await ready(parts, surface))
 
 
 async def container_of(request: Request, parts: State, surface: Surface) -> Response:

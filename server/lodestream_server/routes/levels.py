@@ -56,7 +56,7 @@ async def get_level(
 
     Ranges of it are answered, so that a program such as GDAL (``/vsicurl/``) can read what it shows of a ``cog``.
     """
-    found = ready(parts, surface)
+    found = await ready(parts, surface)
     _check(found, level)
     format_ = written(wanted)
     etag = f'"{found.container}-{level}-{format_.name}-{written_by()}"'

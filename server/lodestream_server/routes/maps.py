@@ -61,8 +61,8 @@ _Version = Annotated[str | None, Query(max_length=64, description="as a document
 async def _found(request: Request, parts: Parts, surface: str) -> Surface:
     """Return the surface of a request, which a name may lead to."""
     if request.scope["route"].path.startswith("/v1/names/"):
-        surface = leads_to(parts, surface).id
-    return ready(parts, surface)
+        surface = (await leads_to(parts, surface)).id
+    return await ready(parts, surface)
 
 
 _Found = Annotated[Surface, Depends(_found)]

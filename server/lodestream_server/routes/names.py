@@ -17,10 +17,10 @@ from ..access.access import Caller
 from ..access.scopes import READ, Reader, Writer
 from ..problems import SlowUploadError, responses
 from ..store.index import Named, Surface
-from ..store.layout import NAME
+from ..store.layout import NAME, name_key
 from . import descriptions, files, models
 from .routing import Parts, State, described, readable
-from .sending import ready
+from .sending import look_for, ready
 from .surfaces import Wait, base, description, owned, settled
 
 __all__ = ["leads_to", "router"]
@@ -55,7 +55,7 @@ async def point_name(caller: Writer, request: Request, parts: Parts, name: _Name
     """
     surface, names = await _asked(request, parts), parts.surfaces.names
     new = parts.surfaces.index.find_name(name) is None
-    found = None if surface is None else ready(parts, surface)
+    found = None if surface is None else await ready(parts, surface)
     if new:
         await parts.limits.check_owner(caller.owner)
     fits = parts.limits.names(caller)
@@ -104,8 +104,8 @@ async def list_names(
 )
 async def get_name(caller: Reader, request: Request, parts: Parts, name: _Name, wait: Wait = 0.0) -> Response:
     """Return what is told of the surface to which a name leads now; its `url` is that of the surface."""
-    await settled(request, parts, caller, leads_to(parts, name).id, wait)
-    return described(request, parts, await description(leads_to(parts, name), caller, parts, request))
+    await settled(request, parts, caller, (await leads_to(parts, name)).id, wait)
+    return described(request, parts, await description(await leads_to(parts, name), caller, parts, request))
 
 
 @readable(
@@ -118,7 +118,7 @@ async def get_name(caller: Reader, request: Request, parts: Parts, name: _Name, 
 )
 async def get_name_container(request: Request, parts: Parts, name: _Name) -> Response:
     """Return the container of the surface to which a name leads now; another one, with another ETag, later."""
-    return await files.container_of(request, parts, ready(parts, leads_to(parts, name).id))
+    return await files.container_of(request, parts, await ready(parts, (await leads_to(parts, name)).id))
 
 
 @router.delete("/{name}", status_code=204, summary="Delete a name", responses=responses(403, 404, 422, 503))
@@ -149,7 +149,7 @@ async def _asked(request: Request, parts: State) -> str | None:
     return None if surface is None else surface.removeprefix(f"{base(request)}/")
 
 
-def leads_to(parts: State, name: str) -> Surface:
+async def leads_to(parts: State, name: str) -> Surface:
     """Return the surface to which a name leads.
 
     Raises
@@ -158,8 +158,14 @@ def leads_to(parts: State, name: str) -> Surface:
         If there is no such name, or its surface was deleted.
     DamagedNameError
         If it cannot be read.
+    StoreError, BusyError
+        See `look_for`.
     """
+    if parts.surfaces.index.find_name(name) is None:
+        await parts.following.look_for(name_key(name))
     leads = parts.surfaces.names.get(name).surface
+    if leads is not None:
+        await look_for(parts, leads)
     found = None if leads is None else parts.surfaces.index.find(leads)
     if found is None:
         raise NotFoundError(f"The name {name} led to the surface {leads}, which was deleted")

@@ -20,6 +20,7 @@ from ..access.limits import Limits
 from ..builds.builder import Builder
 from ..builds.level_maker import LevelMaker
 from ..builds.tile_maker import TileMaker
+from ..following import Following
 from ..operation.metrics import Metrics
 from ..operation.pace import Pace
 from ..operation.settings import Settings
@@ -41,6 +42,7 @@ class State:
     settings: Settings
     data: Data
     surfaces: Surfaces
+    following: Following
     partial_uploads: PartialUploads
     upkeep: Upkeep
     builder: Builder

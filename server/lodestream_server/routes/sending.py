@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 from fastapi import Request
@@ -14,14 +14,14 @@ from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive, Scope, Send
 
 from lodestream.errors import NotFoundError
-from lodestream.stores import Blob
+from lodestream.stores import Blob, StoreError
 
 from ..problems import BuildFailedError, BusyError, NotReadyError, PostponedError
 from ..store.index import Surface
 from .byte_ranges import only_range
 from .routing import State
 
-__all__ = ["SentBlob", "SentFile", "ready", "still_there", "while_there"]
+__all__ = ["SentBlob", "SentFile", "look_for", "ready", "still_there", "while_there"]
 
 _log = logging.getLogger(__name__)
 
@@ -99,7 +99,23 @@ def _pieces(blob: Blob, start: int, end: int) -> Iterator[bytes]:
         yield blob.read(offset, min(_PIECE, end - offset))
 
 
-def ready(parts: State, surface: str) -> Surface:
+async def look_for(parts: State, surface: str) -> None:
+    """Look in the bucket for a surface that this server does not know, or not as built: another one may have told so.
+
+    Raises
+    ------
+    StoreError, BusyError
+        If it is not known here, and the bucket does not answer.
+    """
+    known = parts.surfaces.index.find(surface)
+    if known is None:
+        await parts.following.look_for(surface)
+    elif known.state == "queued":
+        with suppress(StoreError, BusyError):
+            await parts.following.look_for(surface)
+
+
+async def ready(parts: State, surface: str) -> Surface:
     """Return a surface that has a container.
 
     Raises
@@ -108,7 +124,14 @@ def ready(parts: State, surface: str) -> Surface:
         If there is no such surface.
     NotReadyError, PostponedError, BuildFailedError
         If it is still being built, waits for a retry, or has failed.
+    StoreError, BusyError
+        See `look_for`.
     """
+    await look_for(parts, surface)
+    return _ready(parts, surface)
+
+
+def _ready(parts: State, surface: str) -> Surface:
     found = parts.surfaces.get(surface)
     if found.state == "failed":
         raise BuildFailedError(f"The surface {surface} could not be built: {found.reason}")
@@ -136,10 +159,10 @@ def still_there(parts: State, surface: str) -> Iterator[None]:
     try:
         yield
     except NotFoundError:
-        ready(parts, surface)
+        _ready(parts, surface)
         raise BusyError(f"The container of {surface} was deleted and stored again meanwhile; try again") from None
     except BusyError:
-        ready(parts, surface)
+        _ready(parts, surface)
         raise
 
 

@@ -105,7 +105,7 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: AnyQuery, surfa
                     first = await _first_message(socket, parts.settings.head_seconds)
                 caller = parts.access.reader_with(_token(first))
         with parts.limits.stream(caller) as credit:
-            found = ready(parts, surface)
+            found = await ready(parts, surface)
             with still_there(parts, surface):
                 sha256 = found.container or ""
                 container = parts.containers.open_known(sha256, caller.key)

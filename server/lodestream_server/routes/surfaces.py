@@ -26,7 +26,7 @@ from ..store.index import Position, Surface
 from ..store.layout import Manifest
 from . import descriptions, models
 from .routing import AnyQuery, Parts, State, described, readable
-from .sending import while_there
+from .sending import look_for, while_there
 
 __all__ = ["Wait", "base", "description", "keep", "owned", "router", "settled"]
 
@@ -291,13 +291,18 @@ def _manifest(received: uploads.Upload, chosen: options.SurfaceOptions, owner: s
 async def settled(request: Request, parts: State, caller: Caller, surface: str, seconds: float) -> None:
     """Wait until the build of a surface has ended, the client is gone, or so many seconds are over.
 
+    Of a server that does not write, the surface is looked for in the bucket before that.
+
     Raises
     ------
     NotFoundError
         If there is no such surface.
     TooManyError, BusyError
         If the caller, or all together, have as many requests that wait as allowed.
+    StoreError, BusyError
+        See `look_for`.
     """
+    await look_for(parts, surface)
     if seconds and parts.surfaces.get(surface).state in ("queued", "building"):
         with parts.limits.waits.take(caller):
             await while_there(request, parts.builder.settled(surface, seconds), lambda _: None)
