@@ -8,10 +8,10 @@ can be explained as a whole.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Literal, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Literal, NamedTuple, TypeAlias, TypeVar
 
-from .events import Answer, Finding, History, Operation, Seen, Subject
+from .events import Answer, Finding, History, Operation, Seen, Span, Subject
 from .order import ABSENT, BARE, PRESENT, Step, Unexplained, unexplained
 
 __all__ = ["check"]
@@ -45,23 +45,39 @@ _SHOWN = 12
 
 T = TypeVar("T")
 
+Progress: TypeAlias = Callable[[str], None]
 
-def check(history: History) -> list[Finding]:
+
+class _Shown(NamedTuple):
+    """What a list showed, of every surface or name at once."""
+
+    operation: Operation
+    since: float | None
+    shown: dict[str, str]
+
+
+def check(history: History, progress: Progress = lambda _: None) -> list[Finding]:
     """Everything that is wrong in a history; of the order, the first answer about each surface that cannot be.
+
+    Parameters
+    ----------
+    history : History
+    progress : callable
+        Is told of which surface or name the order is looked for.
 
     Raises
     ------
     ValueError
         When something is restored of which there is no backup.
     """
-    surfaces = _Surfaces(history.operations)
+    surfaces, waits = _Surfaces(history.operations), _Waits(history.waiting)
     return [
         *history.findings,
         *_answers(history, surfaces),
         *surfaces.findings(),
-        *_of_those_who_wait(history),
-        *_orders(history, surfaces),
-        *_names(history),
+        *_of_those_who_wait(history, waits),
+        *_orders(history, surfaces, waits, progress),
+        *_names(history, waits, progress),
     ]
 
 
@@ -74,11 +90,24 @@ def _answers(history: History, surfaces: _Surfaces) -> list[Finding]:
     return list(found.values())
 
 
-def _of_those_who_wait(history: History) -> Iterator[Finding]:
+class _Waits:
+    """When servers were known not to write."""
+
+    def __init__(self, spans: Iterable[Span]) -> None:
+        self._spans: dict[str | None, list[Span]] = defaultdict(list)
+        for span in spans:
+            self._spans[span.server].append(span)
+
+    def hold(self, operation: Operation) -> bool:
+        """Whether an operation was asked and answered in such a time of its server."""
+        return any(span.holds(operation) for server in (None, operation.server) for span in self._spans.get(server, ()))
+
+
+def _of_those_who_wait(history: History, waits: _Waits) -> Iterator[Finding]:
     """What was acknowledged by a server that did not write at that time."""
     for operation in history.operations:
         status = None if operation.answer is None else operation.answer.status
-        if status in _DONE.get(operation.kind, ()) and any(span.holds(operation) for span in history.waiting):
+        if status in _DONE.get(operation.kind, ()) and waits.hold(operation):
             text = f"{operation.subject or operation.name}: expected 503 from {operation.server}, got {status}"
             yield Finding("not the writer", text, (operation,))
 
@@ -188,52 +217,62 @@ def _more_than_one(rule: str, expected: str, found: Mapping[T, Operation]) -> It
         yield Finding(rule, f"{expected}, got {names}", tuple(found.values()))
 
 
-def _orders(history: History, surfaces: _Surfaces) -> Iterator[Finding]:
-    steps: dict[Subject, list[Step]] = {subject: [] for subject in surfaces.ids}
+def _orders(history: History, surfaces: _Surfaces, waits: _Waits, progress: Progress) -> Iterator[Finding]:
+    """Where the answers about a surface have no order."""
+    own: dict[Subject, list[Operation]] = {subject: [] for subject in surfaces.ids}
+    named: dict[Subject, list[tuple[Operation, str]]] = defaultdict(list)
+    lists: list[_Shown] = []
     for operation in history.operations:
         if operation.kind in _OF_NAMES:
             for seen in operation.answer.seen if operation.answer is not None else ():
                 if (of := surfaces.only(seen.id)) is not None:
-                    steps[of].append(_seen_as(operation, seen.state, history))
+                    named[of].append((operation, seen.state))
         elif operation.subject is not None:
-            steps.setdefault(operation.subject, []).extend(_steps(operation, history))
+            own.setdefault(operation.subject, []).append(operation)
         elif operation.answer is not None and operation.answer.status == 200:
-            listed = {seen.id: seen.state for seen in operation.answer.seen}
-            for subject, ids in surfaces.ids.items():
-                state = next((listed[surface] for surface in ids if surface in listed), ABSENT)
-                steps[subject].append(_seen_as(operation, state, history))
-    for subject, own in steps.items():
-        found = unexplained(own, history.marks)
+            shown = {seen.id: seen.state for seen in operation.answer.seen}
+            lists.append(_Shown(operation, history.since(operation), shown))
+    # One after another: each list is a step of every surface.
+    for number, (subject, operations) in enumerate(own.items(), 1):
+        steps = [step for operation in operations for step in _steps(operation, history, waits)]
+        steps += [_seen_as(operation, state, history.since(operation)) for operation, state in named[subject]]
+        if subject in surfaces.ids:
+            for operation, since, shown in lists:
+                state = next((shown[surface] for surface in surfaces.ids[subject] if surface in shown), ABSENT)
+                steps.append(_seen_as(operation, state, since))
+        progress(f"surface {number} of {len(own)}, {len(steps):,} steps")
+        found = unexplained(steps, history.marks)
         if found is not None:
-            yield _out_of_order(subject, found, own)
+            yield _out_of_order(subject, found, steps)
 
 
-def _names(history: History) -> Iterator[Finding]:
+def _names(history: History, waits: _Waits, progress: Progress) -> Iterator[Finding]:
     """Where the answers about a name have no order."""
-    names = {operation.name for operation in history.operations if operation.name is not None}
-    steps: dict[str, list[Step]] = {name: [] for name in sorted(names)}
+    own: dict[str, list[Operation]] = defaultdict(list)
+    lists: list[_Shown] = []
     for operation in history.operations:
-        if operation.kind == "names":
-            if operation.answer is not None and operation.answer.status == 200:
-                found = dict(operation.answer.names)
-                for name, own in steps.items():
-                    own.append(_read(operation, {found.get(name, ABSENT)}, history))
-        elif operation.name is not None:
-            steps[operation.name].extend(_steps_of_name(operation, history))
-    for name, own in steps.items():
-        unexplained_ = unexplained(own, history.marks)
-        if unexplained_ is not None:
-            yield _out_of_order(name, unexplained_, own)
+        if operation.name is not None:
+            own[operation.name].append(operation)
+        elif operation.kind == "names" and operation.answer is not None and operation.answer.status == 200:
+            lists.append(_Shown(operation, history.since(operation), dict(operation.answer.names)))
+    for number, (name, operations) in enumerate(sorted(own.items()), 1):
+        steps = [step for operation in operations for step in _steps_of_name(operation, history, waits)]
+        for operation, since, shown in lists:
+            steps.append(_read(operation, {shown.get(name, ABSENT)}, since))
+        progress(f"name {number} of {len(own)}, {len(steps):,} steps")
+        found = unexplained(steps, history.marks)
+        if found is not None:
+            yield _out_of_order(name, found, steps)
 
 
-def _steps_of_name(operation: Operation, history: History) -> Iterator[Step]:
+def _steps_of_name(operation: Operation, history: History, waits: _Waits) -> Iterator[Step]:
     answer, kind = operation.answer, operation.kind
-    status = None if answer is None else answer.status
+    status, since = None if answer is None else answer.status, history.since(operation)
     if kind == "follow":
         # That it leads to a surface that was deleted meanwhile is told with 404 too.
         for seen in answer.seen if answer is not None else ():
-            yield _read(operation, {seen.id}, history)
-    elif _did_nothing(operation, history):
+            yield _read(operation, {seen.id}, since)
+    elif _did_nothing(operation, waits):
         return
     elif status in _DONE[kind] or status is None or status in _UNKNOWN:
         done = status in _DONE[kind]
@@ -241,31 +280,31 @@ def _steps_of_name(operation: Operation, history: History) -> Iterator[Step]:
         as_: Literal["point", "delete"] = "point" if kind == "point" else "delete"
         yield Step(as_, operation.begun, ended, latest, operation=operation, value=operation.surface)
     elif kind == "unpoint" and status == 404:
-        yield _read(operation, {ABSENT}, history)
+        yield _read(operation, {ABSENT}, since)
 
 
-def _steps(operation: Operation, history: History) -> Iterator[Step]:
+def _steps(operation: Operation, history: History, waits: _Waits) -> Iterator[Step]:
     """What an operation says of its surface, and does to it."""
     answer, kind = operation.answer, operation.kind
-    status = None if answer is None else answer.status
+    status, since = None if answer is None else answer.status, history.since(operation)
     if kind in _DONE:
         if status in _DONE[kind]:
             yield _write(operation, operation.ended, None)
-        elif _did_nothing(operation, history):
+        elif _did_nothing(operation, waits):
             return
         elif status is None or status in _UNKNOWN:
             yield _write(operation, None, history.ends.get(operation.server))
         elif kind != "upload" and status in (403, 404, 409):
-            yield _read(operation, {ABSENT} if status == 404 else PRESENT, history)
+            yield _read(operation, {ABSENT} if status == 404 else PRESENT, since)
     elif kind in ("fetch", "values") and answer is not None:
         if answer.status in _BYTES and not answer.seen:
-            yield _read(operation, _BYTES[answer.status], history)
+            yield _read(operation, _BYTES[answer.status], since)
     elif status == 404:
-        yield _read(operation, {ABSENT}, history)
+        yield _read(operation, {ABSENT}, since)
     # Apart from what it did: the answer may be older than the end of it.
     for seen in answer.seen if answer is not None else ():
         # Whoever has pushed and is told that it is ready does not push again.
-        yield _read(operation, {seen.state}, history) if kind == "upload" else _seen_as(operation, seen.state, history)
+        yield _read(operation, {seen.state}, since) if kind == "upload" else _seen_as(operation, seen.state, since)
 
 
 def _write(operation: Operation, ended: float | None, latest: float | None) -> Step:
@@ -273,21 +312,20 @@ def _write(operation: Operation, ended: float | None, latest: float | None) -> S
     return Step(operation.kind, operation.begun, ended, latest, operation=operation)
 
 
-def _read(operation: Operation, observed: Iterable[str], history: History) -> Step:
-    since = history.since(operation)
+def _read(operation: Operation, observed: Iterable[str], since: float | None) -> Step:
     return Step(
         "read", operation.begun, operation.ended, observed=frozenset(observed), operation=operation, since=since
     )
 
 
-def _seen_as(operation: Operation, state: str, history: History) -> Step:
-    return _read(operation, {state, BARE} if state == "ready" else {state}, history)
+def _seen_as(operation: Operation, state: str, since: float | None) -> Step:
+    return _read(operation, {state, BARE} if state == "ready" else {state}, since)
 
 
-def _did_nothing(operation: Operation, history: History) -> bool:
+def _did_nothing(operation: Operation, waits: _Waits) -> bool:
     """Whether a change was refused by a server that was known not to write."""
     refused = operation.answer is not None and operation.answer.status == 503
-    return refused and any(span.holds(operation) for span in history.waiting)
+    return refused and waits.hold(operation)
 
 
 def _out_of_order(subject: Subject | str, found: Unexplained, steps: list[Step]) -> Finding:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -275,9 +276,12 @@ class History:
         if operation.kind in ("upload", "retry") and operation.answer.status in (200, 202):
             return None
         since = operation.begun - self.lag
-        for span in reversed(self.troubles):
-            if span.begun <= operation.ended and span.ended >= since:
-                since = min(since, span.begun - self.lag)
+        # One after another: those before one that is too early are too early as well.
+        for number in range(bisect_right(self.troubles, operation.ended, key=lambda span: span.begun) - 1, -1, -1):
+            span = self.troubles[number]
+            if span.ended < since:
+                break
+            since = min(since, span.begun - self.lag)
         return since
 
     def refused(self) -> int:

@@ -19,10 +19,12 @@ the surface was deleted or uploaded meanwhile, perhaps half of it.
 
 from __future__ import annotations
 
+import itertools
 import math
-from bisect import bisect_left
+from bisect import insort
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import le
 from typing import Literal, NamedTuple, TypeAlias
 
 from .events import Mark, Operation
@@ -63,8 +65,11 @@ PRESENT = frozenset(SPONTANEOUS) - {ABSENT}
 
 States: TypeAlias = frozenset[str]
 
-# So many steps that are pending have subsets enough.
-_MANY = 8
+# What a step without an answer does: those that do the same are counted.
+_Does: TypeAlias = tuple[str, str | None]
+
+# More ways than clients that are answered have.
+_MANY = 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +125,10 @@ class _Way(NamedTuple):
     states: States
     saved: States | None  # what the backup has met
     saving: bool
-    pending: frozenset[int]  # steps that have begun and have not taken effect
+    # Steps with an answer that have begun and have not taken effect: those that change something, and reads.
+    writes: frozenset[int]
+    reads: frozenset[int]
+    used: frozenset[int]  # steps without an answer that have taken effect, and may not do so again
 
 
 def later(states: States) -> States:
@@ -169,44 +177,44 @@ def unexplained(steps: Sequence[Step], marks: Iterable[Mark] = ()) -> Unexplaine
     ValueError
         When something is restored of which there is no backup.
     """
-    ways = {_Way(frozenset({ABSENT}), None, False, frozenset())}
-    past = [(-math.inf, frozenset({ABSENT}))] if any(step.since is not None for step in steps) else None
+    register, past = _Register(steps), _Past()
     for moment, what in _in_time(steps, marks):
         if isinstance(what, Mark):
-            ways = {_marked(way, what) for way in _all_orders(ways, steps)}
+            register.mark(what)
         elif what.action == "looks":
-            assert past is not None
             step = steps[what.number]
-            possible = _from(past, step.since if step.since is not None else moment)
-            if not possible & step.observed:
-                return Unexplained(step, possible)
+            since = moment if step.since is None else step.since
+            if not past.holds(step.observed, since):
+                return Unexplained(step, past.states(since))
             continue
         elif what.action == "begins":
-            ways = {way._replace(pending=way.pending | {what.number}) for way in ways}
-        else:
-            step = steps[what.number]
-            following = {way for way in ways if what.number not in way.pending}
-            ways -= following
-            for way in ways:
-                following |= _until(way, what.number, steps)
-                if step.ended is None:
-                    following.add(way._replace(pending=way.pending - {what.number}))
-            if not following:
-                return Unexplained(step, _possible(_all_orders(ways, steps, without=what.number)))
-            ways = {way._replace(pending=way.pending - {what.number}) for way in following}
-        if past is not None:
-            past.append((moment, _possible(_all_orders(ways, steps))))
+            register.begin(what.number)
+        elif not register.end(what.number):
+            return Unexplained(steps[what.number], register.possible())
+        past.note(moment, register.possible())
     return None
 
 
-def _possible(ways: Iterable[_Way]) -> States:
-    return frozenset().union(*(later(way.states) for way in ways))
+class _Past:
+    """When the surface can have been in which state."""
 
+    def __init__(self) -> None:
+        self._now: States = frozenset({ABSENT})
+        self._until: dict[str, float] = {}
 
-def _from(past: Sequence[tuple[float, States]], since: float) -> States:
-    """The states of some moment from one on, given those from each moment to the next."""
-    first = max(0, bisect_left(past, since, key=lambda each: each[0]) - 1)
-    return frozenset().union(*(states for _, states in past[first:]))
+    def note(self, moment: float, possible: States) -> None:
+        """From a moment on it can be in these, and in no others."""
+        if possible != self._now:
+            self._until.update(dict.fromkeys(self._now - possible, moment))
+            self._now = possible
+
+    def holds(self, states: States, since: float) -> bool:
+        """Whether it can have been in one of these at any moment from one on."""
+        return not self._now.isdisjoint(states) or any(self._until.get(state, -math.inf) >= since for state in states)
+
+    def states(self, since: float) -> States:
+        """All of them at any moment from one on."""
+        return self._now | {state for state, until in self._until.items() if until >= since}
 
 
 class _Moment(NamedTuple):
@@ -231,54 +239,150 @@ def _in_time(steps: Sequence[Step], marks: Iterable[Mark]) -> Iterator[tuple[flo
         yield moment, what
 
 
-def _until(way: _Way, number: int, steps: Sequence[Step]) -> set[_Way]:
-    """The ways on in which a step has taken effect, after any others that were pending."""
-    found = set()
-    for before in _all_orders({way}, steps, without=number):
-        after = _happened(before, number, steps)
-        if after is not None:
-            found.add(after)
-    return found
+class _Register:
+    """All ways in which everything up to now may have happened, but for those to which another one is as good.
+
+    What may follow on one of the ways, by steps that have begun, is always one of them too. So a step that ends has
+    taken effect on some of them, and only these are left.
+
+    A way is as good as another one if whatever explains an answer on the other one does so on it: it leaves at least
+    the states of the other one, the same steps to take effect (of reads, which can only rule out states, none that the
+    other one does not have), and as many steps without an answer, for as long. Of two of these that do the same, the
+    one that may happen for the shorter time is used first.
+    """
+
+    def __init__(self, steps: Sequence[Step]) -> None:
+        self._steps = steps
+        first = _Way(frozenset({ABSENT}), None, False, frozenset(), frozenset(), frozenset())
+        # By what is to take effect: others cannot be as good.
+        self._ways: dict[frozenset[int], list[_Way]] = {first.writes: [first]}
+        # Without an answer, by what they do; first the one that may happen for the shortest time.
+        self._unanswered: dict[_Does, list[int]] = {}
+        self._again = False
+
+    def possible(self) -> States:
+        """The states in which the surface can be now."""
+        return frozenset().union(*(later(states) for states in {way.states for way in self._all()}))
+
+    def begin(self, number: int) -> None:
+        """From now on a step may take effect."""
+        step = self._steps[number]
+        if step.ended is None:
+            insort(self._unanswered.setdefault(_does(step), []), number, key=self._latest)
+        elif step.kind == "read":
+            self._set(way._replace(reads=way.reads | {number}) for way in self._all())
+        else:
+            self._set(way._replace(writes=way.writes | {number}) for way in self._all())
+        self._follow(number)
+
+    def end(self, number: int) -> bool:
+        """From now on a step has taken effect, or never will if it has no answer; whether there is a way."""
+        step = self._steps[number]
+        if step.ended is None:
+            does = _does(step)
+            self._unanswered[does].remove(number)
+            if not self._unanswered[does]:
+                del self._unanswered[does]
+            self._again = self._again and bool(self._unanswered)
+            if any(number in way.used for way in self._all()):
+                self._set(way._replace(used=way.used - {number}) for way in self._all())
+            return True
+        left = [way for way in self._all() if number not in way.writes and number not in way.reads]
+        if left:
+            self._set(left)
+        return bool(left)
+
+    def mark(self, mark: Mark) -> None:
+        """Something happens to all surfaces."""
+        self._set(_marked(way, mark) for way in self._all())
+        self._follow()
+
+    def _all(self) -> list[_Way]:
+        return [way for ways in self._ways.values() for way in ways]
+
+    def _set(self, ways: Iterable[_Way]) -> None:
+        ways = list(ways)
+        self._ways = {}
+        for way in ways:
+            self._add(way)
+
+    def _add(self, way: _Way) -> bool:
+        """Have one way more, and those no longer to which it is as good; whether none is as good as it."""
+        others = self._ways.setdefault(way.writes, [])
+        if any(self._as_good(other, way) for other in others):
+            return False
+        others[:] = [other for other in others if not self._as_good(way, other)]
+        others.append(way)
+        return True
+
+    def _follow(self, new: int | None = None) -> None:
+        """Add the ways on which any steps have taken effect, in any order; all others have been tried if one is new."""
+        left = [(way, new) for way in self._all()]
+        while left:
+            way, only = left.pop()
+            for number in self._next(way) if only is None else [only]:
+                after = self._happened(way, number)
+                if after is not None and self._add(after):
+                    left.append((after, None))
+            if not self._again and self._unanswered and sum(map(len, self._ways.values())) > _MANY:
+                # As many ways as there are subsets of what was not answered could not be counted. From now on, until
+                # there is nothing more that has no answer, each of these may happen again and again: it is not found
+                # if one of them did so.
+                self._again = True
+                self._set(way._replace(used=frozenset()) for way in self._all())
+                left = [(way, None) for way in self._all()]
+
+    def _next(self, way: _Way) -> Iterator[int]:
+        """What may take effect next; of several steps without an answer that do the same, one."""
+        yield from way.writes
+        yield from way.reads
+        for numbers in self._unanswered.values():
+            yield from itertools.islice((number for number in numbers if number not in way.used), 1)
+
+    def _happened(self, way: _Way, number: int) -> _Way | None:
+        """The way on which a step has taken effect; None if it cannot have."""
+        step = self._steps[number]
+        states = apply(step, way.states)
+        if not states or number in way.used:
+            return None
+        saved = way.saved | states if way.saving and way.saved is not None else way.saved
+        one = frozenset({number})
+        used = way.used | one if step.ended is None and not self._again else way.used
+        return _Way(states, saved, way.saving, way.writes - one, way.reads - one, used)
+
+    def _as_good(self, way: _Way, other: _Way) -> bool:
+        """Whether one is as good as another that has the same to take effect."""
+        return (
+            way.states >= other.states
+            and way.reads <= other.reads
+            and (way.saved is None or other.saved is None or way.saved >= other.saved)
+            and (way.used <= other.used or self._spares(way.used, other.used))
+        )
+
+    def _spares(self, used: frozenset[int], other: frozenset[int]) -> bool:
+        """Whether as many steps without an answer are left as on another way, each for as long."""
+        if len(used) > len(other):
+            return False
+        ours, theirs = self._lasting(used), self._lasting(other)
+        return all(
+            len(moments) <= len(theirs.get(does, ())) and all(map(le, moments, theirs[does]))
+            for does, moments in ours.items()
+        )
+
+    def _lasting(self, used: frozenset[int]) -> dict[_Does, list[float]]:
+        """Until when steps may happen, by what they do, the last first."""
+        found: dict[_Does, list[float]] = {}
+        for number in sorted(used, key=self._latest, reverse=True):
+            found.setdefault(_does(self._steps[number]), []).append(self._latest(number))
+        return found
+
+    def _latest(self, number: int) -> float:
+        latest = self._steps[number].latest
+        return math.inf if latest is None else latest
 
 
-def _all_orders(ways: Iterable[_Way], steps: Sequence[Step], without: int | None = None) -> set[_Way]:
-    """The ways on in which any of the pending steps have taken effect, in any order."""
-    found = set(ways)
-    left = list(found)
-    while left:
-        way = left.pop()
-        for number in _distinct(way.pending, steps):
-            after = _happened(way, number, steps) if number != without else None
-            if after is not None and after not in found:
-                found.add(after)
-                left.append(after)
-    return found
-
-
-def _distinct(pending: frozenset[int], steps: Sequence[Step]) -> Iterator[int]:
-    # Of steps without an answer that do the same, the one that may happen for the shortest time is as good as another.
-    first: dict[tuple[str, str | None], tuple[float, int]] = {}
-    for number in sorted(pending):
-        step = steps[number]
-        if step.ended is not None:
-            yield number
-            continue
-        until = math.inf if step.latest is None else step.latest
-        what = (step.kind, step.value)
-        first[what] = min(first.get(what, (math.inf, number)), (until, number))
-    yield from (number for _, number in first.values())
-
-
-def _happened(way: _Way, number: int, steps: Sequence[Step]) -> _Way | None:
-    states = apply(steps[number], way.states)
-    if not states or (steps[number].ended is None and states == way.states):
-        return None  # it cannot happen, or it need not
-    saved = way.saved | states if way.saving and way.saved is not None else way.saved
-    if steps[number].kind == "point" and steps[number].ended is None and len(way.pending) > _MANY:
-        # Many without an answer may be pending, each to another surface, and their subsets could not be counted: each
-        # may happen more than once.
-        return _Way(states, saved, way.saving, way.pending)
-    return _Way(states, saved, way.saving, way.pending - {number})
+def _does(step: Step) -> _Does:
+    return step.kind, step.value
 
 
 def _marked(way: _Way, mark: Mark) -> _Way:
