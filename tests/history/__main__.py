@@ -1,6 +1,7 @@
 """``python -m tests.history``: one history, of some kinds of disasters only, and everything that is wrong in it.
 
 ``--kinds kill,full --count 10 --seed 3 --no-owners`` says which, how many, of which chance, and without tokens.
+``--again FILE`` judges one that was kept, as `tests.torture.takeovers` does when something is wrong.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ from pathlib import Path
 
 from tests.torture import history
 
+from .checker import check
 from .disasters import KINDS
+from .events import History
 
 
 def main() -> int:
@@ -24,7 +27,10 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--owners", action=argparse.BooleanOptionalAction, default=True, help="tokens and owners")
     parser.add_argument("--longest", type=float, default=1.5, help="most seconds between two things that happen")
+    parser.add_argument("--again", type=Path, metavar="FILE", help="judge the history in this file")
     args = parser.parse_args()
+    if args.again is not None:
+        return _again(args.again)
     kinds = args.kinds.split(",")
     unknown = sorted(set(kinds) - KINDS.keys())
     if unknown:
@@ -48,6 +54,16 @@ def main() -> int:
         f"{dict(done.disasters)}; {done.ready} surfaces at the end; {len(done.findings)} findings"
     )
     return 1 if done.findings else 0
+
+
+def _again(file: Path) -> int:
+    """Judge what was kept."""
+    kept = History.read(file)
+    findings = check(kept, lambda told: print(told, flush=True))
+    for finding in findings:
+        print(finding)
+    print(f"{len(kept.operations)} operations; {len(findings)} findings")
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gzip
+import pickle
 import threading
 import time
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 __all__ = ["Answer", "Finding", "History", "Kind", "Mark", "Operation", "Seen", "Span", "Subject"]
@@ -16,6 +19,9 @@ Kind: TypeAlias = Literal[
     "upload", "delete", "retry", "look", "list", "fetch", "values", "point", "unpoint", "follow", "names"
 ]
 MarkKind: TypeAlias = Literal["backup begins", "backup ends", "restored"]
+
+# What a history has in a file.
+_RECORDED = ("admins", "operations", "marks", "ends", "findings", "lag", "troubles", "waiting")
 
 
 @dataclass(frozen=True)
@@ -305,6 +311,17 @@ class History:
         """Note that a backup begins or has ended, or that a server is about to start in what was restored from it."""
         with self._lock:
             self.marks.append(Mark(kind, self.clock()))
+
+    def write(self, path: Path) -> None:
+        """Write all that was recorded to a file, from which `read` makes it again."""
+        with self._lock:
+            recorded = {name: getattr(self, name) for name in _RECORDED}
+            path.write_bytes(gzip.compress(pickle.dumps(recorded), compresslevel=1))
+
+    @classmethod
+    def read(cls, path: Path) -> History:
+        """Make a history of a file that `write` has written."""
+        return cls(**pickle.loads(gzip.decompress(path.read_bytes())))
 
     def found(self, rule: str, text: str) -> None:
         """Note that something is wrong."""

@@ -5,8 +5,7 @@ between its beginning and its answer; one without an answer takes effect at some
 States change by themselves as `SPONTANEOUS` says. If there is an order of such moments that gives every answer, the
 history is explained, or linearizable (Herlihy and Wing, "Linearizability: a correctness condition for concurrent
 objects", 1990). All orders are tried at once, answer by answer (Lowe, "Testing for linearizability", 2017): what is
-kept are the ways in which everything up to now can have happened, and an operation is put in order only when its own
-answer, or another one, asks for it.
+kept are the ways in which everything up to now can have happened, but none to which another one is as good.
 
 Of several servers one writes and the others follow it: what they tell may be of a moment some seconds ago. Such a read
 must be explained by a state that the surface may have had since then, each by itself.
@@ -70,6 +69,8 @@ _Does: TypeAlias = tuple[str, str | None]
 
 # More ways than clients that are answered have.
 _MANY = 400
+
+_REMEMBERED = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,12 +254,13 @@ class _Register:
 
     def __init__(self, steps: Sequence[Step]) -> None:
         self._steps = steps
-        first = _Way(frozenset({ABSENT}), None, False, frozenset(), frozenset(), frozenset())
-        # By what is to take effect: others cannot be as good.
-        self._ways: dict[frozenset[int], list[_Way]] = {first.writes: [first]}
+        # By what is to take effect, and then by their states: only some of them can be as good.
+        self._ways: dict[frozenset[int], dict[States, list[_Way]]] = {}
         # Without an answer, by what they do; first the one that may happen for the shortest time.
         self._unanswered: dict[_Does, list[int]] = {}
         self._again = False
+        self._lasting: dict[frozenset[int], dict[_Does, list[float]]] = {}
+        self._add(_Way(frozenset({ABSENT}), None, False, frozenset(), frozenset(), frozenset()))
 
     def possible(self) -> States:
         """The states in which the surface can be now."""
@@ -284,6 +286,7 @@ class _Register:
             if not self._unanswered[does]:
                 del self._unanswered[does]
             self._again = self._again and bool(self._unanswered)
+            self._lasting.clear()
             if any(number in way.used for way in self._all()):
                 self._set(way._replace(used=way.used - {number}) for way in self._all())
             return True
@@ -298,7 +301,7 @@ class _Register:
         self._follow()
 
     def _all(self) -> list[_Way]:
-        return [way for ways in self._ways.values() for way in ways]
+        return [way for alike in self._ways.values() for ways in alike.values() for way in ways]
 
     def _set(self, ways: Iterable[_Way]) -> None:
         ways = list(ways)
@@ -308,11 +311,17 @@ class _Register:
 
     def _add(self, way: _Way) -> bool:
         """Have one way more, and those no longer to which it is as good; whether none is as good as it."""
-        others = self._ways.setdefault(way.writes, [])
-        if any(self._as_good(other, way) for other in others):
+        alike = self._ways.setdefault(way.writes, {})
+        own = alike.setdefault(way.states, [])
+        if any(self._as_good(other, way) for other in own):
             return False
-        others[:] = [other for other in others if not self._as_good(way, other)]
-        others.append(way)
+        for states, others in alike.items():
+            if states > way.states and any(self._as_good(other, way) for other in others):
+                return False
+        for states, others in alike.items():
+            if states <= way.states:
+                others[:] = [other for other in others if not self._as_good(way, other)]
+        own.append(way)
         return True
 
     def _follow(self, new: int | None = None) -> None:
@@ -324,7 +333,7 @@ class _Register:
                 after = self._happened(way, number)
                 if after is not None and self._add(after):
                     left.append((after, None))
-            if not self._again and self._unanswered and sum(map(len, self._ways.values())) > _MANY:
+            if not self._again and self._unanswered and len(self._all()) > _MANY:
                 # As many ways as there are subsets of what was not answered could not be counted. From now on, until
                 # there is nothing more that has no answer, each of these may happen again and again: it is not found
                 # if one of them did so.
@@ -351,10 +360,9 @@ class _Register:
         return _Way(states, saved, way.saving, way.writes - one, way.reads - one, used)
 
     def _as_good(self, way: _Way, other: _Way) -> bool:
-        """Whether one is as good as another that has the same to take effect."""
+        """Whether one is as good as another that has the same to take effect, and no states that it does not have."""
         return (
-            way.states >= other.states
-            and way.reads <= other.reads
+            way.reads <= other.reads
             and (way.saved is None or other.saved is None or way.saved >= other.saved)
             and (way.used <= other.used or self._spares(way.used, other.used))
         )
@@ -363,17 +371,21 @@ class _Register:
         """Whether as many steps without an answer are left as on another way, each for as long."""
         if len(used) > len(other):
             return False
-        ours, theirs = self._lasting(used), self._lasting(other)
+        ours, theirs = self._until(used), self._until(other)
         return all(
             len(moments) <= len(theirs.get(does, ())) and all(map(le, moments, theirs[does]))
             for does, moments in ours.items()
         )
 
-    def _lasting(self, used: frozenset[int]) -> dict[_Does, list[float]]:
+    def _until(self, used: frozenset[int]) -> dict[_Does, list[float]]:
         """Until when steps may happen, by what they do, the last first."""
-        found: dict[_Does, list[float]] = {}
-        for number in sorted(used, key=self._latest, reverse=True):
-            found.setdefault(_does(self._steps[number]), []).append(self._latest(number))
+        found = self._lasting.get(used)
+        if found is None:
+            if len(self._lasting) > _REMEMBERED:
+                self._lasting.clear()
+            found = self._lasting[used] = {}
+            for number in sorted(used, key=self._latest, reverse=True):
+                found.setdefault(_does(self._steps[number]), []).append(self._latest(number))
         return found
 
     def _latest(self, number: int) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -620,6 +621,36 @@ def test_names_may_be_late_too(story: Story) -> None:
     assert story.findings == []
     story("names", None, 200, server="reader", at=(9.5, 10))
     assert story.rules == ["lost"]
+
+
+def test_a_history_that_was_kept_is_judged_the_same(story: Story, tmp_path: Path) -> None:
+    story.history.lag = 5.0
+    story.history.trouble(Span(100, 101))
+    story.history.waits(Span(2, 9, "second"))
+    story.upload()
+    story("delete", ANN, 204, server="second", at=(4, 5))
+    story.look(at=(15, 16))
+    story.history.write(tmp_path / "kept")
+    kept = check(History.read(tmp_path / "kept"))
+    assert [str(finding) for finding in kept] == [str(finding) for finding in story.findings]
+    assert story.rules == ["not the writer", "came back"]
+
+
+def test_each_trouble_before_another_one_explains_more(story: Story) -> None:
+    story.history.lag = 5.0
+    for span in (Span(10, 12), Span(16, 17), Span(40, 41)):
+        story.history.trouble(span)
+    assert story.history.since(story("look", ANN, 200, at=(21, 22))) == 5  # of the second, and so of the first
+    assert story.history.since(story("look", ANN, 200, at=(23, 24))) == 18
+    assert story.history.since(story("look", ANN, 200, at=(39, 40))) == 34
+
+
+def test_it_is_told_what_is_being_judged(story: Story) -> None:
+    story.upload()
+    named(story)
+    told: list[str] = []
+    check(story.history, told.append)
+    assert told == ["surface 1 of 1, 2 steps", "name 1 of 1, 1 steps"]
 
 
 def test_a_server_that_waits_acknowledges_nothing(story: Story) -> None:

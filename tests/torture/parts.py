@@ -250,9 +250,11 @@ def _takeovers(folder: Path, count: int, seconds: float | None) -> tuple[int, tu
     def tell(told: str) -> None:
         print(f"{PROGRESS}takeovers, {told}", flush=True)
 
-    times = takeovers.Times()
+    times, seed = takeovers.Times(), time.time_ns() % 2**32
+    # Beside the folder, which is removed.
+    kept = Path(tempfile.gettempdir()) / f"lodestream-takeovers-{seed}.history"
     try:
-        done = takeovers.run(folder, count, seconds, times=times, seed=time.time_ns() % 2**32, progress=tell)
+        done = takeovers.run(folder, count, seconds, times=times, seed=seed, progress=tell, keep=kept)
     except pytest.skip.Exception as skipped:
         return 0, (f"skipped: {skipped}",)
     facts = (
@@ -266,7 +268,8 @@ def _takeovers(folder: Path, count: int, seconds: float | None) -> tuple[int, tu
         f"{len(done.revoked):,} tokens ended at readers after {_spread(done.revoked)}",
         f"at the end {done.ready} surfaces ready; findings: {len(done.findings)}",
     )
-    assert not done.findings, "\n".join((*facts, *map(str, done.findings[:20])))
+    again = f"python -m tests.history --again {kept}"
+    assert not done.findings, "\n".join((*facts, *map(str, done.findings[:20]), again))
     return done.disasters.total(), facts
 
 

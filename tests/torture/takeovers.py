@@ -122,6 +122,7 @@ def run(
     seed: int = 1,
     kinds: Sequence[str] = DISASTERS,
     progress: Callable[[str], None] = lambda _: None,
+    keep: Path | None = None,
 ) -> Done:
     """Let so many disasters happen, or as many as the seconds allow, and judge the history.
 
@@ -139,7 +140,10 @@ def run(
     kinds : sequence of str
         Those of `DISASTERS` that may come, each as often as the others.
     progress : callable
-        Is told after each disaster how far it is.
+        Is told after each disaster how far it is, and then how far it is judged.
+    keep : Path or None
+        A file in which the history is left if anything in it is wrong, or if it is not judged to its end;
+        ``python -m tests.history --again FILE`` judges it again.
 
     Raises
     ------
@@ -160,8 +164,13 @@ def run(
             story.tell(count, seconds, kinds, progress)
         except AssertionError as error:
             raise AssertionError("\n".join((str(error), *map(str, check(history)[:_SHOWN])))) from error
+    if keep is not None:
+        history.write(keep)
     done.lags = list(_lags(history))
-    done.findings = check(history)
+    judged = time.monotonic()
+    done.findings = check(history, lambda told: progress(f"judged for {time.monotonic() - judged:.0f} s: {told}"))
+    if keep is not None and not done.findings:
+        keep.unlink()
     _count(history, done)
     done.seconds = time.monotonic() - started
     return done
