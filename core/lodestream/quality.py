@@ -51,9 +51,9 @@ class Quality:
 
     def __post_init__(self) -> None:
         if self.effort not in EFFORTS:
-            raise OptionError(f"expected effort to be one of {', '.join(EFFORTS)}, got {str(self.effort)[:80]!a}")
+            raise OptionError(f"effort must be one of {', '.join(EFFORTS)}, and is {str(self.effort)[:80]!a}")
         if self.precision is not None and self.rms is not None:
-            raise OptionError("expected either a precision or a root mean square error, got both")
+            raise OptionError("give either a precision or an RMS error, not both")
 
     @classmethod
     def of(
@@ -104,11 +104,11 @@ class Quality:
             name, equals, tolerance = text.rpartition("=")
             key = name if equals else None
             if key in tolerances:
-                raise OptionError(f"expected each precision once, {_shown(key)} given twice")
-            tolerances[key] = Tolerance.parse(tolerance)
+                raise OptionError(f"the precision of {_shown(key)} is given twice")
+            tolerances[key] = _parsed("precision", tolerance)
         points = tolerances.pop(None, None)
         attributes = {name: tolerance for name, tolerance in tolerances.items() if name is not None}
-        error = None if rms is None else Tolerance.parse(rms)
+        error = None if rms is None else _parsed("rms", rms)
         return cls(precision=points, rms=error, attributes=attributes, effort=cast("Effort", effort))
 
     def texts(self) -> tuple[list[str], str | None]:
@@ -122,6 +122,13 @@ class Quality:
         return precisions, None if self.rms is None else str(self.rms)
 
 
+def _parsed(option: str, text: str) -> Tolerance:
+    try:
+        return Tolerance.parse(text)
+    except OptionError as error:
+        raise OptionError(f"{option}: {error}") from None
+
+
 def _shown(name: str | None) -> str:
-    """Quote the name of an attribute for a message; P stands for the points."""
-    return "P" if name is None else f"{name[:80]!a}"
+    """Quote the name of an attribute for a message."""
+    return "the points" if name is None else f"{name[:80]!a}"

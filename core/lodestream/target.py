@@ -116,7 +116,9 @@ class Tolerance:
                 number = f"{mantissa}e{int(exponent if exponential else 0) - 2}"
             return cls(float(number), relative)
         except ValueError:
-            raise OptionError(f"expected a number such as 0.5, or 0.1% (of the extent), got {text!r}") from None
+            raise OptionError(
+                f"{text[:80]!a} is not an error bound: write 0 or more, such as 0.5, or 0.1% of the extent"
+            ) from None
 
     def __str__(self) -> str:
         """Return the canonical text of this tolerance, which `parse` reads."""

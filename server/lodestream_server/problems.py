@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import errno
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from fastapi import FastAPI, Request
+from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
 from fastapi.requests import HTTPConnection
 from fastapi.responses import JSONResponse, Response
@@ -30,6 +31,7 @@ from lodestream.errors import (
 from lodestream.protocol.messages import MessageError
 
 from .codes import MEANINGS, address
+from .refusals import faults_of_parameters
 
 __all__ = [
     "MEDIA_TYPE",
@@ -325,11 +327,17 @@ def _methods(request: Request) -> list[str]:
 
 async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
-    wrong = [(*item["loc"][:2], item["msg"]) for item in error.errors()]
-    detail = "; ".join(
-        f"The parameter {name} of the {place}: {words[0].lower()}{words[1:]}" for place, name, words in wrong
-    )
-    return _document(request, "bad-option", detail, {})
+    told = dict(_descriptions(request.scope["route"].dependant))
+    return _document(request, "bad-option", faults_of_parameters(error.errors(), told), {})
+
+
+def _descriptions(dependant: Dependant) -> Iterator[tuple[str, str]]:
+    """Iterate over names and descriptions of what is read from path and query, by a route or what it depends on."""
+    for parameter in [*dependant.path_params, *dependant.query_params]:
+        if parameter.field_info.description:
+            yield parameter.alias, parameter.field_info.description
+    for other in dependant.dependencies:
+        yield from _descriptions(other)
 
 
 def _document(request: HTTPConnection, code: str, detail: str, headers: Mapping[str, str]) -> JSONResponse:

@@ -270,10 +270,10 @@ def test_precisions_that_cannot_be(run: Run, server: str, files: Path, tmp_path:
     out = tmp_path / "scan.lode"
     for words, code, says in (
         (("colour=0.5",), 1, "'colour'"),
-        (("intensity=",), 2, "expected a number"),
+        (("intensity=",), 2, "not an error bound"),
         (("=0.5",), 2, "expected P or NAME=P"),
-        (("0.5", "0.6"), 2, "P given twice"),
-        (("intensity=1", "intensity=1"), 2, "'intensity' given twice"),
+        (("0.5", "0.6"), 2, "the precision of the points is given twice"),
+        (("intensity=1", "intensity=1"), 2, "'intensity' is given twice"),
     ):
         given = [word for value in words for word in ("--precision", value)]
         found, _, err = run("encode", files / "scan.pcd", out, *given)

@@ -52,7 +52,7 @@ def test_a_tolerance_has_one_spelling(tolerance: Tolerance, text: str) -> None:
 
 @pytest.mark.parametrize("text", ["", "%", "fine", "-1", "-1%", "nan", "nan%", "inf", "0.1%%", "1e%", "1e-3d", "1 m"])
 def test_other_texts_are_refused(text: str) -> None:
-    with pytest.raises(OptionError, match="expected"):
+    with pytest.raises(OptionError, match="is not an error bound: write 0 or more"):
         Tolerance.parse(text)
 
 
@@ -118,7 +118,7 @@ def test_no_errors_of_channels_are_no_limit() -> None:
         ({"until_rms": {"a": 1}, "until_max": 2}, "either an error of the whole surface or errors of channels"),
         ({"until_rms": {"a": 1}, "region": ((0, 1), (0, 1))}, "either errors of channels or a region"),
         ({"until_rms": {"a": 1}, "level": 2}, "either a level or other limits"),
-        ({"until_rms": "much"}, "a number such as 0.5"),
+        ({"until_rms": "much"}, "write 0 or more, such as 0.5"),
     ],
 )
 def test_errors_that_make_no_sense_are_refused(limits: dict[str, Any], expected: str) -> None:

@@ -34,7 +34,7 @@ def checked(value: object) -> int | float:
     try:
         return float(text)
     except ValueError:
-        raise OptionError(f"expected nodata= a number or nan, got {str(value)[:80]!r}") from None
+        raise OptionError(f"nodata must be a number or nan, and is {str(value)[:80]!a}") from None
 
 
 def with_nodata(surface: Surface, nodata: int | float, room: Room) -> Surface:

@@ -16,6 +16,7 @@ from lodestream.errors import InputError, NotFoundError, TooLargeError
 from ..access.access import Caller
 from ..access.scopes import READ, Reader, Writer
 from ..problems import SlowUploadError, responses
+from ..refusals import fault_of_body
 from ..store.index import Named, Surface
 from ..store.layout import NAME, name_key
 from . import descriptions, files, models
@@ -27,7 +28,11 @@ __all__ = ["leads_to", "router"]
 
 router = APIRouter(prefix="/v1/names", tags=["names"])
 
-_Name = Annotated[str, Path(pattern=f"^{NAME}$")]
+_Name = Annotated[
+    str, Path(pattern=f"^{NAME}$", description="a letter or a digit, and at most 99 more letters, digits and ._-")
+]
+# What the body is that makes a name lead to a surface.
+_POINTING = '{"surface": ID}, with the id or url of a surface, or null'
 _JSON = "application/json"
 _LONGEST_BODY = 1024
 _DAY = 86400.0
@@ -83,7 +88,7 @@ async def list_names(
     request: Request,
     parts: Parts,
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of names on the page")] = 100,
-    after: Annotated[str, Query(pattern=f"^({NAME})?$", description="from `next` of the previous page")] = "",
+    after: Annotated[str, Query(pattern=f"^({NAME})?$", description="taken from `next` of the previous page")] = "",
 ) -> Response:
     """Return names and the address of the surface to which each leads (null: it cannot be read).
 
@@ -144,8 +149,8 @@ async def _asked(request: Request, parts: State) -> str | None:
         raise SlowUploadError(f"The body was not complete within {seconds:g} s") from None
     try:
         surface = models.Pointing.model_validate_json(bytes(body)).surface
-    except ValidationError:
-        raise InputError(f'The body must be {{"surface": ID}} in JSON, and is {bytes(body[:80])!r}') from None
+    except ValidationError as error:
+        raise InputError(fault_of_body(error.errors(include_url=False)[0], _POINTING)) from None
     return None if surface is None else surface.removeprefix(f"{base(request)}/")
 
 

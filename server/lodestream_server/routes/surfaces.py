@@ -110,7 +110,7 @@ async def list_surfaces(
     request: Request,
     parts: Parts,
     limit: Annotated[int, Query(ge=1, le=1000, description="maximum number of surfaces on the page")] = 100,
-    after: Annotated[str | None, Query(pattern=_PLACE, description="from `next` of the previous page")] = None,
+    after: Annotated[str | None, Query(pattern=_PLACE, description="taken from `next` of the previous page")] = None,
     thumbnails: Thumbnails = False,
 ) -> Response:
     """Return surfaces without their files, options, layers and levels; `next` is the address of the next page, or null.

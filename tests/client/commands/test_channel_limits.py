@@ -129,7 +129,7 @@ def test_errors_are_told_of_what_is_written_whatever_ended_it(
     ("options", "expected"),
     [
         (("--until-rms", "=1"), "expected E or NAME=E"),
-        (("--until-rms", "speed=fast"), "expected a number such as 0.5"),
+        (("--until-rms", "speed=fast"), "'fast' is not an error bound: write 0 or more"),
         (("--until-rms", "speed=0.1%"), "expected an error of 'speed' in its own unit"),
         (("--until-rms", "speed=1", "--until-rms", "speed=2"), "given twice"),
         (("--until-rms", "1", "--until-max", "speed=2"), "either an error of the whole surface or errors of channels"),

@@ -55,7 +55,7 @@ def test_a_memory_limit_changes_nothing(run: Run, tmp_path: Path) -> None:
 def test_what_is_no_number(run: Run, file: Path, server: str, value: str) -> None:
     for words in (("encode", file, file.with_suffix(".lode")), ("push", file, server)):
         code, _, stderr = run(*words, "--nodata", value)
-        assert (code, f"expected nodata= a number or nan, got '{value}'" in stderr) == (1, True), stderr
+        assert (code, f"nodata must be a number or nan, and is '{value}'" in stderr) == (1, True), stderr
     code, _, stderr = run("encode", file, file.with_suffix(".lode"), "--nodata", "1", "-o", "nodata=1")
     assert (code, "nodata given twice" in stderr) == (2, True)
 
@@ -74,7 +74,7 @@ def test_push(run: Run, file: Path, server: str) -> None:
 def test_the_query_of_an_upload(file: Path, server: str) -> None:
     answer = httpx.post(f"{server}/v1/surfaces", content=file.read_bytes(), params={"nodata": "much"})
     assert (answer.status_code, answer.json()["code"]) == (422, "bad-option")
-    assert "expected nodata= a number or nan, got 'much'" in answer.json()["detail"]
+    assert "nodata must be a number or nan, and is 'much'" in answer.json()["detail"]
 
 
 def test_a_surface_in_memory(server: str) -> None:

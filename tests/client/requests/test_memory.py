@@ -217,7 +217,7 @@ def test_options_that_have_no_place(terrain_file: Path) -> None:
             [heights],
             {"options": {"band": "1"}},
         ),
-        (OptionError, "got both", [heights], {"precision": 1, "rms": 1}),
+        (OptionError, "not both", [heights], {"precision": 1, "rms": 1}),
         (OptionError, "'best'", [heights], {"effort": "best"}),
         (OptionError, "'maybe'", [heights], {"closed": "maybe"}),
         (OptionError, "closed=auto", [ls.Surface(blocks=[block(0), block(1)])], {"closed": "rows"}),

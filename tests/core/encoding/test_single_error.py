@@ -120,7 +120,7 @@ def test_a_constant_is_a_constant() -> None:
 
 
 def test_either_a_precision_or_an_error() -> None:
-    with pytest.raises(OptionError, match="got both"):
+    with pytest.raises(OptionError, match="not both"):
         ls.encode(waves(9, 9), 0.1, rms=0.1)
 
 

@@ -168,7 +168,7 @@ def test_nan_and_infinity_are_values_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", ["high", "", "1,5", True, "0x10"])
 def test_what_is_no_number_is_refused(tmp_path: Path, value: object) -> None:
     np.save(tmp_path / "a.npy", np.arange(12.0).reshape(3, 4))
-    with pytest.raises(OptionError, match="expected nodata= a number or nan, got"):
+    with pytest.raises(OptionError, match="nodata must be a number or nan, and is"):
         ls.read(tmp_path / "a.npy", nodata=value)  # type: ignore[arg-type]
 
 

@@ -108,7 +108,7 @@ def test_unknown_parameters_are_refused_with_those_that_there_are(http: httpx.Cl
         assert words in refused.json()["detail"], refused.text
     assert http.get(made["url"]).status_code == 200
     wrong = http.get("/v1/surfaces?limit=0").json()["detail"]
-    assert wrong == "The parameter limit of the query: input should be greater than or equal to 1"
+    assert wrong == "The parameter limit of the query must be at least 1, and is '0'"
 
 
 def test_the_same_bytes_and_options_are_the_same_surface(http: httpx.Client) -> None:

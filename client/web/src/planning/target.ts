@@ -115,7 +115,9 @@ export function tolerance(given: number | string | Tolerance): Tolerance {
   const digits = relative ? given.slice(0, -1) : given;
   // Number("") is 0.
   if (digits.trim() === "" || Number.isNaN(Number(digits))) {
-    throw new OptionError(`expected a number such as 0.5, or 0.1% (of the extent), got ${JSON.stringify(given)}`);
+    throw new OptionError(
+      `${JSON.stringify(given)} is not an error bound: write 0 or more, such as 0.5, or 0.1% of the extent`,
+    );
   }
   // By the exponent, so that the number is that of the decimals without rounding twice.
   const [mantissa, exponent = "0"] = digits.trim().toLowerCase().split("e");
