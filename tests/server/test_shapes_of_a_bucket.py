@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,12 @@ import pytest
 import lodestream as ls
 from lodestream_server import running_server
 from tests.patience import PATIENCE
-from tests.server.helpers import eventually, hills, npy, push
+from tests.server.helpers import eventually, hills, npy, problem, push
 from tests.stores.emulators import Emulator, ministack, s3
 from tests.stores.faults import FaultProxy, fault_proxy
+from tests.stores.memory import memory
 
-__all__ = ["ministack", "s3"]
+__all__ = ["memory", "ministack", "s3"]
 
 pytest.importorskip("pyproj")
 maps = pytest.importorskip("lodestream.maps")
@@ -37,6 +38,21 @@ def bucket(s3: Emulator, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultProxy
         for name, value in s3.at(proxy.port).items():
             monkeypatch.setenv(name, value)
         yield proxy
+
+
+@contextmanager
+def serving(address: str, scratch: Path, **settings: Any) -> Iterator[httpx.Client]:
+    """A server of a bucket."""
+    usual = {"workers": 1, "look_seconds": 0.2, "scratch": scratch}
+    with (
+        running_server(address, **(usual | settings)) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        yield http
+
+
+def writes(http: httpx.Client) -> bool:
+    return bool(http.get("/readyz").json()["role"] == "writer")
 
 
 def asked(bucket: FaultProxy, container: str) -> int:
@@ -60,23 +76,44 @@ def test_tiles_meshes_and_levels_are_those_of_the_container(s3: Emulator, bucket
     path = tmp_path / "hill.lode"
     path.write_bytes(terrain())
     address, known = s3.address(), expected(path)
-    with ExitStack() as stack:
-
-        def start(name: str, **settings: Any) -> httpx.Client:
-            usual = {"workers": 1, "look_seconds": 0.2, "scratch": tmp_path / name}
-            url = stack.enter_context(running_server(address, **(usual | settings)))
-            return stack.enter_context(httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE))
-
-        writer = start("writer")
-        eventually(lambda: writer.get("/readyz").json()["role"] == "writer", "the server to write")
+    with serving(address, tmp_path / "writer") as writer:
+        eventually(lambda: writes(writer), "the server to write")
         hill = push(writer, path.read_bytes(), filename="hill.lode")
-        reader = start("reader", read_only=True)
-        for http in (writer, reader):
-            bucket.seen.clear()
-            told = http.get(f"{hill['url']}/map.json").raise_for_status().json()
-            assert told["bounds"] == pytest.approx([7, 45, 8.2, 46], abs=0.01)
-            assert http.get(f"{hill['url']}/terrain/layer.json").raise_for_status().json()["format"]
-            for place, data in known.items():
-                answer = http.get(f"{hill['url']}/{place}", headers={"accept-encoding": "identity"})
-                assert answer.raise_for_status().content == data, place
-            assert asked(bucket, hill["container_sha256"]) == 1, "it was fetched once for all of them"
+        with serving(address, tmp_path / "reader", read_only=True) as reader:
+            for http in (writer, reader):
+                bucket.seen.clear()
+                told = http.get(f"{hill['url']}/map.json").raise_for_status().json()
+                assert told["bounds"] == pytest.approx([7, 45, 8.2, 46], abs=0.01)
+                assert http.get(f"{hill['url']}/terrain/layer.json").raise_for_status().json()["format"]
+                for place, data in known.items():
+                    answer = http.get(f"{hill['url']}/{place}", headers={"accept-encoding": "identity"})
+                    assert answer.raise_for_status().content == data, place
+                assert asked(bucket, hill["container_sha256"]) == 1, "it was fetched once for all of them"
+
+
+def test_one_that_fills_the_cache_is_fetched_once_and_a_larger_one_is_refused(
+    memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import obstore
+
+    data, fetched = terrain(), list[str]()
+    get_range = obstore.get_range
+
+    def counted(store: Any, path: str, **named: Any) -> Any:
+        fetched.append(path)
+        return get_range(store, path, **named)
+
+    monkeypatch.setattr(obstore, "get_range", counted)
+    with serving(memory, tmp_path / "writer", cache_bytes=len(data)) as http:
+        eventually(lambda: writes(http), "the server to write")
+        hill = push(http, data, filename="hill.lode")
+        shapes = [f"{hill['url']}/{path}" for path in ("map.json", "tiles/7/66/45.png", "levels/0?format=npy")]
+        fetched.clear()
+        assert [http.get(shape).status_code for shape in shapes] == [200] * 3
+        assert len(fetched) == 1
+    with serving(memory, tmp_path / "reader", read_only=True, cache_bytes=len(data) - 1) as http:
+        for shape in shapes:
+            answer = http.get(shape)
+            assert problem(answer) == (413, "too-large")
+            assert f"{len(data) - 1} at most (cache_bytes)" in answer.json()["detail"]
+        assert http.get(f"{hill['url']}/container").content == data

@@ -280,8 +280,8 @@ class Settings(BaseSettings, Bounds):
     cache_bytes: _Size | None = _choice(
         None,
         "limits",
-        "disk space of the scratch folder for containers of a bucket, which are fetched whole when they are read a "
-        "second time, and for levels and tiles; one may take half of it; 0 keeps none",
+        "disk space of the scratch folder for containers of a bucket: one that is read a second time is fetched whole "
+        "if it takes at most half of that, one of which levels or tiles are made if it takes at most all of it",
         metavar=_SIZE,
         usual="16GiB, or a tenth of the disk if that is less",
         ge=0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import logging
 import re
@@ -14,10 +15,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self
 
+from lodestream.errors import LodestreamError, StreamError, TooLargeError
 from lodestream.stores import Blob, Store, StoreError
 from lodestream.stores.folder import FileBlob
 from lodestream.stores.threads import Threads
 
+from ..problems import BusyError, FullError, RestartingError
 from . import layout
 from .durable import NewFile, discard, rename
 from .index import IndexLostError
@@ -36,6 +39,9 @@ _WAITING = 32
 #: Seconds that the end of a server waits for fetches to notice it.
 _FAREWELL = 5.0
 
+#: What somebody can do whose level or tile cannot be made.
+_ADVICE = "stream the surface, or fetch its container"
+
 _NAME = re.compile(r"([0-9a-f]{64})\.[0-9a-f]{8}\.lode")
 
 
@@ -43,10 +49,13 @@ class ContainerCache:
     """Files of containers, in a folder that outlives the server. All of it may be used from any thread.
 
     A container that is read twice is fetched whole, in the background, if it takes no more than half of ``most`` and
-    half of what is free on the disk; for levels and tiles at once. Two who want it cause one fetch. Its bytes are
-    compared with its name as they come, and are on disk before the file has that name; so what a start finds is only
-    asked for its size. The least recently used ones go first, those in use stay. Whatever is wrong with disk or folder
-    is told in the log, and costs speed alone: then the store is read.
+    half of what is free on the disk. Whatever is wrong with disk or folder is told in the log, and costs speed alone:
+    then the store is read. Levels and tiles are made of files alone: so their container is fetched at once, and may
+    take all of ``most``.
+
+    Two who want it cause one fetch. Its bytes are compared with its name as they come, and are on disk before the file
+    has that name; so what a start finds is only asked for its size. The least recently used ones go first, those in use
+    stay.
 
     Parameters
     ----------
@@ -121,19 +130,41 @@ class ContainerCache:
         return _CachedBlob(file, lease, self._instead(sha256, size))
 
     @contextmanager
-    def local(self, sha256: str, size: int) -> Iterator[Path | None]:
-        """Give the file of a container for the length of a block, fetched if need be; None if there is no room."""
+    def local(self, sha256: str, size: int) -> Iterator[Path]:
+        """Give the file of a container for the length of a block, fetched if need be.
+
+        Raises
+        ------
+        TooLargeError
+            If it is larger than all files may be together.
+        FullError, BusyError
+            If the disk has no room for it, or others are reading what has the room.
+        AbsentError, StoreError
+            If it is not in the store, or cannot be read there or kept here.
+        StreamError
+            If the store has other bytes than the name says.
+        """
         blob = self._opened(sha256, size)
         if blob is not None:
             with blob:
+                assert blob.path is not None
                 yield blob.path
             return
-        lease = self._fetch(sha256, size)
+        if size > self._most:
+            raise TooLargeError(
+                f"The container has {size} bytes, and the server's files of containers {self._most} at most "
+                f"(cache_bytes); {_ADVICE}"
+            )
         try:
-            yield None if lease is None else lease.path
+            lease = self._fetch(sha256, size)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise self._no_room(size) from error
+            raise StoreError(f"{self._folder}: {error}") from error
+        try:
+            yield lease.path
         finally:
-            if lease is not None:
-                lease.release()
+            lease.release()
 
     def forget(self, sha256: str) -> None:
         """Remove the file of a container, when nobody reads it any more."""
@@ -160,49 +191,51 @@ class ContainerCache:
                 if len(self._seen) > _SEEN:
                     self._seen.popitem(last=False)
                 return
-            if self._closed or sha256 in self._wanted or len(self._wanted) >= _WAITING or not self._fits(size):
+            if self._closed or sha256 in self._wanted or len(self._wanted) >= _WAITING or size > self._most // 2:
                 return
             with suppress(RuntimeError):  # the program ends
                 self._wanted[sha256] = self._threads.submit(self._fetch_aside, sha256, size)
 
     def _fetch_aside(self, sha256: str, size: int) -> None:
         try:
-            lease = self._fetch(sha256, size)
-            if lease is not None:
-                lease.release()
+            self._fetch(sha256, size).release()
+        except (FullError, BusyError):
+            pass
+        except (LodestreamError, OSError) as error:
+            if not self._closed:
+                self._tell(error)
         finally:
             with self._lock:
                 self._wanted.pop(sha256, None)
 
-    def _fits(self, size: int) -> bool:
-        return size <= self._most // 2
-
-    def _fetch(self, sha256: str, size: int) -> Lease | None:
-        """Fetch a container unless it is there, and lend its file; None if that is not possible."""
-        with self._lock:
-            lease = self._files.lend(sha256)
-            if lease is not None or self._closed or not self._fits(size):
-                return lease
-            coming = self._coming.get(sha256)
-            if coming is None:
-                done = self._coming[sha256] = Future[None]()
-        if coming is not None:
-            coming.result()
-            return self._files.lend(sha256)
-        try:
-            return self._fetched(sha256, size)
-        except (StoreError, OSError) as error:
-            if not self._closed:
-                self._tell(error)
-            return None
-        finally:
+    def _fetch(self, sha256: str, size: int) -> Lease:
+        """Fetch a container unless it is there, and lend its file."""
+        while True:
             with self._lock:
-                del self._coming[sha256]
-            done.set_result(None)
+                lease = self._files.lend(sha256)
+                if lease is not None:
+                    return lease
+                coming = self._coming.get(sha256)
+                if coming is None:
+                    done = self._coming[sha256] = Future[None]()
+                    break
+            coming.result()  # the same error for all
+        try:
+            lease = self._fetched(sha256, size)
+        except BaseException as error:
+            self._come(sha256)
+            done.set_exception(error)
+            raise
+        self._come(sha256)
+        done.set_result(None)
+        return lease
 
-    def _fetched(self, sha256: str, size: int) -> Lease | None:
-        if not self._promise(size):
-            return None
+    def _come(self, sha256: str) -> None:
+        with self._lock:
+            del self._coming[sha256]
+
+    def _fetched(self, sha256: str, size: int) -> Lease:
+        self._promise(size)
         # One that was forgotten may still be read under its own name.
         path = self._folder / f"{sha256}.{secrets.token_hex(4)}.lode"
         new = path.with_suffix(".new")
@@ -212,11 +245,11 @@ class ContainerCache:
             with NewFile(new) as file:
                 for piece in self._store.pieces(layout.container_key(sha256), size):
                     if self._closed:
-                        raise StoreError("the server ends")
+                        raise RestartingError("The server is about to restart")
                     digest.update(piece)
                     file.write(piece)
             if digest.hexdigest() != sha256:
-                raise StoreError(
+                raise StreamError(
                     f"{layout.container_key(sha256)} has other bytes than its name says; run lodestream fsck"
                 )
             rename(new, path)
@@ -227,8 +260,8 @@ class ContainerCache:
             with self._setting_aside:
                 self._promised -= size
 
-    def _promise(self, size: int) -> bool:
-        """Make room for a file, if there can be room, and set it aside."""
+    def _promise(self, size: int) -> None:
+        """Make room for a file, and set it aside."""
         with self._setting_aside:
             self._files.shrink(self._most - self._promised - size)
             # Half of what is free stays for uploads and builds.
@@ -236,10 +269,18 @@ class ContainerCache:
             if lacking > 0:
                 self._files.shrink(max(self._files.size - lacking, 0))
                 lacking = 2 * (self._promised + size) - self._room()
-            if lacking > 0 or self._files.size + self._promised + size > self._most:
-                return False
+            if self._files.size + self._promised + size > self._most:
+                raise BusyError(
+                    f"There is no room for the container: {size} bytes beside others in use; try again soon"
+                )
+            if lacking > 0:
+                raise self._no_room(size)
             self._promised += size
-            return True
+
+    def _no_room(self, size: int) -> FullError:
+        return FullError(
+            f"The server's disk has no room for the container: {size} bytes, which may take half of it; {_ADVICE}"
+        )
 
     def _tell(self, error: Exception) -> None:
         """Log what is wrong, once until a container is fetched again."""

@@ -156,15 +156,22 @@ class Containers:
         ------
         NotFoundError, BusyError, StoreError
             See `blob`.
+        TooLargeError, FullError, StreamError
+            Of one on another machine, see `ContainerCache.local`.
         """
         size = self._check(sha256)
         with ExitStack() as stack:
-            path = None if self._cache is None else stack.enter_context(self._cache.local(sha256, size))
-            if path is None:
-                try:
-                    path = stack.enter_context(self._surfaces.store.local(layout.container_key(sha256)))
-                except AbsentError:
-                    self.gone(sha256)
+            try:
+                if self._cache is None:
+                    local = self._surfaces.store.local(layout.container_key(sha256))
+                else:
+                    local = self._cache.local(sha256, size)
+                path = stack.enter_context(local)
+            except AbsentError:
+                self.gone(sha256)
+            except StreamError as error:
+                self.tell_damage(sha256, error)
+                raise
             yield path
 
     def is_used(self, sha256: str) -> bool:

@@ -9,12 +9,15 @@ import secrets
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from lodestream.errors import LodestreamError, StreamError, TooLargeError
 from lodestream.stores import Blob, Folder, Store, StoreError
+from lodestream_server.problems import BusyError, FullError, RestartingError
 from lodestream_server.store import durable
 from lodestream_server.store.container_cache import ContainerCache
 from tests.server.helpers import eventually
@@ -87,9 +90,16 @@ def in_cache(cache: ContainerCache, name: str, size: int = SIZE) -> bool:
 
 
 def keep(cache: ContainerCache, name: str, size: int = SIZE) -> bool:
-    """Fetch a container as levels do; whether it was kept."""
-    with cache.local(name, size) as path:
-        return path is not None
+    """Fetch a container as levels do; whether that could be done."""
+    with suppress(LodestreamError), cache.local(name, size) as path:
+        return path.is_file()
+    return False
+
+
+def ask_twice(cache: ContainerCache, name: str, size: int = SIZE) -> None:
+    """Read a container twice, as streams do, and wait until it is fetched, or cannot be."""
+    assert [cache.open(name, size), cache.open(name, size)] == [None, None]
+    eventually(lambda: not cache._wanted, "it to be fetched in the background")
 
 
 def read(blob: Blob | None) -> bytes:
@@ -106,7 +116,6 @@ def test_what_is_read_twice_is_a_file_afterwards(world: World) -> None:
     assert cache.open(name, SIZE) is None
     eventually(lambda: in_cache(cache, name), "it to be fetched")
     with cache.local(name, SIZE) as path:
-        assert path is not None
         assert path.read_bytes() == data
     assert read(cache.open(name, SIZE)) == data
     assert len(world.remote.fetched) == 1
@@ -120,7 +129,7 @@ def test_many_who_want_it_cause_one_fetch(world: World) -> None:
 
     def local(_: int) -> bytes:
         with cache.local(name, SIZE) as path:
-            return b"" if path is None else path.read_bytes()
+            return path.read_bytes()
 
     with ThreadPoolExecutor(8) as threads:
         found = threads.map(local, range(8))
@@ -142,7 +151,8 @@ def test_the_least_recently_used_go_first_and_those_in_use_stay(world: World) ->
     assert world.has(*names) == [True, False, True, True, False]
     assert world.kept() == 3 * SIZE
     blobs = [cache.open(name, SIZE) for name in (names[0], names[2], names[3])]
-    assert not keep(cache, names[4]), "there is no room"
+    with pytest.raises(BusyError, match="beside others in use"), cache.local(names[4], SIZE):
+        pass
     assert None not in blobs
     cache.forget(names[2])
     assert not keep(cache, names[2])
@@ -155,14 +165,21 @@ def test_the_least_recently_used_go_first_and_those_in_use_stay(world: World) ->
 
 def test_one_takes_half_of_all_and_of_what_is_free_at_most(world: World) -> None:
     names = [world.put()[0] for _ in range(4)]
-    assert not keep(world.cache(2 * SIZE - 2), names[0])
+    small = world.cache(2 * SIZE - 2)
+    ask_twice(small, names[0])
     assert world.remote.fetched == []
+    assert [keep(small, names[0]), keep(small, names[1]), keep(small, names[1])] == [True] * 3
+    assert (world.has(*names[:2]), len(world.remote.fetched)) == ([False, True], 2), "for levels it may take all"
+    small.forget(names[1])
+    with pytest.raises(TooLargeError, match="cache_bytes"), world.cache(SIZE - 1).local(names[0], SIZE):
+        pass
     world.free = 4 * SIZE
     cache = world.cache()
     kept = [(keep(cache, name), world.kept() // SIZE) for name in names]
     assert kept == [(True, 1), (True, 2), (True, 3), (True, 3)], "older ones make room on a disk that is nearly full"
     world.free = SIZE
-    assert not keep(cache, names[0])
+    with pytest.raises(FullError, match="no room"), cache.local(names[0], SIZE):
+        pass
     assert world.kept() == 0, "others have the room"
 
 
@@ -190,7 +207,9 @@ def test_other_bytes_than_the_name_says_are_not_kept(world: World, caplog: pytes
     world._new.write_bytes(bytes(SIZE))
     world.remote.put_file(f"containers/{name}.lode", world._new)
     cache = world.cache()
-    assert [keep(cache, name), keep(cache, name)] == [False, False]
+    with pytest.raises(StreamError, match="other bytes than its name says"), cache.local(name, SIZE):
+        pass
+    ask_twice(cache, name)
     assert list(world.files.iterdir()) == []
     (told,) = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
     assert "other bytes than its name says" in told
@@ -210,7 +229,10 @@ def test_a_full_disk_and_a_folder_that_is_none_only_cost_speed(
     cache = world.cache()
     with monkeypatch.context() as patch:
         patch.setattr(durable, "disk", Full())
-        assert [keep(cache, name), keep(cache, name)] == [False, False]
+        with pytest.raises(FullError, match="no room"), cache.local(name, SIZE):
+            pass
+        ask_twice(cache, name)
+        ask_twice(cache, name)
         assert list(world.files.iterdir()) == []
     assert keep(cache, name)
     assert [record.message for record in caplog.records if "No space left" in record.message][1:] == []
@@ -221,7 +243,9 @@ def test_a_full_disk_and_a_folder_that_is_none_only_cost_speed(
     world.files.rmdir()
     world.files.write_bytes(b"")
     broken = world.cache()
-    assert [keep(broken, name), broken.open(name, SIZE)] == [False, None]
+    with pytest.raises(StoreError, match="containers"), broken.local(name, SIZE):
+        pass
+    ask_twice(broken, name)
     assert data
 
 
@@ -258,5 +282,6 @@ def test_the_end_of_a_server_gives_up_what_is_being_fetched(world: World, caplog
     world.remote.gate.set()
     ending.join()
     assert list(world.files.iterdir()) == []
-    assert not keep(cache, name)
+    with pytest.raises(RestartingError), cache.local(name, SIZE):
+        pass
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
