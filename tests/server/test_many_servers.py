@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,17 +108,17 @@ def test_a_reader_serves_what_the_writer_built_and_changes_nothing(site: Site) -
 
 @pytest.fixture
 def gets(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Whatever is read whole from a bucket, by the paths of the objects."""
+    """The paths of objects that are read from a bucket, at each request."""
     import obstore
 
     found: list[str] = []
-    get = obstore.get
 
-    def counted(store: Any, path: str, **named: Any) -> Any:
+    def count(request: Callable[..., Any], store: Any, path: str, **named: Any) -> Any:
         found.append(path)
-        return get(store, path, **named)
+        return request(store, path, **named)
 
-    monkeypatch.setattr(obstore, "get", counted)
+    for name in ("get", "get_range", "head"):
+        monkeypatch.setattr(obstore, name, partial(count, getattr(obstore, name)))
     return found
 
 
@@ -147,6 +148,33 @@ def test_a_reader_that_has_not_followed_yet_looks_for_what_it_is_asked_for(site:
     with ThreadPoolExecutor(8) as threads:
         assert set(threads.map(lambda path: readers[1].get(path).status_code, strange[:1] * 16)) == {404}
     assert 0 < len(gets) < 16, "who asks for the same has one look"
+
+
+def test_what_a_reader_knows_costs_one_request_at_most(site: Site, gets: list[str]) -> None:
+    first = writer(site, look_seconds=3600.0)
+    reader = site.start("reader", read_only=True, look_seconds=3600.0)
+    uploaded = push(first, npy(hills()))
+    place = f"/v1/surfaces/{uploaded['id']}"
+    first.put("/v1/names/hill", json={"surface": uploaded["id"]}).raise_for_status()
+
+    def stream() -> None:
+        with raw_stream(f"{reader.base_url}{place}") as opened:
+            opened.send(Open(Target(), credit=1 << 20))
+            assert data_of(opened.until_end()) > 1000
+
+    known: dict[str, Callable[[], object]] = {path: partial(reader.get, path) for path in (place, "/v1/names/hill")}
+    known |= {"/v1/surfaces": partial(states, reader), "stream": stream}
+    for ask in known.values():
+        ask()
+        ask()
+    eventually(lambda: list((site.folder / "reader").glob("lodestream/containers/*.lode")), "the container as a file")
+    costs = {}
+    for what, ask in known.items():
+        gets.clear()
+        ask()
+        costs[what] = [path.removeprefix("data/") for path in gets if "writer.json" not in path]
+    described = [f"built/{uploaded['id']}.json"]
+    assert costs == {place: described, "/v1/names/hill": described, "/v1/surfaces": [], "stream": []}
 
 
 def test_a_reader_looks_whether_a_build_has_ended(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
