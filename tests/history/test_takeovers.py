@@ -12,7 +12,8 @@ from tests.torture import takeovers
 
 @pytest.mark.long
 def test_servers_of_one_bucket_that_are_killed_and_stopped_behind_a_network_that_fails(tmp_path: Path) -> None:
-    times = takeovers.Times(lease=3.0, look=0.5, list_=15.0)
+    # Nobody lists everything meanwhile: what `changes.json` does not tell is never seen.
+    times = takeovers.Times(lease=3.0, look=0.5)
     # Two clients, which leave the processors to the tests beside them.
     done = takeovers.run(tmp_path, 100, 60.0, times=times, clients=2, seed=int(os.environ.get("LODESTREAM_SEED", "1")))
     if done.findings:

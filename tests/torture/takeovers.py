@@ -30,8 +30,7 @@ from tests.history.bucket_site import READERS, WRITERS, BucketSite
 from tests.history.checker import check
 from tests.history.driver import Client, Crowd, Goods, Server
 from tests.history.events import Finding, History, Operation, Span, Subject
-from tests.patience import PATIENCE
-from tests.server.helpers import eventually, hills, npy
+from tests.server.helpers import hills, npy
 from tests.stores.emulators import reach, running_ministack
 from tests.stores.faults import Fault, FaultProxy, fault_proxy
 
@@ -148,7 +147,8 @@ def run(
     Raises
     ------
     AssertionError
-        When a server does not start, or none comes to write; the findings up to then are in its message.
+        When a server does not start, two write at once, or something never comes; the findings up to then are in its
+        message.
     """
     started, done = time.monotonic(), Done()
     history = History(admins=frozenset({"admin"}), lag=_SEEN + times.slack)
@@ -224,9 +224,9 @@ class _Story:
         # Their ids are learned first, so that a list can be read whatever is answered later.
         with closing(self._client("operator", goods, crowd, *WRITERS)) as operator:
             for subject in goods.bodies:
-                eventually(lambda: operator.upload(subject) and subject in crowd.ids, f"{subject} to be taken")  # noqa: B023
+                site.wait(lambda: operator.upload(subject) and subject in crowd.ids, f"{subject} to be taken")  # noqa: B023
         with _at_work(beside):
-            with crowd:
+            with crowd, site.ended_by_failures():
                 while self._done.disasters.total() < count and (
                     seconds is None or time.monotonic() - started < seconds
                 ):
@@ -335,7 +335,7 @@ class _Story:
         """Let the server that writes go; the other one takes over."""
         site, history, begun = self.site, self._history, time.monotonic()
         {"kill": site.kill, "stop": site.stop, "end": site.end}[kind](writer)
-        eventually(lambda: site.role(waiting) == "writer", f"{waiting} to take over")
+        site.wait(lambda: site.role(waiting) == "writer", f"{waiting} to take over")
         taken = time.monotonic() - begun
         self._done.takeovers.append(taken)
         limit = self._times.lease + _TAKEOVER + self._times.slack
@@ -357,7 +357,7 @@ class _Story:
         """Ask every server for everything, once every build has come to its end."""
 
         def work() -> None:
-            until = time.monotonic() + PATIENCE
+            until = time.monotonic() + self.site.patience
             with closing(self._client("operator", goods, crowd, self.site.writer() or "")) as operator:
                 for subject in goods.bodies:
                     state = operator.settled(subject, until)
