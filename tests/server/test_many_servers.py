@@ -15,20 +15,22 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from websockets.exceptions import InvalidStatus
 
 from lodestream import Target
 from lodestream.errors import InputError, LodestreamError
-from lodestream.protocol.messages import Open
+from lodestream.protocol.messages import Error, Open, Opened
 from lodestream.stores import ConflictError, StoreError, open_store
 from lodestream_client.program import main
 from lodestream_server import following, running_server
 from lodestream_server.access.tokens import TokenObject, Tokens
 from lodestream_server.builds import worker
+from lodestream_server.routes import streams
 from lodestream_server.store.lease import Lease
 from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
 from tests.server.builds import slow
-from tests.server.helpers import data_of, eventually, hills, npy, problem, push, raw_stream, settled
+from tests.server.helpers import closed, data_of, eventually, hills, npy, problem, push, raw_stream, settled
 from tests.stores.emulators import ministack, s3
 from tests.stores.memory import memory
 
@@ -254,17 +256,33 @@ def test_what_the_reader_of_a_folder_or_of_nothing_is_told(site: Site, tmp_path:
         site.start("writer")
 
 
-def test_a_token_that_is_revoked_ends_at_every_reader(site: Site) -> None:
+def test_a_token_that_is_revoked_ends_at_every_reader_and_so_do_its_streams(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(streams, "_TOKEN_SECONDS", LOOK)
     tokens = TokenObject(open_store(site.address))
     text, _ = tokens.create("ann", ("write",))
-    writer(site)
-    reader = site.start("reader", read_only=True)
     header = {"authorization": f"Bearer {text}"}
+    first = writer(site)
+    first.headers.update(header)
+    uploaded = push(first, npy(hills(200, 200)))
+    reader = site.start("reader", read_only=True)
     assert reader.get("/v1/surfaces").status_code == 401
     assert reader.get("/v1/surfaces", headers=header).status_code == 200
     assert problem(reader.post("/v1/surfaces", headers=header))[1] == "read-only"
-    tokens.revoke("ann")
-    within(10.0, lambda: reader.get("/v1/surfaces", headers=header).status_code == 401, "it to be refused")
+    surface = f"{str(reader.base_url).rstrip('/')}/v1/surfaces/{uploaded['id']}"
+    with raw_stream(surface, additional_headers=header) as stream:
+        stream.send(Open(credit=1 << 13))
+        assert isinstance(stream.receive(), Opened)
+        tokens.revoke("ann")
+        within(10.0, lambda: reader.get("/v1/surfaces", headers=header).status_code == 401, "it to be refused")
+        while not isinstance(event := stream.receive(), Error):  # it has no credit, and waits
+            pass
+        assert event.code == "bad-token"
+        closed(stream, 4401)
+    with pytest.raises(InvalidStatus), raw_stream(surface, additional_headers=header):
+        pass
+    assert reader.get(f"{surface}/container", headers=header | {"range": "bytes=0-9"}).status_code == 401
 
 
 def test_a_pull_that_is_cut_short_goes_on_at_another_server(

@@ -54,12 +54,12 @@ _WINDOW = b"window_errors"
 
 _Result = TypeVar("_Result")
 
-# How often it is looked whether a stream's token is still valid. With the wait for a close frame it makes less than the
-# ten seconds that are promised.
-_TOKEN_SECONDS = 3.0
+# How often it is looked whether a stream's token is still valid. With the look at the tokens of a bucket before it, and
+# the wait for a close frame after it, it makes less than the ten seconds that are promised.
+_TOKEN_SECONDS = 2.0
 
 # Long enough for a close frame to leave through a full buffer, short enough not to keep a dead peer.
-_CLOSE_SECONDS = 5.0
+_CLOSE_SECONDS = 4.0
 
 _PATH = "/v1/surfaces/{surface}/stream"
 

@@ -26,6 +26,7 @@ from lodestream.protocol.wire import serialize
 from lodestream_client import Client
 from lodestream_server import running_server
 from lodestream_server.access.tokens import SCOPES, TokenFile
+from lodestream_server.operation.settings import Settings
 from lodestream_server.routes import streams
 from tests.patience import PATIENCE
 from tests.server.helpers import Keys, Raw, closed, eventually, hills, kept, npy, problem, push, raw_stream
@@ -175,7 +176,8 @@ def test_a_first_message_that_is_none_is_refused(tmp_path: Path) -> None:
 def test_the_streams_of_a_token_end_with_it(
     served: Served, http: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert streams._TOKEN_SECONDS + streams._CLOSE_SECONDS < 10, "what is promised"
+    looked = Settings().look_seconds  # of a server that shares a bucket
+    assert looked + streams._TOKEN_SECONDS + streams._CLOSE_SECONDS < 10, "what is promised"
     monkeypatch.setattr(streams, "_TOKEN_SECONDS", 0.3)
     file = TokenFile(served.keys.folder / "tokens.json")
     tokens = {
