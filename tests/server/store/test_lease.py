@@ -73,6 +73,28 @@ def test_it_is_trusted_a_fifth_less_than_it_lasts_and_from_before_the_write(stor
     assert lease.number == 1
 
 
+@pytest.mark.parametrize("method", ["create", "replace"])
+def test_what_a_write_takes_counts_in_the_time_for_which_it_is_trusted(
+    store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    lease, write = Lease(store, clock=clock), getattr(store, method)
+
+    def slow(*given: Any) -> Any:
+        clock.now += 5.0
+        return write(*given)
+
+    monkeypatch.setattr(store, method, slow)
+    begun = clock.now
+    lease.tend()
+    if method == "replace":
+        begun = clock.now
+        lease.tend()
+    clock.now = begun + SECONDS * 0.8 - 0.1
+    assert lease.held
+    clock.now = begun + SECONDS * 0.8
+    assert not lease.held, "others count from when it was written, which may be as early as that"
+
+
 @pytest.mark.parametrize("offset", [0.0, -1e9, 1e9])
 def test_another_one_takes_it_when_it_was_not_renewed_by_its_own_clock(
     store: Store, clock: Clock, offset: float
