@@ -48,6 +48,8 @@ class TileOrder(NamedTuple):
         Of a tile.
     address : str
         Of tiles, in a document.
+    name : str
+        Of the surface, in a document.
     encoding, image, size, nodata
         Of an image, see `lodestream.maps.web_tile`.
     scale, error
@@ -64,6 +66,7 @@ class TileOrder(NamedTuple):
     x: int = 0
     y: int = 0
     address: str = ""
+    name: str = ""
     encoding: str = "terrain-rgb"
     image: str = "png"
     size: int = 256
@@ -170,9 +173,9 @@ def _made(field: HeightField, order: TileOrder) -> bytes:
     place = order.z, order.x, order.y
     match order.what:
         case "map":
-            return _document(tile_json(field, order.address, encoding=encoding, size=order.size))
+            return _document(tile_json(field, order.address, encoding=encoding, size=order.size), order.name)
         case "layers":
-            return _document(layer_json(field, order.address))
+            return _document(layer_json(field, order.address), order.name)
         case "tile":
             made = web_tile(field, *place, encoding=encoding, image=image, size=order.size, nodata=order.nodata)
             box = box_of_web(*place)
@@ -183,5 +186,5 @@ def _made(field: HeightField, order: TileOrder) -> bytes:
     return made if field.placement.meets(box) else b""
 
 
-def _document(content: dict[str, Any]) -> bytes:
-    return json.dumps(content, ensure_ascii=False).encode()
+def _document(content: dict[str, Any], name: str) -> bytes:
+    return json.dumps({**content, "name": name}, ensure_ascii=False).encode()

@@ -25,6 +25,7 @@ from . import descriptions, models
 from .names import leads_to
 from .routing import Parts, State, caching, matches, readable
 from .sending import ready, still_there, while_there
+from .surfaces import name_of
 
 __all__ = ["router"]
 
@@ -60,12 +61,22 @@ _Version = Annotated[str | None, Query(max_length=64, description="as a document
 # A coroutine, because FastAPI calls a plain function in a thread.
 async def _found(request: Request, parts: Parts, surface: str) -> Surface:
     """Return the surface of a request, which a name may lead to."""
-    if request.scope["route"].path.startswith("/v1/names/"):
+    if _is_of_a_name(request):
         surface = (await leads_to(parts, surface)).id
     return await ready(parts, surface)
 
 
 _Found = Annotated[Surface, Depends(_found)]
+
+
+def _is_of_a_name(request: Request) -> bool:
+    path: str = request.scope["route"].path
+    return path.startswith("/v1/names/")
+
+
+def _called(request: Request, found: Surface) -> str:
+    """Return what a document calls a surface: the name by which it was asked for, or what lists call it."""
+    return str(request.path_params["surface"]) if _is_of_a_name(request) else name_of(found) or ""
 
 
 def _mapped(
@@ -119,7 +130,8 @@ async def map_json(
     options |= {name: value for name, value in (("nodata", nodata), ("error", error)) if value}
     query = "&".join(f"{name}={value}" for name, value in options.items())
     address = f"{place}/tiles/{{z}}/{{x}}/{{y}}.png?{query}&v={_version(found)}"
-    order = TileOrder("map", address=address, encoding=encoding, size=int(size), scale=scale)
+    name = _called(request, found)
+    order = TileOrder("map", address=address, name=name, encoding=encoding, size=int(size), scale=scale)
     return await _made(request, parts, caller, found, order, _JSON, version=None)
 
 
@@ -144,7 +156,9 @@ async def tile(
 
     Heights are never drawn higher than they are: maps do that themselves.
     """
-    order = TileOrder("tile", z, x, y, "", encoding, image, int(size), nodata, scale, error)
+    order = TileOrder(
+        "tile", z, x, y, encoding=encoding, image=image, size=int(size), nodata=nodata, scale=scale, error=error
+    )
     return await _made(request, parts, caller, found, order, f"image/{image}", version=v)
 
 
@@ -166,7 +180,8 @@ async def layer_json(
     options = {name: value for name, value in (("offset", offset), ("nodata", nodata), ("error", error)) if value}
     options |= {} if scale is None else {"scale": scale}
     query = "".join(f"&{name}={value}" for name, value in options.items())
-    order = TileOrder("layers", address=f"{{z}}/{{x}}/{{y}}.terrain?v={_version(found)}{query}", scale=scale)
+    address = f"{{z}}/{{x}}/{{y}}.terrain?v={_version(found)}{query}"
+    order = TileOrder("layers", address=address, name=_called(request, found), scale=scale)
     return await _made(request, parts, caller, found, order, _JSON, version=None)
 
 

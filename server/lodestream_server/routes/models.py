@@ -336,7 +336,7 @@ class TileJson(BaseModel):
     """Where the tiles of a map are: TileJSON 3.0.0."""
 
     tilejson: Literal["3.0.0"]
-    name: str
+    name: str = Field(description="of the surface, or the name that leads to it")
     scheme: Literal["xyz"]
     tiles: list[str] = Field(description="address of a tile, with {z}, {x} and {y}")
     bounds: list[float] = Field(description="west, south, east and north in degrees", min_length=4, max_length=4)
@@ -359,7 +359,7 @@ class LayerJson(BaseModel):
     """Where the meshes of a globe are: the layer.json of quantized-mesh-1.0, as CesiumJS reads it."""
 
     tilejson: Literal["2.1.0"]
-    name: str
+    name: str = Field(description="of the surface, or the name that leads to it")
     format: Literal["quantized-mesh-1.0"]
     version: str
     scheme: Literal["tms"]

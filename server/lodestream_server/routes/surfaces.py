@@ -28,7 +28,7 @@ from . import descriptions, models
 from .routing import AnyQuery, Parts, State, described, readable
 from .sending import look_for, while_there
 
-__all__ = ["Wait", "base", "description", "keep", "owned", "router", "settled"]
+__all__ = ["Wait", "base", "description", "keep", "name_of", "owned", "router", "settled"]
 
 router = APIRouter(prefix="/v1/surfaces", tags=["surfaces"])
 
@@ -357,11 +357,10 @@ def _told(
 ) -> dict[str, Any]:
     """Return what a list tells of a surface."""
     it, ready = surface.manifest, surface.state == "ready"
-    name = it.name or options.printable(surface.summary.name or "") or next(filter(None, it.filenames), None)
     return {
         "id": surface.id,
         "url": f"{base(request)}/{surface.id}",
-        "name": name,
+        "name": name_of(surface),
         **owned(it.owner, caller),
         "state": surface.state,
         "progress": parts.builder.progress(surface),
@@ -373,6 +372,12 @@ def _told(
         **(surface.summary.shown if ready else {}),
         **({"thumbnail": _address(surface.summary.thumbnail if ready else None)} if thumbnails else {}),
     }
+
+
+def name_of(surface: Surface) -> str | None:
+    """Return what people call a surface: as its upload says, else its file's contents, else the file's name."""
+    it = surface.manifest
+    return it.name or options.printable(surface.summary.name or "") or next(filter(None, it.filenames), None)
 
 
 def _address(thumbnail: str | None) -> str | None:

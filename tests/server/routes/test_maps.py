@@ -112,6 +112,15 @@ def test_tiles_may_be_off_by_an_error(http: httpx.Client, hill: dict[str, Any], 
     assert mesh.content != maps.mesh_tile(field, 6, 66, 48, normals=False)
 
 
+def test_documents_name_the_surface_as_lists_do_or_as_it_was_asked_for(http: httpx.Client) -> None:
+    named = push(http, terrain(seed=5), filename="alps.lode", name="The Alps")
+    http.put("/v1/names/alps", json={"surface": named["id"]}).raise_for_status()
+    unnamed = push(http, terrain(seed=6), filename="hills.lode")
+    for url, name in ((named["url"], "The Alps"), ("/v1/names/alps", "alps"), (unnamed["url"], "hills.lode")):
+        for document in ("map.json", "terrain/layer.json"):
+            assert http.get(f"{url}/{document}").raise_for_status().json()["name"] == name
+
+
 def test_gdal_reads_terrarium_by_its_driver_of_tiles(http: httpx.Client) -> None:
     """At pixels of a tilted plane, in the zoom of its cells."""
     fields = pytest.importorskip("tests.core.maps.fields")
