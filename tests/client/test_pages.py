@@ -83,7 +83,7 @@ def block_commands(text: str) -> Iterator[str]:
     """The commands of blocks of a shell, without prompts, variables before them, ``&`` and comments."""
     for language, block in _FENCED.findall(text):
         if language in _SHELL:
-            lines = block.splitlines()
+            lines = re.sub(r"\\\n *", "", block).splitlines()
             yield from (line.removeprefix("$ ") for line in lines if language != "console" or line.startswith("$ "))
     yield from _INDENTED.findall(_FENCED.sub("", text))
 
