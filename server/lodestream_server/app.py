@@ -102,7 +102,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 return len(surfaces.index) + named, surfaces.index.count_of(owner) + named_by_owner
 
             def kept(owner: str | None) -> int:
-                return surfaces.index.kept(owner) + partial_uploads.kept(owner)
+                # In this order: an upload that becomes a surface meanwhile counts twice, and never not at all.
+                return partial_uploads.kept(owner) + surfaces.index.kept(owner)
 
             partial_uploads = await asyncio.to_thread(
                 PartialUploads, data.partial, chosen.max_partial_uploads, chosen.partial_seconds

@@ -62,7 +62,7 @@ class Limits:
         Returns how many surfaces and names there are: all of them, and those of an owner. It and `kept` are called in
         threads.
     kept : callable (owner) -> int
-        Returns the bytes on disk of an owner's surfaces and names.
+        Returns the bytes on disk of an owner's surfaces and names, and of uploads that come in parts.
     alone : callable
         Returns whether there is nobody to share with.
     endless : bool
@@ -140,7 +140,13 @@ class Limits:
 
     @asynccontextmanager
     async def upload(
-        self, request: Request, caller: Caller, *, stored: bool = True, size: int | None = None
+        self,
+        request: Request,
+        caller: Caller,
+        *,
+        stored: bool = True,
+        size: int | None = None,
+        is_part: bool = False,
     ) -> AsyncIterator[Request]:
         """Count an upload in progress, and yield a request that checks the limits while its body arrives.
 
@@ -153,6 +159,8 @@ class Limits:
         stored : bool
         size : int or None
             Bytes that are announced; None: as many as the body has.
+        is_part : bool
+            Whether the body belongs to an upload that comes in parts, whose bytes `kept` counts as they are written.
 
         Raises
         ------
@@ -172,7 +180,8 @@ class Limits:
         promised = int(length) if length.isascii() and length.isdecimal() and len(length) < 19 else 0
         promised = promised if size is None else size
         # One that is too large anyway is refused for that.
-        room = _Room(self, caller, promised if stored and promised <= self._settings.upload_bytes else 0, stored)
+        promised = promised if stored and promised <= self._settings.upload_bytes else 0
+        room = _Room(self, caller, promised, stored=stored, is_part=is_part)
         clock = asyncio.timeout(None)
         with self._uploads.take(caller):
             async with self._counted(room, clock):
@@ -257,13 +266,16 @@ class Limits:
         if self._settings.owner_bytes is None and self._alone():
             return
         free = _ENDLESS if self._endless else free
-        has = await asyncio.to_thread(self._count_kept, owner) + self._taken[owner]
+        # Before what is kept: an upload that ends meanwhile counts twice, and never not at all.
+        taken = self._taken[owner]
+        has = await asyncio.to_thread(self._count_kept, owner) + taken
         self._kept.check(_owner(owner), promised, Held(has + free, has, has))
 
     def took(self, room: _Room, size: int) -> None:
         """Count bytes of an upload that have arrived; they are no longer announced but used."""
-        room.taken += size
-        self._taken[room.caller.owner] += size
+        if not room.is_part:
+            room.taken += size
+            self._taken[room.caller.owner] += size
         size = min(size, room.promised)
         room.promised -= size
         _subtract(self._promised, room.caller.key, size)
@@ -311,11 +323,12 @@ class Limits:
 
 
 class _Room:
-    """What an upload has said it will take and has not taken yet, and what it has."""
+    """What an upload has said it will take and has not taken yet, and what it has that nobody else counts."""
 
-    def __init__(self, limits: Limits, caller: Caller, promised: int, stored: bool) -> None:
+    def __init__(self, limits: Limits, caller: Caller, promised: int, *, stored: bool, is_part: bool) -> None:
         self.caller = caller
         self.promised = promised
+        self.is_part = is_part
         self.taken = 0
         self._stored = stored
         self._limits = limits

@@ -189,7 +189,7 @@ async def continue_upload(caller: Writer, request: Request, parts: Parts, upload
         if it.declared.surface is None:
             missing = it.declared.length - it.offset
             uploads.check_promised(request, missing)
-            async with parts.limits.upload(request, caller) as watched:
+            async with parts.limits.upload(request, caller, is_part=True) as watched:
                 await it.append(uploads.blocks(watched, parts.settings, missing))
                 if it.is_complete:
                     await _finish(it, caller, parts)

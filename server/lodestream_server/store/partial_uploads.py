@@ -95,6 +95,8 @@ class PartialUpload:
     declared : Declared
     offset : int
         Bytes that are on disk.
+    kept : int
+        Bytes that count as the owner's: those of the file, synchronised or not, until they are a surface's.
     touched : float
     """
 
@@ -102,6 +104,7 @@ class PartialUpload:
         self.id = folder.name
         self.declared = declared
         self.offset = offset
+        self.kept = 0 if declared.surface is not None else offset
         self.touched = touched
         self.folder = folder
         self._lock = asyncio.Lock()
@@ -184,6 +187,7 @@ class PartialUpload:
                 async for block in blocks:
                     await carried_out(partial(self._write, arrived, block))
                     arrived += len(block)
+                    self.kept = arrived
         except TimeoutError:
             if clock.expired():
                 raise LockedError("Another request has taken over this upload") from None
@@ -222,6 +226,7 @@ class PartialUpload:
 
     async def finish(self, surface: str) -> None:
         """Note the surface that the upload has become, and remove its bytes. The upload is held."""
+        self.kept = 0
         finished = replace(self.declared, surface=surface)
         await carried_out(partial(self._note, finished))
         self.declared, self.touched = finished, time.time()
@@ -270,8 +275,7 @@ class PartialUploads:
 
     def kept(self, owner: str | None) -> int:
         """Return the bytes on disk of an owner's uploads that are not finished; may be called from any thread."""
-        going = [upload for upload in list(self._all.values()) if upload.declared.surface is None]
-        return sum(upload.offset for upload in going if upload.declared.owner == owner)
+        return sum(upload.kept for upload in list(self._all.values()) if upload.declared.owner == owner)
 
     def get(self, name: str, owner: str | None) -> PartialUpload:
         """Return an upload of an owner.

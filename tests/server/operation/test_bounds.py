@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -12,9 +12,12 @@ from typing import Any
 
 import pytest
 
+from lodestream_server.access.limits import Limits
+from lodestream_server.operation.settings import Settings
 from lodestream_server.problems import BusyError, FullError, TooManyError
 from lodestream_server.store.index import LEAST, Index, Surface
 from lodestream_server.store.layout import Manifest
+from lodestream_server.store.partial_uploads import Declared, PartialUploads
 from tests.server.access.test_limits import ANNA, BERT, CARL, Disk, limits, read, request
 from tests.server.helpers import PATIENCE
 
@@ -150,6 +153,53 @@ def test_an_upload_that_does_not_say_its_size_stops_at_its_owners_share(tmp_path
         asyncio.run(read(made, request(*[bytes(1 << 24)] * 3)))
     # What was promised and taken for good stays good, whatever comes beside it.
     assert len(asyncio.run(read(made, request(bytes(1 << 24), b"x", length=(1 << 24) + 1), BERT))) == (1 << 24) + 1
+
+
+def test_each_byte_of_a_part_counts_once(tmp_path: Path, disk: dict[str, int]) -> None:
+    """As it is written, at the end of the part while its request goes on, and once there is the surface."""
+    disk["free"] = 1 << 40
+    stored = {"anna": 0}  # what the index counts
+
+    async def together() -> None:
+        uploads = PartialUploads(tmp_path / "partial", 8, 3600.0)
+        made = Limits(
+            Settings(data=tmp_path, keep_free=0, owner_bytes=1000),
+            (tmp_path,),
+            lambda _: (0, 0),
+            lambda owner: uploads.kept(owner) + stored.get(owner or "", 0),
+            lambda: True,
+        )
+
+        async def has(size: int) -> None:
+            """Anna has so many bytes: what is left of her 1,000 may be taken, and not one more."""
+            await read(made, request(b"", length=1000 - size))
+            with pytest.raises(FullError, match=f"has {size} and {1001 - size} more"):
+                await read(made, request(b"", length=1001 - size))
+
+        upload = await uploads.create(Declared("anna", 900, (), None, None, ""))
+        for offset, size in ((0, 600), (600, 300)):
+            chunks = [bytes(size // 3)] * 3
+            async with (
+                upload.continued(offset),
+                made.upload(request(*chunks, length=size), ANNA, is_part=True) as watched,
+            ):
+
+                async def blocks(arrived: int, watched: Any = watched) -> AsyncIterator[bytes]:
+                    async for block in watched.stream():
+                        if block:
+                            yield block
+                            arrived += len(block)
+                            assert uploads.kept("anna") == arrived
+
+                await upload.append(blocks(offset))
+                await has(offset + size)
+                if upload.is_complete:
+                    stored["anna"] = 900
+                    await upload.finish("surface")
+                    await has(900)
+            assert not made._taken
+
+    asyncio.run(together())
 
 
 @pytest.fixture
