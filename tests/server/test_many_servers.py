@@ -365,9 +365,3 @@ def test_tokens_that_two_change_at_once_are_told_and_not_lost(memory: str) -> No
     assert tokens.used
     first.look()
     assert tokens.find(text) is None, "nobody is let in by what cannot be read"
-
-
-def test_buckets_are_not_checked(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["fsck", "s3://memory/data"])
-    assert "expected a folder, got s3://memory/data: buckets are not checked" in capsys.readouterr().err

@@ -6,8 +6,9 @@ import argparse
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,25 +18,30 @@ from lodestream.text import printable
 from ..linux import require_linux
 
 if TYPE_CHECKING:
-    from lodestream.stores import Entry
+    from lodestream.stores import Entry, Store
 
     from ..maintenance.findings import Report
+    from ..store.lease import Lease
 
 __all__ = ["fsck", "register"]
+
+# Seconds that it waits for the lease of a bucket, whose holder may have been killed; and how often it looks.
+_PATIENCE = 20.0
+_LOOK_SECONDS = 0.1
 
 
 def register(subparsers: Any, _: Sequence[str] = ()) -> None:
     """Add ``fsck`` to the sub-commands of a parser."""
     parser = subparsers.add_parser(
         "fsck",
-        help="check and repair the data folder of a server",
-        description="Check all that is in the data folder of a server, by hashes and checksums. No server may be "
-        "running in the folder. Without an option nothing is changed. Nothing is built here: what is to be built again "
-        "is built by the next start of the server. Exit code 0: nothing is damaged, or all damage was repaired without "
-        "loss; 1: something is damaged.",
+        help="check and repair the data of a server",
+        description="Check all that is in the data folder of a server, or in its bucket, by hashes and checksums. No "
+        "server may be running in the folder; those of a bucket may, unless something is to be changed. Without an "
+        "option nothing is changed. Nothing is built here: what is to be built again is built by the next start of the "
+        "server. Exit code 0: nothing is damaged, or all damage was repaired without loss; 1: something is damaged.",
         allow_abbrev=False,
     )
-    parser.add_argument("data", metavar="DIR", type=_folder, help="data folder of a server; no bucket")
+    parser.add_argument("data", metavar="DATA", type=_place, help="data folder of a server, or address of its bucket")
     parser.add_argument(
         "--scratch",
         metavar="DIR",
@@ -57,39 +63,37 @@ def register(subparsers: Any, _: Sequence[str] = ()) -> None:
         "--retry",
         action="store_true",
         help="queue the surfaces that wait because an earlier build failed for a temporary reason. The index says "
-        "which do: give --scratch if the server has that setting",
+        "which do: give --scratch if the server has that setting. Not for a bucket, whose index is the server's",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=fsck)
 
 
-def _folder(text: str) -> Path:
+def _place(text: str) -> Path | str:
+    """Return a folder, or the address of a bucket."""
     from lodestream.errors import InputError
     from lodestream.stores.addresses import place_of
 
     try:
-        place = place_of(text)
+        return Path(text) if place_of(text) is None else text
     except InputError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-    if place is not None:
-        raise argparse.ArgumentTypeError(f"expected a folder, got {place.address}: buckets are not checked")
-    return Path(text)
 
 
 def fsck(args: argparse.Namespace) -> int:
-    """Check a folder, change what is asked for, and print the findings; return the exit code.
+    """Check the data of a server, change what is asked for, and print the findings; return the exit code.
 
     Raises
     ------
     LodestreamError
-        If it is not the data folder of a server, or another process uses it.
+        If it is not the data of a server, or another process uses the folder, or writes to the bucket.
     OptionError
         If an environment variable has an invalid value.
     UnavailableError
         If this is not Linux.
     """
     require_linux()
-    from lodestream.stores import Folder
+    from lodestream.stores import Folder, open_store
 
     from ..maintenance.check import check, require_data
     from ..maintenance.strays import collect
@@ -98,24 +102,37 @@ def fsck(args: argparse.Namespace) -> int:
     from ..store.data import INDEX, check_version, scratch_of
     from .serve import chosen_settings
 
-    folder: Path = args.data
-    store = Folder(folder, private=True)
-    check_version(folder)
-    require_data(store)
-    index = scratch_of(folder, chosen_settings(args).scratch) / INDEX
-    # Whoever only looks makes no lock where there is none: nobody has worked there.
+    index: Path | None = None
+    guard: AbstractContextManager[Lease | None]
     changes = args.repair or args.collect or args.retry
-    with _alone(folder) if changes or (folder / LOCK).is_file() else nullcontext():
-        known, waits = index.is_file(), waiting(store, index)
-        with _progress() as progress:
-            report = check(store, repair=args.repair, waiting=() if args.retry else waits, progress=progress)
+    if isinstance(args.data, Path):
+        store: Store = Folder(args.data, private=True)
+        check_version(args.data)
+        index = scratch_of(args.data, chosen_settings(args).scratch) / INDEX
+        # Whoever only looks makes no lock where there is none: nobody has worked there.
+        guard = _alone(args.data) if changes or (args.data / LOCK).is_file() else nullcontext()
+    else:
+        store = open_store(args.data)
         if args.retry:
+            raise LodestreamError(
+                f"expected a folder for --retry, got {store.describe()}: what waits is known to the server that "
+                "writes; start it, and run lodestream retry URL"
+            )
+        guard = _writing(store) if changes else nullcontext()
+    require_data(store)
+    with guard as lease:
+        known, waits = index is not None and index.is_file(), {} if index is None else waiting(store, index)
+        with _progress() as progress:
+            report = check(
+                store, repair=args.repair, waiting=() if args.retry else waits, lease=lease, progress=progress
+            )
+        if args.retry and index is not None:
             retry(store, index)
         removed: list[Entry] = []
         refusal = None
         if args.collect:
             try:
-                removed = collect(store)
+                removed = collect(store, lease)
             except LodestreamError as error:
                 refusal = str(error)
     if args.json:
@@ -142,7 +159,29 @@ def fsck(args: argparse.Namespace) -> int:
 
 
 @contextmanager
+def _writing(store: Store) -> Iterator[Lease]:
+    """Hold the lease of a bucket for the length of a block, so that no server changes anything."""
+    from ..store.lease import Lease
+
+    lease = Lease(store)
+    lease.start()
+    try:
+        end = time.monotonic() + _PATIENCE
+        while not lease.held:
+            if time.monotonic() > end:
+                raise LodestreamError(
+                    f"expected that no server writes to {store.describe()}, but {lease.holder or 'another one'} does: "
+                    "end it, and those that wait to take over, then try again"
+                )
+            time.sleep(_LOOK_SECONDS)
+        yield lease
+    finally:
+        lease.close()
+
+
+@contextmanager
 def _alone(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder for the length of a block."""
     from ..store.claim import claim
 
     guard = claim(folder)

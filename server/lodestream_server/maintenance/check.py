@@ -1,6 +1,7 @@
 """Checking the data of a server, in whatever store: is everything there, and whole, that its small objects refer to?
 
-Small objects have checksums, uploads and containers are named by their hashes. A repair builds nothing: it removes what
+Small objects have checksums, uploads and containers are named by their hashes. In a bucket servers may go on working
+meanwhile: what is deleted while it is checked is no finding. A repair builds nothing: it removes what
 says that a surface is built, so that the next start of a server builds it, and only if its upload is whole. Uploads and
 manifests are never touched.
 """
@@ -16,9 +17,12 @@ from lodestream.errors import LodestreamError
 from lodestream.stores import AbsentError, Store, StoreError
 
 from ..builds.finished import CHECKED, ERRORS, TOLD, figures_of
+from ..problems import StandbyError
 from ..store import layout
+from ..store.changes import ChangeLog
 from ..store.identity import establish, read_identity
 from ..store.layout import BUILT, IDENTITY, SURFACES, Built, DamagedObjectError, Identity
+from ..store.lease import Lease
 from .facts import CONTAINER, Facts, Found
 from .findings import Finding, Report
 
@@ -49,9 +53,10 @@ def check(
     *,
     repair: bool = False,
     waiting: Collection[str] = (),
+    lease: Lease | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
-    """Check the data of a server that does not run meanwhile. Without a repair nothing is changed.
+    """Check the data of a server. Without a repair nothing is changed; with one no server may write meanwhile.
 
     Parameters
     ----------
@@ -60,6 +65,8 @@ def check(
         Whether to remove what keeps a surface with a whole upload from being built again.
     waiting : collection of str
         Surfaces that the next start does not build.
+    lease : Lease or None
+        Of a bucket: a repair needs it, and other servers are told of it.
     progress : callable
         Called with the bytes that were read of uploads and containers, and the bytes of all of them.
 
@@ -73,12 +80,16 @@ def check(
     require_data(store)
     started = time.monotonic()
     report = Report(store.describe())
-    judge = _Judge(store, report, repair, waiting)
+    judge = _Judge(store, report, repair, waiting, lease)
     judge.identity()
     with Facts(store, report, progress) as facts:
         facts.gather()
         for found in facts.surfaces():
             judge.surface(found)
+    if lease is not None and any(found.repaired for found in report.findings):
+        changes = ChangeLog(store)
+        changes.begin()
+        changes.write()
     report.seconds = time.monotonic() - started
     return report
 
@@ -86,8 +97,11 @@ def check(
 class _Judge:
     """Says what facts mean, and repairs what it may."""
 
-    def __init__(self, store: Store, report: Report, repair: bool, waiting: Collection[str]) -> None:
+    def __init__(
+        self, store: Store, report: Report, repair: bool, waiting: Collection[str], lease: Lease | None
+    ) -> None:
         self._store, self._report, self._repair, self._waiting = store, report, repair, waiting
+        self._lease = lease
 
     def identity(self) -> None:
         try:
@@ -164,14 +178,28 @@ class _Judge:
 
     def _found(self, found: Finding, mend: Callable[[], None] | None = None, done: str = "") -> bool:
         """Add a finding, mended if that is asked for and possible; return whether it was."""
+        if found.surface is not None and self._is_gone(found.surface):
+            return False
         if self._repair and mend is not None:
             try:
+                if self._lease is not None and not self._lease.held:
+                    raise StandbyError("another server may have taken the lease of the bucket")
                 mend()
                 found = replace(found, repair=done, repaired=True)
             except StoreError as error:
                 found = replace(found, repair=f"not repaired: {error}")
         self._report.findings.append(found)
         return found.repaired
+
+    def _is_gone(self, surface: str) -> bool:
+        """Return whether a surface was deleted since its manifest was read."""
+        try:
+            self._store.get(layout.manifest_key(surface))
+        except AbsentError:
+            return True
+        except StoreError:
+            pass
+        return False
 
 
 def _vouchers(it: Found) -> tuple[str | None, ...]:

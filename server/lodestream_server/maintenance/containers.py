@@ -15,9 +15,7 @@ from ..builds.finished import ERRORS, figures_of
 from ..store import layout
 from ..store.layout import Summary
 
-__all__ = ["check_container", "chunks_of", "digest_of", "errors_of"]
-
-_CHUNK = 1 << 20
+__all__ = ["check_container", "digest_of", "errors_of"]
 
 
 def check_container(
@@ -37,7 +35,7 @@ def check_container(
     frames, digest = FrameReader(keeps=()), hashlib.sha256()
     place: LodestreamError | None = None
     try:
-        for chunk in told(chunks_of(store, key)):
+        for chunk in told(store.pieces(key)):
             digest.update(chunk)
             if place is None:
                 try:
@@ -59,15 +57,6 @@ def check_container(
         return "version", str(error), None
     except LodestreamError as error:
         return "bad", str(error), None
-
-
-def chunks_of(store: Store, key: str) -> Iterator[bytes]:
-    """Read an object, a chunk at a time."""
-    with store.open(key) as blob:
-        offset = 0
-        while chunk := blob.read(offset, _CHUNK):
-            yield chunk
-            offset += len(chunk)
 
 
 def errors_of(info: bytes) -> str | None:

@@ -9,12 +9,13 @@ import hashlib
 import itertools
 import sqlite3
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, Self
+from typing import NamedTuple, Self, TypeVar
 
 from lodestream.container.sections import SIGNATURE, is_container
-from lodestream.stores import Store, StoreError
+from lodestream.stores import AbsentError, Entry, Store, StoreError
 
 from ..store import layout
 from ..store.layout import (
@@ -28,13 +29,19 @@ from ..store.layout import (
     Manifest,
     Name,
 )
-from .containers import check_container, chunks_of, digest_of, errors_of
+from ..store.surfaces import side_by_side
+from .containers import check_container, digest_of, errors_of
 from .findings import Finding, Report
 
 __all__ = ["CONTAINER", "Facts", "Found"]
 
 #: What an uploaded container is said to be.
 CONTAINER = "container"
+
+# Small objects that are read before what they say is noted.
+_AT_ONCE = 64
+
+_Small = TypeVar("_Small", Name, Manifest, Built)
 
 # `built`: none, failed, ready, bad, unreadable. `state` of an upload or a container: whole, bad, unreadable, version
 # (another one than this server reads); what has no row is missing. A manifest that is damaged has no upload.
@@ -130,26 +137,39 @@ class Facts:
         """Return what was found of each surface whose manifest can be read, in the order of their ids."""
         return (Found(*row) for row in self._facts.execute(_SURFACES))
 
+    def _read(
+        self, kind: type[_Small], entries: Iterable[Entry]
+    ) -> Iterator[tuple[Entry, _Small | DamagedObjectError | StoreError]]:
+        """Read small objects, or say why one cannot be; leave out what is gone: in a bucket, servers go on working."""
+        entries = iter(entries)
+        with side_by_side(self._store.at_once) as each:
+            while some := list(itertools.islice(entries, _AT_ONCE)):
+                for entry, small in zip(some, each(partial(self._small, kind), [it.key for it in some]), strict=True):
+                    if not isinstance(small, AbsentError):
+                        yield entry, small
+
+    def _small(self, kind: type[_Small], key: str) -> _Small | DamagedObjectError | StoreError:
+        try:
+            return layout.parse(kind, key, self._store.get(key)[0])
+        except (DamagedObjectError, StoreError) as error:
+            return error
+
     def _names(self) -> None:
-        for entry in self._store.entries(NAMES):
-            if layout.name_of(entry.key) is not None:
-                try:
-                    layout.parse(Name, entry.key, self._store.get(entry.key)[0])
-                except (DamagedObjectError, StoreError) as error:
-                    lost = isinstance(error, DamagedObjectError)
-                    self._report.findings.append(Finding("name", entry.key, None, str(error), lost=lost))
+        listed = (it for it in self._store.entries(NAMES) if layout.name_of(it.key) is not None)
+        for entry, it in self._read(Name, listed):
+            if not isinstance(it, Name):
+                lost = isinstance(it, DamagedObjectError)
+                self._report.findings.append(Finding("name", entry.key, None, str(it), lost=lost))
 
     def _manifests(self) -> None:
-        for entry in self._store.entries(SURFACES):
-            if (id_ := layout.id_of(entry.key)) is None:
-                continue
+        listed = (it for it in self._store.entries(SURFACES) if layout.id_of(it.key) is not None)
+        for entry, it in self._read(Manifest, listed):
+            id_ = layout.id_of(entry.key)
             self._report.surfaces += 1
             self._facts.execute("INSERT INTO surface (id) VALUES (?)", (id_,))
-            try:
-                it = layout.parse(Manifest, entry.key, self._store.get(entry.key)[0])
-            except (DamagedObjectError, StoreError) as error:
-                lost = isinstance(error, DamagedObjectError)
-                self._report.findings.append(Finding("manifest", entry.key, id_, str(error), lost=lost))
+            if not isinstance(it, Manifest):
+                lost = isinstance(it, DamagedObjectError)
+                self._report.findings.append(Finding("manifest", entry.key, id_, str(it), lost=lost))
                 continue
             self._facts.execute(
                 "UPDATE surface SET write = ?, upload = ?, upload_bytes = ?, files = ? WHERE id = ?",
@@ -157,20 +177,14 @@ class Facts:
             )
 
     def _builts(self) -> None:
-        for entry in self._store.entries(BUILT):
-            if (id_ := layout.id_of(entry.key)) is None:
+        for entry, built in self._read(Built, filter(self._is_of_surface, self._store.entries(BUILT))):
+            id_ = layout.id_of(entry.key)
+            if not isinstance(built, Built):
+                state = "bad" if isinstance(built, DamagedObjectError) else "unreadable"
+                self._facts.execute("UPDATE surface SET built = ?, problem = ? WHERE id = ?", (state, str(built), id_))
                 continue
-            known = self._facts.execute("SELECT write FROM surface WHERE id = ?", (id_,)).fetchone()
-            if known is None:
-                self._stray(entry.size)
-                continue
-            try:
-                built = layout.parse(Built, entry.key, self._store.get(entry.key)[0])
-            except (DamagedObjectError, StoreError) as error:
-                state = "bad" if isinstance(error, DamagedObjectError) else "unreadable"
-                self._facts.execute("UPDATE surface SET built = ?, problem = ? WHERE id = ?", (state, str(error), id_))
-                continue
-            if known[0] not in (None, built.manifest):
+            (write,) = self._facts.execute("SELECT write FROM surface WHERE id = ?", (id_,)).fetchone()
+            if write not in (None, built.manifest):
                 continue  # of another manifest: it counts as absent
             state, size = "failed" if built.container is None else "ready", built.container_bytes
             self._facts.execute(
@@ -178,6 +192,15 @@ class Facts:
                 "WHERE id = ?",
                 (state, built.container, size, digest_of(size, built.info, built.summary), errors_of(built.info), id_),
             )
+
+    def _is_of_surface(self, entry: Entry) -> bool:
+        """Return whether what became of a build is that of a surface, otherwise count it as a stray."""
+        if (id_ := layout.id_of(entry.key)) is None:
+            return False
+        known = bool(self._facts.execute("SELECT 1 FROM surface WHERE id = ?", (id_,)).fetchall())
+        if not known:
+            self._stray(entry.size)
+        return known
 
     def _uploads(self) -> None:
         for sha256, group in itertools.groupby(self._store.entries(UPLOADS), lambda it: layout.sha256_of(it.key)):
@@ -205,7 +228,7 @@ class Facts:
         digest, kind, head = hashlib.sha256(), None, len(SIGNATURE)
         try:
             for number in range(files):
-                for place, chunk in enumerate(self._told(chunks_of(self._store, layout.upload_key(sha256, number)))):
+                for place, chunk in enumerate(self._told(self._store.pieces(layout.upload_key(sha256, number)))):
                     digest.update(chunk)
                     kind = CONTAINER if place == 0 and is_container(chunk[:head]) else kind
                 digest.update(sizes[number].to_bytes(8, "big"))  # see `Upload.end`

@@ -44,7 +44,7 @@ from .names import Names
 from .private import make_private
 from .states import Event, after
 
-__all__ = ["STRAY", "Surfaces"]
+__all__ = ["STRAY", "Surfaces", "side_by_side"]
 
 _log = logging.getLogger(__name__)
 #: Seconds after which what no small object refers to is a stray that may be removed: whoever has put it there has come
@@ -710,7 +710,7 @@ class Surfaces:
     def _take(self, changed: Sequence[Comparison]) -> DamagedObjectError | None:
         """Read surfaces from the store into the index; return what is wrong with one that cannot be read."""
         damaged = None
-        with self._lock, self._index.together(), _side_by_side(self.store.at_once) as each:
+        with self._lock, self._index.together(), side_by_side(self.store.at_once) as each:
             for found, there in zip(changed, each(self._stored, [found.id for found in changed]), strict=True):
                 if there is None:
                     self._index.drop(found.id)
@@ -867,7 +867,7 @@ class _Stored:
 
 
 @contextmanager
-def _side_by_side(at_once: int) -> Iterator[Callable[..., Iterator[Any]]]:
+def side_by_side(at_once: int) -> Iterator[Callable[..., Iterator[Any]]]:
     """Give what maps a function over things, so many at the same time."""
     if at_once == 1:
         yield map

@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 import lodestream as ls
 from lodestream.container import read_index, sections
 from lodestream.errors import InputError, LodestreamError
-from lodestream.stores import Folder, Store, StoreError
+from lodestream.stores import Entry, Folder, Store, StoreError
 from lodestream_server.builds.finished import CHECKED, ERRORS, figures_of
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.findings import Finding, Report
@@ -216,6 +216,22 @@ def test_data_in_order_in_any_store(kind: str, request: pytest.FixtureRequest, t
     report = check(store, repair=True)
     assert (report.clean, report.lost, report.queued) == (True, 0, 3)
     assert told(check(store)) == set()
+
+
+@pytest.mark.parametrize("when", [layout.SURFACES, layout.BUILT, layout.UPLOADS, layout.CONTAINERS])
+def test_what_is_deleted_while_it_is_checked_is_no_finding(data: Path, made: Made, when: str) -> None:
+    class Working(Folder):
+        """Where a server deletes a surface once something is listed."""
+
+        def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
+            listed = list(super().entries(prefix, after))
+            if prefix == when and len(listed) > 1:
+                kinds = ("manifest", "built", "upload", "container")
+                self.delete([made.key(kind, LODE) for kind in kinds])
+            return iter(listed)
+
+    report = check(Working(data))
+    assert (report.findings, report.clean) == ([], True)
 
 
 def test_data_in_order_are_not_changed(data: Path, made: Made) -> None:

@@ -16,22 +16,27 @@ import pytest
 
 import lodestream as ls
 from lodestream.errors import InputError, LodestreamError
-from lodestream.stores import Folder
+from lodestream.stores import Folder, open_store
 from lodestream_server import running_server
+from lodestream_server.commands import fsck as command
 from lodestream_server.commands.fsck import register
 from lodestream_server.store.claim import claim
 from lodestream_server.store.data import Data
 from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
-from tests.server.helpers import hills, npy, push, settled, upload_of
+from tests.server.helpers import eventually, hills, npy, push, settled, upload_of
 
 Surface = dict[str, Any]
 Fsck = Callable[..., tuple[int, dict[str, Any]]]
 
 
 @contextmanager
-def serving(data: Path) -> Iterator[httpx.Client]:
-    with running_server(data, workers=1) as url, httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http:
+def serving(data: Path | str, **settings: Any) -> Iterator[httpx.Client]:
+    with (
+        running_server(data, workers=1, **settings) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        eventually(lambda: http.get("/readyz").json().get("role", "writer") == "writer", "it to write")
         yield http
 
 
@@ -271,3 +276,54 @@ def test_it_says_in_words_what_it_found(
     assert first.endswith(" - removed; the next start of the server builds it again")
     assert last.endswith(": 1 damaged, 1 of these repaired")
     assert more == "the next start of the server builds 1 surface"
+
+
+def test_a_bucket_is_checked_beside_its_servers_and_repaired_without_them(
+    memory: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "_PATIENCE", 0.5)
+    store, bad = open_store(memory), tmp_path / "bad"
+
+    def asked(*options: str) -> tuple[int, dict[str, Any]]:
+        code = run(memory, "--json", *options)
+        return code, json.loads(capsys.readouterr().out)
+
+    with serving(memory, scratch=tmp_path / "first") as http:
+        one, two = push(http, npy(hills(seed=1))), push(http, ls.encode(hills(seed=2)), filename="two.lode")
+        http.put("/v1/names/one", json={"surface": one["id"]}).raise_for_status()
+        code, report = asked()
+        assert (code, report["clean"], report["findings"], report["data"]) == (0, True, [], memory)
+        assert (report["surfaces"], report["uploads"], report["containers"], report["strays"]) == (2, 2, 2, 0)
+        key = f"containers/{one['container_sha256']}.lode"
+        bad.write_bytes(b"half")
+        store.put_file(key, bad)
+        code, report = asked()
+        assert (code, [(it["what"], it["key"], it["surface"]) for it in report["findings"]]) == (
+            1,
+            [("container", key, one["id"])],
+        )
+        for option in ("--repair", "--collect"):
+            with pytest.raises(LodestreamError, match=r"no server writes to s3://memory/data, but .* end it"):
+                run(memory, option)
+        with pytest.raises(LodestreamError, match="lodestream retry URL"):
+            run(memory, "--retry")
+    code, report = asked("--repair", "--collect")
+    assert (code, report["clean"], report["queued"]) == (0, True, 1)
+    assert (report["refused"], report["collected"]["keys"]) == (None, []), "no stray is a day old"
+    with serving(memory, scratch=tmp_path / "second") as http:
+        assert [settled(http, it["url"]) for it in (one, two)] == [one, two]
+        http.delete(two["url"]).raise_for_status()
+    code, report = asked()
+    assert (code, report["surfaces"], report["strays"]) == (0, 1, 2), "servers collect them after a day"
+
+
+def test_who_waits_for_a_bucket_takes_over_after_a_repair(memory: str, tmp_path: Path) -> None:
+    with serving(memory, scratch=tmp_path / "first"):
+        pass
+    with command._writing(open_store(memory)) as lease:
+        assert lease.held
+        with running_server(memory, workers=1, scratch=tmp_path / "second") as url:
+            told = httpx.get(f"{url}/readyz", trust_env=False).json()
+            assert told["role"] == "waiting"
+            lease.close()
+            eventually(lambda: httpx.get(f"{url}/readyz", trust_env=False).json()["role"] == "writer", "it to write")
