@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, OptionError
-from ..target import check_integer
+from ..target import Limit, Tolerance, check_integer
 from .block_cache import BlockCache
 from .placement import Placement
 from .tile_grids import Box
@@ -56,10 +56,11 @@ class HeightField:
     scale : float, optional
         Metres upwards of one unit of the heights: -1 for depths in metres. None: as a compound CRS says, downward axes
         included; without one, as the unit in the metadata says; without that, 1.
-    error : float, optional
-        Metres that heights may be off: they are made from the fewest layers whose told maximum error is no larger, so
-        that fewer bytes are read. At the finest level none is further off. Heights of coarser levels are weighted means
-        of finer ones, whose errors are not told: they were at most 1.13 times as far off. 0: from everything.
+    error : float, str or Tolerance, optional
+        How far heights may be off, in metres, or relative to the range of all heights (``"0.1%"``): they are made from
+        the fewest layers whose told maximum error is no larger, so that fewer bytes are read. At the finest level none
+        is further off. Heights of coarser levels are weighted means of finer ones, whose errors are not told: they were
+        at most 1.13 times as far off. 0: from everything.
     cache : BlockCache, optional
         For decoded blocks; by default one of 64 MiB of its own.
     max_vertices : int, optional
@@ -77,7 +78,7 @@ class HeightField:
     InputError
         If it is no single block of heights, has no CRS or no position, or its unit is none of length.
     OptionError
-        If the scale is 0 or not finite, or the error is not 0 or more.
+        If the scale is 0 or not finite, or the error is no number of 0 or more.
     UnavailableError
         If pyproj is not installed.
     StreamError, TooLargeError
@@ -104,7 +105,7 @@ class HeightField:
         size: int,
         *,
         scale: float | None = None,
-        error: float = 0.0,
+        error: Limit = 0.0,
         cache: BlockCache | None = None,
         max_vertices: int | None = None,
     ) -> None:
@@ -118,7 +119,7 @@ class HeightField:
 
     @classmethod
     def open(
-        cls, path: str | Path, *, scale: float | None = None, error: float = 0.0, cache: BlockCache | None = None
+        cls, path: str | Path, *, scale: float | None = None, error: Limit = 0.0, cache: BlockCache | None = None
     ) -> HeightField:
         """Open a container in a file, which must not change; parameters and errors as of the class.
 
@@ -141,7 +142,7 @@ class HeightField:
             cache=cache,
         )
 
-    def with_options(self, *, scale: float | None = None, error: float = 0.0) -> HeightField:
+    def with_options(self, *, scale: float | None = None, error: Limit = 0.0) -> HeightField:
         """Return the field of the same container with this scale and error instead of its own; nothing is read again.
 
         Raises
@@ -155,11 +156,9 @@ class HeightField:
         field._choose(scale, error)
         return field
 
-    def _choose(self, scale: float | None, error: float) -> None:
+    def _choose(self, scale: float | None, error: Limit) -> None:
         """Set the scale and the error."""
-        if not (math.isfinite(error) and error >= 0):
-            raise OptionError(f"expected an error of 0 metres or more, got {error}")
-        self._error = error
+        self._error = Tolerance.of(error)
         self._metres = _metres_of(self._windows.metadata, self.placement.projection.vertical, scale)
 
     @property
@@ -267,8 +266,10 @@ class HeightField:
         )
         scale, offset = self._metres
         layers = None
-        if self._error:
-            error = self._error / abs(scale) if scale else math.inf
+        if self._error.value:
+            error = self._error.value / abs(scale) if scale else math.inf
+            if self._error.relative:
+                error = self._error.absolute(self._windows.header.extent)
             layers = self._windows.layers_within(error, level, (rows, columns))
 
         def decoded() -> NDArray[np.float32]:

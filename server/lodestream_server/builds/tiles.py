@@ -16,6 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from lodestream.errors import LodestreamError
+from lodestream.target import Tolerance
 
 from .answers import Refusal
 
@@ -52,8 +53,10 @@ class TileOrder(NamedTuple):
         Of the surface, in a document.
     encoding, image, size, nodata
         Of an image, see `lodestream.maps.web_tile`.
-    scale, error
+    scale : float or None
         Of the heights, see `lodestream.maps.HeightField`.
+    error : str
+        How far heights may be off, as `Tolerance` writes it.
     offset : float
         Added to the heights of a mesh, in metres.
     normals : bool
@@ -72,7 +75,7 @@ class TileOrder(NamedTuple):
     size: int = 256
     nodata: float = 0.0
     scale: float | None = None
-    error: float = 0.0
+    error: str = str(Tolerance(0))
     offset: float = 0.0
     normals: bool = False
     is_gzipped: bool = False
@@ -138,7 +141,7 @@ class _Fields:
         self._max_vertices = max_vertices
         self._open: OrderedDict[str, tuple[HeightField, int]] = OrderedDict()
 
-    def get(self, container: str, descriptor: int, *, scale: float | None, error: float) -> HeightField:
+    def get(self, container: str, descriptor: int, *, scale: float | None, error: str) -> HeightField:
         """Return a container as heights; it stays open for later requests, whatever their options."""
         from lodestream.maps import HeightField
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
+from urllib.parse import quote
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
 
 from lodestream.errors import NotFoundError
+from lodestream.target import Tolerance
 
 from ..access.access import Caller
 from ..access.scopes import Reader
@@ -52,8 +54,13 @@ _Scale = Annotated[
     Query(allow_inf_nan=False, description="metres upwards of one unit of the heights; by default as the surface says"),
 ]
 _Error = Annotated[
-    float,
-    Query(ge=0, le=20_000, description="metres that heights may be off: so fewer bytes of the surface are decoded"),
+    str,
+    Query(
+        pattern=r"^[0-9]{1,5}(\.[0-9]{0,12})?([eE][+-]?[0-9]{1,2})?%?$",
+        description="a number of metres, or 0.1% of the range of all heights, by which heights may be off: so fewer "
+        "bytes of the surface are decoded",
+        examples=["2.5", "0.1%"],
+    ),
 ]
 _Version = Annotated[str | None, Query(max_length=64, description="as a document names it; tiles with it never change")]
 
@@ -118,7 +125,7 @@ async def map_json(
     size: _Size = "256",
     scale: _Scale = None,
     nodata: _Height = 0.0,
-    error: _Error = 0.0,
+    error: _Error = "0",
 ) -> Response:
     """Return the TileJSON of a surface with a CRS: its bounds, its zooms and the address of its tiles.
 
@@ -127,7 +134,7 @@ async def map_json(
     place = f"{request.url.scheme}://{request.url.netloc}{request.url.path.removesuffix('/map.json')}"
     options: dict[str, Any] = {"encoding": encoding, "size": size}
     options |= {} if scale is None else {"scale": scale}
-    options |= {name: value for name, value in (("nodata", nodata), ("error", error)) if value}
+    options |= ({"nodata": nodata} if nodata else {}) | _allowed(error)
     query = "&".join(f"{name}={value}" for name, value in options.items())
     address = f"{place}/tiles/{{z}}/{{x}}/{{y}}.png?{query}&v={_version(found)}"
     name = _called(request, found)
@@ -149,7 +156,7 @@ async def tile(
     size: _Size = "256",
     nodata: _Height = 0.0,
     scale: _Scale = None,
-    error: _Error = 0.0,
+    error: _Error = "0",
     v: _Version = None,
 ) -> Response:
     """Return a tile in Web Mercator, y from the north; 404 where the surface does not reach.
@@ -157,7 +164,16 @@ async def tile(
     Heights are never drawn higher than they are: maps do that themselves.
     """
     order = TileOrder(
-        "tile", z, x, y, encoding=encoding, image=image, size=int(size), nodata=nodata, scale=scale, error=error
+        "tile",
+        z,
+        x,
+        y,
+        encoding=encoding,
+        image=image,
+        size=int(size),
+        nodata=nodata,
+        scale=scale,
+        error=_tolerance(error),
     )
     return await _made(request, parts, caller, found, order, f"image/{image}", version=v)
 
@@ -171,14 +187,14 @@ async def layer_json(
     offset: _Height = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,
-    error: _Error = 0.0,
+    error: _Error = "0",
 ) -> Response:
     """Return the layer.json of a surface with a CRS; CesiumJS takes the address of its folder, ``.../terrain``.
 
     `offset` lifts heights above the geoid to those above the ellipsoid, which globes draw: -100 to 85 m.
     """
-    options = {name: value for name, value in (("offset", offset), ("nodata", nodata), ("error", error)) if value}
-    options |= {} if scale is None else {"scale": scale}
+    options: dict[str, Any] = {name: value for name, value in (("offset", offset), ("nodata", nodata)) if value}
+    options |= _allowed(error) | ({} if scale is None else {"scale": scale})
     query = "".join(f"&{name}={value}" for name, value in options.items())
     address = f"{{z}}/{{x}}/{{y}}.terrain?v={_version(found)}{query}"
     order = TileOrder("layers", address=address, name=_called(request, found), scale=scale)
@@ -197,7 +213,7 @@ async def mesh(
     offset: _Height = 0.0,
     nodata: _Height = 0.0,
     scale: _Scale = None,
-    error: _Error = 0.0,
+    error: _Error = "0",
     v: _Version = None,
 ) -> Response:
     """Return a quantized mesh in the geographic scheme TMS, y from the south; 404 where the surface does not reach.
@@ -211,12 +227,22 @@ async def mesh(
         y,
         nodata=nodata,
         scale=scale,
-        error=error,
+        error=_tolerance(error),
         offset=offset,
         normals=_NORMALS in request.headers.get("accept", ""),
         is_gzipped=_takes_gzip(request.headers.get("accept-encoding", "")),
     )
     return await _made(request, parts, caller, found, order, _MESH, version=v)
+
+
+def _tolerance(error: str) -> str:
+    """Return an error in one spelling, so that a tile has one ETag."""
+    return str(Tolerance.parse(error))
+
+
+def _allowed(error: str) -> dict[str, str]:
+    """Return what the address of tiles says of the error; nothing of none."""
+    return {"error": quote(_tolerance(error))} if Tolerance.parse(error).value else {}
 
 
 def _takes_gzip(accepted: str) -> bool:

@@ -29,7 +29,7 @@ def container() -> bytes:
     return ls.encode(ls.Surface(heights, metadata=utm("EPSG:32633", 5e5, 5e6, 10) | {"scale": 0.1}))
 
 
-def opened(**options: float) -> tuple[HeightField, list[int]]:
+def opened(**options: float | str) -> tuple[HeightField, list[int]]:
     """A field, and the numbers of bytes that are read from now on."""
     data, lengths = container(), list[int]()
 
@@ -135,9 +135,24 @@ def test_tiles_of_mountains() -> None:
     assert mesh_tile(field.with_options(error=10.0), zoom, x, y) != mesh_tile(field, zoom, x, y)
 
 
-@pytest.mark.parametrize("error", [-1.0, float("nan"), float("inf")])
-def test_an_error_that_is_none_is_refused(error: float) -> None:
-    with pytest.raises(OptionError, match="expected an error of 0 metres or more"):
+def test_an_error_may_be_relative_to_the_range_of_all_heights() -> None:
+    """Whatever metres one unit of the heights has."""
+    field, _ = opened()
+    heights = every(field, field.levels)
+    extent = float(np.nanmax(heights) - np.nanmin(heights))
+    found = []
+    for percent in (0.1, 1.0, 10.0):
+        found.append(every(field.with_options(error=f"{percent}%"), field.levels))
+        np.testing.assert_array_equal(found[-1], every(field.with_options(error=percent / 100 * extent), field.levels))
+        relative = ls.Tolerance(percent / 100, relative=True)
+        in_feet = every(field.with_options(error=relative, scale=0.3048), field.levels)
+        np.testing.assert_allclose(in_feet, found[-1] * np.float32(0.3048), rtol=1e-6, atol=1e-3)
+    assert not np.array_equal(found[0], found[-1])
+
+
+@pytest.mark.parametrize("error", [-1.0, float("nan"), float("inf"), "much", "-1%"])
+def test_an_error_that_is_none_is_refused(error: float | str) -> None:
+    with pytest.raises(OptionError, match=r"expected an error of 0 or more|is not an error bound: write 0 or more"):
         opened(error=error)
 
 

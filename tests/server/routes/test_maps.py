@@ -112,6 +112,20 @@ def test_tiles_may_be_off_by_an_error(http: httpx.Client, hill: dict[str, Any], 
     assert mesh.content != maps.mesh_tile(field, 6, 66, 48, normals=False)
 
 
+def test_the_error_of_tiles_may_be_relative(http: httpx.Client, hill: dict[str, Any], field: Any) -> None:
+    off = field.with_options(error="5%")
+    for place in ("map.json", "terrain/layer.json"):
+        told = http.get(f"{hill['url']}/{place}", params={"error": "5.0%"}).raise_for_status().json()
+        assert "error=5%25" in told["tiles"][0]
+    (address,) = http.get(f"{hill['url']}/map.json", params={"error": "5%"}).json()["tiles"]
+    tile = http.get(address.format(z=7, x=66, y=45)).raise_for_status()
+    assert tile.content == maps.web_tile(off, 7, 66, 45) != maps.web_tile(field, 7, 66, 45)
+    other = http.get(f"{hill['url']}/tiles/7/66/45.png", params={"error": "0.5e1%", "encoding": "terrain-rgb"})
+    assert other.headers["etag"] == tile.headers["etag"]
+    refused = http.get(f"{hill['url']}/map.json", params={"error": "5 m"}).json()["detail"]
+    assert refused.startswith("The parameter error of the query must be a number of metres, or 0.1% of the range of")
+
+
 def test_documents_name_the_surface_as_lists_do_or_as_it_was_asked_for(http: httpx.Client) -> None:
     named = push(http, terrain(seed=5), filename="alps.lode", name="The Alps")
     http.put("/v1/names/alps", json={"surface": named["id"]}).raise_for_status()
@@ -165,7 +179,7 @@ def test_a_name_has_tiles_of_the_version_to_which_it_leads(http: httpx.Client, h
         ("tiles/7/66/45.png?scale=inf", (422, "bad-option")),
         ("tiles/7/66/45.png?error=-1", (422, "bad-option")),
         ("tiles/7/66/45.png?error=nan", (422, "bad-option")),
-        ("terrain/6/66/48.terrain?error=1e9", (422, "bad-option")),
+        ("terrain/6/66/48.terrain?error=much", (422, "bad-option")),
         ("map.json?encoding=jpeg", (422, "bad-option")),
         ("terrain/6/0/0.terrain", (404, "not-found")),
         ("terrain/40/0/0.terrain", (422, "bad-option")),
