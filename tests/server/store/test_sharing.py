@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from lodestream.errors import LodestreamError, NotFoundError
-from lodestream.stores import Store, StoreError, open_store
+from lodestream.stores import ConflictError, Store, StoreError, open_store
 from lodestream_server.problems import ReadOnlyError, StandbyError
 from lodestream_server.store import layout
 from lodestream_server.store.changes import ChangeReader
@@ -98,6 +99,69 @@ def test_readers_see_what_the_writer_does(server: Make, tmp_path: Path) -> None:
     with pytest.raises(NotFoundError):
         reader.surfaces.names.get("a")
     assert reader.listed == 1, "but for the first time nothing was listed"
+
+
+def test_a_reader_that_looks_at_any_moment_of_a_change_has_seen_it_afterwards(
+    server: Make, memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store: Any = open_store(memory)
+    looking = threading.Lock()
+
+    def look() -> None:
+        if looking.acquire(blocking=False):
+            try:
+                writer.surfaces.changes.write()
+                reader.tend()
+            finally:
+                looking.release()
+
+    def between(write: Callable[..., Any]) -> Callable[..., Any]:
+        def made(*given: Any, **named: Any) -> Any:
+            look()
+            result = write(*given, **named)
+            look()
+            return result
+
+        return made
+
+    writer, reader = server("writer", store=store), server("reader", writes=False)
+    writer.tend()
+    reader.tend()
+    for name in ("create", "replace", "put_file", "delete"):
+        monkeypatch.setattr(store, name, between(getattr(store, name)))
+    surfaces, everybody = writer.surfaces, lambda _: True
+    (one, files), (other, others) = upload(tmp_path, 0), upload(tmp_path, 1)
+    steps: list[Callable[[], object]] = [
+        lambda: surfaces.accept(one, files),
+        lambda: surfaces.begin(one.id),
+        lambda: surfaces.refused(one.id, "no surface"),
+        lambda: surfaces.retry(one.id),
+        lambda: build(surfaces, one, tmp_path),
+        lambda: surfaces.accept(other, others),
+        lambda: surfaces.names.point("a", one.id, None, everybody, 60.0),
+        lambda: surfaces.names.point("a", other.id, None, everybody, 0.0),
+        lambda: surfaces.names.expire(time.time() + 1.0),
+        lambda: surfaces.names.delete("a", everybody),
+        lambda: surfaces.accept(*upload(tmp_path, 0)),
+        lambda: surfaces.delete(one.id),
+        lambda: surfaces.delete(other.id),
+    ]
+    for number, step in enumerate(steps):
+        step()
+        look()
+        assert told(reader) == told(writer), number
+    assert reader.listed == 1, "but for the first time nothing was listed"
+    assert reader.states() == {}
+
+
+def told(server: Server) -> list[object]:
+    """What a server says of its surfaces and names, but for builds, of which only the writer knows."""
+    index = server.surfaces.index
+    surfaces = [
+        (it.manifest, it.state.replace("building", "queued"), it.reason, it.container)
+        for it in index.page((0.0, ""), 100)
+    ]
+    return [surfaces, [(it.name, it.surface) for it in index.names("", 100)]]
 
 
 def changes(server: Server, folder: Path) -> dict[str, Callable[[], object]]:
@@ -252,6 +316,43 @@ def test_two_that_both_believe_to_write_do_not_overwrite_each_other(server: Make
     first.surfaces.changes.write()
     second.surfaces.changes.write()
     assert new
+
+
+@pytest.mark.parametrize("change", ["point", "forget"])
+def test_a_name_that_another_writer_changes_meanwhile_is_not_overwritten(
+    server: Make, memory: str, clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+) -> None:
+    store: Any = open_store(memory)
+    first, second = server("first", store=store), server("second")
+    first.tend()
+    manifests = [upload(tmp_path, number) for number in range(3)]
+    for manifest, files in manifests:
+        first.surfaces.accept(manifest, files)
+    one, other, third = (manifest.id for manifest, _ in manifests)
+    everybody = lambda _: True  # noqa: E731
+    first.surfaces.names.point("a", one, None, everybody, 60.0)
+    second.tend()
+    clock.now += SECONDS + 1
+    second.tend()
+    first.lease._until = clock.now + 3600.0  # its clock stands
+    get = store.get
+
+    def read(key: str, *given: Any) -> Any:
+        found = get(key, *given)
+        if key == "names/a.json":
+            monkeypatch.setattr(store, "get", get)
+            if change == "point":
+                second.surfaces.names.point("a", other, None, everybody, 60.0)
+            else:
+                second.surfaces.names.delete("a", everybody)
+        return found
+
+    monkeypatch.setattr(store, "get", read)
+    with pytest.raises(ConflictError):
+        first.surfaces.names.point("a", third, None, everybody, 60.0)
+    second.surfaces.sync()
+    found = second.surfaces.index.find_name("a")
+    assert (found and found.surface) == (other if change == "point" else None)
 
 
 def test_bytes_that_nothing_refers_to_stay_for_a_day_in_case_another_server_refers_to_them(

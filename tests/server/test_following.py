@@ -1,0 +1,59 @@
+"""What a server of a bucket looks at again and again, whatever becomes of one look."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from lodestream.stores import Store, StoreError, open_store
+from lodestream_server.following import Following
+from lodestream_server.operation.settings import Settings
+from lodestream_server.store.changes import ChangeLog
+from tests.server.helpers import eventually
+from tests.stores.memory import memory
+
+__all__ = ["memory"]
+
+
+@pytest.fixture
+def store(memory: str) -> Store:
+    return open_store(memory)
+
+
+@pytest.mark.parametrize("error", [StoreError("no network"), RuntimeError("no network")], ids=["store", "fault"])
+def test_a_look_that_fails_is_repeated_and_the_others_go_on(
+    store: Store, error: Exception, caplog: pytest.LogCaptureFixture
+) -> None:
+    looks = Counter[str]()
+    log = ChangeLog(store)
+
+    def look(what: str) -> None:
+        looks[what] += 1
+        if looks[what] < 3:
+            raise error
+
+    def refresh(changed: tuple[str, ...]) -> None:
+        look("changes")
+
+    surfaces: Any = SimpleNamespace(
+        store=store, lease=object(), writes=False, sync=lambda: look("list"), refresh=refresh
+    )
+    access: Any = SimpleNamespace(look=lambda: look("tokens"))
+    following = Following(Settings(look_seconds=0.01, list_seconds=0.01), surfaces, access)
+    following.start()
+    try:
+        eventually(lambda: looks["list"] >= 4 and looks["tokens"] >= 4, "looks after failures")
+        log.add("a")
+        log.write()
+        listed = looks["list"]
+        eventually(lambda: looks["list"] > listed + 3, "the first change to be met")
+        log.add("b")
+        log.write()
+        eventually(lambda: looks["changes"] >= 3, "what has changed to be taken once it can be")
+    finally:
+        following.close()
+    for what in ("the tokens", "the bucket"):
+        assert any(what in record.message for record in caplog.records)
