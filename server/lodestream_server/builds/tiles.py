@@ -145,6 +145,7 @@ class _Fields:
         """Return a container as heights; it stays open for later requests, whatever their options."""
         from lodestream.maps import HeightField
 
+        self._let_go()
         if container in self._open:
             self._open.move_to_end(container)
             return self._open[container][0].with_options(scale=scale, error=error)
@@ -165,6 +166,13 @@ class _Fields:
         while len(self._open) > _OPEN:
             os.close(self._open.popitem(last=False)[1][1])
         return field
+
+    def _let_go(self) -> None:
+        """Close the files that were removed, which take room on the disk until then."""
+        for container, (_, file) in list(self._open.items()):
+            if not os.fstat(file).st_nlink:
+                os.close(file)
+                del self._open[container]
 
 
 def _made(field: HeightField, order: TileOrder) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,9 @@ import pytest
 
 import lodestream as ls
 from lodestream_server import running_server
+from lodestream_server.builds import tiles
+from lodestream_server.builds.answers import Refusal
+from lodestream_server.builds.tiles import MadeTile, TileOrder
 from tests.server.helpers import PATIENCE, hills, npy, problem, push
 
 pytest.importorskip("pyproj")
@@ -221,3 +225,29 @@ def test_a_surface_without_a_place_says_what_it_lacks(http: httpx.Client) -> Non
 def test_of_what_is_not_there_nothing_is_made(http: httpx.Client, tmp_path: Path) -> None:
     assert problem(http.get("/v1/surfaces/0123/map.json")) == (404, "not-found")
     assert problem(http.get("/v1/names/nobody/map.json")) == (404, "not-found")
+
+
+def test_files_that_were_removed_take_no_room_for_long(tmp_path: Path) -> None:
+    one, other = (tmp_path / name for name in ("one", "other"))
+    fields = tiles._Fields(1 << 20, 1 << 20)
+
+    def made(path: Path) -> MadeTile | Refusal:
+        with path.open("rb") as file:
+            return tiles.answer(fields, path.name, list(TileOrder("tile", 7, 66, 45)), file.fileno())
+
+    def held() -> set[str]:
+        links = (f"/proc/self/fd/{name}" for name in os.listdir("/proc/self/fd"))
+        return {Path(os.readlink(link)).name for link in links if os.path.lexists(link)} & {"one (deleted)"}
+
+    for number, path in enumerate((one, other)):
+        path.write_bytes(terrain(seed=number))
+    first = made(one)
+    assert isinstance(first, MadeTile)
+    one.unlink()
+    assert held()
+    assert made(other) != first
+    assert not held()
+    one.write_bytes(terrain())
+    assert made(one) == first
+    for _, descriptor in fields._open.values():
+        os.close(descriptor)
