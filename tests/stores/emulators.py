@@ -106,7 +106,8 @@ def _run(*command: str | Path, folder: Path) -> None:
 
 def _install_ministack(folder: Path) -> None:
     _run(sys.executable, "-m", "venv", folder, folder=folder)
-    pip: list[str | Path] = [folder / "bin" / "python", "-m", "pip", "--disable-pip-version-check"]
+    # By itself: what PYTHONPATH leads to now is not there when it runs.
+    pip: list[str | Path] = [folder / "bin" / "python", "-I", "-m", "pip", "--disable-pip-version-check"]
     _run(*pip, "install", "--quiet", "--requirement", HERE / "ministack.txt", folder=folder)
 
 
