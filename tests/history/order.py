@@ -64,10 +64,7 @@ PRESENT = frozenset(SPONTANEOUS) - {ABSENT}
 
 States: TypeAlias = frozenset[str]
 
-# What a step without an answer does: those that do the same are counted.
-_Does: TypeAlias = tuple[str, str | None]
-
-# More ways than clients that are answered have.
+# More ways than the clients of a test have with what is answered.
 _MANY = 400
 
 _REMEMBERED = 10_000
@@ -120,16 +117,26 @@ class Unexplained:
     possible: States
 
 
+class _Does(NamedTuple):
+    """What a step does."""
+
+    answered: bool
+    kind: str
+    value: str | None
+    observed: States
+
+
 class _Way(NamedTuple):
     """One way in which everything up to now may have happened."""
 
     states: States
     saved: States | None  # what the backup has met
     saving: bool
-    # Steps with an answer that have begun and have not taken effect: those that change something, and reads.
+    # Which of the steps that have begun and not ended have taken effect: those that change something and are answered,
+    # those that are not, and reads.
     writes: frozenset[int]
+    used: frozenset[int]
     reads: frozenset[int]
-    used: frozenset[int]  # steps without an answer that have taken effect, and may not do so again
 
 
 def later(states: States) -> States:
@@ -247,20 +254,21 @@ class _Register:
     taken effect on some of them, and only these are left.
 
     A way is as good as another one if whatever explains an answer on the other one does so on it: it leaves at least
-    the states of the other one, the same steps to take effect (of reads, which can only rule out states, none that the
-    other one does not have), and as many steps without an answer, for as long. Of two of these that do the same, the
-    one that may happen for the shorter time is used first.
+    the states of the other one, the same answered changes to take effect, no read (which can only rule out states)
+    that the other one has behind it, and as many changes without an answer, for as long. Of steps that do the same,
+    the one that ends first takes effect first.
     """
 
     def __init__(self, steps: Sequence[Step]) -> None:
         self._steps = steps
-        # By what is to take effect, and then by their states: only some of them can be as good.
+        # By the changes that have taken effect, and then by their states: only some of them can be as good.
         self._ways: dict[frozenset[int], dict[States, list[_Way]]] = {}
-        # Without an answer, by what they do; first the one that may happen for the shortest time.
-        self._unanswered: dict[_Does, list[int]] = {}
+        # What has begun and not ended, by what it does; the one that ends first comes first.
+        self._open: dict[_Does, list[int]] = {}
         self._again = False
         self._lasting: dict[frozenset[int], dict[_Does, list[float]]] = {}
-        self._add(_Way(frozenset({ABSENT}), None, False, frozenset(), frozenset(), frozenset()))
+        nothing = frozenset[int]()
+        self._add(_Way(frozenset({ABSENT}), None, False, nothing, nothing, nothing))
 
     def possible(self) -> States:
         """The states in which the surface can be now."""
@@ -268,43 +276,42 @@ class _Register:
 
     def begin(self, number: int) -> None:
         """From now on a step may take effect."""
-        step = self._steps[number]
-        if step.ended is None:
-            insort(self._unanswered.setdefault(_does(step), []), number, key=self._latest)
-        elif step.kind == "read":
-            self._set(way._replace(reads=way.reads | {number}) for way in self._all())
-        else:
-            self._set(way._replace(writes=way.writes | {number}) for way in self._all())
+        does = _does(self._steps[number])
+        insort(self._open.setdefault(does, []), number, key=lambda each: (self._end(each), each))
         self._follow(number)
 
     def end(self, number: int) -> bool:
         """From now on a step has taken effect, or never will if it has no answer; whether there is a way."""
-        step = self._steps[number]
+        step, one = self._steps[number], frozenset({number})
         if step.ended is None:
-            does = _does(step)
-            self._unanswered[does].remove(number)
-            if not self._unanswered[does]:
-                del self._unanswered[does]
-            self._again = self._again and bool(self._unanswered)
-            self._lasting.clear()
-            if any(number in way.used for way in self._all()):
-                self._set(way._replace(used=way.used - {number}) for way in self._all())
-            return True
-        left = [way for way in self._all() if number not in way.writes and number not in way.reads]
-        if left:
-            self._set(left)
-        return bool(left)
+            left = [way._replace(used=way.used - one) for way in self._all()]
+        elif step.kind == "read":
+            left = [way._replace(reads=way.reads - one) for way in self._all() if number in way.reads]
+        else:
+            left = [way._replace(writes=way.writes - one) for way in self._all() if number in way.writes]
+        if not left:
+            return False
+        does = _does(step)
+        self._open[does].remove(number)
+        if not self._open[does]:
+            del self._open[does]
+        self._again = self._again and self._some_unanswered()
+        self._lasting.clear()
+        self._set(left)
+        return True
 
     def mark(self, mark: Mark) -> None:
         """Something happens to all surfaces."""
-        self._set(_marked(way, mark) for way in self._all())
+        self._set([_marked(way, mark) for way in self._all()])
         self._follow()
+
+    def _some_unanswered(self) -> bool:
+        return any(not does.answered for does in self._open)
 
     def _all(self) -> list[_Way]:
         return [way for alike in self._ways.values() for ways in alike.values() for way in ways]
 
-    def _set(self, ways: Iterable[_Way]) -> None:
-        ways = list(ways)
+    def _set(self, ways: list[_Way]) -> None:
         self._ways = {}
         for way in ways:
             self._add(way)
@@ -329,40 +336,42 @@ class _Register:
         left = [(way, new) for way in self._all()]
         while left:
             way, only = left.pop()
-            for number in self._next(way) if only is None else [only]:
-                after = self._happened(way, number)
+            for number in self._next(way):
+                after = self._happened(way, number) if only in (None, number) else None
                 if after is not None and self._add(after):
                     left.append((after, None))
-            if not self._again and self._unanswered and len(self._all()) > _MANY:
+            if not self._again and len(self._all()) > _MANY and self._some_unanswered():
                 # As many ways as there are subsets of what was not answered could not be counted. From now on, until
                 # there is nothing more that has no answer, each of these may happen again and again: it is not found
                 # if one of them did so.
                 self._again = True
-                self._set(way._replace(used=frozenset()) for way in self._all())
+                self._set([way._replace(used=frozenset()) for way in self._all()])
                 left = [(way, None) for way in self._all()]
 
     def _next(self, way: _Way) -> Iterator[int]:
-        """What may take effect next; of several steps without an answer that do the same, one."""
-        yield from way.writes
-        yield from way.reads
-        for numbers in self._unanswered.values():
-            yield from itertools.islice((number for number in numbers if number not in way.used), 1)
+        """What may take effect next; of several steps that do the same, one."""
+        for does, numbers in self._open.items():
+            done = way.used if not does.answered else way.reads if does.kind == "read" else way.writes
+            yield from itertools.islice((number for number in numbers if number not in done), 1)
 
     def _happened(self, way: _Way, number: int) -> _Way | None:
         """The way on which a step has taken effect; None if it cannot have."""
-        step = self._steps[number]
+        step, one = self._steps[number], frozenset({number})
         states = apply(step, way.states)
-        if not states or number in way.used:
+        if not states:
             return None
         saved = way.saved | states if way.saving and way.saved is not None else way.saved
-        one = frozenset({number})
-        used = way.used | one if step.ended is None and not self._again else way.used
-        return _Way(states, saved, way.saving, way.writes - one, way.reads - one, used)
+        after = way._replace(states=states, saved=saved)
+        if step.ended is None:
+            return after if self._again else after._replace(used=way.used | one)
+        if step.kind == "read":
+            return after._replace(reads=way.reads | one)
+        return after._replace(writes=way.writes | one)
 
     def _as_good(self, way: _Way, other: _Way) -> bool:
-        """Whether one is as good as another that has the same to take effect, and no states that it does not have."""
+        """Whether one is as good as another on which the same changes have taken effect and no more states are left."""
         return (
-            way.reads <= other.reads
+            way.reads >= other.reads
             and (way.saved is None or other.saved is None or way.saved >= other.saved)
             and (way.used <= other.used or self._spares(way.used, other.used))
         )
@@ -384,17 +393,18 @@ class _Register:
             if len(self._lasting) > _REMEMBERED:
                 self._lasting.clear()
             found = self._lasting[used] = {}
-            for number in sorted(used, key=self._latest, reverse=True):
-                found.setdefault(_does(self._steps[number]), []).append(self._latest(number))
+            for number in sorted(used, key=self._end, reverse=True):
+                found.setdefault(_does(self._steps[number]), []).append(self._end(number))
         return found
 
-    def _latest(self, number: int) -> float:
-        latest = self._steps[number].latest
-        return math.inf if latest is None else latest
+    def _end(self, number: int) -> float:
+        step = self._steps[number]
+        end = step.latest if step.ended is None else step.ended
+        return math.inf if end is None else end
 
 
 def _does(step: Step) -> _Does:
-    return step.kind, step.value
+    return _Does(step.ended is not None, step.kind, step.value, step.observed)
 
 
 def _marked(way: _Way, mark: Mark) -> _Way:
