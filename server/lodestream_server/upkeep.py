@@ -40,6 +40,11 @@ class Upkeep:
     builder : Builder
     levels : LevelMaker
     partial_uploads : PartialUploads
+
+    Attributes
+    ----------
+    is_failing : bool
+        Whether the index could not be brought up to date the last time.
     """
 
     def __init__(
@@ -49,6 +54,7 @@ class Upkeep:
         self._builder = builder
         self._levels = levels
         self._partial_uploads = partial_uploads
+        self.is_failing = False
         self._lost, self._synced = asyncio.Event(), asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -80,6 +86,7 @@ class Upkeep:
                     _log.info("the index of the surfaces is made again")
                 elif not self._surfaces.is_current:
                     await asyncio.to_thread(self._surfaces.sync)
+                self.is_failing = False
                 self._synced.set()
                 if self._surfaces.writes:
                     await self._builder.resume()
@@ -90,7 +97,14 @@ class Upkeep:
                         await self._lost.wait()
                 self._lost.clear()
             except Exception as error:  # whatever it is, nobody else would do this work
-                _log.error("the index of the surfaces could not be brought up to date: %s", error)
+                self.is_failing = True
+                lease = self._surfaces.lease
+                holds = lease is not None and lease.held and not self._surfaces.writes
+                _log.error(
+                    "the index of the surfaces could not be brought up to date, which is tried again: %s%s",
+                    error,
+                    "; this server has the lease of the bucket, and nobody writes until then" if holds else "",
+                )
                 await asyncio.sleep(_AGAIN_SECONDS)
 
     def forget_levels(self, deleted: Surface) -> None:

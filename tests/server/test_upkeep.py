@@ -16,6 +16,9 @@ from lodestream.stores import Folder, StoreError
 from lodestream_server import running_server
 from lodestream_server.store.surfaces import Surfaces
 from tests.server.helpers import PATIENCE, eventually, hills, listed, npy, problem, push, settled
+from tests.stores.memory import memory
+
+__all__ = ["memory"]
 
 WORKERS = 3
 MADE = "the index of the surfaces is made again"
@@ -147,3 +150,26 @@ def test_a_server_is_ready_once_all_surfaces_are_known(tmp_path: Path, monkeypat
             assert http.get("/readyz").json()["index"] == "current"
     finally:
         go.set()
+
+
+def test_a_server_whose_bucket_cannot_be_listed_says_so(
+    memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("lodestream_server.upkeep._AGAIN_SECONDS", 0.01)
+
+    sync = Surfaces.sync
+
+    def unlisted(surfaces: Surfaces, progress: Callable[[int], None] = lambda _: None) -> int:
+        if surfaces.lease is not None and surfaces.lease.held:
+            raise StoreError("there is an odd key")
+        return sync(surfaces, progress)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Surfaces, "sync", unlisted)
+        with running_server(memory, scratch=tmp_path, workers=1) as url, client(url) as http:
+            eventually(lambda: http.get("/readyz").json()["index"] == "failing", "the list to fail")
+            eventually(lambda: "there is an odd key; this server has the lease" in caplog.text, "the log to say so")
+            assert http.get("/readyz").json()["role"] == "waiting"
+            broken.undo()
+            eventually(lambda: http.get("/readyz").json()["index"] == "current", "the list")
+            assert http.get("/readyz").json()["role"] == "writer"

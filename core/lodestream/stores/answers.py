@@ -20,6 +20,8 @@ _T = TypeVar("_T")
 
 _STATUS = re.compile(r"status code: (\d{3})\b", re.ASCII)
 _CODE = re.compile(r"<Code>([A-Za-z]{1,60})</Code>", re.ASCII)
+# Of an object in a list, as Rust writes a text: without control characters.
+_UNLISTED = re.compile(r'path: "((?:[^"\\\n]|\\.){1,200})')
 _RETRIED = re.compile(r"\bafter [1-9]\d* retries", re.ASCII)
 
 #: Codes of stores without the bucket or container itself.
@@ -172,6 +174,12 @@ def _words(name: str, text: str, status: int | None, code: str, known: str) -> s
         return f"the bucket is elsewhere ({known or 'redirected'}): set AWS_REGION to its region"
     if status in (401, 403) or code in _EXPIRED or name in ("PermissionDeniedError", "UnauthenticatedError"):
         return f"the store refuses access ({known or name}): {_CREDENTIALS}"
+    if name == "InvalidPathError":
+        key = _UNLISTED.search(text)
+        return (
+            f"it cannot be listed because of the object {key[1] if key else ''!a}, of whose key a part is empty, . or "
+            ".., or has a control character: delete that object with another program"
+        )
     if status is not None:
         return f"the store answers {known}"
     if "builder error" in text or name in ("UnknownConfigurationKeyError", "ValueError", "TypeError"):

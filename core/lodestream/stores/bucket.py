@@ -22,7 +22,15 @@ from ..errors import UnavailableError
 from .answers import RequestError, ask, check_process, wait_for
 from .blocks import Blocks, Extent
 from .connections import LONGEST_PAUSE, Limits, connected, endpoint_of, parsed
-from .errors import AbsentError, ConflictError, ExistsError, StoreError, UnacknowledgedError, UnfitStoreError
+from .errors import (
+    AbsentError,
+    ConflictError,
+    ExistsError,
+    OversizedError,
+    StoreError,
+    UnacknowledgedError,
+    UnfitStoreError,
+)
 from .headers import headers
 from .interface import SMALL, Entry, Progress, Tag
 from .keys import checked_key, checked_prefix, checked_small, is_key
@@ -104,10 +112,10 @@ class Bucket:
         found = self._ask(key, partial(self._read, self._at(key), most, tag))
         if found is None:
             return None
-        data, its_tag = found
+        data, its_tag = found[0], self._tag(found[1])
         if data is None:
-            raise StoreError(f"{self._named(key)}: expected at most {most:,} bytes")
-        return data, self._tag(its_tag)
+            raise OversizedError(f"{self._named(key)}: expected at most {most:,} bytes", its_tag)
+        return data, its_tag
 
     def create(self, key: str, data: bytes) -> Tag:
         """Write a small object if there is none, and return its tag."""

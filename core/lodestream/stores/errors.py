@@ -8,6 +8,7 @@
     ├── ConflictError                 the object has another tag than the one that was read
     ├── UnacknowledgedError           the write may have taken place, or may still
     ├── FullError                     there is no space left
+    ├── OversizedError                the object is larger than it may be
     └── UnfitStoreError               the store does not keep what it is told, so nothing may be kept in it
 
 A message names the store, the key and what can be done. None has a credential in it.
@@ -16,12 +17,14 @@ A message names the store, the key and what can be done. None has a credential i
 from __future__ import annotations
 
 from ..errors import LodestreamError
+from .interface import Tag
 
 __all__ = [
     "AbsentError",
     "ConflictError",
     "ExistsError",
     "FullError",
+    "OversizedError",
     "StoreError",
     "UnacknowledgedError",
     "UnfitStoreError",
@@ -58,6 +61,20 @@ class UnacknowledgedError(StoreError):
 
 class FullError(StoreError):
     """There is no space left, or a quota is used up; nothing was written."""
+
+
+class OversizedError(StoreError):
+    """An object that is read as a whole has more bytes than it may have.
+
+    Attributes
+    ----------
+    tag : Tag
+        Of the object, with which it may be replaced.
+    """
+
+    def __init__(self, message: str, tag: Tag) -> None:
+        super().__init__(message)
+        self.tag = tag
 
 
 class UnfitStoreError(StoreError):

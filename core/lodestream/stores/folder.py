@@ -25,7 +25,15 @@ from ..operating_system import (
     synchronise_file,
     synchronise_folder,
 )
-from .errors import AbsentError, ConflictError, ExistsError, FullError, StoreError, UnacknowledgedError
+from .errors import (
+    AbsentError,
+    ConflictError,
+    ExistsError,
+    FullError,
+    OversizedError,
+    StoreError,
+    UnacknowledgedError,
+)
 from .interface import SMALL, Entry, Progress, Tag
 from .keys import checked_key, checked_prefix, checked_small, is_key
 from .probe import try_out
@@ -50,6 +58,8 @@ _ABSENT = (FileNotFoundError, NotADirectoryError, IsADirectoryError)
 _HELD = (5, 32, 33)
 #: Seconds until a file that a program has open is given up, or a folder that others remove again and again.
 _PATIENCE = 1.0
+# Hexadecimal digits of a tag.
+_TAG = 32
 
 
 class Folder:
@@ -82,15 +92,24 @@ class Folder:
         try:
             with self._opened(key, path) as file:
                 data = file.read(most + 1)
+                if len(data) <= most:
+                    return data, _tag(data)
+                whole = sha256(data)
+                while piece := file.read(_PIECE):
+                    whole.update(piece)
         except OSError as error:
             self._refuse(key, error)
-        if len(data) > most:
-            raise StoreError(f"{self.describe()}: {key}: expected at most {most:,} bytes")
-        return data, _tag(data)
+        tag = Tag(whole.hexdigest()[:_TAG])
+        raise OversizedError(f"{self.describe()}: {key}: expected at most {most:,} bytes", tag)
 
     def get_if(self, key: str, tag: Tag | None, most: int = SMALL) -> tuple[bytes, Tag] | None:
         """Read a small object and its tag; return None if it is still the one with this tag."""
-        data, there = self.get(key, most)
+        try:
+            data, there = self.get(key, most)
+        except OversizedError as error:
+            if error.tag == tag:
+                return None
+            raise
         return None if there == tag else (data, there)
 
     def create(self, key: str, data: bytes) -> Tag:
@@ -260,6 +279,8 @@ class Folder:
     def _tag_of(self, key: str) -> Tag | None:
         try:
             return self.get(key)[1]
+        except OversizedError as error:
+            return error.tag
         except AbsentError:
             return None
 
@@ -455,7 +476,7 @@ class FileBlob:
 
 
 def _tag(data: bytes) -> Tag:
-    return Tag(sha256(data).hexdigest()[:32])
+    return Tag(sha256(data).hexdigest()[:_TAG])
 
 
 def _is_held(error: OSError) -> bool:

@@ -118,8 +118,10 @@ class Store(Protocol):
         ------
         AbsentError
             If there is none.
+        OversizedError
+            If it is larger.
         StoreError
-            If it is larger, or the store cannot be read.
+            If the store cannot be read.
         InputError
             If the key cannot be one; so do all methods below.
         """
@@ -142,8 +144,10 @@ class Store(Protocol):
         ------
         AbsentError
             If there is none.
+        OversizedError
+            If it is larger.
         StoreError
-            If it is larger, or the store cannot be read.
+            If the store cannot be read.
         """
         ...
 

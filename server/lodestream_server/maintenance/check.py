@@ -43,7 +43,7 @@ def require_data(store: Store) -> None:
         if next(iter(store.entries(prefix)), None) is not None:
             return
     try:
-        store.get(IDENTITY)
+        layout.read(store, IDENTITY)
     except AbsentError:
         raise LodestreamError(f"expected the data of a server, with {IDENTITY}, got {store.describe()}") from None
 
@@ -116,7 +116,7 @@ class _Judge:
     def _identify(self) -> None:
         # It only tells an index of other data from the one of these.
         try:
-            tag = self._store.get(IDENTITY)[1]
+            tag = layout.read(self._store, IDENTITY)[1]
         except AbsentError:
             establish(self._store)
         else:
@@ -167,7 +167,7 @@ class _Judge:
         """Write the description of a container again; the old one alone has a thumbnail, and who vouches for errors."""
         assert it.container is not None
         key = layout.built_key(it.id)
-        data, tag = self._store.get(key)
+        data, tag = layout.read(self._store, key)
         built = layout.parse(Built, key, data)
         errors = it.errors if it.errors in _vouchers(it) else TOLD if it.upload_kind == CONTAINER else None
         with self._store.open(layout.container_key(it.container)) as blob:

@@ -150,7 +150,7 @@ class Facts:
 
     def _small(self, kind: type[_Small], key: str) -> _Small | DamagedObjectError | StoreError:
         try:
-            return layout.parse(kind, key, self._store.get(key)[0])
+            return layout.parse(kind, key, layout.read(self._store, key)[0])
         except (DamagedObjectError, StoreError) as error:
             return error
 

@@ -309,10 +309,10 @@ class Readiness(BaseModel):
     )
 
     status: Literal["ready", "starting"]
-    index: Literal["current", "being brought up to date", "being made again"] = Field(
-        description="what is known of the surfaces: being brought up to date with the data folder, so that what was "
-        "stored or deleted there while no server ran is not told right yet; or being made again because it was lost, "
-        "while whatever is about surfaces is answered 503"
+    index: Literal["current", "being brought up to date", "failing", "being made again"] = Field(
+        description="what is known of the surfaces: being brought up to date with the data, so that what was stored or "
+        "deleted there while no server ran is not told right yet; failing, if that cannot be done now, and the log "
+        "says why; or being made again because it was lost, while whatever is about surfaces is answered 503"
     )
     role: Literal["writer", "reader", "waiting"] = Field(
         description="reader: it only reads; waiting: another server writes to the bucket, and uploads are answered 503"

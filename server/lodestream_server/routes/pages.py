@@ -98,7 +98,8 @@ async def get_health() -> Response:
 async def get_readiness(parts: Parts) -> Response:
     """Return whether processes can start and all surfaces are known. Before that uploads wait, and all else works."""
     surfaces = parts.surfaces
-    index = "current" if surfaces.is_current else "being brought up to date"
+    behind = "failing" if parts.upkeep.is_failing else "being brought up to date"
+    index = "current" if surfaces.is_current else behind
     index = "being made again" if surfaces.is_lost else index
     builder = parts.builder
     told = {"index": index, **_role(surfaces), "confinement": builder.confinement, "missing": builder.missing}

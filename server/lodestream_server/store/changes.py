@@ -133,7 +133,7 @@ class ChangeLog:
 
     def _read(self) -> tuple[Changes | None, Tag] | None:
         try:
-            data, tag = self._store.get(CHANGES)
+            data, tag = layout.read(self._store, CHANGES)
         except AbsentError:
             return None
         try:
@@ -171,7 +171,7 @@ class ChangeReader:
             If the store cannot be read.
         """
         try:
-            found = self._store.get_if(CHANGES, self._tag)
+            found = layout.read_if(self._store, CHANGES, self._tag)
         except AbsentError:  # no server has written yet
             return
         if found is None:

@@ -47,7 +47,7 @@ def read_identity(store: Store) -> Identity:
     DamagedObjectError
         If it cannot be read.
     """
-    identity = layout.parse(Identity, IDENTITY, store.get(IDENTITY)[0])
+    identity = layout.parse(Identity, IDENTITY, layout.read(store, IDENTITY)[0])
     if identity.version != layout.VERSION:
         raise InputError(
             f"expected data of version {layout.VERSION} in {store.describe()}, got version {identity.version}: "
@@ -58,7 +58,7 @@ def read_identity(store: Store) -> Identity:
 
 def _published(store: Store) -> bool:
     try:
-        store.get("view.json")
+        layout.read(store, "view.json")
     except AbsentError:
         return False
     return True

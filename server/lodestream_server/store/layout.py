@@ -39,6 +39,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from lodestream.container.series import SERIES, place_of
 from lodestream.errors import InputError, LodestreamError
+from lodestream.stores import OversizedError, Store, Tag
 from lodestream.stores.keys import is_key
 
 __all__ = [
@@ -74,6 +75,8 @@ __all__ = [
     "name_of",
     "new_write",
     "parse",
+    "read",
+    "read_if",
     "sha256_of",
     "upload_key",
 ]
@@ -402,6 +405,30 @@ def dump(small: Identity | Manifest | Built | Name | Writer | Changes) -> bytes:
     if info:
         body += _INFO + info + b"\n"
     return body + b', "check": "%08x"}' % zlib.crc32(body)
+
+
+def read(store: Store, key: str) -> tuple[bytes, Tag]:
+    """Read the bytes of a small object, and its tag; of one that is too large to be one none, so that `parse` tells it.
+
+    Raises
+    ------
+    AbsentError
+        If there is none.
+    StoreError
+        If the store cannot be read.
+    """
+    try:
+        return store.get(key)
+    except OversizedError as error:
+        return b"", error.tag
+
+
+def read_if(store: Store, key: str, tag: Tag | None) -> tuple[bytes, Tag] | None:
+    """Read the same unless it is still the object that was read with a tag: then return None."""
+    try:
+        return store.get_if(key, tag)
+    except OversizedError as error:
+        return b"", error.tag
 
 
 def parse(kind: type[T], key: str, data: bytes) -> T:

@@ -143,7 +143,7 @@ class Lease:
     def _look(self, begun: float) -> bool:
         """Look what is there; return whether it may be taken."""
         try:
-            found = self._store.get_if(WRITER, self._tag)
+            found = layout.read_if(self._store, WRITER, self._tag)
         except AbsentError:
             self._tag, self._there, self._until = None, None, -math.inf
             return True

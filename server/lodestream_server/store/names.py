@@ -303,7 +303,7 @@ class Names:
         """Return a name and its tag, and tell the index; None if there is none, or it cannot be read."""
         name = found = None
         try:
-            data, tag = self._store.get(key)
+            data, tag = layout.read(self._store, key)
             name = layout.parse(Name, key, data)
             found = name, tag
         except AbsentError:
@@ -326,7 +326,7 @@ class Names:
             If it belongs to another owner.
         """
         try:
-            data, tag = self._store.get(key)
+            data, tag = layout.read(self._store, key)
         except AbsentError:
             return None, None
         try:

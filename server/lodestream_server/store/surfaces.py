@@ -329,7 +329,7 @@ class Surfaces:
         try:
             self.store.create(key, data)
         except ExistsError:
-            there, tag = self.store.get(key)
+            there, tag = layout.read(self.store, key)
             try:
                 known = layout.parse(Manifest, key, there)
             except DamagedObjectError as error:
@@ -428,7 +428,7 @@ class Surfaces:
     def _read_built(self, manifest: Manifest) -> tuple[Built, Tag] | None:
         key = layout.built_key(manifest.id)
         try:
-            data, tag = self.store.get(key)
+            data, tag = layout.read(self.store, key)
         except AbsentError:
             return None
         built = layout.parse(Built, key, data)
@@ -544,7 +544,7 @@ class Surfaces:
             tag = self.store.create(key, data)
         except ExistsError:
             # Of another manifest, of another version of the format, of a failure before a retry, or damaged.
-            there, old = self.store.get(key)
+            there, old = layout.read(self.store, key)
             tag = self.store.replace(key, data, old)
             with suppress(DamagedObjectError):
                 container = layout.parse(Built, key, there).container
@@ -742,7 +742,7 @@ class Surfaces:
         """Read what the store has of a surface; None if there is none."""
         key = layout.manifest_key(surface)
         try:
-            manifest = layout.parse(Manifest, key, self.store.get(key)[0])
+            manifest = layout.parse(Manifest, key, layout.read(self.store, key)[0])
         except AbsentError:
             return None
         except DamagedObjectError as error:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from urllib.parse import quote
 
 import obstore
 import pytest
@@ -229,6 +230,26 @@ def test_objects_of_other_programs_are_not_listed(s3: Emulator) -> None:
         connection.close()
     assert [entry.key for entry in store.entries("")] == ["a/b", "marker"]
     assert [entry.key for entry in store.entries("a/")] == ["a/b"]
+
+
+@pytest.mark.sweep(2)
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("a//x", "a//x"), ("a/../x", "a/../x"), ("a/./x", "a/./x"), ("a/b\nc", r"a/b\\nc"), ('a/"\x7f', r'a/\\"\\u{7f}')],
+)
+def test_an_object_of_another_program_that_cannot_be_listed_is_named(s3: Emulator, name: str, told: str) -> None:
+    store = open_store(s3.address())
+    store.create("a/b", b"1")
+    prefix = store.describe().removeprefix("s3://tests/")
+    connection = http.client.HTTPConnection("127.0.0.1", s3.port, timeout=PATIENCE)
+    connection.request("PUT", f"/tests/{prefix}/{quote(name)}", body=b"")
+    assert connection.getresponse().status == 200
+    connection.close()
+    with pytest.raises(StoreError) as refused:
+        list(store.entries("a/"))
+    assert f"because of the object '{prefix}/{told}', of whose key a part is empty" in str(refused.value)
+    assert "delete that object" in str(refused.value)
+    assert store.get("a/b")[0] == b"1"
 
 
 def test_stores_of_one_bucket_do_not_see_each_other(s3: Emulator) -> None:

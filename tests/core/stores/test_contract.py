@@ -19,8 +19,10 @@ from lodestream.stores import (
     ConflictError,
     Entry,
     ExistsError,
+    OversizedError,
     Store,
     StoreError,
+    Tag,
 )
 
 from .places import PLACES, Place
@@ -238,12 +240,28 @@ def test_an_entry_has_another_tag_after_a_change(store: Store) -> None:
 def test_more_bytes_than_a_reader_takes_are_refused(store: Store, tmp_path: Path) -> None:
     store.create("a", bytes(1000))
     assert len(store.get("a", most=1000)[0]) == 1000
-    with pytest.raises(StoreError, match="at most 999 bytes"):
+    with pytest.raises(OversizedError, match="at most 999 bytes") as found:
         store.get("a", most=999)
+    assert found.value.tag == store.get("a")[1]
+    assert store.get_if("a", found.value.tag, most=999) is None
     with pytest.raises(InputError, match="at most 16,777,216 bytes"):
         store.create("b", bytes(SMALL + 1))
     with pytest.raises(InputError, match="at most 16,777,216 bytes"):
         store.replace("a", bytes(SMALL + 1), store.get("a")[1])
+
+
+def test_an_object_that_is_too_large_for_a_small_one_can_be_replaced_and_deleted(store: Store, tmp_path: Path) -> None:
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(SMALL + 1)
+    store.put_file("a", tmp_path / "large")
+    with pytest.raises(ExistsError):
+        store.create("a", b"1")
+    with pytest.raises(OversizedError) as found:
+        store.get("a")
+    with pytest.raises(ConflictError):
+        store.replace("a", b"1", Tag("another"))
+    tag = store.replace("a", b"1", found.value.tag)
+    assert store.get("a") == (b"1", tag)
 
 
 BAD_KEYS = ("", "/a", "a/", "a//b", "..", "a/../b", ".", "a/.b", ".lodestream/lock", "a.", "a b", "ä", "a\\b", "a:b",

@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 
 from lodestream.errors import LodestreamError, NotFoundError
-from lodestream.stores import ConflictError, Store, StoreError, open_store
-from lodestream_server.problems import ReadOnlyError, StandbyError
+from lodestream.stores import SMALL, ConflictError, Store, StoreError, open_store
+from lodestream_server.problems import DamagedNameError, ReadOnlyError, StandbyError
 from lodestream_server.store import layout
 from lodestream_server.store.changes import ChangeReader
+from lodestream_server.store.layout import DamagedObjectError
 from lodestream_server.store.lease import Lease
 from lodestream_server.store.surfaces import Surfaces
 
@@ -435,3 +436,37 @@ def test_a_bucket_that_fails_while_it_is_read_leaves_the_index_as_it_was(
     assert reader.states() == {}
     reader.tend()
     assert reader.states() == {layout.id_of(layout.manifest_key(f"{0:020x}")): "queued"}
+
+
+def test_an_object_that_is_too_large_counts_as_damaged_and_stops_nobody(
+    server: Make, clock: Clock, tmp_path: Path
+) -> None:
+    writer, reader = server("writer"), server("reader", writes=False)
+    writer.tend()
+    manifest, files = upload(tmp_path, 0)
+    writer.surfaces.accept(manifest, files)
+    build(writer.surfaces, manifest, tmp_path)
+    store, at = writer.surfaces.store, layout.manifest_key(f"{7:020x}")
+    for key in (at, layout.built_key(manifest.id), layout.name_key("large"), "changes.json", "writer.json"):
+        with (tmp_path / "large").open("wb") as file:
+            file.truncate(SMALL + 1)
+        store.put_file(key, tmp_path / "large")
+    reader.tend()
+    assert reader.states() == {manifest.id: "queued"}
+    clock.now += SECONDS + 1
+    for _ in range(2):  # a look, and what follows after as long as a lease lasts
+        writer.lease.tend()
+        clock.now += SECONDS
+    writer.tend()
+    assert writer.surfaces.writes
+    with pytest.raises(DamagedNameError):
+        writer.surfaces.names.get("large")
+    with pytest.raises(DamagedObjectError, match="nothing is removed"):
+        writer.surfaces.collect()
+    build(writer.surfaces, manifest, tmp_path)
+    writer.tend()
+    reader.tend()
+    assert writer.states() == reader.states() == {manifest.id: "ready"}
+    writer.surfaces.names.point("large", manifest.id, None, lambda _: True, 60.0)
+    store.delete([at])
+    writer.surfaces.collect()
