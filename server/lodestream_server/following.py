@@ -65,7 +65,8 @@ class Following:
             ("the bucket", settings.list_seconds, surfaces.sync),
         )
         self._threads: list[threading.Thread] = []
-        self._asked = Threads(1)
+        self._one_at_a_time = threading.Lock()
+        self._asked = Threads(2)  # what has changed may be much
         self._coming: dict[str, asyncio.Task[None]] = {}  # looks that have not begun
         self._lately: dict[str, _Look] = {}
 
@@ -101,14 +102,20 @@ class Following:
                 _log.exception("%s could not be looked at", what)
 
     def _follow(self) -> None:
-        if not self._surfaces.writes:
-            self._changes.look(lambda what: self._surfaces.sync() if what is None else self._surfaces.refresh(what))
+        with self._one_at_a_time:
+            if not self._surfaces.writes:
+                self._changes.look(lambda what: self._surfaces.sync() if what is None else self._surfaces.refresh(what))
 
     async def look_for(self, what: str) -> None:
-        """Read a surface, by its id, or a name, by its key, from the bucket: somebody asks for what is not known here.
+        """Look in the bucket for what somebody asks for and is not known here.
 
         A server that writes knows everything. Whoever asks gets a look that begins after that, so it finds whatever was
         acknowledged before. Where there are too many there is none: then this server sees it when it follows.
+
+        Parameters
+        ----------
+        what : str
+            The id of a surface, the key of a name; or `layout.CHANGES` for anything that the writer has told of.
 
         Raises
         ------
@@ -138,9 +145,16 @@ class Following:
             await asyncio.gather(asyncio.wrap_future(last.answer), return_exceptions=True)
             await asyncio.sleep(last.begun + _BETWEEN - time.monotonic())
         del self._coming[what]
-        look = self._lately[what] = _Look(time.monotonic(), self._asked.submit(self._surfaces.refresh, (what,)))
+        look = self._lately[what] = _Look(time.monotonic(), self._asked.submit(self._look, what))
         await asyncio.wrap_future(look.answer)
+
+    def _look(self, what: str) -> None:
+        if what == layout.CHANGES:
+            self._follow()
+        else:
+            self._surfaces.refresh((what,))
 
 
 def _is_key(what: str) -> bool:
-    return layout.id_of(layout.manifest_key(what)) is not None or layout.name_of(what) is not None
+    named = layout.id_of(layout.manifest_key(what)) or layout.name_of(what)
+    return what == layout.CHANGES or named is not None

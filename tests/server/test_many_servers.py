@@ -137,8 +137,19 @@ def test_a_reader_that_has_not_followed_yet_looks_for_what_it_is_asked_for(site:
         stream.send(Open(Target(level=0), credit=1 << 20))
         assert data_of(stream.until_end())
     assert [states(reader) for reader in readers] == [{uploaded["id"]: "ready"}] * 3
+    other = push(first, npy(hills(seed=2)))
+    eventually(
+        lambda: readers[0].get(f"/v1/containers/{other['container_sha256']}.lode").status_code == 200,
+        "the writer to tell of its container",
+    )
     first.delete("/v1/names/hill").raise_for_status()
     first.delete(place).raise_for_status()
+    gets.clear()
+    unknown = [f"/v1/containers/{number:064x}.lode" for number in range(16)]
+    with ThreadPoolExecutor(8) as threads:
+        assert set(threads.map(lambda path: readers[0].get(path).status_code, unknown)) == {404}
+    assert 0 < gets.count("data/changes.json") < 16, "what the writer has told answers all of them"
+    assert not any("containers/00" in path for path in gets)
     gets.clear()
     strange = [f"/v1/surfaces/{number:020x}" for number in range(100)]
     asked = [*strange, "/v1/surfaces/nothing", "/v1/names/nobody"]

@@ -17,6 +17,7 @@ from ..access.scopes import READ
 from ..problems import BusyError, responses
 from ..store.containers import Containers
 from ..store.index import Surface
+from ..store.layout import CHANGES
 from . import descriptions
 from .byte_ranges import sort_out
 from .routing import Parts, State, caching, matches, readable
@@ -72,6 +73,8 @@ async def container_of(request: Request, parts: State, surface: Surface) -> Resp
 )
 async def get_container(request: Request, parts: Parts, sha256: str) -> Response:
     """Return a container. It never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
+    if not parts.surfaces.index.uses_container(sha256):  # of which surface it is, the bucket does not say
+        await parts.following.look_for(CHANGES)
     return await _sent(request, parts, sha256, {"cache-control": caching(parts, forever=True)})
 
 
