@@ -258,7 +258,7 @@ def test_what_does_not_exist_is_named(http: httpx.Client, surface: dict[str, Any
     for path, words in (
         ("/levels/99", f"0 to {finest}"),
         ("/levels/-1", f"0 to {finest}"),
-        ("/levels/x", "integer"),
+        ("/levels/x", "a whole number"),
         ("/levels/1?format=off", "to be one of npy, "),
     ):
         answer = http.get(surface["url"] + path)
