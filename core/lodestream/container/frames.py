@@ -203,8 +203,10 @@ class FrameReader:
             consumed = memoryview(self._data)[self._place : self._place + length]
             self._place += length
         else:
-            consumed = bytes(self._data[:length])
-            del self._data[:length]  # without a copy of what is left
+            # What is left is the end of one call's bytes; what is taken may be as long as the file, and is not copied.
+            taken, self._data, self._place = self._data, bytes(memoryview(self._data)[length:]), 0
+            del taken[length:]
+            consumed = memoryview(taken).toreadonly()
         self._offset += length
         return consumed
 

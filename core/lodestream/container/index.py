@@ -347,9 +347,9 @@ def _parse_units(
     fields: FieldReader, first: int, units: int, channels: int, at: list[int], segments: list[list[Segment]]
 ) -> None:
     """Parse the units of a page; ``at`` holds the offset of the next segment of each layer, and is updated."""
-    unit = 0
+    unit, layers, data = 0, len(at), bytes(fields.data)
     while fields.left:
-        start, count = fields.at, fields.varint(len(at))
+        start, count = fields.at, fields.varint(layers)
         if not count:
             unit += 1 + fields.varint(units)
             continue
@@ -358,21 +358,32 @@ def _parse_units(
         remaining = 2 * top - 1
         if unit >= units or not 1 <= top <= COEFFICIENT_BITS:
             raise CorruptStreamError(f"expected one of {units} units and 1 to 28 planes, got {unit}, {top}", start)
-        for _ in range(count):
-            code = fields.byte()
-            passes, skip = (code & 7) + 1, code >> 3
-            if passes > _MAX_SHORT_PASSES:
-                passes += fields.varint(2 * COEFFICIENT_BITS)
-            if skip == _MAX_SHORT_SKIP:
-                skip += fields.varint(len(at))
-            layer, remaining = layer + 1 + skip, remaining - passes
-            length = fields.varint()
-            (check,) = fields.unpack("H")
-            if layer >= len(at) or remaining < 0 or not length:
-                raise CorruptStreamError(f"expected passes and layers of unit {first + unit}, got others", start)
-            place = ByteRange(at[layer], length)
-            segments[layer].append(Segment(layer, tile, channel, top, passes, place, int(check)))
-            at[layer] += length
+        # There are many segments: what a field nearly always is, one byte, is read without a call.
+        place = fields.place
+        try:
+            for _ in range(count):
+                code, length = data[place], data[place + 1]
+                place += 1
+                passes, skip = (code & 7) + 1, code >> 3
+                if passes > _MAX_SHORT_PASSES or skip == _MAX_SHORT_SKIP or length > 127:
+                    fields.place = place
+                    if passes > _MAX_SHORT_PASSES:
+                        passes += fields.varint(2 * COEFFICIENT_BITS)
+                    if skip == _MAX_SHORT_SKIP:
+                        skip += fields.varint(layers)
+                    length, place = fields.varint(), fields.place
+                else:
+                    place += 1
+                check = data[place] | data[place + 1] << 8
+                place += 2
+                layer, remaining = layer + 1 + skip, remaining - passes
+                if layer >= layers or remaining < 0 or not length:
+                    raise CorruptStreamError(f"expected passes and layers of unit {first + unit}, got others", start)
+                segments[layer].append(Segment(layer, tile, channel, top, passes, ByteRange(at[layer], length), check))
+                at[layer] += length
+        except IndexError:
+            raise CorruptStreamError("expected 1 more bytes, got 0", fields.offset + len(data)) from None
+        fields.place = place
         unit += 1
     if unit > units:
         raise CorruptStreamError(f"expected {units} units, got {unit}", fields.at)
@@ -392,8 +403,8 @@ def _parse_chunks(pages: list[FieldReader], header: Header, residual: ByteRange)
         at = first
         for _ in range(min(PAGE * header.channels, count - len(chunks))):
             length = fields.varint(residual.length)
-            (check,) = fields.unpack("H") if length else (0,)
-            chunks.append(Chunk(ByteRange(at, length), int(check)))
+            check = int.from_bytes(fields.take(2), "little") if length else 0
+            chunks.append(Chunk(ByteRange(at, length), check))
             at += length
         fields.end()
     if at != end:

@@ -39,8 +39,7 @@ __all__ = [
 JointChanges = tuple[tuple[Runs, Runs], tuple[Runs, Runs]]
 
 
-@dataclass(frozen=True, order=True, slots=True)
-class ByteRange:
+class ByteRange(NamedTuple):
     """Bytes ``offset`` to ``offset + length`` of a container."""
 
     offset: int
@@ -336,8 +335,7 @@ class LevelRecord:
         return Errors(self.rms, self.max_error, self.channels)
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
+class Segment(NamedTuple):
     """A run of ``passes`` coding passes that one tile of one channel adds in one layer.
 
     ``top`` is the number of bit-planes of the tile, told with its first segment and repeated here; ``check`` is the
@@ -353,8 +351,7 @@ class Segment:
     check: int
 
 
-@dataclass(frozen=True, slots=True)
-class Chunk:
+class Chunk(NamedTuple):
     """What corrects one channel in one window of a block; ``check`` is the lower half of the CRC-32 of its bytes."""
 
     range: ByteRange

@@ -81,6 +81,9 @@ class MemoryStore:
 
     def read(self, offset: int, length: int) -> bytes:
         """Return stored bytes."""
+        for start, data in self._slices:
+            if start <= offset and offset + length <= start + len(data):
+                return data[offset - start : offset - start + length]  # without a copy if this is all of it
         joined = bytearray(length)
         for start, data in self._slices:
             first, last = max(start, offset), min(start + len(data), offset + length)

@@ -113,7 +113,7 @@ def with_metadata(data: bytes, change: Callable[[dict[str, Any]], None]) -> byte
             payload[:] = serialized
 
     length = len(sections.section(sections.METADATA, serialized))
-    moved = replace(index, metadata=replace(index.metadata, length=length))
+    moved = replace(index, metadata=index.metadata._replace(length=length))
     return rewritten(data, rewrite, moved)
 
 

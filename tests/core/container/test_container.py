@@ -423,30 +423,30 @@ def test_noise_in_place_of_every_segment_still_makes_pictures() -> None:
 def test_an_index_that_lies_is_corrupt() -> None:
     container, index = contained("small")
     assert_equal(index_of(with_index(container, index)), index)
-    first, large = index.segments[0], replace(index.segments[0].range, length=10**6)
+    first, large = index.segments[0], index.segments[0].range._replace(length=10**6)
     lies = [
         replace(
             index,
             layers=index.layers[:-1],
             segments=tuple(s for s in index.segments if s.layer < len(index.layers) - 1),
         ),
-        replace(index, segments=(replace(first, range=large), *index.segments[1:])),
-        replace(index, segments=(replace(first, top=29), *index.segments[1:])),
-        replace(index, segments=(replace(first, top=0), *index.segments[1:])),
-        replace(index, segments=(replace(first, passes=2 * first.top), *index.segments[1:])),
+        replace(index, segments=(first._replace(range=large), *index.segments[1:])),
+        replace(index, segments=(first._replace(top=29), *index.segments[1:])),
+        replace(index, segments=(first._replace(top=0), *index.segments[1:])),
+        replace(index, segments=(first._replace(passes=2 * first.top), *index.segments[1:])),
         replace(index, levels=index.levels[:-1]),
         replace(index, header=replace(index.header, length=index.header.length + 1)),
         replace(index, optional=(OptionalSection(200, ByteRange(index.layers[1].offset + 1, 9)),)),
         replace(index, optional=(OptionalSection(9, ByteRange(index.layers[1].offset, 9)),)),
         replace(index, residual=None),
-        replace(index, metadata=replace(index.metadata, length=5)),
+        replace(index, metadata=index.metadata._replace(length=5)),
     ]
     for lie in lies:
         with pytest.raises(CorruptStreamError):
             index_of(with_index(container, lie))
     # Segments that are each no longer than their layer, but are so together, would stand before it.
     longest = [
-        replace(s, range=replace(s.range, length=index.layers[s.layer].end - index.layers[s.layer].offset))
+        s._replace(range=s.range._replace(length=index.layers[s.layer].end - index.layers[s.layer].offset))
         for s in index.segments
     ]
     with pytest.raises(CorruptStreamError, match=r"within their layer|at most"):
@@ -562,8 +562,8 @@ def with_long_metadata(size: int) -> tuple[bytes, Index]:
     values = {**index.metadata_values, "values_sha256": index.digest, "crs": ""}
     missing = size - len(sections.serialize_metadata(values)) - 2  # of the longer kind of string
     metadata = sections.section(sections.METADATA, sections.serialize_metadata({**values, "crs": "x" * missing}))
-    place = replace(index.metadata, length=len(metadata))
-    moved = replace(index, metadata=place, index=replace(index.index, offset=place.end))
+    place = index.metadata._replace(length=len(metadata))
+    moved = replace(index, metadata=place, index=index.index._replace(offset=place.end))
     made = with_index(container, moved)
     return container[: place.offset] + metadata + made[index.index.offset :], moved
 

@@ -106,7 +106,7 @@ def test_stored_segments_are_decoded_in_the_order_of_the_file() -> None:
     late = [s for s in index.segments if s.tile != parent] + [s for s in index.segments if s.tile == parent]
     data = b"".join([container[s.range.offset : s.range.offset + s.range.length] for s in late])
     places = accumulate((s.range.length for s in late), initial=0)
-    moved = [replace(s, range=ByteRange(place, s.range.length)) for s, place in zip(late, places, strict=False)]
+    moved = [s._replace(range=ByteRange(place, s.range.length)) for s, place in zip(late, places, strict=False)]
 
     remaining: dict[int, int] = {}
     one_by_one = []

@@ -33,7 +33,7 @@ def with_chunk(data: bytes, chance: random.Random, rule: int | None) -> bytes:
     if rule is not None:
         content = bytes([rule]) + content[1:]
     chunks = list(index.chunks)
-    chunks[number] = replace(chunks[number], check=sections.check_of(content))
+    chunks[number] = chunks[number]._replace(check=sections.check_of(content))
     start = place.offset - index.residual.offset
 
     def change(kind: int, _: int, payload: bytearray) -> None:

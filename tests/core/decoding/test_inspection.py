@@ -154,14 +154,14 @@ def test_an_index_that_says_something_else(exact: bytes, near: bytes) -> None:
         first = index.segments[0]
         others: list[Index] = [
             replace(index, layers=(replace(index.layers[0], rms=1e6), *index.layers[1:])),
-            replace(index, segments=(replace(first, check=first.check ^ 1), *index.segments[1:])),
-            replace(index, segments=(replace(first, top=first.top + 1), *index.segments[1:])),
+            replace(index, segments=(first._replace(check=first.check ^ 1), *index.segments[1:])),
+            replace(index, segments=(first._replace(top=first.top + 1), *index.segments[1:])),
             replace(index, segments=index.segments[1:]),
         ]
         if index.chunks:
             number = next(k for k, chunk in enumerate(index.chunks) if chunk.range.length)
             chunks = list(index.chunks)
-            chunks[number] = replace(chunks[number], check=chunks[number].check ^ 1)
+            chunks[number] = chunks[number]._replace(check=chunks[number].check ^ 1)
             others.append(replace(index, chunks=tuple(chunks)))
         for other in others:
             with pytest.raises(ls.CorruptStreamError, match=f"at byte {index.index.offset}|expected"):
