@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, assert_never
 
@@ -22,6 +22,8 @@ __all__ = ["EffectIO"]
 
 # Messages that are taken from a WebSocket in one turn of the loop. Credit bounds their bytes.
 _AT_ONCE = 64
+# Chunks of an answer, of at most 64 KiB, that may wait until somebody takes one.
+_MOST_CHUNKS = 8
 
 
 class EffectIO:
@@ -48,7 +50,10 @@ class EffectIO:
         self._http = http
         self._socket: ClientConnection | None = None
         self._response: httpx.Response | None = None
-        self._body: AsyncIterator[bytes] | None = None
+        self._patience = 0.0  # seconds for which a chunk of it is waited for
+        self._body: asyncio.Task[None] | None = None  # takes its chunks as they arrive
+        self._lost: Exception | None = None  # why there are no more
+        self._news, self._room = asyncio.Event(), asyncio.Event()
         self._ahead: tuple[Get, asyncio.Task[httpx.Response]] | None = None
 
     @property
@@ -73,8 +78,7 @@ class EffectIO:
             case Ahead(get):
                 await self._ask_ahead(get)
             case Read():
-                assert self._body is not None, "a body is read of an open answer"
-                self.arrived.append(await anext(self._body, b""))
+                await self._read()
             case Wait(until):
                 with suppress(TimeoutError):
                     async with asyncio.timeout(self._left(until)):
@@ -87,6 +91,7 @@ class EffectIO:
 
     async def poll(self, effect: Effect) -> Any:
         """Carry out one effect like `perform` if that needs no waiting; otherwise return `WAITS`."""
+        self._room.set()
         await asyncio.sleep(0)  # what has come is taken by the event loop, which had no turn while a view was drawn
         match effect:
             case Send() | Ahead():
@@ -156,13 +161,51 @@ class EffectIO:
                 self._ahead = None
                 raise
             self._ahead = None
-        self._body = self._response.aiter_raw()
+        self._patience, self._lost = get.seconds, None
+        self._body = asyncio.create_task(self._receive(self._response))
         return Head.of(self._response)
 
+    async def _receive(self, response: httpx.Response) -> None:
+        """Take the chunks of an answer as they arrive, so that nobody has to ask for each."""
+        try:
+            async for chunk in response.aiter_raw():
+                self.arrived.append(chunk)
+                self._news.set()
+                if len(self.arrived) >= _MOST_CHUNKS:
+                    self._room.clear()
+                    await self._room.wait()
+            self.arrived.append(b"")
+        except Exception as error:  # whoever reads is told
+            self._lost = error
+        self._news.set()
+
+    async def _read(self) -> None:
+        """Wait until a chunk has arrived."""
+        import httpx
+
+        assert self._body is not None, "a body is read of an open answer"
+        self._room.set()
+        try:
+            async with asyncio.timeout(self._patience):
+                while not self.arrived:
+                    if self._lost is not None:
+                        raise self._lost
+                    self._news.clear()
+                    await self._news.wait()
+        except TimeoutError as error:
+            raise httpx.ReadTimeout("no more of the answer came in time") from error
+
     async def _ask(self, get: Get) -> httpx.Response:
+        import httpx
+
         client = self._http()
-        request = client.build_request("GET", get.url, headers=dict(get.headers), timeout=get.seconds)
-        return await client.send(request, stream=True)
+        # How long a body is waited for is up to whoever reads it.
+        request = client.build_request("GET", get.url, headers=dict(get.headers), timeout=None)
+        try:
+            async with asyncio.timeout(get.seconds):
+                return await client.send(request, stream=True)
+        except TimeoutError as error:
+            raise httpx.ReadTimeout("no answer came in time") from error
 
     async def _ask_ahead(self, get: Get) -> None:
         if self._ahead is None or not self._ahead[0].asks_as(get):
@@ -186,6 +229,10 @@ class EffectIO:
 
     async def _leave(self, how: HangUp) -> None:
         """Close all that is open, except the request that was made ahead."""
+        body, self._body = self._body, None
+        if body is not None:
+            body.cancel()
+            await asyncio.wait({body})
         self.arrived.clear()
         if self._socket is not None and how.abort:
             self._socket.transport.abort()
@@ -193,7 +240,7 @@ class EffectIO:
             # What was sent is still delivered; closing a WebSocket would first wait for the other side's close frame.
             self._socket.transport.close()
         socket, self._socket = self._socket, None
-        response, self._response, self._body = self._response, None, None
+        response, self._response = self._response, None
         if socket is not None:
             await socket.close()
         if response is not None:
