@@ -19,14 +19,15 @@ from .requests.answers import Answer, Head, Incoming
 from .requests.api import Description, Identity, Progress
 from .requests.bodies import Asked, Body, Closure, Parcel, Source, are_files, check_asked, opened, prepared
 from .requests.calls import Flow
-from .stream.async_stream import AsyncStream
-from .stream.options import ConnectKeywords, ConnectOptions
 
 if TYPE_CHECKING:
     import httpx
 
     from lodestream.errors import LodestreamError
     from lodestream.quality import Effort
+
+    from .stream.async_stream import AsyncStream
+    from .stream.options import ConnectKeywords, ConnectOptions
 
 __all__ = ["AsyncClient"]
 
@@ -104,6 +105,8 @@ class AsyncClient:
         Parameters and errors are those of `Client.connect`. The connection is opened, and errors of the server are
         raised, on entering.
         """
+        from .stream.async_stream import AsyncStream  # with what decodes: other requests need none of it
+
         url = self.place(source)
         return AsyncStream(url, self.options_for(url, options), self.requests_to(url))
 
@@ -213,6 +216,8 @@ class AsyncClient:
 
     def options_for(self, url: str, options: ConnectKeywords) -> ConnectOptions:
         """Return the options of a stream."""
+        from .stream.options import ConnectOptions
+
         return ConnectOptions(token=self._token_for(url), **options)
 
     def requests_to(self, url: str) -> Callable[[], httpx.AsyncClient]:

@@ -16,11 +16,12 @@ from .async_client import AsyncClient
 from .requests import api, calls
 from .requests.api import Description, Identity, Progress
 from .requests.bodies import Asked, Closure, Source, are_files, check_asked, prepared
-from .stream.blocking_stream import Stream
-from .stream.options import ConnectKeywords
 
 if TYPE_CHECKING:
     from lodestream.quality import Effort
+
+    from .stream.blocking_stream import Stream
+    from .stream.options import ConnectKeywords
 
 __all__ = ["Client"]
 
@@ -150,6 +151,8 @@ class Client:
         >>> stream.ended, view.points_at(3).shape
         ('level', (7, 6))
         """
+        from .stream.blocking_stream import Stream  # with what decodes: other requests need none of it
+
         url = self._async.place(source)
         loop_thread.current().hold(self._async)
         return Stream(url, self._async.options_for(url, options), self._async.requests_to(url), self)

@@ -91,7 +91,7 @@ class Part:
 
     def mark(self, surface: Surface) -> None:
         """Set name and place in the series in a surface's metadata."""
-        from lodestream.container.series import SERIES
+        from lodestream.series import SERIES
 
         surface.metadata["name"] = self.name
         surface.metadata[SERIES] = dict(self.series)

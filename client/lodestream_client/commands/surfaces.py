@@ -6,6 +6,8 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from lodestream.series import place_of
+
 from ..requests.states import STATES
 from ..terminal.output import human_size, note, print_json, say_columns
 from .arguments import Subparsers, add_command, add_json_option, add_token_option, token_of
@@ -155,8 +157,6 @@ def _together(surfaces: Sequence[Description]) -> list[Description]:
     first: dict[str, int] = {}
     places: list[tuple[int, int]] = []
     for number, surface in enumerate(surfaces):
-        from lodestream.container.series import place_of
-
         place = place_of(surface.details)
         places.append((number, 0) if place is None else (first.setdefault(place.name, number), place.index))
     return [surfaces[number] for number in sorted(range(len(surfaces)), key=places.__getitem__)]
@@ -164,8 +164,6 @@ def _together(surfaces: Sequence[Description]) -> list[Description]:
 
 def _series(surface: Description) -> str:
     """Return the series of a surface and its index as text; empty if it is in none."""
-    from lodestream.container.series import place_of
-
     place = place_of(surface.details)
     return "" if place is None else f"{place.name}, {place.along} {place.index}"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ..container.series import LONGEST, Place
+from ..series import LONGEST, Place
 
 __all__ = ["Member"]
 

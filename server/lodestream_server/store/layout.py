@@ -37,8 +37,8 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from lodestream.container.series import SERIES, place_of
 from lodestream.errors import InputError, LodestreamError
+from lodestream.series import SERIES, place_of
 from lodestream.stores import OversizedError, Store, Tag
 from lodestream.stores.keys import is_key
 

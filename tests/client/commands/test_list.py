@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lodestream.container.series import Place, place_of
+from lodestream.series import Place, place_of
 
 from ..conftest import Run
 from ..scripted import document, scripted

@@ -24,6 +24,7 @@ from lodestream_client.program import build_parser
 from tests.patience import PATIENCE
 
 from .. import manual
+from ..scripted import document, scripted
 from ..stream.test_misbehaving import websocket_server
 
 ROOT = Path(__file__).parents[3]
@@ -72,6 +73,13 @@ def test_a_command_on_files_loads_no_more_than_it_uses(container_file: Path, tmp
         assert loaded_after(statement, unused) == []
     statement = "from lodestream_client.program import build_parser\nbuild_parser(['decode', 'a', 'b'])"
     assert loaded_after(statement, (*unused, "importlib.metadata")) == []
+
+
+def test_what_only_asks_a_server_loads_nothing_that_decodes() -> None:
+    with scripted(lambda asked: document({"surfaces": []})) as server:
+        statement = f"from lodestream_client.__main__ import main\nassert main(['list', {server.url!r}]) == 0"
+        unused = (*HEAVY, "numpy", "websockets", "lodestream.container", "lodestream_client.stream.session")
+        assert loaded_after(statement, unused) == []
 
 
 def test_all_names_are_there() -> None:
