@@ -15,9 +15,11 @@ def test_servers_of_one_bucket_that_are_killed_and_stopped_behind_a_network_that
     # Nobody lists everything meanwhile: what `changes.json` does not tell is never seen.
     times = takeovers.Times(lease=3.0, look=0.5)
     # Two clients, which leave the processors to the tests beside them.
-    done = takeovers.run(tmp_path, 100, 60.0, times=times, clients=2, seed=int(os.environ.get("LODESTREAM_SEED", "1")))
+    seed, kept = int(os.environ.get("LODESTREAM_SEED", "1")), tmp_path / "history"
+    done = takeovers.run(tmp_path, 100, 60.0, times=times, clients=2, seed=seed, keep=kept)
     if done.findings:
-        pytest.fail("\n".join(map(str, done.findings)))
+        pytest.fail("\n".join((*map(str, done.findings), f"python -m tests.history --again {kept}")))
+    assert not kept.exists()
     assert done.disasters.total() >= 2
     assert done.uploads >= 10
     assert done.deletes
