@@ -14,7 +14,7 @@ from .errors import (
     UnfitStoreError,
 )
 from .folder import Folder
-from .interface import SMALL, Blob, Entry, Progress, Store, Tag
+from .interface import SMALL, Blob, Entry, Progress, Still, Store, Tag
 
 __all__ = [
     "SMALL",
@@ -27,6 +27,7 @@ __all__ = [
     "FullError",
     "OversizedError",
     "Progress",
+    "Still",
     "Store",
     "StoreError",
     "Tag",

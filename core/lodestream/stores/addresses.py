@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from .bucket import Bucket
-from .connections import SCHEMES, Place, parsed
+from .connections import SCHEMES, Limits, Place, parsed
 from .folder import Folder
 from .interface import Store
 
@@ -18,7 +18,7 @@ __all__ = ["open_store", "place_of"]
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(/?)", re.ASCII)
 
 
-def open_store(address: str | os.PathLike[str], *, fetched: Path | None = None) -> Store:
+def open_store(address: str | os.PathLike[str], limits: Limits | None = None, *, fetched: Path | None = None) -> Store:
     """Open a store.
 
     Parameters
@@ -27,6 +27,8 @@ def open_store(address: str | os.PathLike[str], *, fetched: Path | None = None) 
         A folder, which need not exist yet, or a bucket: ``s3://bucket/prefix``, ``az://container/prefix`` or
         ``abfss://container@account.dfs.core.windows.net/prefix``. Credentials, region and endpoint of a bucket come
         from the environment (``AWS_*``, ``AZURE_*``) or from the machine's role.
+    limits : Limits, optional
+        How long a bucket is waited for.
     fetched : Path, optional
         Folder, which is there, for the files that `Store.local` makes of objects in a bucket.
 
@@ -39,7 +41,7 @@ def open_store(address: str | os.PathLike[str], *, fetched: Path | None = None) 
     StoreError
         If credentials, region or account of a bucket are missing.
     """
-    return Folder(Path(address)) if place_of(address) is None else Bucket(os.fspath(address), fetched=fetched)
+    return Folder(Path(address)) if place_of(address) is None else Bucket(os.fspath(address), limits, fetched=fetched)
 
 
 def place_of(address: str | os.PathLike[str]) -> Place | None:

@@ -12,7 +12,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +33,7 @@ from .errors import (
     UnfitStoreError,
 )
 from .headers import headers
-from .interface import SMALL, Entry, Progress, Tag
+from .interface import SMALL, Entry, Progress, Still, Tag, always
 from .keys import checked_key, checked_prefix, checked_small, is_key
 from .probe import try_out
 from .threads import Threads
@@ -96,6 +97,8 @@ class Bucket:
         try:
             self._store = ask(lambda: connected(place, limits, limits.stalled, limits.request))
             self._parts = ask(lambda: connected(place, limits, limits.part, limits.part))
+            once = replace(limits, stalled=min(limits.stalled, limits.delete), retries=0)
+            self._once = ask(lambda: connected(place, once, once.stalled, once.delete))
         except RequestError as failure:
             self._refuse("", failure)
         self._threads = Threads(_THREADS)
@@ -183,25 +186,34 @@ class Bucket:
                 raise StoreError(f"{self._named(key)} cannot be kept in {folder}: {error.strerror}") from error
             yield path
 
-    def delete(self, keys: Iterable[str]) -> None:
+    def delete(self, keys: Iterable[str], still: Still = always) -> None:
         """Delete objects, as far as there are any."""
         places = {key: self._at(key) for key in keys}
         check_process()
         # One by one: not every store has a request for many, and that of Azure fails for those that are gone.
         answers: list[Future[None]] = []
         try:
-            answers.extend(self._threads.submit(self._delete, key, at) for key, at in places.items())
+            answers.extend(self._threads.submit(self._delete, key, at, still) for key, at in places.items())
             for answer in answers:
                 wait_for(answer)
         except BaseException as error:
             under_way = [answer for answer in answers if not answer.cancel()]
-            if isinstance(error, StoreError):
+            if isinstance(error, Exception):
                 wait(under_way)  # they would delete what the caller makes anew
             raise
 
-    def _delete(self, key: str, at: str) -> None:
-        with suppress(AbsentError):
-            self._ask(key, lambda: self._library.delete(self._store, at))
+    def _delete(self, key: str, at: str, still: Still) -> None:
+        end = self._end()
+        for pause in self._pauses():
+            try:
+                if still() < self._limits.delete:
+                    raise RequestError("unknown", "there is not enough time left for a request")
+                return ask(partial(self._library.delete, self._once, at))
+            except RequestError as failure:
+                if failure.kind == "absent":
+                    return None
+                self._pause(key, failure, pause, end)
+        raise AssertionError("there is always another attempt")
 
     def entries(self, prefix: str, after: str = "") -> Iterator[Entry]:
         """List objects in the order of their keys."""

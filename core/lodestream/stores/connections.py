@@ -54,11 +54,13 @@ class Limits:
     part : float
         Seconds of a request that writes a part of a large object.
     retries : int
-        How often a request that failed is made again.
+        How often the library makes a request that failed again.
     again : float
         Seconds after which a call that failed, with its retries, is not made once more.
     pause : float
         Seconds until what failed is made again for the first time; then about twice as many each time, up to 2.
+    delete : float
+        Seconds of a request that deletes. It has no condition, so the library never makes it again.
     """
 
     stalled: float = 10.0
@@ -67,6 +69,7 @@ class Limits:
     retries: int = 3
     again: float = 10.0
     pause: float = 0.05
+    delete: float = 5.0
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from .errors import (
     StoreError,
     UnacknowledgedError,
 )
-from .interface import SMALL, Entry, Progress, Tag
+from .interface import SMALL, Entry, Progress, Still, Tag, always
 from .keys import checked_key, checked_prefix, checked_small, is_key
 from .probe import try_out
 
@@ -174,19 +174,19 @@ class Folder:
             raise self._absent(key)
         yield path
 
-    def delete(self, keys: Iterable[str]) -> None:
+    def delete(self, keys: Iterable[str], still: Still = always) -> None:
         """Delete objects, as far as there are any."""
         paths = {key: self._path(key) for key in keys}
         for key, path in paths.items():
             try:
-                _patiently(partial(self._remove, key, path))
+                _patiently(partial(self._remove, key, path, still))
             except OSError as error:
                 self._refuse(key, error)
         # Also of what was gone already: it may be gone in memory alone.
         for folder, key in {folder: key for key, path in paths.items() for folder in self._above(path)}.items():
             self._synchronise(key, folder)
 
-    def _remove(self, key: str, path: Path) -> None:
+    def _remove(self, key: str, path: Path, still: Still) -> None:
         """Remove a file, if there is one, and the folders that are then empty."""
         try:
             path.lstat()  # what says only whether it is there would take an error of the disk for a no
@@ -196,6 +196,7 @@ class Folder:
             return
         # Or, after a create of another writer, a `replace` that has looked would overwrite what it never read.
         with self._locked(key), suppress(*_ABSENT):
+            still()
             path.unlink()
         for folder in self._above(path)[:-1]:
             try:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NewType, Protocol, Self
 
-__all__ = ["SMALL", "Blob", "Entry", "Progress", "Store", "Tag"]
+__all__ = ["SMALL", "Blob", "Entry", "Progress", "Still", "Store", "Tag", "always"]
 
 #: Bytes that a small object may have, which is read and written as a whole.
 SMALL = 16 << 20
@@ -18,6 +19,14 @@ Tag = NewType("Tag", str)
 
 #: Takes the bytes that were written so far; may raise an error to stop.
 Progress = Callable[[int], None]
+
+#: Returns the seconds for which its caller may make a change that has no condition; raises an error if it may not.
+Still = Callable[[], float]
+
+
+def always() -> float:
+    """Return the seconds of whoever need not heed others."""
+    return math.inf
 
 
 @dataclass(frozen=True)
@@ -251,8 +260,18 @@ class Store(Protocol):
         """
         ...
 
-    def delete(self, keys: Iterable[str]) -> None:
+    def delete(self, keys: Iterable[str], still: Still = always) -> None:
         """Delete objects, as far as there are any.
+
+        A delete has no condition, since not every store knows one: it would also delete what another writer has put
+        there meanwhile. So whoever may be overtaken says each time whether it may still be done.
+
+        Parameters
+        ----------
+        keys : iterable of str
+        still : callable, optional
+            Called, in any thread, right before each request, also before one that is made again. What it raises is
+            raised here, and no further request is made. None may take longer than the seconds that it returns.
 
         Raises
         ------

@@ -30,6 +30,7 @@ from pathlib import Path
 
 from lodestream.errors import InputError
 from lodestream.stores import AbsentError, Folder, Store, open_store
+from lodestream.stores.connections import Limits
 from lodestream.stores.folder import OWN
 
 from .claim import LOCK, claim
@@ -52,6 +53,9 @@ BUCKET_SCRATCH = Path("lodestream-scratch")
 
 # How often it is told how far the index is.
 _TELL_SECONDS = 2.0
+
+# Of what a lease lasts: how long a request that deletes may take. So much is left of it whenever it is renewed in time.
+_DELETED = 1 / 4
 
 # What a data folder had before there was a store: `lodestream.json` is not in such a folder.
 _EARLIER = "records"
@@ -153,7 +157,9 @@ class Data:
             self._guards.append(claim(scratch))
             for each in (self._incoming, self.levels, fetched):
                 discard(each)
-            store: Store = Folder(folder, private=True) if folder is not None else _bucket(str(place), fetched)
+            store: Store = (
+                Folder(folder, private=True) if folder is not None else _bucket(str(place), lease_seconds, fetched)
+            )
             lease = None if folder is not None else Lease(store, lease_seconds, wanted=not read_only)
             if read_only:
                 _check_there(store)
@@ -217,9 +223,9 @@ class Data:
         return make_folder(self._incoming / os.urandom(8).hex())
 
 
-def _bucket(address: str, fetched: Path) -> Store:
+def _bucket(address: str, lease_seconds: float, fetched: Path) -> Store:
     make_private(fetched)
-    return open_store(address, fetched=fetched)
+    return open_store(address, Limits(delete=min(Limits.delete, _DELETED * lease_seconds)), fetched=fetched)
 
 
 def _check_there(store: Store) -> None:

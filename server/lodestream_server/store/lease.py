@@ -101,7 +101,12 @@ class Lease:
     @property
     def held(self) -> bool:
         """Whether this server has it, and nobody else can have taken it over."""
-        return self._clock() < self._until
+        return self.left > 0
+
+    @property
+    def left(self) -> float:
+        """Seconds for which it is still held if nobody renews it; 0 if it is not."""
+        return max(0.0, self._until - self._clock())
 
     @property
     def holder(self) -> str | None:

@@ -193,7 +193,7 @@ class Names:
         key = layout.name_key(name)
         with self._writing:
             _, tag = self._before(key, may_change)
-            self._store.delete([key])  # also of what is gone already: perhaps not from the disk
+            self._store.delete([key], self._surfaces.still)  # also of what is gone already: perhaps not from the disk
             self._surfaces.tell(key)
             self._surfaces.index.gone(key)
             if tag is None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -182,6 +183,17 @@ class Surfaces:
         writer = "this one is about to" if self.lease.held else f"{self.lease.holder or 'nobody'} does"
         raise StandbyError(f"This server does not write to its bucket now, {writer}; try again soon")
 
+    def still(self) -> float:
+        """Return the seconds for which this server changes the store, and no other: a delete is asked each time.
+
+        Raises
+        ------
+        ReadOnlyError, StandbyError
+            See `check_writer`.
+        """
+        self.check_writer()
+        return math.inf if self.lease is None else self.lease.left
+
     def tell(self, what: str) -> None:
         """Tell other servers that a surface has changed, by its id, or a name, by its key."""
         if self.lease is not None:
@@ -349,8 +361,8 @@ class Surfaces:
             if not ours:  # somebody was told that it is stored
                 raise UnacknowledgedError(f"{new.id} is stored, and cannot be told now: {error}") from error
             try:
-                self.store.delete([layout.manifest_key(new.id)])
-            except StoreError:
+                self.store.delete([layout.manifest_key(new.id)], self.still)
+            except LodestreamError:  # also if another server writes now: it may have told somebody that it is stored
                 raise UnacknowledgedError(f"{new.id} may be stored or not; upload it again: {error}") from error
             raise
 
@@ -392,7 +404,7 @@ class Surfaces:
             return
         unused = [key for key in keys if not self._coming[key] and not self._is_used(key, but=deleted)]
         if unused:
-            self.store.delete(unused)
+            self.store.delete(unused, self.still)
 
     def _is_used(self, key: str, but: str | None = None) -> bool:
         """Return whether a surface, other than one, refers to an object."""
@@ -573,7 +585,7 @@ class Surfaces:
                 return known
             tag = known.built_tag
             if known.state == "failed":
-                self.store.delete([layout.built_key(surface)])  # or a lost index would make it fail again
+                self.store.delete([layout.built_key(surface)], self.still)  # or a lost index would make it fail again
                 tag = None
             again = replace(known, state=state, reason=None, attempts=0, built_tag=tag)
             if known.state == "failed":
@@ -632,17 +644,18 @@ class Surfaces:
         """
         with self.writing:
             if self.index.find(surface) is None and layout.id_of(layout.manifest_key(surface)) is not None:
-                self.store.delete([layout.manifest_key(surface)])  # of a killed server, whose delete is not on disk yet
+                # Of a killed server, whose delete is not on disk yet.
+                self.store.delete([layout.manifest_key(surface)], self.still)
             known = self.get(surface)
             it = known.manifest
-            self.store.delete([layout.manifest_key(surface)])  # it is deleted from here on
+            self.store.delete([layout.manifest_key(surface)], self.still)  # it is deleted from here on
             self.tell(surface)
             keys = [layout.upload_key(it.upload, number) for number in range(len(it.filenames))]
             keys += [layout.container_key(known.container)] if known.container is not None else []
             try:
-                self.store.delete([layout.built_key(surface)])
+                self.store.delete([layout.built_key(surface)], self.still)
                 self._remove_unused(keys, deleted=surface)
-            except StoreError as error:
+            except LodestreamError as error:  # also of a lease that is over, as `writing` says at its end
                 _log.warning("%s was deleted, but some of its files are left as strays: %s", surface, error)
             self.index.gone(surface)
 
@@ -813,8 +826,7 @@ class Surfaces:
                     for entry in found[first : first + _REMOVED_AT_ONCE]
                     if not self._coming[entry.key] and not self._is_used(entry.key)
                 ]
-                self.check_writer()  # the next writer may refer to them
-                self.store.delete([entry.key for entry in unused])
+                self.store.delete([entry.key for entry in unused], self.still)  # the next writer may refer to them
             removed += unused
         return removed
 

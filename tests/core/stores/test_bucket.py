@@ -18,6 +18,7 @@ import obstore
 import pytest
 from obstore.store import S3Store
 
+from lodestream.errors import LodestreamError
 from lodestream.stores import AbsentError, Store, StoreError, Tag, UnfitStoreError, open_store
 from lodestream.stores.answers import ask
 from lodestream.stores.bucket import Bucket
@@ -25,7 +26,7 @@ from lodestream.stores.connections import Limits
 from lodestream.stores.headers import headers
 from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator
-from tests.stores.faults import FaultProxy, fault_proxy
+from tests.stores.faults import Fault, FaultProxy, fault_proxy
 
 
 @pytest.fixture
@@ -174,6 +175,38 @@ def test_a_delete_that_failed_deletes_nothing_afterwards(s3: Emulator, monkeypat
         store.delete(map(str, range(100)))
     assert gate.is_set(), "those under way are waited for"
     assert len(begun) < 100, "others do not begin"
+
+
+def test_a_delete_is_made_again_only_while_it_may_be_and_never_by_the_library(s3: Emulator, proxy: FaultProxy) -> None:
+    store = Bucket(s3.address(), Limits(pause=0.01))
+    store.create("a", b"1")
+    asked: list[int] = []
+
+    def still() -> float:
+        asked.append(sum(line.startswith(("DELETE", "POST")) for line in proxy.seen))
+        if len(asked) == 3:
+            raise LodestreamError("over")
+        return 10.0
+
+    proxy.faults = [Fault("503", where="DELETE|POST")]
+    with pytest.raises(LodestreamError, match="over"):
+        store.delete(["a"], still)
+    assert asked == [0, 1, 2], "it is asked before each request"
+    proxy.faults = []
+    assert store.get("a")[0] == b"1"
+
+
+def test_a_delete_takes_no_longer_than_it_may(s3: Emulator, proxy: FaultProxy) -> None:
+    store = Bucket(s3.address(), Limits(2 * PATIENCE, 2 * PATIENCE, again=0.0, delete=0.5))
+    proxy.faults = [Fault("hung", where="DELETE|POST")]
+    begun = time.monotonic()
+    with pytest.raises(StoreError, match="does not answer"):
+        store.delete(["a"], lambda: 0.5)
+    assert time.monotonic() - begun < PATIENCE, "other requests may take longer"
+    assert len(proxy.seen) == 1
+    with pytest.raises(StoreError, match="not enough time left"):
+        store.delete(["a"], lambda: 0.4)
+    assert len(proxy.seen) == 1
 
 
 def answer(s3: Emulator, target: str) -> tuple[dict[str, str], bytes]:

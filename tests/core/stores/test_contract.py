@@ -12,7 +12,7 @@ from typing import TypeVar
 
 import pytest
 
-from lodestream.errors import InputError
+from lodestream.errors import InputError, LodestreamError
 from lodestream.stores import (
     SMALL,
     AbsentError,
@@ -211,6 +211,27 @@ def test_deletes_may_be_repeated(store: Store) -> None:
     store.delete(["b/c", "a"])
     store.delete([])
     assert [entry.key for entry in store.entries("")] == ["b/d"]
+
+
+def test_whoever_deletes_is_asked_before_each_of_them(store: Store) -> None:
+    for key in ("a", "b"):
+        store.create(key, body())
+
+    def over() -> float:
+        raise LodestreamError("over")
+
+    with pytest.raises(LodestreamError, match="over"):
+        store.delete(["a", "b"], over)
+    assert [entry.key for entry in store.entries("")] == ["a", "b"]
+    asked: list[bool] = []
+
+    def still() -> float:
+        asked.append(True)
+        return 10.0
+
+    store.delete(["a", "b"], still)
+    assert len(asked) == 2
+    assert list(store.entries("")) == []
 
 
 def test_entries_come_in_the_order_of_their_keys_from_any_place(store: Store) -> None:

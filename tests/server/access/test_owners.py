@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from lodestream.stores import Folder, StoreError
+from lodestream.stores import Folder, Still, StoreError
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
 from lodestream_server.builds import worker
@@ -168,11 +168,11 @@ def stubborn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Containers cannot be removed from the store."""
     remove = Folder.delete
 
-    def delete(store: Folder, keys: Iterable[str]) -> None:
+    def delete(store: Folder, keys: Iterable[str], *still: Still) -> None:
         wanted = list(keys)
         if any(key.startswith(CONTAINERS) for key in wanted):
             raise StoreError("Input/output error")
-        remove(store, wanted)
+        remove(store, wanted, *still)
 
     monkeypatch.setattr(Folder, "delete", delete)
 

@@ -14,6 +14,7 @@ import pytest
 
 from lodestream.errors import LodestreamError, NotFoundError
 from lodestream.stores import SMALL, ConflictError, Store, StoreError, open_store
+from lodestream.stores.threads import Threads
 from lodestream_server.problems import DamagedNameError, ReadOnlyError, StandbyError
 from lodestream_server.store import layout
 from lodestream_server.store.changes import ChangeReader
@@ -289,6 +290,99 @@ def test_what_waited_for_its_turn_until_the_lease_was_over_deletes_nothing(
             second.tend()
         with pytest.raises(StandbyError):
             deletion.result()
+    second.surfaces.sync()
+    assert manifest.id in second.states()
+
+
+class Hung:
+    """The library for buckets: before one of its deletes is answered the lease ends, and another server writes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        obstore = pytest.importorskip("obstore")
+        self._delete = obstore.delete
+        self.then: Callable[[], object] | None = None
+        self.where, self.fails = "", True
+        monkeypatch.setattr(obstore, "delete", self._call)
+
+    def _call(self, store: Any, at: str) -> None:
+        if self.then is not None and self.where in at:
+            then, self.then = self.then, None
+            if not self.fails:
+                self._delete(store, at)
+            then()
+            if self.fails:
+                raise TimeoutError("no answer")
+        else:
+            self._delete(store, at)
+
+
+@pytest.fixture
+def hung(monkeypatch: pytest.MonkeyPatch) -> Hung:
+    return Hung(monkeypatch)
+
+
+def test_a_writer_that_is_stopped_while_it_collects_deletes_nothing_that_another_one_has_acknowledged(
+    server: Make, memory: str, clock: Clock, tmp_path: Path, hung: Hung
+) -> None:
+    store: Any = open_store(memory)
+    store._threads = Threads(1)  # so that nothing else is on its way
+    first, second = server("first", store=store), server("second")
+    first.tend()
+    second.tend()
+    manifests = [upload(tmp_path, number)[0] for number in range(3)]
+    for number, manifest in enumerate(manifests):
+        store.put_file(layout.upload_key(manifest.upload, 0), upload(tmp_path, number)[1][0])
+
+    def take_over() -> None:
+        clock.now += SECONDS + 1
+        second.tend()
+        for number in range(3):
+            second.surfaces.accept(*upload(tmp_path, number))
+
+    hung.where, hung.then, hung.fails = "uploads/", take_over, False
+    with pytest.raises(StandbyError):
+        first.surfaces.collect(older=-1.0)
+    assert {f"uploads/{manifest.upload}/0" for manifest in manifests} <= set(keys(store))
+    assert hung.then is None
+
+
+@pytest.mark.parametrize("change", ["expire", "delete", "retry", "forget"])
+def test_a_delete_that_failed_is_not_made_again_after_the_lease_is_over(
+    server: Make, clock: Clock, tmp_path: Path, hung: Hung, change: str
+) -> None:
+    first, second = server("first"), server("second")
+    first.tend()
+    second.tend()
+    manifest, files = upload(tmp_path, 0)
+    first.surfaces.accept(manifest, files)
+    names = first.surfaces.names
+    names.point("n", manifest.id, None, lambda _: True, 0.0)
+    change_it: dict[str, Callable[[], object]] = {
+        "expire": names.expire,
+        "delete": lambda: first.surfaces.delete(manifest.id),
+        "retry": lambda: first.surfaces.retry(manifest.id),
+        "forget": lambda: names.delete("n", lambda _: True),
+    }
+    if change == "expire":
+        other, files = upload(tmp_path, 1)
+        first.surfaces.accept(other, files)
+        names.point("n", other.id, None, lambda _: True, 0.0)
+    if change == "retry":
+        first.surfaces.begin(manifest.id)
+        first.surfaces.refused(manifest.id, "no surface")
+    key = {"retry": layout.built_key(manifest.id), "forget": layout.name_key("n")}.get(change)
+
+    def take_over() -> None:
+        clock.now += SECONDS + 1
+        second.tend()
+        if change != "retry":  # an upload would be one too
+            second.surfaces.accept(*upload(tmp_path, 0))
+
+    hung.where, hung.then = key or layout.manifest_key(manifest.id), take_over
+    with suppress(StandbyError):  # what expires tells it in the log
+        change_it[change]()
+    assert hung.then is None
+    assert hung.where in keys(second.surfaces.store)
     second.surfaces.sync()
     assert manifest.id in second.states()
 

@@ -203,8 +203,8 @@ class Unanswered:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._store, name)
 
-    def delete(self, keys: Any) -> None:
-        self._store.delete(keys)
+    def delete(self, keys: Any, still: Any) -> None:
+        self._store.delete(keys, still)
         raise UnacknowledgedError("the power may fail")
 
 
