@@ -124,7 +124,7 @@ class Following:
         BusyError
             If that takes long.
         """
-        if self._surfaces.lease is None or self._surfaces.writes or not _is_key(what):
+        if self._surfaces.writes or not _is_key(what):
             return
         coming = self._coming.get(what)
         if coming is None:

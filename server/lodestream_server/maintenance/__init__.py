@@ -1,1 +1,1 @@
-"""Checking and repairing the data of a server that does not run. Above `builds`, which describes containers."""
+"""Checking the data of a server, and repairing them while none writes. Above `builds`, which describes containers."""

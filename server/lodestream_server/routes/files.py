@@ -73,7 +73,7 @@ async def container_of(request: Request, parts: State, surface: Surface) -> Resp
 )
 async def get_container(request: Request, parts: Parts, sha256: str) -> Response:
     """Return a container. It never changes: its name is the SHA-256 of its contents, which is also its strong ETag."""
-    if not parts.surfaces.index.uses_container(sha256):  # of which surface it is, the bucket does not say
+    if not parts.surfaces.writes and not parts.surfaces.index.uses_container(sha256):
         await parts.following.look_for(CHANGES)
     return await _sent(request, parts, sha256, {"cache-control": caching(parts, forever=True)})
 

@@ -166,7 +166,7 @@ async def leads_to(parts: State, name: str) -> Surface:
     StoreError, BusyError
         See `look_for`.
     """
-    if parts.surfaces.index.find_name(name) is None:
+    if not parts.surfaces.writes and parts.surfaces.index.find_name(name) is None:
         await parts.following.look_for(name_key(name))
     leads = parts.surfaces.names.get(name).surface
     if leads is not None:

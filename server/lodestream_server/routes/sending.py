@@ -107,6 +107,8 @@ async def look_for(parts: State, surface: str) -> None:
     StoreError, BusyError
         If it is not known here, and the bucket does not answer.
     """
+    if parts.surfaces.writes:  # it knows everything
+        return
     known = parts.surfaces.index.find(surface)
     if known is None:
         await parts.following.look_for(surface)
