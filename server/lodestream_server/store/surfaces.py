@@ -548,25 +548,55 @@ class Surfaces:
             built = Built(known.manifest.write, None, 0, _bounded(reason), layout.new_write(), info=info)
             return self._told(known, built)
 
-    def _told(self, known: Surface, built: Built) -> Surface:
-        """Write what became of a build in place of whatever is there, and tell the index."""
+    def _told(self, known: Surface, built: Built) -> Surface | None:
+        """Write what became of a build, and tell the index; return the surface as the store has it then.
+
+        What is there of the same manifest, and was not known, another server has told meanwhile: that stays. None: the
+        manifest is gone, or another one.
+        """
         key, data = layout.built_key(known.id), layout.dump(built)
         before: list[str] = []
         try:
             tag = self.store.create(key, data)
         except ExistsError:
-            # Of another manifest, of another version of the format, of a failure before a retry, or damaged.
-            there, old = layout.read(self.store, key)
-            tag = self.store.replace(key, data, old)
-            with suppress(DamagedObjectError):
-                container = layout.parse(Built, key, there).container
-                before += [layout.container_key(container)] if container not in (None, built.container) else []
+            there, tag = layout.read(self.store, key)
+            try:
+                found = layout.parse(Built, key, there)
+            except DamagedObjectError:
+                found = None
+            if found is not None and tag != known.built_tag and self._stands(found, built):
+                built = found
+            elif tag != known.built_tag and not self._is_there(known.manifest):
+                return None
+            else:  # of another manifest, of a container that is gone or no longer read, or damaged
+                self.check_writer()
+                tag = self.store.replace(key, data, tag)
+                if found is not None and found.container not in (None, built.container):
+                    before.append(layout.container_key(found.container))
         told = _surface(known.manifest, built, tag)
         self.tell(known.id)
         self.note(lambda: self.index.put(told))
         with suppress(StoreError):
             self._remove_unused(before)
         return told
+
+    def _stands(self, found: Built, new: Built) -> bool:
+        """Return whether what was told of the same manifest holds: its container, if it has one, is there."""
+        if found.manifest != new.manifest:
+            return False
+        if found.container in (None, new.container):
+            return True
+        return self._size(layout.container_key(found.container)) == found.container_bytes
+
+    def _is_there(self, manifest: Manifest) -> bool:
+        """Return whether the store has this very manifest, or one that cannot be read."""
+        key = layout.manifest_key(manifest.id)
+        try:
+            return layout.parse(Manifest, key, layout.read(self.store, key)[0]).write == manifest.write
+        except AbsentError:
+            return False
+        except DamagedObjectError:
+            return True
 
     def retry(self, surface: str) -> Surface:
         """Queue a surface again that failed or waits; return it. Others are left as they are.

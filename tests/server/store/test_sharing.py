@@ -6,14 +6,14 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lodestream.errors import LodestreamError, NotFoundError
-from lodestream.stores import SMALL, ConflictError, Store, StoreError, open_store
+from lodestream.stores import SMALL, ConflictError, Store, StoreError, UnacknowledgedError, open_store
 from lodestream.stores.threads import Threads
 from lodestream_server.problems import DamagedNameError, ReadOnlyError, StandbyError
 from lodestream_server.store import layout
@@ -385,6 +385,67 @@ def test_a_delete_that_failed_is_not_made_again_after_the_lease_is_over(
     assert hung.where in keys(second.surfaces.store)
     second.surfaces.sync()
     assert manifest.id in second.states()
+
+
+def test_a_manifest_that_another_server_has_acknowledged_is_not_taken_back(
+    server: Make, clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = server("first"), server("second")
+    first.tend()
+    second.tend()
+    manifest, files = upload(tmp_path, 0)
+
+    def put(*_: object) -> None:
+        clock.now += SECONDS + 1
+        second.tend()
+        second.surfaces.accept(*upload(tmp_path, 0))
+        raise StoreError("the disk of the index fails")
+
+    monkeypatch.setattr(first.surfaces._index, "put", put)
+    with pytest.raises(UnacknowledgedError):
+        first.surfaces.accept(manifest, files)
+    second.surfaces.sync()
+    assert manifest.id in second.states()
+
+
+@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("event", ["built", "refused"])
+@pytest.mark.parametrize("believes", [False, True])
+def test_what_another_server_has_told_of_a_build_stays(
+    server: Make, memory: str, clock: Clock, tmp_path: Path, again: bool, event: str, believes: bool
+) -> None:
+    store: Any = open_store(memory)
+    first, second = server("first", store=store), server("second")
+    first.tend()
+    second.tend()
+    manifest, files = upload(tmp_path, 0)
+    first.surfaces.accept(manifest, files)
+    first.surfaces.begin(manifest.id)
+    create = store.create
+
+    def stop(key: str, data: bytes) -> Any:
+        if key.startswith("built/"):
+            clock.now += SECONDS + 1
+            second.tend()
+            if again:
+                second.surfaces.delete(manifest.id)
+                second.surfaces.accept(*upload(tmp_path, 0))
+            other = second.surfaces.get(manifest.id).manifest
+            second.surfaces.begin(other.id)
+            second.surfaces.built(other.id, *container(tmp_path, other))
+            if believes:
+                first.lease._until = clock.now + 3600.0  # its clock stands
+        return create(key, data)
+
+    store.create = stop
+    tell = changes(first, tmp_path)[event]
+    with nullcontext() if believes else pytest.raises(StandbyError):
+        told: Any = tell()
+        assert (told is None) == again
+        assert again or told.state == "ready"
+    second.surfaces.sync()
+    assert second.states() == {manifest.id: "ready"}
+    assert second.surfaces.get(manifest.id).reason is None
 
 
 def test_two_that_both_believe_to_write_do_not_overwrite_each_other(server: Make, clock: Clock, tmp_path: Path) -> None:
