@@ -141,7 +141,7 @@ def run(
     progress : callable
         Is told after each disaster how far it is, and then how far it is judged.
     keep : Path or None
-        A file in which the history is left if anything in it is wrong, or if it is not judged to its end;
+        A file in which the history is left if anything is wrong, or if it does not come to its end;
         ``python -m tests.history --again FILE`` judges it again.
 
     Raises
@@ -164,8 +164,9 @@ def run(
             story.tell(count, seconds, kinds, progress)
         except AssertionError as error:
             raise AssertionError("\n".join((str(error), *map(str, check(history)[:_SHOWN])))) from error
-    if keep is not None:
-        history.write(keep)
+        finally:
+            if keep is not None:
+                history.write(keep)
     done.lags = list(_lags(history))
     judged = time.monotonic()
     done.findings = check(history, lambda told: progress(f"judged for {time.monotonic() - judged:.0f} s: {told}"))
