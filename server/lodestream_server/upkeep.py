@@ -12,6 +12,7 @@ from functools import partial
 
 from .builds.builder import Builder
 from .builds.level_maker import LevelMaker
+from .operation.threads import in_store
 from .store.index import IndexLostError, Surface
 from .store.partial_uploads import PartialUploads
 from .store.surfaces import Surfaces
@@ -82,10 +83,10 @@ class Upkeep:
             try:
                 if self._surfaces.is_lost:
                     _log.error("the index of the surfaces is lost; requests are answered 503 until it is made again")
-                    await asyncio.to_thread(self._surfaces.restore)
+                    await in_store(self._surfaces.restore)
                     _log.info("the index of the surfaces is made again")
                 elif not self._surfaces.is_current:
-                    await asyncio.to_thread(self._surfaces.sync)
+                    await in_store(self._surfaces.sync)
                 self.is_failing = False
                 self._synced.set()
                 if self._surfaces.writes:
@@ -120,7 +121,7 @@ class Upkeep:
         while True:
             if self._surfaces.is_synced and self._surfaces.writes:
                 try:
-                    for surface in await asyncio.to_thread(self._surfaces.names.expire):
+                    for surface in await in_store(self._surfaces.names.expire):
                         self.forget_levels(surface)
                 except IndexLostError:
                     pass  # it is told; what is due stays so
@@ -138,7 +139,7 @@ class Upkeep:
             await asyncio.sleep(_COLLECT_SECONDS)
             if self._surfaces.writes:
                 try:
-                    removed = await asyncio.to_thread(self._surfaces.collect)
+                    removed = await in_store(self._surfaces.collect)
                     _log.info("removed %d objects that nothing refers to", len(removed))
                 except Exception as error:  # whatever it is, nobody else would do this work
                     _log.error("strays could not be removed now, which is tried again: %s", error)

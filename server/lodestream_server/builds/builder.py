@@ -47,7 +47,7 @@ from lodestream.stores import AbsentError, StoreError
 from ..access.access import key_of
 from ..access.limits import Limits
 from ..operation.settings import Settings
-from ..operation.threads import carried_out, entered
+from ..operation.threads import carried_out, entered, in_store
 from ..problems import FullError
 from ..store.durable import discard
 from ..store.index import IndexLostError, Surface
@@ -234,7 +234,7 @@ class Builder:
 
     async def _accept(self, manifest: Manifest, files: Sequence[Path], folder: Path, caller: str | None) -> Surface:
         try:
-            surface, new = await asyncio.to_thread(self._surfaces.accept, manifest, files)
+            surface, new = await in_store(self._surfaces.accept, manifest, files)
         finally:
             # By nobody else, and not before: it may be on its way to its place.
             await asyncio.to_thread(discard, folder)
@@ -331,7 +331,7 @@ class Builder:
         StoreError
             If that cannot be stored.
         """
-        again = await asyncio.to_thread(self._surfaces.retry, surface)
+        again = await in_store(self._surfaces.retry, surface)
         self._resume(again, caller)
         return again
 
@@ -360,7 +360,7 @@ class Builder:
                 if not task.cancelling():  # a second time it would not wait for the end of its process
                     task.cancel()
                 await asyncio.wait((task,))  # which does not cancel it either, if whoever deletes is cut short
-            await asyncio.to_thread(self._surfaces.delete, surface)
+            await in_store(self._surfaces.delete, surface)
             await asyncio.to_thread(self._work.forget, surface)
         finally:
             self._deleting.discard(surface)
@@ -470,7 +470,7 @@ class Builder:
             # Not in a thread: builds wait for their turns in the order in which they were queued.
             known = self._surfaces.index.find(surface)
             if known is not None and known.state == "building":  # that the last attempt had ended could not be noted
-                known = await asyncio.to_thread(self._surfaces.later, surface)
+                known = await in_store(self._surfaces.later, surface)
             if known is None or known.state != "queued":
                 return None
             if known.attempts >= _ATTEMPTS:
@@ -503,13 +503,13 @@ class Builder:
     async def _try(self, note: Callable[[], object]) -> None:
         """Note something of a build that is found out again if it is lost."""
         try:
-            await asyncio.to_thread(note)
+            await in_store(note)
         except (StoreError, IndexLostError) as error:
             _log.warning("what became of a build could not be noted: %s", error)
 
     async def _do_without(self, surface: str, problem: str) -> State:
         """Return the state of a surface whose upload is of no use: somebody may have restored its container."""
-        if await asyncio.to_thread(self._surfaces.found, surface) is not None:
+        if await in_store(self._surfaces.found, surface) is not None:
             return "ready"
         return await self._postpone(surface, problem)
 
@@ -638,7 +638,7 @@ class Builder:
         try:
             info = await asyncio.to_thread(results.check, job.container, built, job.files)
             picture = thumbnails.png_of(built.thumbnail)
-            await asyncio.to_thread(self._surfaces.built, surface, job.container, built.sha256, info, picture)
+            await in_store(self._surfaces.built, surface, job.container, built.sha256, info, picture)
         except OSError as error:
             return _not_now(error)
         except TooLargeError as error:
@@ -655,7 +655,7 @@ class Builder:
         if surface.container is not None:
             return await self._postpone(surface.id, f"it was ready before, and cannot be built again: {reason}")
         try:
-            await asyncio.to_thread(self._surfaces.refused, surface.id, reason, choices)
+            await in_store(self._surfaces.refused, surface.id, reason, choices)
         except stores.FullError:
             raise
         except StoreError as error:
@@ -674,7 +674,7 @@ class Builder:
 
     async def _postpone(self, surface: str, reason: str) -> State:
         _log.warning("%s waits for a retry: %s", surface, reason)
-        await asyncio.to_thread(self._surfaces.stuck, surface, reason)
+        await in_store(self._surfaces.stuck, surface, reason)
         await asyncio.to_thread(self._work.forget, surface)  # a retry begins with the upload
         return "waiting"
 

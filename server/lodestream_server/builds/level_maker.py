@@ -33,7 +33,7 @@ from ..access.access import Caller
 from ..access.limits import Limits
 from ..access.shares import Held
 from ..operation.settings import Settings
-from ..operation.threads import carried_out, entered
+from ..operation.threads import carried_out, entered, in_store
 from ..problems import BusyError, FullError
 from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
@@ -213,7 +213,7 @@ class LevelMaker:
                 raise self._no_room(0) from None
             # It may read the file that was there when it began, and no other in its place.
             if error.kind == "FileNotFoundError" or error.errno == errno.EACCES:
-                (await asyncio.to_thread(self._containers.blob, key.container)).close()  # or it says that it is gone
+                (await in_store(self._containers.blob, key.container)).close()  # or it says that it is gone
                 if os.access(wanted.container, os.R_OK):
                     raise _ReplacedError("its container was deleted and built again meanwhile") from None
             _log.error("making a level failed unexpectedly: %s", error.traceback)

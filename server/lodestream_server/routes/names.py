@@ -15,6 +15,7 @@ from lodestream.errors import InputError, NotFoundError, TooLargeError
 
 from ..access.access import Caller
 from ..access.scopes import READ, Reader, Writer
+from ..operation.threads import in_store
 from ..problems import SlowUploadError, responses
 from ..refusals import fault_of_body
 from ..store.index import Named, Surface
@@ -65,10 +66,10 @@ async def point_name(caller: Writer, request: Request, parts: Parts, name: _Name
         await parts.limits.check_owner(caller.owner)
     fits = parts.limits.names(caller)
     if found is None:
-        await asyncio.to_thread(names.check, name, caller.may_change, fits)
+        await in_store(names.check, name, caller.may_change, fits)
         return Response(status_code=204)
     keep = _DAY * parts.settings.keep_replaced_days
-    await asyncio.to_thread(names.point, name, found.id, caller.owner, caller.may_change, keep, fits)
+    await in_store(names.point, name, found.id, caller.owner, caller.may_change, keep, fits)
     content = await description(found, caller, parts, request)
     return Response(content, 201 if new else 200, media_type=_JSON)
 
@@ -132,7 +133,7 @@ async def delete_name(caller: Writer, parts: Parts, name: _Name) -> Response:
 
     Only its owner and an admin may do this.
     """
-    await asyncio.to_thread(parts.surfaces.names.delete, name, caller.may_change)
+    await in_store(parts.surfaces.names.delete, name, caller.may_change)
     return Response(status_code=204)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
@@ -16,6 +16,7 @@ from starlette.types import Message, Receive, Scope, Send
 from lodestream.errors import NotFoundError
 from lodestream.stores import Blob, StoreError
 
+from ..operation.threads import in_store
 from ..problems import BuildFailedError, BusyError, NotReadyError, PostponedError
 from ..store.index import Surface
 from .byte_ranges import only_range
@@ -83,20 +84,20 @@ class SentBlob(StreamingResponse):
         headers |= {"content-length": str(end - start), "accept-ranges": "bytes"}
         if wanted is not None:
             headers["content-range"] = f"bytes {start}-{end - 1}/{blob.size}"
-        pieces = iter(()) if request.method == "HEAD" else _pieces(blob, start, end)
+        pieces = _pieces(blob, start, start if request.method == "HEAD" else end)
         super().__init__(pieces, 200 if wanted is None else 206, headers, media_type)
         self._blob = blob
         self._first = start, min(_PIECE, end - start)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send it."""
-        await asyncio.to_thread(self._blob.read, *self._first)
+        await in_store(self._blob.read, *self._first)
         await super().__call__(scope, receive, send)
 
 
-def _pieces(blob: Blob, start: int, end: int) -> Iterator[bytes]:
+async def _pieces(blob: Blob, start: int, end: int) -> AsyncIterator[bytes]:
     for offset in range(start, end, _PIECE):
-        yield blob.read(offset, min(_PIECE, end - offset))
+        yield await in_store(blob.read, offset, min(_PIECE, end - offset))
 
 
 async def look_for(parts: State, surface: str) -> None:

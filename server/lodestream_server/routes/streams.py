@@ -31,6 +31,7 @@ from ..access.access import Caller, anybody
 from ..access.scopes import READ, StreamReader
 from ..codes import MEANINGS
 from ..operation.logs import event
+from ..operation.threads import in_store
 from ..problems import NoWebSocketError, SilentError, answer, problem, responses
 from ..store.containers import OpenContainer
 from .routing import AnyQuery, readable
@@ -111,7 +112,7 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: AnyQuery, surfa
                 container = parts.containers.open_known(sha256, caller.key)
                 if container is None:
                     share = partial(parts.limits.check_index, caller)
-                    container = await asyncio.to_thread(parts.containers.open, sha256, caller.key, share)
+                    container = await in_store(parts.containers.open, sha256, caller.key, share)
             sender = Sender(container.index, container.sha256, credit, container.window_errors)
             await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
     except WebSocketDisconnect:
@@ -321,7 +322,7 @@ class _Session:
             elif wanted is not None:
                 data = self._container.read_at_once(wanted)
                 if data is None:
-                    data = await asyncio.to_thread(self._container.read, wanted)
+                    data = await in_store(self._container.read, wanted)
                 else:
                     # The others' turn: of many streams each has its first picture before any has its second.
                     await self._pace.turn()

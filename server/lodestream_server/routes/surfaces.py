@@ -19,6 +19,7 @@ from lodestream.stores import AbsentError
 from ..access.access import Caller
 from ..access.scopes import Reader, Writer
 from ..builds import options
+from ..operation.threads import in_store
 from ..problems import BusyError, FullError, NotOwnerError, TooManyError, responses
 from ..store import layout, uploads
 from ..store.durable import discard
@@ -82,7 +83,7 @@ async def upload_surface(caller: Writer, request: Request, parts: AnyQuery) -> R
                 raise
             watched = await held.enter_async_context(parts.limits.upload(request, caller, stored=False))
             received = await uploads.receive(watched, None, parts.settings, filename)
-            known = await asyncio.to_thread(_known, received, _chosen(query, received), caller.owner, parts)
+            known = await in_store(_known, received, _chosen(query, received), caller.owner, parts)
             if known is None:
                 raise refusal from None
             surface = known
@@ -326,7 +327,7 @@ async def description(
     if until is not None:
         head["replaced_until"] = datetime.fromtimestamp(until, UTC).isoformat(timespec="milliseconds")
     # What was built is described by bytes of the store, which may be many.
-    return await asyncio.to_thread(_joined, parts, surface, head)
+    return await in_store(_joined, parts, surface, head)
 
 
 def _joined(parts: State, surface: Surface, head: dict[str, Any]) -> bytes:
