@@ -144,6 +144,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             upkeep.start()
             data.start()
             following.start()
+            # Before all else ends, which may take long while the bucket does not answer.
+            ending.push_async_callback(asyncio.to_thread, data.leave)
             yield
 
     app = FastAPI(

@@ -29,7 +29,7 @@ __all__ = ["Following"]
 _log = logging.getLogger(__name__)
 
 # Seconds that the end of a server waits for looks that are under way.
-_FAREWELL = 5.0
+_FAREWELL = 0.5
 
 # A stranger may ask for anything, and each look at the bucket has its price: there are so many in a second, and so many
 # seconds between two for the same thing. Whoever asks waits for it for so long.
@@ -133,6 +133,9 @@ class Following:
             if len({what, *self._coming, *self._lately}) > _MOST_LOOKS:
                 return
             coming = self._coming[what] = asyncio.create_task(self._look_for(what))
+            coming.add_done_callback(
+                lambda look: look.cancelled() or look.exception()
+            )  # nobody may wait for it by then
         try:
             async with asyncio.timeout(_PATIENCE):
                 await asyncio.shield(coming)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,8 +12,9 @@ from typing import Any
 import httpx
 import pytest
 
-from lodestream.stores import open_store
+from lodestream.stores import StoreError, open_store
 from lodestream_server import running_server
+from lodestream_server.store import layout
 from lodestream_server.store.lease import Lease
 from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
@@ -44,17 +46,18 @@ def stored(memory: str, tmp_path: Path) -> str:
 
 
 class Hanging:
-    """Calls that wait until they are let go; how many do."""
+    """Calls that wait until they are let go; how many do, and whether one gave up."""
 
     def __init__(self) -> None:
         self.count = 0
         self.over = threading.Event()
+        self.gave_up = False
         self._lock = threading.Lock()
 
     def __call__(self, *_: Any, **__: Any) -> bytes:
         with self._lock:
             self.count += 1
-        self.over.wait(PATIENCE)
+        self.gave_up |= not self.over.wait(PATIENCE)
         return b""
 
 
@@ -81,3 +84,42 @@ def test_what_the_index_knows_is_told_while_many_wait_for_the_bucket(
             assert not any(answer.done() for answer in answers)
         finally:
             hanging.over.set()
+
+
+def test_a_look_that_fails_when_nobody_waits_for_it_any_more_is_no_error_of_the_server(
+    stored: str, memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any
+) -> None:
+    def get(*_: Any) -> None:
+        hanging()
+        raise StoreError("it does not answer")
+
+    monkeypatch.setattr("lodestream_server.following._PATIENCE", 0.01)
+    with (
+        running_server(memory, scratch=tmp_path / "scratch", workers=1, read_only=True) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        monkeypatch.setattr("lodestream.stores.bucket.Bucket.get", get)
+        for number in range(101, 104):  # of which there is no surface
+            assert http.get(f"/v1/surfaces/{number:020x}").status_code == 503
+        hanging.over.set()
+        eventually(lambda: hanging.count == 3, "all looks to have failed")
+    gc.collect()
+    assert "never retrieved" not in caplog.text
+
+
+def test_a_server_ends_and_gives_up_its_lease_while_the_bucket_hangs(
+    memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        ThreadPoolExecutor(1) as reader,
+        running_server(memory, scratch=tmp_path / "scratch", workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        eventually(lambda: http.get("/readyz").json()["role"] == "writer", "the server to write")
+        monkeypatch.setattr("lodestream.stores.bucket.Bucket.get", hanging)
+        reader.submit(http.put, "/v1/names/dem", json={"surface": None})  # it holds the lock of all changes
+        eventually(lambda: hanging.count == 1, "the change to wait")
+    assert not hanging.gave_up
+    found = open_store(memory).get_if(layout.WRITER, None)
+    assert found is not None
+    assert layout.parse(layout.Writer, layout.WRITER, found[0]).holder is None

@@ -25,7 +25,7 @@ _AGAIN = 1.0
 # So often it is tried at once when others write too.
 _TRIES = 10
 # Seconds that the end of a server waits for the last changes.
-_FAREWELL = 5.0
+_FAREWELL = 0.5
 
 
 class ChangeLog:
@@ -64,10 +64,14 @@ class ChangeLog:
         self._thread = threading.Thread(target=self._run, name="lodestream-changes", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Write what is left, and end."""
+    def end(self) -> None:
+        """Begin to end: write what is left."""
         self._ending.set()
         self._wake.set()
+
+    def close(self) -> None:
+        """Write what is left, and end; if the store does not answer, the next server lets readers list everything."""
+        self.end()
         if self._thread is not None:
             self._thread.join(_FAREWELL)
 

@@ -37,7 +37,7 @@ _SEEN = 10_000
 _AT_ONCE = 2
 _WAITING = 32
 #: Seconds that the end of a server waits for fetches to notice it.
-_FAREWELL = 5.0
+_FAREWELL = 0.5
 
 #: What somebody can do whose level or tile cannot be made.
 _ADVICE = "stream the surface, or fetch its container"

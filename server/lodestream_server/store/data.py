@@ -200,12 +200,17 @@ class Data:
         if read:
             _log.info("made the index of %d surfaces in %.1f s", read, time.monotonic() - begun)
 
+    def leave(self) -> None:
+        """Give up the lease of a bucket, and tell what has changed: from now on this server does not write."""
+        if self.surfaces.lease is not None:
+            self.surfaces.changes.end()
+            self.surfaces.lease.close()
+            self.surfaces.changes.close()
+
     def close(self) -> None:
         """Close the index, and release the folder, or give up the lease of the bucket."""
         if hasattr(self, "surfaces"):
-            if self.surfaces.lease is not None:
-                self.surfaces.changes.close()
-                self.surfaces.lease.close()
+            self.leave()
             self.surfaces.close()
         for guard in self._guards:
             os.close(guard)

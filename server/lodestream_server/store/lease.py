@@ -40,8 +40,8 @@ _RENEWED, _WATCHED, _TRUSTED = 1 / 3, 1 / 15, 4 / 5
 
 _LONGEST_NAME = 100
 
-# Seconds that the end of a server waits for a request that is under way.
-_FAREWELL = 5.0
+# Seconds that the end of a server waits until it is given up: longer, and whoever ends the server would kill it.
+_FAREWELL = 4.0
 
 
 def _clock() -> float:
@@ -184,14 +184,15 @@ class Lease:
         """Give it up, so that others need not wait."""
         self._ending.set()
         if self._thread is not None:
-            self._thread.join(_FAREWELL)
-            if self._thread.is_alive():  # the store does not answer: others take over when the lease is over
-                self._until = -math.inf
-                return
+            self._thread.join(_FAREWELL)  # if the store does not answer, others take over when the lease is over
+        else:
+            self._give_up()
+        self._until = -math.inf
+
+    def _give_up(self) -> None:
         if self._ours:
             with suppress(LodestreamError), self._one_at_a_time:
                 self._write(self._clock(), self.number, released=True)
-        self._until = -math.inf
 
     def _run(self) -> None:
         pause = 0.0
@@ -209,6 +210,7 @@ class Lease:
                 self._failing = True
             self._tell()
             pause = self._seconds * (_RENEWED if self._ours and not self._failing else _WATCHED)
+        self._give_up()
 
     def _tell(self) -> None:
         held = self.held

@@ -17,7 +17,6 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any
 
 from lodestream.errors import InputError, LodestreamError, NotFoundError
 from lodestream.stores import AbsentError, Entry, ExistsError, Store, StoreError, Tag, UnacknowledgedError
+from lodestream.stores.threads import Threads
 
 from ..problems import ReadOnlyError, StandbyError
 from . import layout
@@ -54,6 +54,9 @@ STRAY = 86400.0
 
 # Another upload, or somebody who asks for it, begins another attempt of these.
 _STOPPED = ("failed", "waiting")
+
+# Seconds that the end of a server of a bucket waits for a change that is under way.
+_FAREWELL = 0.5
 
 # Surfaces that `sync` reads in one transaction; strays that are removed while uploads wait.
 _AT_ONCE = 500
@@ -151,9 +154,13 @@ class Surfaces:
         self.tell_lost()
 
     def close(self) -> None:
-        """Close the index, once the change that is under way is made."""
-        with self._lock.lock:
-            self._index.close()
+        """Close the index, once the change that is under way is made; if a bucket does not answer it stays open."""
+        lock = self._lock.lock
+        if lock.acquire(timeout=-1 if self.lease is None else _FAREWELL):
+            try:
+                self._index.close()
+            finally:
+                lock.release()
 
     @property
     def writes(self) -> bool:
@@ -914,8 +921,7 @@ def side_by_side(at_once: int) -> Iterator[Callable[..., Iterator[Any]]]:
     if at_once == 1:
         yield map
         return
-    with ThreadPoolExecutor(at_once) as pool:
-        yield pool.map
+    yield Threads(at_once).map
 
 
 def _surface(manifest: Manifest, built: Built | None, tag: Tag | None) -> Surface:
