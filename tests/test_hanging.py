@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tomllib
@@ -27,9 +28,14 @@ def test_a_test_that_hangs_is_named(tmp_path: Path, processes: list[str]) -> Non
     (tmp_path / "test_one.py").write_text("import time\n\ndef test_that_hangs():\n    time.sleep(36_000)\n")
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", str(tmp_path / "pytest.ini")]
     (tmp_path / "pytest.ini").write_text("[pytest]\nfaulthandler_timeout = 1\nfaulthandler_exit_on_timeout = true\n")
-    limits = ["--max-worker-restart", "0"] if processes else []
+    limits = ["-p", "xdist", "--max-worker-restart", "0"] if processes else []
     done = subprocess.run(
-        [*command, *processes, *limits, str(tmp_path)], capture_output=True, text=True, timeout=PATIENCE, check=False
+        [*command, *limits, *processes, str(tmp_path)],
+        env={**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"},  # others take seconds to be loaded, in each process
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
     )
     assert done.returncode != 0
     assert "test_that_hangs" in done.stdout + done.stderr

@@ -97,16 +97,16 @@ def bands(folder: Path, url: str) -> None:
     """Encode in bands, through files that are mapped, to the bytes of an encoding in memory; decode to a file."""
     import lodestream as ls
 
-    heights = terrain(700, 600)
+    heights = terrain(350, 300)
     np.save(folder / "heights.npy", heights)
     whole = folder / "whole.lode"
     ls.encode(folder / "heights.npy", out=whole)
     parts = folder / "parts.lode"
     parts.write_bytes(b"an earlier file")
-    ls.encode(folder / "heights.npy", out=parts, memory=4 << 20, scratch=folder / "scratch")
+    ls.encode(folder / "heights.npy", out=parts, memory=1 << 20, scratch=folder / "scratch")
     assert parts.read_bytes() == whole.read_bytes()
     assert list((folder / "scratch").iterdir()) == []
-    run("decode", parts, folder / "back.npy", "--memory", "16MB")
+    run("decode", parts, folder / "back.npy", "--memory", "8MB")
     assert np.array_equal(np.load(folder / "back.npy"), heights)
 
 
@@ -115,7 +115,7 @@ def continuing(folder: Path, url: str) -> None:
     import lodestream as ls
     from lodestream.encoding.folders import kept_folder
 
-    heights, scratch = terrain(700, 600), folder / "scratch"
+    heights, scratch = terrain(350, 300), folder / "scratch"
     np.save(folder / "heights.npy", heights)
 
     def stop(fraction: float) -> None:
@@ -123,7 +123,7 @@ def continuing(folder: Path, url: str) -> None:
             raise KeyboardInterrupt
 
     def build(progress: Any = None) -> None:
-        ls.encode(folder / "heights.npy", out=folder / "x.lode", memory=4 << 20, scratch=scratch, progress=progress)
+        ls.encode(folder / "heights.npy", out=folder / "x.lode", memory=1 << 20, scratch=scratch, progress=progress)
 
     with pytest.raises(KeyboardInterrupt):
         build(stop)
