@@ -43,7 +43,7 @@ else
 	@$(TESTED) $(BIN)/python $(PYTEST) $(ARGS)
 endif
 
-test-rest: kernels ## run the tests that `make test` leaves out because they are long, and the other cases of its sweeps
+test-rest: kernels ## run what `make test` leaves out: the other cases of its sweeps, and long tests, with samples of their cases
 	@HYPOTHESIS_PROFILE=rest $(TESTED) $(BIN)/python $(PYTEST) $(ARGS)
 
 cover: ## run the tests and say which lines of Python none of them runs, in whatever process

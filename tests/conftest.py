@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from lodestream.confinement import available, missing
-from tests.examples import EXAMPLES, LONG, PROFILE, REST, USUAL, left_out
+from tests.examples import EXAMPLES, MARKS, PROFILE, REST, USUAL, chosen
 
 # No deadline: no test here is about time. The same examples in every run, so that a change is judged by what it
 # changes; HYPOTHESIS_PROFILE=torture tries others, and 200 times as many, see `tests.examples`.
@@ -91,10 +91,17 @@ LONGEST = (
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let the processes of pytest-xdist take files in their order here, and not those of the most tests first."""
-    config.addinivalue_line("markers", "sweep(count): of its cases `make test` takes so many, see tests.examples")
-    config.addinivalue_line("markers", "long: `make test` leaves it out, and `make test-rest` runs it")
+    config.addinivalue_line("markers", "sweep(count): so many of its cases are its sample, see tests.examples")
+    config.addinivalue_line("markers", "long: `make test` leaves it out, `make test-rest` runs it, or its sample")
     config.option.loadscopereorder = False
     gc.disable()  # what is collected stays: to look through it again and again frees nothing
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files of which the profile `REST` takes nothing: each process would take seconds to import them."""
+    if PROFILE != REST or _is_named(config) or not collection_path.match("test_*.py"):
+        return None
+    return None if MARKS.search(collection_path.read_text(encoding="utf-8")) else True
 
 
 def pytest_collection_finish() -> None:
@@ -104,18 +111,17 @@ def pytest_collection_finish() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is long, and all but samples of sweeps, unless a test is named, or take just that for the profile
-    `REST`; begin with the files that take longest.
-    """
-    named = config.option.keyword or config.option.markexpr or any("::" in each for each in config.args)
-    if PROFILE not in LONG and not named:
-        others = left_out(items)
-        if PROFILE == REST:
-            others = set(items) - others
-        config.hook.pytest_deselected(items=[item for item in items if item in others])
-        items[:] = [item for item in items if item not in others]
+    """Take the tests of the profile, or all of them if a test is named; begin with the files that take longest."""
+    if not _is_named(config):
+        taken = chosen(items, PROFILE)
+        config.hook.pytest_deselected(items=[item for item in items if item not in taken])
+        items[:] = [item for item in items if item in taken]
     places = _places(list(dict.fromkeys(map(_file, items))))
     items.sort(key=lambda item: places[_file(item)])
+
+
+def _is_named(config: pytest.Config) -> bool:
+    return bool(config.option.keyword or config.option.markexpr or any("::" in each for each in config.args))
 
 
 def _file(item: pytest.Item) -> str:

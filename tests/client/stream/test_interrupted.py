@@ -319,6 +319,7 @@ def test_an_interrupt_of_the_writing_loses_nothing(
     check_resumed((relief_surface, "--transport", "ws"), places / "o.npy", folder, relief, run)
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.long
 def test_a_pull_that_is_killed_is_gone_on_from_unasked(
     source: tuple[str, ...], folder: Path, tmp_path: Path, relief: Terrain, run: Run
@@ -513,6 +514,7 @@ def test_what_a_stream_gives_to_a_sink(surface: str, container_file: Path) -> No
         assert covered > len(content) * 0.9
 
 
+@pytest.mark.sweep(1)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.long
 def test_encode_and_decode_leave_no_half_of_a_file(
@@ -537,7 +539,8 @@ def test_encode_and_decode_leave_no_half_of_a_file(
     assert list(places.iterdir()) == [out]
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.sweep(1)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.long
 def test_the_demo_leaves_no_server(tmp_path: Path, number: signal.Signals, code: int) -> None:
     with command("demo", "--out", tmp_path / "demo") as process:

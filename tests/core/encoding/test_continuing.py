@@ -147,6 +147,7 @@ def _expected(case: str) -> bytes:
     return ls.encode(CASES[case][0]())
 
 
+@pytest.mark.sweep(2)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.long
 def test_a_damaged_file_never_reaches_a_container(case: str, tmp_path: Path) -> None:

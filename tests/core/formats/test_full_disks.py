@@ -31,7 +31,8 @@ except OSError as error:
 """
 
 
-@pytest.mark.parametrize("limit", [1, 2_000, 20_000, 700_000, 900_000, 1_300_000])
+@pytest.mark.sweep(3)
+@pytest.mark.parametrize("limit", [1, 900_000, 20_000, 2_000, 700_000, 1_300_000])
 @pytest.mark.long
 def test_a_netcdf_that_does_not_fit_is_told_and_kills_nobody(tmp_path: Path, limit: int) -> None:
     # HDF5 ends a process whose writes fail.
@@ -59,7 +60,8 @@ for _ in range(5):
 """
 
 
-@pytest.mark.parametrize("limit", [1, 3_000, 20_000, 300_000])
+@pytest.mark.sweep(2)
+@pytest.mark.parametrize("limit", [3_000, 300_000, 1, 20_000])
 @pytest.mark.long
 def test_a_store_that_does_not_fit_leaves_nothing(tmp_path: Path, limit: int) -> None:
     # Threads of zarr were still writing chunks while the folder was removed.
