@@ -2,9 +2,10 @@
 
 Whoever has the lease writes the object ``writer.json`` anew every few seconds. Whoever wants it watches that object,
 and takes it over when its tag has been the same for as long as the lease lasts, by the watcher's own clock: the clocks
-of two machines are never compared. A holder trusts the lease for a fifth less than it lasts, from before its last write
-was begun: so it stops before anybody takes over, even if it was stopped for a while. Every write is made in place of
-the one that was read, so of several that take over at once one does.
+of two machines are never compared. One that is gone is waited for as long, since its holder may not have noticed. A
+holder trusts the lease for a fifth less than it lasts, from before its last write was begun: so it stops before anybody
+takes over, even if it was stopped for a while. Every write is made in place of the one that was read, so of several
+that take over at once one does.
 
 Should all of this fail, nothing is overwritten: each change of the data is made under a condition too.
 """
@@ -91,7 +92,8 @@ class Lease:
         self._until = -math.inf  # by the clock; so long it is trusted
         self._tag: Tag | None = None
         self._there: Writer | None = None
-        self._since = 0.0  # since when the object is known to be the same
+        self._since: float | None = None  # since when the object is known to be the same, or gone; None: never seen
+        self._lasts = seconds  # how long whoever had it last may trust it, and a little longer
         self._one_at_a_time = threading.Lock()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
@@ -137,7 +139,7 @@ class Lease:
             self._write(begun, self.number)
             return
         except ConflictError:
-            self._ours, self._tag = False, None
+            self._ours, self._tag, self._since = False, None, self._clock()
         free = self._look(begun)
         if self._there is not None and self._there.holder == self._own:
             self._ours = True  # a renewal of which no answer came
@@ -150,11 +152,12 @@ class Lease:
         try:
             found = layout.read_if(self._store, WRITER, self._tag)
         except AbsentError:
+            if self._tag is not None:  # somebody has deleted it, whom its holder need not have noticed
+                self._since = self._clock()
             self._tag, self._there, self._until = None, None, -math.inf
-            return True
+            return self._since is None or begun - self._since >= self._lasts
         if found is None:
-            lasts = self._seconds if self._there is None else max(self._seconds, min(self._there.seconds, _LONGEST))
-            return begun - self._since >= lasts
+            return self._since is None or begun - self._since >= self._lasts
         data, self._tag = found
         self._since = self._clock()
         try:
@@ -162,7 +165,9 @@ class Lease:
         except DamagedObjectError as error:
             _log.error("%s; it is replaced unless somebody renews it", error)
             self._there = None
-        return self._there is not None and self._there.holder is None
+            return False
+        self._lasts = max(self._seconds, min(self._there.seconds, _LONGEST))
+        return self._there.holder is None
 
     def _write(self, begun: float, number: int, *, released: bool = False) -> None:
         there = Writer(None if released else self._own, self._name, number, self._seconds, layout.new_write())

@@ -210,6 +210,7 @@ def test_an_object_that_is_gone_or_damaged_is_made_again_with_another_number(sto
     store.delete(["writer.json"])
     lease.tend()
     assert not lease.held
+    clock.now += SECONDS
     lease.tend()
     assert lease.held
     assert lease.number == 2
@@ -220,6 +221,23 @@ def test_an_object_that_is_gone_or_damaged_is_made_again_with_another_number(sto
     clock.now += SECONDS
     other.tend()
     assert other.held
+
+
+@pytest.mark.parametrize("seconds", [SECONDS, 30.0])
+def test_an_object_that_somebody_deletes_is_waited_for_as_long_as_its_holder_may_trust_it(
+    store: Store, clock: Clock, seconds: float
+) -> None:
+    first, second = Lease(store, seconds, clock=clock), Lease(store, clock=clock)
+    first.tend()
+    second.tend()
+    first.tend()
+    store.delete(["writer.json"])
+    while not second.held:
+        second.tend()
+        assert not (first.held and second.held)
+        clock.now += 1.0
+    assert clock.now <= 1000.0 + seconds + 2.0
+    assert second.number == 1
 
 
 def test_a_lease_that_says_it_lasts_long_is_waited_for_but_not_for_ever(store: Store, clock: Clock) -> None:
