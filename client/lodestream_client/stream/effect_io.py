@@ -230,8 +230,7 @@ class EffectIO:
     async def _leave(self, how: HangUp) -> None:
         """Close all that is open, except the request that was made ahead."""
         body, self._body = self._body, None
-        if body is not None:
-            body.cancel()
+        if body is not None and body.cancel():
             await asyncio.wait({body})
         self.arrived.clear()
         if self._socket is not None and how.abort:
