@@ -429,5 +429,5 @@ def test_a_server_s_error_is_its_own_class() -> None:
         assert isinstance(core.effect, Hear)
         core.done(serialize(Error(code, "Title", "detail")))
         assert next_effect(core) == HangUp(abort=True)
-        with pytest.raises(kind, match="Title: detail"):
+        with pytest.raises(kind, match=r"^detail$"):
             core.done(None)
