@@ -156,6 +156,41 @@ def test_a_reader_that_looks_at_any_moment_of_a_change_has_seen_it_afterwards(
     assert reader.states() == {}
 
 
+@pytest.mark.parametrize("looks", ["hint", "list"])
+@pytest.mark.parametrize("is_built", [False, True])
+def test_what_was_deleted_and_uploaded_again_between_two_looks_is_another_surface(
+    server: Make, memory: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looks: str, is_built: bool
+) -> None:
+    store: Any = open_store(memory)
+    delete = store.delete
+
+    def stay(keys: Any, *given: Any, **named: Any) -> None:  # what became of the build is left as a stray
+        if any(key.startswith("built/") for key in keys):
+            raise StoreError("no network")
+        delete(keys, *given, **named)
+
+    monkeypatch.setattr(store, "delete", stay)
+    writer, reader = server("writer", store=store), server("reader", writes=False)
+    writer.tend()
+    manifest, files = upload(tmp_path, 0)
+    writer.surfaces.accept(manifest, files)
+    if is_built:
+        build(writer.surfaces, manifest, tmp_path)
+    writer.tend()
+    reader.tend()
+    writer.surfaces.delete(manifest.id)
+    again, files = upload(tmp_path, 0)
+    writer.surfaces.accept(again, files)
+    writer.tend()
+    if looks == "hint":
+        reader.tend()
+    else:
+        reader.surfaces.sync()
+    assert told(reader) == told(writer)
+    assert reader.surfaces.get(again.id).manifest.write == again.write != manifest.write
+    assert reader.states() == {again.id: "queued"}
+
+
 def told(server: Server) -> list[object]:
     """What a server says of its surfaces and names, but for builds, of which only the writer knows."""
     index = server.surfaces.index
