@@ -31,7 +31,7 @@ _SOON = 8.0
 
 #: Until all is settled: so many times as long as the lease lasts, and the seconds that servers and what they were asked
 #: take on a machine that does several other things.
-_LEASES, _SETTLED = 3, 60.0
+_LEASES, _SETTLED = 3, 120.0
 
 
 @dataclass

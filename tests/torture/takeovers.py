@@ -28,8 +28,9 @@ from lodestream_server.access.tokens import TokenObject
 from lodestream_server.store.layout import WRITER
 from tests.history.bucket_site import READERS, WRITERS, BucketSite
 from tests.history.checker import check
-from tests.history.driver import Client, Crowd, Goods, Server
+from tests.history.driver import Client, Crowd, Goods
 from tests.history.events import Finding, History, Operation, Span, Subject
+from tests.patience import PATIENCE
 from tests.server.helpers import hills, npy
 from tests.stores.emulators import reach, running_ministack
 from tests.stores.faults import Fault, FaultProxy, fault_proxy
@@ -47,6 +48,8 @@ DISASTERS = ("kill", "stop", "end", "kill waiting", "kill reader", "stop reader"
 _TAKEOVER, _SEEN, _REVOKED = 3.0, 5.0, 10.0
 
 _KINDS = ("lost", "closed", "409", "503", "slow")
+#: Requests for the lease that fail when a server goes on.
+_OF_LEASE = 20
 _BODIES = 6
 _NAMES = 3
 _SHOWN = 10
@@ -217,7 +220,7 @@ class _Story:
         site.open()
         started = time.monotonic()
         crowd = Crowd(self._history, goods, site.servers, list(goods.bodies), seed=self._seed, size=self._clients)
-        guests = _Guests(self._history, site, self._tokens, _REVOKED + self._times.slack)
+        guests = self._guests("guest")
         beside: list[_Watch | _Guests] = [
             *(_Watch(self._history, goods, site, name, crowd.ids) for name in READERS),
             guests,
@@ -235,20 +238,29 @@ class _Story:
                     # Every other time is long enough for what readers promise.
                     least, most = self._random.choice(((0.0, 0.2), (1.0, 1.3)))
                     self._calm(self._random.uniform(least, most) * (self._history.lag or 0))
-                    self._disaster(left.pop())
+                    self._disaster(left.pop(), goods, crowd)
                     progress(self._told(started))
             time.sleep((self._history.lag or 0) + self._times.look)  # what was uploaded last is seen
         self._calm(0.0, self._settled(goods, crowd))
+        with closing(self._guests("last guest")) as last:
+            self._calm(0.0, last.step)
         self._judge(guests)
+        self._judge(last)
+
+    def _guests(self, name: str) -> _Guests:
+        return _Guests(self._history, self.site, self._tokens, name, _REVOKED + self._times.slack)
 
     def _judge(self, guests: _Guests) -> None:
-        """Look how long tokens that were revoked were taken, while nothing failed."""
-        for span in guests.revoked:
-            if not _troubled(self._history, span.begun, span.ended):
-                self._done.revoked.append(span.ended - span.begun)
-                if span.ended - span.begun > guests.limit:
-                    text = f"{span.server}: expected it to end within {guests.limit:.0f} s"
-                    self._history.found("token", f"{text}, got {span.ended - span.begun:.1f}")
+        """Look how long new tokens were not taken, and revoked ones were, while nothing failed."""
+        for what, spans in (("be taken", guests.made), ("end", guests.revoked)):
+            for span in spans:
+                seconds = span.ended - span.begun
+                if seconds > guests.limit and not _troubled(self._history, span.begun, span.ended):
+                    text = f"{span.server}: expected a token to {what} within {guests.limit:.0f} s, got {seconds:.1f}"
+                    self._history.found("token", text)
+        self._done.revoked += [
+            span.ended - span.begun for span in guests.revoked if not _troubled(self._history, span.begun, span.ended)
+        ]
 
     def _told(self, started: float) -> str:
         done = self._done
@@ -295,7 +307,7 @@ class _Story:
             self._done.restless += 1
             self._history.trouble(Span(begun, self._history.clock()))
 
-    def _disaster(self, kind: str) -> None:
+    def _disaster(self, kind: str, goods: Goods, crowd: Crowd) -> None:
         """Let something happen, and wait until all is as before."""
         begun, site, proxy = self._history.clock(), self.site, self._proxy
         writer = site.settle()
@@ -312,6 +324,8 @@ class _Story:
         match kind:
             case "kill" | "stop" | "end":
                 self._taken_over(kind, writer, waiting)
+                if kind == "stop":
+                    self._wakes(writer, goods, crowd)
             case "kill waiting" | "kill reader":
                 name = waiting if kind == "kill waiting" else reader
                 site.kill(name)
@@ -344,21 +358,31 @@ class _Story:
             history.found("takeover", f"{waiting}: expected it to write {limit:.0f} s after a {kind}, got {taken:.1f}")
         if kind != "stop":
             site.start(writer)
-            return
+
+    def _wakes(self, name: str, goods: Goods, crowd: Crowd) -> None:
+        """Let a server go on that was stopped until another one wrote, and ask it for uploads at once."""
+        site, history = self.site, self._history
         since, before = history.clock(), self._leases()
-        name = site.called(writer)
+        called = site.called(name)
         if self._random.random() < 0.5:
             self._moment()
-        site.go_on(writer)
-        self._moment()
+        # It does not learn at once that another one has the lease: it must know by the time.
+        self._proxy.faults.append(Fault("503", _OF_LEASE, rf"\S+ \S*{WRITER}"))
+        self._done.faults += _OF_LEASE  # those that are left are taken off
+        site.go_on(name)
+        until = time.monotonic() + self._random.uniform(0.3, 1.5) * self._times.lease
+        with closing(self._client(f"operator at {name}", goods, crowd, name)) as operator:
+            while time.monotonic() < until:
+                operator.upload(self._random.choice(list(goods.bodies)))
+                time.sleep(0.02)
         if self._leases() == before:
-            history.waits(Span(since, history.clock(), name))
+            history.waits(Span(since, history.clock(), called))
 
     def _settled(self, goods: Goods, crowd: Crowd) -> Callable[[], None]:
         """Ask every server for everything, once every build has come to its end."""
 
         def work() -> None:
-            until = time.monotonic() + self.site.patience
+            until = time.monotonic() + PATIENCE
             with closing(self._client("operator", goods, crowd, self.site.writer() or "")) as operator:
                 for subject in goods.bodies:
                     state = operator.settled(subject, until)
@@ -396,42 +420,46 @@ class _Watch:
 
 
 class _Guests:
-    """Tokens that are made and revoked: how long readers take them."""
+    """Tokens that are made and revoked: how long readers do not take them, and how long they do."""
 
-    def __init__(self, history: History, site: BucketSite, tokens: TokenObject, limit: float) -> None:
+    def __init__(self, history: History, site: BucketSite, tokens: TokenObject, name: str, limit: float) -> None:
         self.limit = limit
+        self.made: list[Span] = []
         self.revoked: list[Span] = []
-        self._history, self._site, self._tokens = history, site, tokens
+        self._history, self._site, self._tokens, self._name = history, site, tokens, name
         self._number = 0
         self._http = httpx.Client(trust_env=False, timeout=5.0)
 
     def step(self) -> None:
         self._number += 1
-        name, until = f"guest {self._number}", time.monotonic() + 4 * self.limit
+        name = f"{self._name} {self._number}"
         try:
+            begun = self._history.clock()
             text, _ = self._tokens.create(name, ("read",))
-            for server in self._site.servers(*READERS):
-                self._reaches(server, text, 200, until)
+            self.made += self._until(text, 200, begun)
             begun = self._history.clock()
             self._tokens.revoke(name)
         except LodestreamError:  # the network fails
             time.sleep(1)
             return
-        for server in self._site.servers(*READERS):
-            if self._reaches(server, text, 401, until) or time.monotonic() > until:
-                self.revoked.append(Span(begun, self._history.clock(), server.name))
+        self.revoked += self._until(text, 401, begun)
         time.sleep(1)
 
-    def _reaches(self, server: Server, text: str, status: int, until: float) -> bool:
-        while time.monotonic() < until:
-            try:
-                answer = self._http.get(f"{server.url}/v1/surfaces", headers={"authorization": f"Bearer {text}"})
-            except httpx.TransportError:
-                return False
-            if answer.status_code == status:
-                return True
+    def _until(self, text: str, status: int, begun: float) -> Iterator[Span]:
+        """Ask all readers until they answer so, or the time is over; give the time of each but those that are gone."""
+        until = time.monotonic() + self.limit + 1.0
+        left = list(self._site.servers(*READERS))
+        while left:
+            for server in tuple(left):
+                try:
+                    answer = self._http.get(f"{server.url}/v1/surfaces", headers={"authorization": f"Bearer {text}"})
+                except httpx.TransportError:
+                    left.remove(server)
+                    continue
+                if answer.status_code == status or time.monotonic() > until:
+                    yield Span(begun, self._history.clock(), server.name)
+                    left.remove(server)
             time.sleep(0.1)
-        return False
 
     def close(self) -> None:
         self._http.close()
