@@ -27,7 +27,7 @@ from lodestream.stores import AbsentError, ConflictError, ExistsError, Store, St
 from . import layout
 from .layout import WRITER, DamagedObjectError, Writer
 
-__all__ = ["LEASE_SECONDS", "Lease"]
+__all__ = ["LEASE_SECONDS", "Lease", "uptime"]
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ _LONGEST_NAME = 100
 _FAREWELL = 4.0
 
 
-def _clock() -> float:
+def uptime() -> float:
     """Return seconds that go on while the machine sleeps: then others take over."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
@@ -78,7 +78,7 @@ class Lease:
         seconds: float = LEASE_SECONDS,
         *,
         wanted: bool = True,
-        clock: Callable[[], float] = _clock,
+        clock: Callable[[], float] = uptime,
     ) -> None:
         self.wanted = wanted
         self.number = 0

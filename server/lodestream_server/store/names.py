@@ -11,7 +11,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import logging
-import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
@@ -120,7 +119,7 @@ class Names:
         StoreError
             If it could not be stored, or it is not known whether it was.
         """
-        key, now = layout.name_key(name), time.time()
+        key, now = layout.name_key(name), self._surfaces.now()
         with self._writing:
             _check_owner(f"the surface {surface}", self._surfaces.get(surface).manifest.owner, may_change)
             before, tag = self._changeable(name, may_change, fits)
@@ -225,14 +224,14 @@ class Names:
         Parameters
         ----------
         now : float, optional
-            Seconds since 1970.
+            Seconds since 1970, see `Surfaces.now`.
 
         Raises
         ------
         IndexLostError
             If the index cannot be used.
         """
-        now = time.time() if now is None else now
+        now = self._surfaces.now() if now is None else now
         gone: list[Surface] = []
         for key in self._surfaces.index.due(now):
             try:

@@ -15,6 +15,7 @@ import json
 import logging
 import math
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -40,7 +41,7 @@ from .layout import (
     DamagedObjectError,
     Manifest,
 )
-from .lease import Lease
+from .lease import Lease, uptime
 from .names import Names
 from .private import make_private
 from .states import Event, after
@@ -109,6 +110,7 @@ class Surfaces:
         self.changes = ChangeLog(store)
         self.is_synced = False
         self._synced_in: int | None = None  # number of the lease since which `sync` has come to its end
+        self._ahead: float | None = None  # of the clock of the bucket before `uptime`, in seconds
         self._identity = establish(store)
         self._path = index
         self.tell_lost = lost
@@ -200,6 +202,10 @@ class Surfaces:
         """
         self.check_writer()
         return math.inf if self.lease is None else self.lease.left
+
+    def now(self) -> float:
+        """Return seconds since 1970; for whoever writes to a bucket by its clock: those of two machines may differ."""
+        return time.time() if self._ahead is None else self._ahead + uptime()
 
     def tell(self, what: str) -> None:
         """Tell other servers that a surface has changed, by its id, or a name, by its key."""
@@ -737,6 +743,7 @@ class Surfaces:
         self._index.complete()
         self.is_synced, self._damaged = True, damaged
         if number is not None and self._synced_in != number:
+            self._ahead = self.store.probe() - uptime()
             self._synced_in = number
             self.changes.begin()
         return taken, damaged

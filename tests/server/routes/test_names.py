@@ -202,7 +202,7 @@ def test_replaced_surfaces_are_deleted_by_the_server(tmp_path: Path, monkeypatch
         time.sleep(0.3)
         assert http.get(f"/v1/surfaces/{ids[0]}").status_code == 200
         tomorrow = SimpleNamespace(time=lambda: time.time() + 90_000)
-        monkeypatch.setattr("lodestream_server.store.names.time", tomorrow)
+        monkeypatch.setattr("lodestream_server.store.surfaces.time", tomorrow)
         eventually(lambda: http.get(f"/v1/surfaces/{ids[0]}").status_code == 404, "the end of its time")
         assert http.get("/v1/names/dem").json()["id"] == ids[1]
 
@@ -216,7 +216,7 @@ def test_replaced_surfaces_go_as_soon_as_the_index_is_up_to_date(
         for id_ in ids:
             put(http, "dem", id_)
     later = 90_000.0
-    monkeypatch.setattr("lodestream_server.store.names.time", SimpleNamespace(time=lambda: time.time() + later))
+    monkeypatch.setattr("lodestream_server.store.surfaces.time", SimpleNamespace(time=lambda: time.time() + later))
     failed, expire = threading.Event(), Names.expire
 
     def failing(names: Names) -> list[Surface]:

@@ -483,6 +483,25 @@ def test_what_another_server_has_told_of_a_build_stays(
     assert second.surfaces.get(manifest.id).reason is None
 
 
+def test_what_a_name_has_replaced_stays_as_long_by_the_clock_of_any_server(
+    server: Make, clock: Clock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second, day = server("first"), server("second"), 86400.0
+    first.tend()
+    second.tend()
+    for number in range(2):
+        manifest, files = upload(tmp_path, number)
+        first.surfaces.accept(manifest, files)
+        first.surfaces.names.point("a", manifest.id, None, lambda _: True, 7 * day)
+    clock.now += SECONDS + 1
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + 8 * day)
+    second.tend()
+    assert second.surfaces.names.expire() == []
+    assert len(second.states()) == 2
+    assert len(second.surfaces.names.expire(second.surfaces.now() + 7 * day)) == 1
+
+
 def test_two_that_both_believe_to_write_do_not_overwrite_each_other(server: Make, clock: Clock, tmp_path: Path) -> None:
     first, second = server("first"), server("second")
     first.tend()
