@@ -141,5 +141,7 @@ class Upkeep:
                 try:
                     removed = await in_store(self._surfaces.collect)
                     _log.info("removed %d objects that nothing refers to", len(removed))
+                    if await in_store(self._surfaces.lose_missing):
+                        await self._builder.resume()
                 except Exception as error:  # whatever it is, nobody else would do this work
                     _log.error("strays could not be removed now, which is tried again: %s", error)

@@ -19,7 +19,8 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 _STATUS = re.compile(r"status code: (\d{3})\b", re.ASCII)
-_CODE = re.compile(r"<Code>([A-Za-z]{1,60})</Code>", re.ASCII)
+# In the body of an answer, or as the library tells those of a request for deletes, whose status is 200.
+_CODE = re.compile(r"(?:<Code>|\(code: )([A-Za-z]{1,60})(?:</Code>|\))", re.ASCII)
 # Of an object in a list, as Rust writes a text: without control characters.
 _UNLISTED = re.compile(r'path: "((?:[^"\\\n]|\\.){1,200})')
 _RETRIED = re.compile(r"\bafter [1-9]\d* retries", re.ASCII)
@@ -28,6 +29,8 @@ _RETRIED = re.compile(r"\bafter [1-9]\d* retries", re.ASCII)
 _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")
 #: Codes for credentials that are over, or were never any.
 _EXPIRED = ("ExpiredToken", "InvalidToken", "TokenRefreshRequired")
+#: Codes for what the credentials do not allow.
+_DENIED = ("AccessDenied", "AllAccessDisabled", "InvalidAccessKeyId", "SignatureDoesNotMatch")
 #: Codes for a request to another region than the bucket's.
 _OTHER_REGION = ("PermanentRedirect", "AuthorizationHeaderMalformed", "IllegalLocationConstraintException")
 #: Where machines of clouds ask for the credentials of their role.
@@ -156,7 +159,7 @@ def _kind(name: str, absent: bool, status: int | None, code: str) -> Kind:
         return "absent"
     if name in ("AlreadyExistsError", "PreconditionError") or status in _CONDITIONS:
         return "condition"
-    if absent or (status is not None and 300 <= status < 500 and status not in _AGAIN):
+    if absent or code in _DENIED or (status is not None and 300 <= status < 500 and status not in _AGAIN):
         return "refused"
     definite = ("PermissionDeniedError", "UnauthenticatedError", "NotSupportedError", "InvalidPathError", "ValueError")
     return "refused" if name in (*definite, "UnknownConfigurationKeyError", "TypeError") else "unknown"
@@ -172,7 +175,11 @@ def _words(name: str, text: str, status: int | None, code: str, known: str) -> s
         return f"there is no such bucket or container ({known})"
     if code in _OTHER_REGION or (status is not None and 300 <= status < 400) or "redirect" in text:
         return f"the bucket is elsewhere ({known or 'redirected'}): set AWS_REGION to its region"
-    if status in (401, 403) or code in _EXPIRED or name in ("PermissionDeniedError", "UnauthenticatedError"):
+    if (
+        status in (401, 403)
+        or code in (*_DENIED, *_EXPIRED)
+        or name in ("PermissionDeniedError", "UnauthenticatedError")
+    ):
         return f"the store refuses access ({known or name}): {_CREDENTIALS}"
     if name == "InvalidPathError":
         key = _UNLISTED.search(text)
@@ -180,7 +187,7 @@ def _words(name: str, text: str, status: int | None, code: str, known: str) -> s
             f"it cannot be listed because of the object {key[1] if key else ''!a}, of whose key a part is empty, . or "
             ".., or has a control character: delete that object with another program"
         )
-    if status is not None:
+    if known:
         return f"the store answers {known}"
     if "builder error" in text or name in ("UnknownConfigurationKeyError", "ValueError", "TypeError"):
         return "the endpoint or a setting in the environment (AWS_..., AZURE_...) cannot be used"

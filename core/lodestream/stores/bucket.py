@@ -190,7 +190,8 @@ class Bucket:
         """Delete objects, as far as there are any."""
         places = {key: self._at(key) for key in keys}
         check_process()
-        # One by one: not every store has a request for many, and that of Azure fails for those that are gone.
+        # One by one, to know which is gone. For S3 the library asks for each by `POST ?delete` (DeleteObjects), which a
+        # store has to have; its refusal is in the body of an answer 200.
         answers: list[Future[None]] = []
         try:
             answers.extend(self._threads.submit(self._delete, key, at, still) for key, at in places.items())

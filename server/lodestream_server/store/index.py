@@ -365,6 +365,17 @@ class Index:
         """Return the ids of surfaces that have a container, or had it before it was lost; at most so many."""
         return [row[0] for row in self._rows("SELECT id FROM surface WHERE container = ? LIMIT ?", sha256, most)]
 
+    def containers(self) -> Iterator[str]:
+        """Return the containers of ready surfaces in their order, some at a time."""
+        last = ""
+        while rows := self._rows(
+            "SELECT DISTINCT container FROM surface WHERE container > ? AND state = 'ready' ORDER BY container LIMIT ?",
+            last,
+            _AT_ONCE,
+        ):
+            yield from (row[0] for row in rows)
+            last = rows[-1][0]
+
     def count_container(self, sha256: str) -> int:
         """Return the number of surfaces that have a container, or had it before it was lost."""
         return int(self._one("SELECT count(*) FROM surface WHERE container = ?", sha256)[0])

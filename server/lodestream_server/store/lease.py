@@ -40,6 +40,8 @@ _LONGEST = 600.0
 _RENEWED, _WATCHED, _TRUSTED = 1 / 3, 1 / 15, 4 / 5
 
 _LONGEST_NAME = 100
+# Characters of the name of another server that are told: `/readyz` and each refusal have it.
+_LONGEST_HOLDER = 200
 
 # Seconds that the end of a server waits until it is given up: longer, and whoever ends the server would kill it.
 _FAREWELL = 4.0
@@ -113,7 +115,7 @@ class Lease:
     @property
     def holder(self) -> str | None:
         """Name of the machine and process that has it, as far as is known; None: nobody."""
-        return None if self._there is None or self._there.holder is None else self._there.name
+        return None if self._there is None or self._there.holder is None else self._there.name[:_LONGEST_HOLDER]
 
     def tend(self) -> None:
         """Renew it, or look who has it and take it if nobody does.

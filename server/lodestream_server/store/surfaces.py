@@ -657,6 +657,26 @@ class Surfaces:
                 users = map(self.index.find, self.index.with_container(container))
                 return [self._unbuilt(known) for known in users if known is not None and known.state == "ready"]
 
+    def lose_missing(self) -> int:
+        """Queue surfaces again whose containers are not listed, and return how many: a reader that misses one cannot.
+
+        Raises
+        ------
+        StoreError
+            If the store cannot be read.
+        """
+        listed = (layout.sha256_of(entry.key) or "" for entry in self.store.entries(CONTAINERS))
+        there, lost = next(listed, None), 0
+        for container in self.index.containers():
+            while there is not None and there < container:
+                there = next(listed, None)
+            if there != container:
+                again = self.lose(container)
+                lost += len(again)
+                if again:
+                    _log.error("the container %s is not in the store, and is built again", container)
+        return lost
+
     def _unbuilt(self, known: Surface) -> Surface:
         """Queue a surface again whose container is not there; what tells of it stays, since it may come back."""
         again = replace(known, state=after(known.state, "lost"))

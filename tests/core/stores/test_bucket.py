@@ -11,7 +11,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import ClassVar
 from urllib.parse import quote
 
 import obstore
@@ -283,6 +285,46 @@ def test_an_object_of_another_program_that_cannot_be_listed_is_named(s3: Emulato
     assert f"because of the object '{prefix}/{told}', of whose key a part is empty" in str(refused.value)
     assert "delete that object" in str(refused.value)
     assert store.get("a/b")[0] == b"1"
+
+
+class Refusing(BaseHTTPRequestHandler):
+    """Answers 200 to DeleteObjects, with each of some errors once."""
+
+    codes: ClassVar[list[str]] = []
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["content-length"]))
+        errors = [f"<Error><Key>p/a</Key><Code>{code}</Code><Message>no</Message></Error>" for code in self.codes[:1]]
+        del self.codes[:1]
+        body = f"<DeleteResult>{''.join(errors or ['<Deleted><Key>p/a</Key></Deleted>'])}</DeleteResult>"
+        self.send_response(200)
+        self.send_header("content-length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body.encode())
+
+    def log_message(self, *_: object) -> None:
+        """Print nothing."""
+
+
+def test_a_delete_that_is_refused_says_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    with ThreadingHTTPServer(("127.0.0.1", 0), Refusing) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        for name, value in {
+            "AWS_ACCESS_KEY_ID": "a",
+            "AWS_SECRET_ACCESS_KEY": "b",
+            "AWS_REGION": "us-east-1",
+            "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}",
+        }.items():
+            monkeypatch.setenv(name, value)
+        store = Bucket("s3://bucket/p", Limits(again=PATIENCE, pause=0.01))
+        monkeypatch.setattr(Refusing, "codes", ["AccessDenied", "AccessDenied"])
+        with pytest.raises(StoreError, match=r"refuses access \(AccessDenied\)"):
+            store.delete(["a"])
+        assert Refusing.codes == ["AccessDenied"], "it is asked once"
+        monkeypatch.setattr(Refusing, "codes", ["SlowDown", "InternalError"])
+        store.delete(["a"])  # since these may pass
+        assert not Refusing.codes
+        server.shutdown()
 
 
 def test_stores_of_one_bucket_do_not_see_each_other(s3: Emulator) -> None:

@@ -299,3 +299,11 @@ def test_a_store_that_does_not_answer_ends_a_lease_and_is_told_once(
     ) == 1
     assert not lease.held
     assert lease._until == -math.inf
+
+
+def test_no_more_than_the_beginning_of_a_long_name_is_told(store: Store, clock: Clock) -> None:
+    first, second = Lease(store, clock=clock), Lease(store, clock=clock)
+    first._name = "y" * 1_000_000
+    first.tend()
+    second.tend()
+    assert second.holder == "y" * 200

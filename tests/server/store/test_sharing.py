@@ -679,3 +679,30 @@ def test_an_object_that_is_too_large_counts_as_damaged_and_stops_nobody(
     writer.surfaces.names.point("large", manifest.id, None, lambda _: True, 60.0)
     store.delete([at])
     writer.surfaces.collect()
+
+
+def test_a_container_that_only_readers_miss_is_built_again(server: Make, tmp_path: Path) -> None:
+    writer, reader = server("writer"), server("reader", writes=False)
+    writer.tend()
+    built = [upload(tmp_path, number)[0] for number in range(5)]
+    for number, manifest in enumerate(built):
+        writer.surfaces.accept(manifest, upload(tmp_path, number)[1])
+        build(writer.surfaces, manifest, tmp_path)
+    writer.tend()
+    reader.tend()
+    assert writer.surfaces.lose_missing() == 0
+    of = {manifest.id: writer.surfaces.get(manifest.id).container or "" for manifest in built}
+    first, *_, last = sorted(of.values())
+    gone = {id_ for id_, container in of.items() if container in (first, last)}
+    assert 0 < len(gone) < len(built)
+    writer.surfaces.store.delete(map(layout.container_key, (first, last)))
+    assert not reader.surfaces.lose(first), "it does not write"
+    assert writer.surfaces.lose_missing() == len(gone)
+    assert {id_ for id_, state in writer.states().items() if state == "queued"} == gone
+    for manifest in built:
+        if manifest.id in gone:
+            build(writer.surfaces, manifest, tmp_path)
+    assert writer.surfaces.lose_missing() == 0
+    writer.tend()
+    reader.tend()
+    assert set(reader.states().values()) == {"ready"}
