@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import ssl
 from collections.abc import Mapping
 from typing import Any
@@ -155,4 +156,15 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
         return UnreachableError(f"no secure connection to {url}: {error}")
     if isinstance(error, TimeoutError | httpx.TimeoutException):
         return UnreachableError(f"no answer from {url} in time")
-    return UnreachableError(f"no connection to {url}: {error or type(error).__name__}")
+    return UnreachableError(f"no connection to {url}: {_reason(error)}")
+
+
+def _reason(error: BaseException) -> str:
+    """Return the system's words for a failed connection, such as connection refused, in place of a library's."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno is not None:
+            words = os.strerror(cause.errno) if cause.errno > 0 else cause.strerror or str(cause)
+            return f"{words[:1].lower()}{words[1:]}"
+        cause = cause.__cause__ or cause.__context__
+    return str(error) or type(error).__name__

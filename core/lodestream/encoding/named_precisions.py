@@ -28,7 +28,7 @@ def check_names(surface: Surface, quality: Quality) -> None:
             continue
         if name not in channels:
             known = ", ".join([*block.attributes, *channels])
-            raise OptionError(f"expected a precision for one of {known}, got one for {name!r}")
+            raise OptionError(f"there is no {name!r} that could have a precision; there are {known}")
         if quality.rms is not None and channels[name] < _width(block):
             raise OptionError(f"expected either a root mean square error or a precision of {name}, got both")
 

@@ -635,6 +635,7 @@ def test_no_server(run: Run, tmp_path: Path) -> None:
         code, stdout, stderr = run(*arguments)
         assert (code, stdout, stderr.count("\n")) == (1, "", 1)
         assert "no connection to http://127.0.0.1:9" in stderr
+        assert stderr.endswith(": connection refused\n")
 
 
 def test_out_is_written_by_rename(run: Run, container_file: Path, tmp_path: Path) -> None:
