@@ -65,6 +65,7 @@ class Following:
             ("the bucket", settings.list_seconds, surfaces.sync),
         )
         self._threads: list[threading.Thread] = []
+        self._seen = time.monotonic()
         self._one_at_a_time = threading.Lock()
         self._asked = Threads(2)  # what has changed may be much
         self._coming: dict[str, asyncio.Task[None]] = {}  # looks that have not begun
@@ -80,6 +81,11 @@ class Following:
         ]
         for thread in self._threads:
             thread.start()
+
+    @property
+    def unseen(self) -> float:
+        """Seconds since it was last seen what others have changed."""
+        return time.monotonic() - self._seen
 
     def close(self) -> None:
         """End, and wait a little for the looks that are under way: what they would find is found by the next server."""
@@ -103,8 +109,10 @@ class Following:
 
     def _follow(self) -> None:
         with self._one_at_a_time:
+            begun = time.monotonic()
             if not self._surfaces.writes:
                 self._changes.look(lambda what: self._surfaces.sync() if what is None else self._surfaces.refresh(what))
+            self._seen = begun
 
     async def look_for(self, what: str) -> None:
         """Look in the bucket for what somebody asks for and is not known here.

@@ -101,6 +101,7 @@ def test_a_look_that_fails_when_nobody_waits_for_it_any_more_is_no_error_of_the_
         monkeypatch.setattr("lodestream.stores.bucket.Bucket.get", get)
         for number in range(101, 104):  # of which there is no surface
             assert http.get(f"/v1/surfaces/{number:020x}").status_code == 503
+        assert http.get("/readyz").json()["unseen"] >= 0
         hanging.over.set()
         eventually(lambda: hanging.count == 3, "all looks to have failed")
     gc.collect()

@@ -318,6 +318,7 @@ class Readiness(BaseModel):
         description="reader: it only reads; waiting: another server writes to the bucket, and uploads are answered 503"
     )
     writer: str | None = _absent("of one that waits: the server that writes")
+    unseen: float | None = _absent("of one that does not write: seconds since it saw what others have changed")
     confinement: str | None = Field(
         description="how the kernel confines builds: landlock+seccomp, one of the two, or none; null: not known yet"
     )

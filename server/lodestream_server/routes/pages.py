@@ -11,11 +11,10 @@ from lodestream.errors import NotFoundError
 
 from ..access.scopes import ADMIN, WRITE
 from ..codes import PAGE
-from ..store.surfaces import Surfaces
 from . import descriptions, models
 from .documentation import render, render_codes
 from .html_page import html_page
-from .routing import Parts, matches, readable
+from .routing import Parts, State, matches, readable
 from .sending import SentFile
 
 __all__ = ["router"]
@@ -102,7 +101,7 @@ async def get_readiness(parts: Parts) -> Response:
     index = "current" if surfaces.is_current else behind
     index = "being made again" if surfaces.is_lost else index
     builder = parts.builder
-    told = {"index": index, **_role(surfaces), "confinement": builder.confinement, "missing": builder.missing}
+    told = {"index": index, **_role(parts), "confinement": builder.confinement, "missing": builder.missing}
     if builder.ready and index == "current":
         return JSONResponse({"status": "ready", **told})
     return JSONResponse({"status": "starting", **told}, 503, {"retry-after": "1"})
@@ -133,12 +132,14 @@ async def get_metrics(parts: Parts) -> Response:
     return Response(parts.metrics.text(), headers={"content-type": parts.metrics.media_type})
 
 
-def _role(surfaces: Surfaces) -> dict[str, str | None]:
+def _role(parts: State) -> dict[str, str | float | None]:
+    surfaces = parts.surfaces
     if surfaces.writes or surfaces.lease is None:
         return {"role": "writer"}
+    unseen = round(parts.following.unseen, 1)
     if not surfaces.lease.wanted:
-        return {"role": "reader"}
-    return {"role": "waiting", "writer": surfaces.lease.holder}
+        return {"role": "reader", "unseen": unseen}
+    return {"role": "waiting", "writer": surfaces.lease.holder, "unseen": unseen}
 
 
 def _sent(request: Request, name: str) -> Response | None:
