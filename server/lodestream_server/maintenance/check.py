@@ -8,6 +8,7 @@ manifests are never touched.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection
 from dataclasses import replace
@@ -159,7 +160,7 @@ class _Judge:
 
         def remove() -> None:
             for key in keys:
-                self._store.delete([key])
+                self._store.delete([key], self._still)
 
         return self._found(found, remove, "removed; the next start of the server builds it again")
 
@@ -182,14 +183,21 @@ class _Judge:
             return False
         if self._repair and mend is not None:
             try:
-                if self._lease is not None and not self._lease.held:
-                    raise StandbyError("another server may have taken the lease of the bucket")
+                self._still()
                 mend()
                 found = replace(found, repair=done, repaired=True)
             except StoreError as error:
                 found = replace(found, repair=f"not repaired: {error}")
         self._report.findings.append(found)
         return found.repaired
+
+    def _still(self) -> float:
+        """Return the seconds for which no server writes; see `Store.delete`."""
+        if self._lease is None:
+            return math.inf
+        if not self._lease.held:
+            raise StandbyError("another server may have taken the lease of the bucket")
+        return self._lease.left
 
     def _is_gone(self, surface: str) -> bool:
         """Return whether a surface was deleted since its manifest was read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 import time
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import pytest
 from lodestream.errors import LodestreamError, NotFoundError
 from lodestream.stores import SMALL, ConflictError, Store, StoreError, UnacknowledgedError, open_store
 from lodestream.stores.threads import Threads
+from lodestream_server.maintenance.check import check as check_data
 from lodestream_server.problems import DamagedNameError, ReadOnlyError, StandbyError
 from lodestream_server.store import layout
 from lodestream_server.store.changes import ChangeReader
@@ -420,6 +422,34 @@ def test_a_delete_that_failed_is_not_made_again_after_the_lease_is_over(
     assert hung.where in keys(second.surfaces.store)
     second.surfaces.sync()
     assert manifest.id in second.states()
+
+
+def test_a_repair_removes_nothing_after_its_lease_is_over(
+    server: Make, memory: str, clock: Clock, tmp_path: Path, hung: Hung
+) -> None:
+    store = open_store(memory)
+    first, second = server("first", store=store), server("second")
+    first.tend()
+    second.tend()
+    body = upload(tmp_path, 0)[1][0].read_bytes()
+    sha256 = hashlib.sha256(body + len(body).to_bytes(8, "big")).hexdigest()
+    manifest, files = upload(tmp_path, 0, upload=sha256)
+    first.surfaces.accept(manifest, files)
+    key = layout.built_key(manifest.id)
+    store.create(key, b"{}")
+
+    def take_over() -> None:
+        clock.now += SECONDS + 1
+        second.tend()
+        build(second.surfaces, manifest, tmp_path)
+
+    hung.where, hung.then = key, take_over
+    (found,) = check_data(store, repair=True, lease=first.lease).findings
+    assert not found.repaired
+    assert "taken the lease" in (found.repair or "")
+    second.surfaces.sync()
+    assert hung.then is None
+    assert second.states() == {manifest.id: "ready"}
 
 
 def test_a_manifest_that_another_server_has_acknowledged_is_not_taken_back(
