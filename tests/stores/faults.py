@@ -72,7 +72,7 @@ class FaultProxy:
         self.port = server.sockets[0].getsockname()[1]
         ready.set()
         try:
-            await asyncio.sleep(3600)
+            await asyncio.Event().wait()  # a run may take more than an hour
         finally:
             server.close()
 
