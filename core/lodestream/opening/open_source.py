@@ -54,6 +54,10 @@ def open_source(
     place = os.fspath(source)
     found = _SCHEME.match(source) if isinstance(source, str) else None
     if found is None:
+        if isinstance(source, str) and source.partition(":")[0].lower() in _BUCKETS:
+            from ..stores.connections import parsed
+
+            parsed(source)  # refuses it, and says which slash is missing
         _refuse_token(token, place)
         return FileSource(Path(place))
     scheme = found[1].lower()

@@ -23,8 +23,11 @@ _STATUS = re.compile(r"status code: (\d{3})\b", re.ASCII)
 _CODE = re.compile(r"(?:<Code>|\(code: )([A-Za-z]{1,60})(?:</Code>|\))", re.ASCII)
 # Of an object in a list, as Rust writes a text: without control characters.
 _UNLISTED = re.compile(r'path: "((?:[^"\\\n]|\\.){1,200})')
+_LACKING = re.compile(r"\bMissing (AccessKeyId|SecretAccessKey)\b", re.ASCII)
 _RETRIED = re.compile(r"\bafter [1-9]\d* retries", re.ASCII)
 
+#: The variables of the two halves of credentials, as the library calls them.
+_VARIABLES = {"AccessKeyId": "AWS_ACCESS_KEY_ID", "SecretAccessKey": "AWS_SECRET_ACCESS_KEY"}
 #: Codes of stores without the bucket or container itself.
 _NO_BUCKET = ("NoSuchBucket", "ContainerNotFound")
 #: Codes for credentials that are over, or were never any.
@@ -169,6 +172,8 @@ def _words(name: str, text: str, status: int | None, code: str, known: str) -> s
     """What a message says of a failure: words of this module, a status, and a code of letters."""
     if any(address in text for address in _ROLE) or "oken request" in text:
         return f"there are no credentials: {_CREDENTIALS}"
+    if lacking := _LACKING.search(text):
+        return f"the credentials are incomplete: set {_VARIABLES[lacking[1]]} too"
     if "Account must be specified" in text:
         return "there is no account: set AZURE_STORAGE_ACCOUNT_NAME"
     if code in _NO_BUCKET:

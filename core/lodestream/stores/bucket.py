@@ -151,7 +151,11 @@ class Bucket:
         """Open an object for reading."""
         at = self._at(key)
         if size is None:
-            size = self._ask(key, lambda: self._library.head(self._store, at))["size"]
+            try:
+                size = self._ask(key, lambda: self._library.head(self._store, at))["size"]
+            except AbsentError:
+                self.get(key, 0)  # the answer to HEAD does not tell whether the object or the bucket is absent
+                raise
         return BucketBlob(self._blocks, Extent(key, size))
 
     def pieces(self, key: str, size: int | None = None) -> Iterator[bytes]:

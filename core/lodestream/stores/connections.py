@@ -110,6 +110,13 @@ def parsed(address: str) -> Place:
     scheme, separated, rest = address.partition("://")
     scheme = scheme.lower()
     if not separated or scheme not in SCHEMES:
+        name, _, behind = scheme.partition(":")
+        if not separated and behind and name in SCHEMES:
+            lacking = "a slash is" if behind.startswith("/") else "two slashes are"
+            raise InputError(
+                f"{lacking} missing after {name}:, expected an address such as {SCHEMES[name]}; put ./ before a folder "
+                "or file with a colon in its name"
+            )
         advice = "" if separated else ": put ./ before a folder with a colon in its name"
         raise InputError(f"expected a folder or an address that begins with {_BEGINNINGS}, got another one{advice}")
     host, _, prefix = rest.partition("/")

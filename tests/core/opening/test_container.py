@@ -271,6 +271,7 @@ def test_damage_is_found_where_it_is_read(tmp_path: Path) -> None:
         (HEIGHTS, {}, ls.InputError, "got ndarray"),
         (b"something else entirely", {}, ls.CorruptStreamError, "container"),
         ("ftp://host/a.lode", {}, ls.InputError, "got one of ftp://"),
+        ("s3:/maps/a.lode", {}, ls.InputError, "a slash is missing after s3:, .* put ./ before a folder or file"),
         ("s3://bucket", {}, ls.InputError, "such as s3://bucket/prefix/NAME.lode, got that of a whole bucket"),
         ("s3://bucket/a/", {}, ls.InputError, "got that of a whole bucket"),
         ("az://box", {}, ls.InputError, "got that of a whole bucket"),

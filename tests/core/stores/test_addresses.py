@@ -75,8 +75,8 @@ def test_a_bucket_says_its_address(address: str, described: str) -> None:
         ("SECRET://bucket/a", "got another one"),
         ("file:///store", "got another one"),
         ("memory://store", "got another one"),
-        ("s3:/maps/SECRET", "put ./ before a folder"),
-        ("S3:maps/SECRET", "put ./ before a folder"),
+        ("s3:/maps/SECRET", "a slash is missing after s3:, expected an address such as s3://bucket/prefix; put"),
+        ("S3:maps/SECRET", "two slashes are missing after s3:, expected .*; put ./ before a folder"),
         ("az:/maps/SECRET", "put ./ before a folder"),
         ("abfss:/maps@SECRET", "put ./ before a folder"),
         ("gs:/maps/SECRET", "put ./ before a folder"),
@@ -141,6 +141,16 @@ def test_an_account_that_is_missing_is_asked_for(monkeypatch: pytest.MonkeyPatch
     monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME")
     with pytest.raises(StoreError, match="set AZURE_STORAGE_ACCOUNT_NAME"):
         open_store("az://container/a")
+
+
+@pytest.mark.parametrize(
+    ("there", "missing"),
+    [("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"), ("AWS_SECRET_ACCESS_KEY", "AWS_ACCESS_KEY_ID")],
+)
+def test_the_missing_half_of_credentials_is_named(there: str, missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(there, "SECRET")
+    with pytest.raises(StoreError, match=f"credentials are incomplete: set {missing} too$"):
+        open_store("s3://bucket")
 
 
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -356,6 +356,7 @@ def test_a_bucket_that_is_not_there_is_not_an_absent_object(scheme: str, request
     store = Bucket(f"{emulator.scheme}://nothing/a", Limits(retries=0, again=0.0))
     for call in (
         lambda: store.get("a"),
+        lambda: store.open("a"),
         lambda: store.create("a", b""),
         lambda: store.replace("a", b"", Tag('"1"')),
         lambda: list(store.entries("")),
