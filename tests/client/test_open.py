@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from lodestream.maps import HeightField, crs_wkt
 from lodestream_client import Client
 from tests.client import files
 from tests.core.surfaces import terrain
@@ -57,6 +58,19 @@ def test_a_file_of_a_host_with_ranges(path: Path) -> None:
         with pytest.raises(ls.CorruptStreamError) as other:
             ls.open(f"{host.url}/text.lode")
         assert other.value.__notes__[0] == f"in {host.url}/text.lode"
+
+
+def test_heights_for_maps_at_an_address(path: Path, tmp_path: Path) -> None:
+    placed = {"crs": crs_wkt("EPSG:4326"), "geotransform": [7.0, 0.01, 0.0, 46.0, 0.0, -0.01]}
+    (tmp_path / "hill.lode").write_bytes(ls.encode(ls.Surface(HEIGHTS, metadata=placed)))
+    places = np.array([7.205]), np.array([45.895])
+    with files.ranged(tmp_path) as host:
+        field = HeightField.open(f"{host.url}/hill.lode")
+        assert field.heights(*places)[0, 0] == HEIGHTS[10, 20]
+        with pytest.raises(ls.NotFoundError):
+            HeightField.open(f"{host.url}/none.lode")
+    with pytest.raises(ls.OptionError, match="to whose server the token belongs"):
+        HeightField.open(tmp_path / "hill.lode", token="secret")
 
 
 def test_a_file_that_changes_on_its_host(path: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from ..terminal.output import LONG, complain, progress_bar
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, standard_output_once
 from .building_options import add_memory_option
 from .decode_by_rows import by_rows
-from .inputs import input_files, named, no_container
+from .inputs import input_files, named
 from .outcome import Outcome, channel_errors, check_grid, check_out, note_unmet
 from .target_options import add_target_options, target_of
 
@@ -108,7 +108,7 @@ def decode_file(options: DecodeOptions) -> Outcome:
             job.decode()
         except StreamError as error:
             if not options.partial or isinstance(error, UnsupportedVersionError) or not job.decoder.layers:
-                advice = no_container(file) or _advice(options.partial, job, error)
+                advice = _advice(options.partial, job, error)
                 raise named(error, options.container, advice) from None
             complain(f"{named(error, options.container)}; the last complete layer before that is written")
             job.ended = "truncated"

@@ -14,7 +14,7 @@ from lodestream.text import is_remeshed, remesh_words
 from ..requests import addresses
 from ..terminal.output import cell, console, human_size, point_words, print_json
 from .arguments import Subparsers, add_command, add_json_option, add_size_option, add_token_option, token_of
-from .inputs import input_files, named, no_container
+from .inputs import input_files, named
 
 __all__ = ["InfoOptions", "register", "run"]
 
@@ -89,13 +89,12 @@ def _of_file(options: InfoOptions) -> Mapping[str, Any]:
                 return opened.info
         except (StreamError, TooLargeError) as error:
             raise named(error, options.what) from None
-    with input_files([options.what]) as files, files.paths[0].open("rb") as file:
+    with input_files([options.what]) as files:
         try:
             return container.open(files.paths[0], max_vertices=options.max_vertices).info
         except (StreamError, TooLargeError) as error:
-            advice = no_container(file)
-            if isinstance(error, TruncatedStreamError):
-                advice = "lodestream decode --partial writes its last complete layer"
+            cut = isinstance(error, TruncatedStreamError)
+            advice = "lodestream decode --partial writes its last complete layer" if cut else ""
             raise named(error, options.what, advice) from None
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from lodestream.errors import FormatWarning, LodestreamError
 
@@ -20,7 +20,6 @@ __all__ = [
     "holds_container",
     "input_files",
     "named",
-    "no_container",
     "option_hints",
     "option_words",
     "reason_of",
@@ -114,12 +113,3 @@ def holds_container(path: Path) -> bool:
         return False
     with path.open("rb") as file:
         return is_container(file.read(len(SIGNATURE)))
-
-
-def no_container(file: BinaryIO) -> str:
-    """Return advice for a file of another format than a container; empty otherwise."""
-    from lodestream.container.sections import SIGNATURE, is_container
-
-    file.seek(0)
-    other = not is_container(file.read(len(SIGNATURE)))
-    return "lodestream encode makes a container of a file of another format" if other else ""

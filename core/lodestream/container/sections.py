@@ -287,7 +287,13 @@ def check_signature(start: bytes) -> None:
         When it is of another version; both are named.
     """
     if not any(magic.startswith(start[: len(magic)]) for magic in (MAGIC, _EARLIER_MAGIC)):
-        raise CorruptStreamError(f"expected a Lodestream container, got {start!r}", 0)
+        text = start.decode("latin-1")
+        begin = repr(text) if text.isascii() and text.isprintable() else f"the bytes {start.hex(' ')}"
+        raise CorruptStreamError(
+            f"expected a Lodestream container, got what begins with {begin}: lodestream encode makes a container of a "
+            "file of another format",
+            0,
+        )
     if len(start) == len(SIGNATURE) and start != SIGNATURE:
         earlier = "" if start.startswith(MAGIC) else " of an earlier numbering"
         raise UnsupportedVersionError(

@@ -6,12 +6,15 @@ import copy
 import math
 import mmap
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError, OptionError
+from ..errors import InputError, OptionError, named
+from ..opening.byte_sources import read_all
+from ..opening.open_source import is_address, open_source
 from ..target import Limit, Tolerance, check_integer
 from .block_cache import BlockCache
 from .placement import Placement
@@ -119,28 +122,45 @@ class HeightField:
 
     @classmethod
     def open(
-        cls, path: str | Path, *, scale: float | None = None, error: Limit = 0.0, cache: BlockCache | None = None
+        cls,
+        path: str | Path,
+        *,
+        token: str | None = None,
+        scale: float | None = None,
+        error: Limit = 0.0,
+        cache: BlockCache | None = None,
     ) -> HeightField:
-        """Open a container in a file, which must not change; parameters and errors as of the class.
+        """Open a container in a file, which must not change, or at an address.
+
+        Parameters
+        ----------
+        path : str or path-like
+            A file, or an address that `lodestream.open` takes: in a bucket, at a URL, on a server.
+        token : str, optional
+            Token of the server of a URL.
+        scale, error, cache : optional
+            As of the class.
 
         Raises
         ------
         InputError
             As of the class, or if the file is empty.
-        OSError
-            If the file cannot be opened.
+        UnavailableError
+            As of the class, or if the library for buckets, or the client, is not installed.
+        LodestreamError, OSError
+            As of the class, or if it cannot be reached or opened. A note of the error names the file or the address.
         """
-        with Path(path).open("rb") as file:
-            if not Path(path).stat().st_size:
+        source = open_source(path, token)
+        if not is_address(path):
+            if not source.size:
                 raise InputError(f"expected a container, got the empty file {path}")
-            mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        return cls(
-            lambda offset, length: mapped[offset : offset + length],
-            len(mapped),
-            scale=scale,
-            error=error,
-            cache=cache,
-        )
+            with Path(path).open("rb") as file:
+                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            read, size = (lambda offset, length: mapped[offset : offset + length]), len(mapped)
+        else:
+            read, size = partial(read_all, source), source.size
+        with named(source.place):
+            return cls(read, size, scale=scale, error=error, cache=cache)
 
     def with_options(self, *, scale: float | None = None, error: Limit = 0.0) -> HeightField:
         """Return the field of the same container with this scale and error instead of its own; nothing is read again.

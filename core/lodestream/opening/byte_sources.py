@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from ..errors import LodestreamError
 from ..operating_system import read_at
 
-__all__ = ["AT_ONCE", "ByteSource", "FileSource", "MemorySource"]
+__all__ = ["AT_ONCE", "ByteSource", "FileSource", "MemorySource", "read_all"]
 
 #: Bytes of one read at most, so that a browser that goes away costs no more than these.
 AT_ONCE = 1 << 20
@@ -49,6 +49,20 @@ class ByteSource(Protocol):
 
     def close(self) -> None:
         """Let go of what is held open; nothing is read afterwards."""
+
+
+def read_all(source: ByteSource, offset: int, length: int) -> bytes:
+    """Return ``length`` bytes from ``offset`` on, in as many reads as it takes; fewer only where the container ends.
+
+    Raises
+    ------
+    LodestreamError, OSError
+        If they cannot be had.
+    """
+    run, end = bytearray(), min(offset + length, source.size)
+    while (at := offset + len(run)) < end:
+        run += source.read(at, end - at)
+    return bytes(run)
 
 
 class MemorySource:

@@ -15,7 +15,7 @@ from ..container.capacity import Capacity
 from ..container.model import ByteRange, Header, Index
 from ..decoding.decoder import Decoder
 from ..decoding.view import View
-from ..errors import CorruptStreamError, InputError, LodestreamError, named
+from ..errors import InputError, LodestreamError, named
 from ..planning.plan import Plan
 from ..planning.planner import plan
 from ..planning.window_errors import read_window_errors, wants_window_errors
@@ -78,10 +78,8 @@ class Container:
         try:
             with named(source.place):
                 self.index: Index = read_index(self._first, source.size, Capacity(max_vertices))
-        except BaseException as error:
+        except BaseException:
             self.close()
-            if isinstance(error, CorruptStreamError) and error.offset == 0:
-                error.add_note("lodestream.read takes files of other formats")
             raise
 
     @property

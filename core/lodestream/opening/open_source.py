@@ -71,7 +71,8 @@ def open_source(
     entry = next(iter(entry_points(group=GROUP, name=scheme)), None)
     if entry is None and scheme in ("http", "https"):
         raise UnavailableError(
-            f"expected Lodestream's client for addresses of {scheme}://, which is not installed: pip install lodestream"
+            f"expected Lodestream's client for addresses of {scheme}://, which is not installed, or was installed "
+            "before it read them: install lodestream with pip, again if it is there"
         )
     if entry is None:
         raise InputError(f"expected {_KNOWN}, got one of {scheme}://")

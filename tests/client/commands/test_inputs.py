@@ -73,7 +73,8 @@ def test_a_file_of_another_format_is_to_be_encoded_first(run: Run, tmp_path: Pat
     out = [tmp_path / "b.npy"] * (command == "decode")
     code, _, stderr = run(command, tmp_path / "a.npy", *out)
     assert code == 1
-    assert stderr.endswith("; lodestream encode makes a container of a file of another format\n")
+    assert stderr.startswith(f"lodestream: {tmp_path / 'a.npy'}: expected a Lodestream container, got ")
+    assert stderr.count("lodestream encode makes a container of a file of another format") == 1
     container = ls.encode(np.arange(12.0).reshape(3, 4))
     (tmp_path / "a.lode").write_bytes(container[:60])
     code, _, stderr = run(command, tmp_path / "a.lode", *out)

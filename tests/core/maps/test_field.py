@@ -156,8 +156,9 @@ def test_a_file_is_read_where_it_is_needed(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="got the empty file"):
         HeightField.open(tmp_path / "empty.lode")
     (tmp_path / "other.lode").write_bytes(b"no container" * 100)
-    with pytest.raises(CorruptStreamError):
+    with pytest.raises(CorruptStreamError, match="lodestream encode makes a container") as other:
         HeightField.open(tmp_path / "other.lode")
+    assert other.value.__notes__ == [f"in {tmp_path / 'other.lode'}"]
     with pytest.raises(FileNotFoundError):
         HeightField.open(tmp_path / "nothing.lode")
 
