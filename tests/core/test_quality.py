@@ -38,27 +38,36 @@ def test_numbers_and_texts_are_a_shorthand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("precisions", "rms"),
+    ("precisions", "rms", "words"),
     [
-        (["1", "2"], None),
-        (["a=1", "a=2"], None),
-        (["1"], "1"),
-        (["a"], None),
-        (["a=b"], None),
-        ([], "fine"),
-        ([""], None),
+        (["1", "2"], None, "the precision of the points is given twice"),
+        (["a=1", "a=2"], None, "the precision of 'a' is given twice"),
+        (["1"], "1", "not both"),
+        (["a"], None, "precision: 'a' is not an error bound"),
+        (["a=b"], None, "precision: 'b' is not an error bound"),
+        ([], "fine", "rms: 'fine' is not an error bound"),
+        ([""], None, "precision: '' is not an error bound"),
     ],
 )
-def test_texts_that_contradict_each_other_are_refused(precisions: list[str], rms: str | None) -> None:
-    with pytest.raises(OptionError, match="expected"):
+def test_texts_that_contradict_each_other_are_refused(precisions: list[str], rms: str | None, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
         Quality.parse(precisions, rms)
 
 
-@pytest.mark.parametrize("error", [-1.0, "nan", float("inf"), [1], "1 m"])
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (-1.0, "an error of 0 or more, got -1"),
+        ("nan", "'nan' is not an error bound"),
+        (float("inf"), "an error of 0 or more, got inf"),
+        ([1], "expected a number such as 0.5"),
+        ("1 m", "'1 m' is not an error bound"),
+    ],
+)
 @pytest.mark.parametrize("place", ["precision", "rms", "attributes"])
-def test_what_is_no_error_is_refused(place: str, error: Any) -> None:
+def test_what_is_no_error_is_refused(place: str, error: Any, words: str) -> None:
     asked: dict[str, Any] = {place: {"a": error} if place == "attributes" else error}
-    with pytest.raises(OptionError, match="expected"):
+    with pytest.raises(OptionError, match=words):
         Quality.of(**asked)
 
 

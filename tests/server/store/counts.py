@@ -12,13 +12,11 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
 from lodestream.operating_system import synchronise_file, synchronise_folder
 from lodestream.stores import Folder
-from lodestream_server.store import names
 from lodestream_server.store.layout import Manifest
 from lodestream_server.store.surfaces import Surfaces
 
@@ -102,7 +100,7 @@ def _watched(cost: Cost) -> Iterator[None]:
 
     with (
         patch("sqlite3.connect", traced),
-        patch.object(names, "time", SimpleNamespace(time=lambda: 1e9)),  # all times are written in as many digits
+        patch.object(Surfaces, "now", lambda _: 1e9),  # all times are written in as many digits
         patch("lodestream.stores.folder.synchronise_file", counting(synchronise_file)),
         patch("lodestream.stores.folder.synchronise_folder", counting(synchronise_folder)),
     ):

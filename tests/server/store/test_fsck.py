@@ -609,7 +609,7 @@ def test_a_repair_that_the_store_refuses(data: Path, made: Made, monkeypatch: py
     flip(data / made.key("container", TWO_FILES), 77)
     store = Folder(data)
 
-    def refuse(keys: list[str]) -> None:
+    def refuse(*_: object) -> None:
         raise StoreError("Read-only file system")
 
     monkeypatch.setattr(store, "delete", refuse)
