@@ -81,9 +81,13 @@ def within(seconds: float, look: Callable[[], object], what: str) -> None:
     assert time.monotonic() - begun < seconds, what
 
 
-def test_a_reader_serves_what_the_writer_built_and_changes_nothing(site: Site) -> None:
+def test_a_reader_serves_what_the_writer_built_and_changes_nothing(
+    site: Site, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     first = writer(site)
     reader = site.start("reader", read_only=True)
+    assert "this server only reads, from s3://memory/data" in caplog.text
     assert role(reader) == "reader"
     uploaded = push(first, npy(hills()))
     assert uploaded["state"] == "ready"
@@ -253,7 +257,7 @@ def test_another_server_waits_says_for_whom_and_takes_over(site: Site) -> None:
     eventually(lambda: states(second) == {uploaded["id"]: "ready"}, "it to answer reads")
     refused = second.post("/v1/surfaces", content=npy(hills(seed=2)))
     assert problem(refused) == (503, "busy")
-    assert "process" in refused.json()["detail"]
+    assert refused.json()["detail"].endswith(") does; send it to that server")
     assert refused.headers["retry-after"] == "5"
 
 

@@ -183,6 +183,8 @@ class Data:
     def start(self) -> None:
         """Take part in the work on a bucket: wait for the lease, and tell what has changed."""
         if self.surfaces.lease is not None:
+            if not self.surfaces.lease.wanted:
+                _log.info("this server only reads, from %s", self.surfaces.store.describe())
             self.surfaces.changes.start()
             self.surfaces.lease.start()
 

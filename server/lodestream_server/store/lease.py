@@ -93,13 +93,17 @@ class Lease:
         self._ours = False  # whether the object that was read or written last is of this server
         self._until = -math.inf  # by the clock; so long it is trusted
         self._tag: Tag | None = None
+        self._heard = clock()  # since when it is not known whether the store answers
         self._there: Writer | None = None
+        self._silent: str | None = None  # whoever had it before and stopped renewing it, if it was taken from somebody
         self._since: float | None = None  # since when the object is known to be the same, or gone; None: never seen
         self._lasts = seconds  # how long whoever had it last may trust it, and a little longer
         self._one_at_a_time = threading.Lock()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._told: tuple[bool, int, str | None] | None = None
+        self._watch: threading.Thread | None = None
+        self._telling = threading.Lock()
+        self._told: tuple[bool, int, str | None, bool] = False, 0, None, False
         self._failing = False
 
     @property
@@ -114,8 +118,39 @@ class Lease:
 
     @property
     def holder(self) -> str | None:
-        """Name of the machine and process that has it, as far as is known; None: nobody."""
-        return None if self._there is None or self._there.holder is None else self._there.name[:_LONGEST_HOLDER]
+        """Name of the machine and process that has it; None: nobody is known to.
+
+        Whoever has not renewed it for as long as it is trusted has it no more, whatever the object says.
+        """
+        there, since = self._there, self._since
+        if there is None or there.holder is None:
+            return None
+        if there.holder == self._own:
+            known = self.held
+        else:
+            known = since is not None and self._clock() < since + _TRUSTED * self._lasts
+        return there.name[:_LONGEST_HOLDER] if known else None
+
+    @property
+    def unheard(self) -> float:
+        """Seconds since the last request for it was begun that the store answered, or since this object was made."""
+        return max(0.0, self._clock() - self._heard)
+
+    @property
+    def standing(self) -> str:
+        """Who writes, and what whoever wants to write had better do: what follows a colon."""
+        if self.held:
+            return "this one is about to; try again soon"
+        holder = self.holder
+        if holder is not None:
+            return f"{holder} does; send it to that server"
+        if self._is_deaf:
+            return f"it has not answered for {self.unheard:.0f} s, and nobody is known to write; try again later"
+        return "nobody is known to; try again soon"
+
+    @property
+    def _is_deaf(self) -> bool:
+        return self._clock() >= self._heard + _TRUSTED * self._seconds
 
     def tend(self) -> None:
         """Renew it, or look who has it and take it if nobody does.
@@ -130,11 +165,14 @@ class Lease:
             if self._ours:
                 self._renew(begun)
             elif self._look(begun) and self.wanted:
-                number = max(self._there.number if self._there else 0, self.number) + 1
+                before = self._there
+                number = max(before.number if before else 0, self.number) + 1
                 with suppress(ExistsError, ConflictError):  # somebody else was first, as the next look tells
                     self._write(begun, number)
+                    self._silent = None if before is None or before.holder is None else before.name[:_LONGEST_HOLDER]
             elif self._there is not None and self._there.holder == self._own:
                 self._write(begun, self._there.number)  # it was taken, and no answer came
+            self._heard = begun
 
     def _renew(self, begun: float) -> None:
         try:
@@ -182,10 +220,15 @@ class Lease:
         self._until = -math.inf if released else begun + _TRUSTED * self._seconds
 
     def start(self) -> None:
-        """Tend it from now on, in a thread of its own: it must not wait for what requests do."""
+        """Tend it from now on, in a thread of its own: it must not wait for what requests do.
+
+        Another one tells when it ends, for which nobody must wait until the store answers.
+        """
         if self.wanted:
             self._thread = threading.Thread(target=self._run, name="lodestream-lease", daemon=True)
+            self._watch = threading.Thread(target=self._keep_telling, name="lodestream-lease-watch", daemon=True)
             self._thread.start()
+            self._watch.start()
 
     def close(self) -> None:
         """Give it up, so that others need not wait."""
@@ -219,16 +262,43 @@ class Lease:
             pause = self._seconds * (_RENEWED if self._ours and not self._failing else _WATCHED)
         self._give_up()
 
+    def _keep_telling(self) -> None:
+        pause = self._seconds * _WATCHED
+        while not self._ending.wait(min(self.left or pause, pause)):
+            self._tell()
+
     def _tell(self) -> None:
-        held = self.held
-        now = held, self.number if held else 0, self.holder
-        before, self._told = self._told, now
-        if now == before:
-            return
-        if held:
-            _log.info("this server has the lease of the bucket (number %d) from now on, and writes", self.number)
-        elif before is not None and before[0]:
-            _log.error("this server has lost the lease of the bucket, and writes nothing; %s has it", self.holder)
-        else:
-            _log.info("%s has the lease of the bucket; this server waits for it, and answers reads", self.holder)
+        with self._telling:
+            held = self.held
+            now = held, self.number if held else 0, self.holder, not held and self._is_deaf
+            before, self._told = self._told, now
+            if now == before or self._ending.is_set():
+                return
+            self._log(before)
         self.turned()
+
+    def _log(self, before: tuple[bool, int, str | None, bool]) -> None:
+        held, number, holder, deaf = self._told
+        if held:
+            silent, self._silent = self._silent, None
+            if silent is None:
+                _log.info("this server has the lease of the bucket (number %d) from now on, and writes", number)
+            else:
+                _log.warning(
+                    "%s has stopped renewing the lease of the bucket; this server has it (number %d) from now on, "
+                    "and writes",
+                    silent,
+                    number,
+                )
+        elif before[0] and holder is not None:
+            _log.error("this server has lost the lease of the bucket, and writes nothing; %s has it", holder)
+        elif before[0]:
+            _log.error(
+                "this server has lost the lease of the bucket, which has not answered for %.0f s; it writes nothing, "
+                "and nobody is known to",
+                self.unheard,
+            )
+        elif holder is not None:
+            _log.info("%s has the lease of the bucket; this server waits for it, and answers reads", holder)
+        elif deaf:
+            _log.warning("the bucket has not answered for %.0f s, and nobody is known to write", self.unheard)

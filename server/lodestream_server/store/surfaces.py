@@ -189,8 +189,7 @@ class Surfaces:
         assert self.lease is not None
         if not self.lease.wanted:
             raise ReadOnlyError("This server only reads (read_only); send this to one that writes")
-        writer = "this one is about to" if self.lease.held else f"{self.lease.holder or 'nobody'} does"
-        raise StandbyError(f"This server does not write to its bucket now, {writer}; try again soon")
+        raise StandbyError(f"This server does not write to its bucket now: {self.lease.standing}")
 
     def still(self) -> float:
         """Return the seconds for which this server changes the store, and no other: a delete is asked each time.

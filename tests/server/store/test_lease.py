@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -12,6 +13,7 @@ import pytest
 
 from lodestream.stores import Store, StoreError, UnacknowledgedError, open_store
 from lodestream_server.store.lease import LEASE_SECONDS, Lease
+from tests.patience import PATIENCE
 from tests.server.helpers import eventually
 
 from .conftest import Place
@@ -299,6 +301,62 @@ def test_a_store_that_does_not_answer_ends_a_lease_and_is_told_once(
     ) == 1
     assert not lease.held
     assert lease._until == -math.inf
+
+
+def test_who_writes_is_told_only_while_that_is_known(
+    store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = Lease(store, clock=clock), Lease(store, clock=clock)
+    assert first.standing == "nobody is known to; try again soon"
+    first._name, second._name = "a (process 1)", "b (process 2)"
+    first.tend()
+    second.tend()
+    assert second.standing == "a (process 1) does; send it to that server"
+    clock.now += SECONDS * 0.8
+    second.tend()
+    assert (second.holder, second.unheard) == (None, 0.0), "it has not been renewed"
+    assert second.standing == "nobody is known to; try again soon"
+
+    def fail(*_: object) -> Any:
+        raise StoreError("no network")
+
+    for method in ("create", "replace", "get_if"):
+        monkeypatch.setattr(store, method, fail)
+    clock.now += SECONDS
+    for lease, seconds in ((first, 27), (second, 15)):
+        with pytest.raises(StoreError):
+            lease.tend()
+        assert (lease.holder, lease.unheard) == (None, seconds), "least of all itself"
+        assert lease.standing == (f"it has not answered for {seconds} s, and nobody is known to write; try again later")
+
+
+def test_the_end_of_a_lease_is_told_while_the_store_hangs_and_a_takeover_names_who_was_silent(
+    store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caplog.set_level(logging.INFO)
+    lease, over, turned = Lease(store, 0.3), threading.Event(), threading.Event()
+    silent = Lease(store, 0.3)
+    silent._name = "other (process 1)"
+    silent.tend()
+    lease.start()
+    eventually(lambda: lease.held, "it to be taken")
+    eventually(lambda: "and writes" in caplog.text, "that to be told")
+    (warning,) = (record.message for record in caplog.records if record.levelname == "WARNING")
+    assert warning == (
+        "other (process 1) has stopped renewing the lease of the bucket; this server has it (number 2) from now on, "
+        "and writes"
+    )
+    lease.turned = turned.set
+    with monkeypatch.context() as hung:
+        hung.setattr(store, "replace", lambda *_: over.wait(PATIENCE))
+        eventually(turned.is_set, "the end to be told")
+        assert not over.is_set()
+        assert not lease.held
+        (lost,) = (record.message for record in caplog.records if record.levelname == "ERROR")
+        assert lost.startswith("this server has lost the lease of the bucket, which has not answered for ")
+        assert lost.endswith(" s; it writes nothing, and nobody is known to")
+    over.set()
+    lease.close()
 
 
 def test_no_more_than_the_beginning_of_a_long_name_is_told(store: Store, clock: Clock) -> None:
