@@ -124,6 +124,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             ending.push_async_callback(upkeep.close)
             following = Following(chosen, surfaces, access)
             ending.push_async_callback(asyncio.to_thread, following.close)
+            metrics.watch_bucket(lambda: surfaces.writes, lambda: following.unseen)
             app.state.parts = State(
                 settings=chosen,
                 data=data,

@@ -10,9 +10,9 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from lodestream.errors import LodestreamError
 from lodestream.stores.threads import Threads
@@ -36,6 +36,8 @@ _FAREWELL = 0.5
 _MOST_LOOKS = 16
 _BETWEEN = 0.5
 _PATIENCE = 5.0
+
+_T = TypeVar("_T")
 
 
 class _Look(NamedTuple):
@@ -84,8 +86,14 @@ class Following:
 
     @property
     def unseen(self) -> float:
-        """Seconds since it was last seen what others have changed."""
-        return time.monotonic() - self._seen
+        """Seconds since what others have changed was last seen; of the writer, since it last renewed its lease.
+
+        0 for data in a folder, which nobody else changes.
+        """
+        lease = self._surfaces.lease
+        if lease is None:
+            return 0.0
+        return lease.unheard if self._surfaces.writes else time.monotonic() - self._seen
 
     def close(self) -> None:
         """End, and wait a little for the looks that are under way: what they would find is found by the next server."""
@@ -109,10 +117,28 @@ class Following:
 
     def _follow(self) -> None:
         with self._one_at_a_time:
-            begun = time.monotonic()
-            if not self._surfaces.writes:
+            begun, lease = time.monotonic(), self._surfaces.lease
+            if lease is not None and self._surfaces.writes:  # until it renewed its lease, nobody else has changed any
+                begun -= lease.unheard
+            else:
                 self._changes.look(lambda what: self._surfaces.sync() if what is None else self._surfaces.refresh(what))
             self._seen = begun
+
+    async def answer(self, asked: Awaitable[_T]) -> _T:
+        """Wait for what a bucket is asked, as long as for a look.
+
+        Raises
+        ------
+        BusyError
+            If that takes long.
+        """
+        if self._surfaces.lease is None:
+            return await asked
+        try:
+            async with asyncio.timeout(_PATIENCE):
+                return await asked
+        except TimeoutError:
+            raise BusyError("The bucket does not answer; try again soon") from None
 
     async def look_for(self, what: str) -> None:
         """Look in the bucket for what somebody asks for and is not known here.
@@ -144,11 +170,7 @@ class Following:
             coming.add_done_callback(
                 lambda look: look.cancelled() or look.exception()
             )  # nobody may wait for it by then
-        try:
-            async with asyncio.timeout(_PATIENCE):
-                await asyncio.shield(coming)
-        except TimeoutError:
-            raise BusyError("The bucket does not answer whether there is such a thing; try again soon") from None
+        await self.answer(asyncio.shield(coming))
 
     async def _look_for(self, what: str) -> None:
         last = self._lately.get(what)

@@ -108,6 +108,36 @@ def test_a_look_that_fails_when_nobody_waits_for_it_any_more_is_no_error_of_the_
     assert "never retrieved" not in caplog.text
 
 
+def test_a_server_tells_for_how_long_the_bucket_has_not_answered_and_lets_nobody_wait_for_it(
+    stored: str, memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    often: dict[str, Any] = {"workers": 1, "lease_seconds": 1.5, "look_seconds": 0.2}
+    with (
+        running_server(memory, scratch=tmp_path / "a", **often) as writer,
+        httpx.Client(base_url=writer, trust_env=False, timeout=PATIENCE) as first,
+        running_server(memory, scratch=tmp_path / "b", read_only=True, **often) as reader,
+        httpx.Client(base_url=reader, trust_env=False, timeout=PATIENCE) as second,
+    ):
+        eventually(lambda: first.get("/readyz").json()["role"] == "writer", "the server to write")
+        assert 0 <= first.get("/readyz").json()["unseen"] < PATIENCE
+        (surface,) = second.get("/v1/surfaces").json()["surfaces"]
+        for http, role in ((first, 1), (second, 0)):
+            assert f"lodestream_writer {role}.0\n" in http.get("/metrics").text
+        monkeypatch.setattr("lodestream_server.following._PATIENCE", 0.01)
+        for method in ("get", "get_if", "create", "replace"):
+            monkeypatch.setattr(f"lodestream.stores.bucket.Bucket.{method}", hanging)
+        eventually(lambda: first.get("/readyz").json()["role"] == "waiting", "the lease to end")
+        assert first.get("/readyz").json()["writer"] is None
+        assert "nobody is known to write" in first.delete(surface["url"]).json()["detail"]
+        eventually(lambda: all(http.get("/readyz").json()["unseen"] > 1.2 for http in (first, second)), "it to be told")
+        for http in (first, second):
+            answer = http.get(surface["url"])
+            assert (answer.status_code, answer.json()["detail"]) == (503, "The bucket does not answer; try again soon")
+            (line,) = (it for it in http.get("/metrics").text.splitlines() if it.startswith("lodestream_bucket_unseen"))
+            assert float(line.split()[1]) > 1.2
+        hanging.over.set()
+
+
 def test_a_server_ends_and_gives_up_its_lease_while_the_bucket_hangs(
     memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

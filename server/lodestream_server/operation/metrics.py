@@ -65,6 +65,13 @@ class Metrics:
             lambda: shutil.disk_usage(folder).free,
         )
 
+    def watch_bucket(self, writes: Callable[[], bool], unseen: Callable[[], float]) -> None:
+        """Set the sources of gauges of servers that share a bucket: whether this one writes, and `Following.unseen`."""
+        self._gauge("writer", "whether the server writes to its data: 1 if it does", writes)
+        self._gauge(
+            "bucket_unseen_seconds", "seconds since the bucket last answered what is asked again and again", unseen
+        )
+
     def answered(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count an HTTP request that was answered."""
         self._requests.labels(method, route, status).inc()

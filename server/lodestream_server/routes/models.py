@@ -317,8 +317,11 @@ class Readiness(BaseModel):
     role: Literal["writer", "reader", "waiting"] = Field(
         description="reader: it only reads; waiting: another server writes to the bucket, and uploads are answered 503"
     )
-    writer: str | None = _absent("of one that waits: the server that writes")
-    unseen: float | None = _absent("of one that does not write: seconds since it saw what others have changed")
+    writer: str | None = _absent("of one that waits: the server that writes; null: none is known to")
+    unseen: float | None = _absent(
+        "of a bucket: seconds since it last answered what is asked again and again: the writer when it renews its "
+        "lease, others when they look what has changed; beyond 15, the bucket does not answer"
+    )
     confinement: str | None = Field(
         description="how the kernel confines builds: landlock+seccomp, one of the two, or none; null: not known yet"
     )

@@ -134,9 +134,11 @@ async def get_metrics(parts: Parts) -> Response:
 
 def _role(parts: State) -> dict[str, str | float | None]:
     surfaces = parts.surfaces
-    if surfaces.writes or surfaces.lease is None:
+    if surfaces.lease is None:
         return {"role": "writer"}
     unseen = round(parts.following.unseen, 1)
+    if surfaces.writes:
+        return {"role": "writer", "unseen": unseen}
     if not surfaces.lease.wanted:
         return {"role": "reader", "unseen": unseen}
     return {"role": "waiting", "writer": surfaces.lease.holder, "unseen": unseen}

@@ -327,7 +327,7 @@ async def description(
     if until is not None:
         head["replaced_until"] = datetime.fromtimestamp(until, UTC).isoformat(timespec="milliseconds")
     # What was built is described by bytes of the store, which may be many.
-    return await in_store(_joined, parts, surface, head)
+    return await parts.following.answer(in_store(_joined, parts, surface, head))
 
 
 def _joined(parts: State, surface: Surface, head: dict[str, Any]) -> bytes:
