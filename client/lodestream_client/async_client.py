@@ -218,7 +218,7 @@ class AsyncClient:
         """Return the options of a stream."""
         from .stream.options import ConnectOptions
 
-        return ConnectOptions(token=self._token_for(url), **options)
+        return ConnectOptions.of(options, self._token_for(url))
 
     def requests_to(self, url: str) -> Callable[[], httpx.AsyncClient]:
         """Return what returns, on the loop, the client of httpx that makes requests to a URL."""

@@ -138,6 +138,8 @@ class Client:
             If there is no connection.
         NotFoundError, RemoteError, RemoteProtocolError
             If the server refuses, or is not a Lodestream server.
+        OptionError
+            If there is no such option, or its value is not allowed.
         TooLargeError
             If the surface needs more memory than allowed.
 
@@ -372,6 +374,8 @@ class Client:
     def describe_file(self, url: str, *, max_vertices: int | None = None) -> Mapping[str, Any]:
         """Return the description of a container file on any web server, as ``lodestream info --json`` prints it.
 
+        `lodestream.open` gives the same as ``info``, but refuses hosts that do not tell the length and the version
+        (``ETag`` or ``Last-Modified``) of a file, whose values might change between two reads. These are taken here.
         `max_vertices` limits the memory of the container's tables, see `connect`.
 
         Raises

@@ -206,7 +206,8 @@ class Surface:
         blocks: Iterable[Block] | None = None,
     ) -> None:
         if (points is None) == (blocks is None):
-            raise InputError("expected either points or blocks")
+            got = "neither" if points is None else "both"
+            raise InputError(f"expected either points, as an array, or blocks, got {got}")
         if blocks is None:
             assert points is not None  # one of the two is there
             self.blocks: tuple[Block, ...] = (Block(points, closed, mask=mask, attributes=attributes),)

@@ -5,14 +5,27 @@ from __future__ import annotations
 import math
 import operator
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import wraps
 from typing import Any, Literal, TypeAlias
 
 from .errors import OptionError
 from .text import names_in
 
-__all__ = ["ChannelLimit", "Limit", "Limits", "Order", "Region", "Target", "Tolerance", "check_integer", "check_spans"]
+__all__ = [
+    "ChannelLimit",
+    "Limit",
+    "Limits",
+    "Order",
+    "Region",
+    "Target",
+    "Tolerance",
+    "check_integer",
+    "check_spans",
+    "check_target",
+    "target_keyword",
+]
 
 Order = Literal["quality", "level"]
 #: Rows and columns, half-open, in full-resolution indices.
@@ -39,6 +52,27 @@ def check_integer(what: str, value: Any) -> int:
     except TypeError:
         pass
     raise OptionError(f"expected {what} as an integer such as 1, got {value!r}")
+
+
+#: Words of other calls, such as `Container.view`, for the keywords of a target.
+_KEYWORDS = {"rms": "until_rms", "max_error": "until_max", "bytes": "max_bytes"}
+
+
+def target_keyword(word: str) -> str | None:
+    """Return the keyword of `Target` that a word stands for, which it may be itself; None if it is none of them."""
+    keyword = _KEYWORDS.get(word, word)
+    return keyword if keyword in Target.__dataclass_fields__ else None
+
+
+def check_target(target: object) -> None:
+    """Refuse what is given in place of a target.
+
+    Raises
+    ------
+    OptionError
+    """
+    if not isinstance(target, Target):
+        raise OptionError(f"expected a target such as lodestream.Target(until_rms=5), got {str(target)[:80]!a}")
 
 
 def check_spans(region: Region) -> None:
@@ -263,3 +297,19 @@ def _limits(given: Limits | None) -> Tolerance | dict[str, Tolerance] | None:
             # The extent is one of lengths; a channel has its own unit.
             raise OptionError(f"expected an error of {name!r} in its own unit, got {limit}, which is of the extent")
     return limits or None
+
+
+def _with_words(made: Callable[..., None]) -> Callable[..., None]:
+    """Return what makes a target, and names the right keyword for a word of another call."""
+
+    @wraps(made)
+    def make(self: Target, *args: Any, **given: Any) -> None:
+        word = next((word for word in given if word in _KEYWORDS), None)
+        if word is not None:
+            raise OptionError(f"expected {_KEYWORDS[word]}={str(given[word])[:80]}, got {word}=")
+        made(self, *args, **given)
+
+    return make
+
+
+Target.__init__ = _with_words(Target.__init__)  # type: ignore[method-assign]  # what it wraps has the parameters

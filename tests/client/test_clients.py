@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -177,6 +178,19 @@ def test_an_id_or_an_address_and_the_token_for_its_server_only(surface: str) -> 
     assert "secret" not in repr(AsyncClient(server, token="secret"))
     assert client._async.options_for(surface, {}).token == "secret"
     assert client._async.options_for("http://other.example/a.lode", {}).token is None
+
+
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_what_is_no_option_of_a_stream_is_refused_in_words(kind: Any) -> None:
+    client = kind("http://127.0.0.1:1")
+    words = {"rms": "until_rms", "max_error": "until_max", "bytes": "max_bytes", "level": "level", "seconds": "seconds"}
+    for name, keyword in words.items():
+        with pytest.raises(ls.OptionError, match=rf"^expected target=lodestream.Target\({keyword}=5\), got {name}=$"):
+            client.connect("ab", **{name: 5})
+    with pytest.raises(ls.OptionError, match=r"expected target, transport, .*, got 'zoom'"):
+        client.connect("ab", zoom=5)
+    with pytest.raises(ls.OptionError, match="expected a target such as"):
+        client.connect("ab", target=5)
 
 
 def test_clients_and_streams_that_nobody_refers_to_are_closed(surface: str) -> None:

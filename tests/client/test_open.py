@@ -60,6 +60,15 @@ def test_a_file_of_a_host_with_ranges(path: Path) -> None:
         assert other.value.__notes__[0] == f"in {host.url}/text.lode"
 
 
+def test_a_host_that_tells_no_version_is_described_only(path: Path) -> None:
+    with files.ranged(path.parent) as host:
+        host.tags = False
+        url = f"{host.url}/hills.lode"
+        assert Client(url).describe_file(url)["shape"] == [300, 400]
+        with pytest.raises(ls.LodestreamError, match="expected the length and the version"):
+            ls.open(url)
+
+
 def test_heights_for_maps_at_an_address(path: Path, tmp_path: Path) -> None:
     placed = {"crs": crs_wkt("EPSG:4326"), "geotransform": [7.0, 0.01, 0.0, 46.0, 0.0, -0.01]}
     (tmp_path / "hill.lode").write_bytes(ls.encode(ls.Surface(HEIGHTS, metadata=placed)))

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import inspect
+import pickle
+from dataclasses import replace
 from decimal import Decimal
 from typing import Any
 
@@ -132,3 +135,15 @@ def test_attributes_are_names_or_a_text_with_commas(names: Any) -> None:
     assert Selection(attributes=names).attributes == ("speed", "kind")
     with pytest.raises(OptionError, match="expected attributes as names or a text with commas, got int"):
         Target(attributes=3)  # type: ignore[arg-type]
+
+
+def test_words_of_other_calls_are_answered_with_the_keyword() -> None:
+    words: dict[str, Any]
+    for word, keyword in (("rms", "until_rms=5"), ("max_error", "until_max=5"), ("bytes", "max_bytes=5")):
+        words = {word: 5}
+        with pytest.raises(OptionError, match=f"^expected {keyword}, got {word}=$"):
+            Target(**words)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'zoom'"):
+        Target(zoom=5)  # type: ignore[call-arg]
+    assert "until_rms" in inspect.signature(Target).parameters
+    assert pickle.loads(pickle.dumps(Target(until_rms=5))) == replace(Target(until_rms=3), until_rms=5)

@@ -188,11 +188,14 @@ def source_url(url: str) -> str:
             f"{base}{_NAMES if shown[1] == 'n' else _SURFACES}/{shown[2]}"
         )
     path = urlsplit(base).path
+    if path.endswith((_SURFACES, _NAMES)):
+        one, what = ("ID", "an id") if path.endswith(_SURFACES) else ("NAME", "a name")
+        raise OptionError(f"expected {what} after {path}/, such as {base}/{one}, got none")
     if urlsplit(url).path.endswith(("/", ".html")):
         raise OptionError(
             f"expected a name after the page's address, such as {base}#NAME: lodestream published lists them"
         )
-    if not path or path.endswith((_SURFACES, _NAMES)):
+    if not path:
         raise OptionError(
             f"expected a surface's address such as http://HOST/v1/surfaces/ID, a container's such as "
             f"http://HOST/NAME.lode, or a published name's such as http://HOST/#NAME, got {url}"

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias, TypedDict
 
-from lodestream.target import Target
+from lodestream.errors import OptionError
+from lodestream.target import Target, check_target, target_keyword
 from lodestream.transfer.receiver_state import Sink, Store
 
 from .reconnecting import Transport
@@ -36,6 +37,29 @@ class ConnectOptions:
     sink: Sink | None = None
     max_vertices: int | None = None
     token: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.target is not None:
+            check_target(self.target)
+
+    @classmethod
+    def of(cls, keywords: ConnectKeywords, token: str | None) -> ConnectOptions:
+        """Return the options that a caller has given, and the token.
+
+        Raises
+        ------
+        OptionError
+            If there is no such option, or the target is none; what is a limit of a target is told.
+        """
+        for name, value in keywords.items():
+            if name in ConnectKeywords.__annotations__:
+                continue
+            keyword = target_keyword(name)
+            if keyword is not None:
+                shown = value if isinstance(value, int | float) else repr(value)[:80]
+                raise OptionError(f"expected target=lodestream.Target({keyword}={shown}), got {name}=")
+            raise OptionError(f"expected {', '.join(ConnectKeywords.__annotations__)}, got {name[:80]!a}")
+        return cls(token=token, **keywords)
 
 
 class ConnectKeywords(TypedDict, total=False):

@@ -168,6 +168,8 @@ def encode(
         If a file cannot be written. If its folder does not exist, this is raised before encoding begins.
     """
     require("encoding")
+    if surface is None:
+        raise InputError("expected a surface, such as an array or the path of a file, got None")
     if executor is not None and not isinstance(executor, Executor):
         kind = f"{type(executor).__module__}.{type(executor).__qualname__}"
         hint = ": pass what its get_executor() returns" if hasattr(executor, "get_executor") else ""

@@ -72,6 +72,8 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
 
     Raises
     ------
+    InputError
+        If it is no `Surface`.
     OptionError
         If no format that can be written has this suffix; the message names those that exist.
     FormatError
@@ -85,6 +87,9 @@ def write(surface: Surface, path: str | os.PathLike[str]) -> None:
     >>> lodestream.read("terrain.vts").shape
     (97, 70)
     """
+    if not isinstance(surface, Surface):
+        kind = type(surface).__name__
+        raise InputError(f"expected a Surface, such as lodestream.Surface(array) makes of an array, got {kind}")
     path, format_ = Path(path), for_writing(path)
     if format_.write is not None and path.exists() and not path.is_file():
         with path.open("wb") as file:  # a pipe or a device cannot be replaced by a file; a folder is refused here

@@ -15,12 +15,13 @@ from ..container.capacity import Capacity
 from ..container.model import ByteRange, Header, Index
 from ..decoding.decoder import Decoder
 from ..decoding.view import View
-from ..errors import InputError, LodestreamError, named
+from ..errors import InputError, LodestreamError, OptionError, named
 from ..planning.plan import Plan
 from ..planning.planner import plan
 from ..planning.window_errors import read_window_errors, wants_window_errors
+from ..sizes import parse_size
 from ..surface import Surface
-from ..target import Limits, Target
+from ..target import Limits, Target, check_target
 from .byte_sources import AT_ONCE, ByteSource
 from .open_source import open_source
 
@@ -97,7 +98,7 @@ class Container:
         *,
         rms: Limits | None = None,
         max_error: Limits | None = None,
-        bytes: int | None = None,
+        bytes: int | str | None = None,
         level: int | None = None,
         attributes: Sequence[str] | str | None = None,
     ) -> View:
@@ -108,8 +109,8 @@ class Container:
         rms, max_error : number, text, Tolerance, mapping or None
             The first layer with an error of at most this, in the surface's unit, or relative to its extent (a text);
             see `lodestream.Target`.
-        bytes : int or None
-            The last layer that ends within so many bytes.
+        bytes : int, text or None
+            The last layer that ends within so many bytes; a text such as ``"20kB"`` or ``"1MiB"``.
         level : int or None
             This level and coarser ones, exactly; `View.surface` and `View.points_at` take its number.
         attributes : sequence of str, or None
@@ -123,7 +124,11 @@ class Container:
             If it is damaged or takes too much memory.
         """
         chosen = None if attributes is None else tuple([attributes] if isinstance(attributes, str) else attributes)
-        return self.view_at(Target(until_rms=rms, until_max=max_error, max_bytes=bytes, level=level, attributes=chosen))
+        try:
+            most = parse_size(bytes) if isinstance(bytes, str) else bytes
+        except ValueError as error:
+            raise OptionError(str(error)) from None
+        return self.view_at(Target(until_rms=rms, until_max=max_error, max_bytes=most, level=level, attributes=chosen))
 
     def window(
         self,
@@ -160,7 +165,8 @@ class Container:
         Raises
         ------
         OptionError
-            If the surface has no such level, region or channel, or not even the first layer is within the bytes.
+            If it is no target, the surface has no such level, region or channel, or not even the first layer is within
+            the bytes.
         StreamError, TooLargeError
             If it is damaged or takes too much memory.
         """
@@ -175,7 +181,7 @@ class Container:
         ------
         As `view_at`.
         """
-        decoder, chosen = self._begun(target or Target(), bounded=True)
+        decoder, chosen = self._begun(Target() if target is None else target, bounded=True)
 
         def states() -> Iterator[View]:
             for _, places in chosen.steps():
@@ -244,6 +250,7 @@ class Container:
 
     def _begun(self, target: Target, *, bounded: bool) -> tuple[Decoder, Plan]:
         """Return a decoder that has what comes before the slices of the plan, and the plan."""
+        check_target(target)
         with named(self.source.place):
             wanted = bounded and wants_window_errors(target, self.header)
             windows = read_window_errors(self.index, self._read) if wanted else None

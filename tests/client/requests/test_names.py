@@ -44,8 +44,10 @@ def test_addresses() -> None:
     for name in ("", "a b", ".a", "a/b", "x" * 101, "\u00e4"):
         with pytest.raises(OptionError, match="at most 100"):
             addresses.name_url("http://host", name)
-    with pytest.raises(OptionError, match="a surface's address"):
+    with pytest.raises(OptionError, match="expected a name after /v1/names/, such as http://host/v1/names/NAME, got"):
         addresses.source_url("http://host/v1/names")
+    with pytest.raises(OptionError, match="expected an id after /v1/surfaces/, such as http://host/v1/surfaces/ID,"):
+        addresses.source_url("http://host/v1/surfaces/")
 
 
 def test_a_name_leads_to_its_surface_in_one_request() -> None:

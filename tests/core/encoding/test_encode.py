@@ -122,6 +122,15 @@ def test_small_surfaces_are_built_by_an_executor_too(shape: tuple[int, int], kin
         assert ls.encode(surface, executor=executor) == ls.encode(surface)
 
 
+def test_what_is_no_surface_is_told_in_words(tmp_path: Path) -> None:
+    with pytest.raises(ls.InputError, match="expected a surface, such as an array or the path of a file, got None"):
+        ls.encode(None)  # type: ignore[call-overload]
+    with pytest.raises(ls.InputError, match="either points, as an array, or blocks, got neither"):
+        ls.Surface()
+    with pytest.raises(ls.InputError, match=r"such as lodestream.Surface\(array\) makes of an array, got ndarray"):
+        ls.write(np.zeros((3, 4)), tmp_path / "a.npy")  # type: ignore[arg-type]
+
+
 def test_a_surface_of_one_point_is_refused_whoever_builds() -> None:
     with ThreadPoolExecutor(1) as executor, pytest.raises(ls.InputError, match="at least two points"):
         ls.encode(np.zeros((1, 1)), executor=executor)

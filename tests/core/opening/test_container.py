@@ -291,6 +291,12 @@ def test_what_cannot_be_had_of_it_is_refused() -> None:
     for wrong in ({"level": 99}, {"level": 1, "rms": 2}, {"rms": "much"}, {"bytes": 3}, {"attributes": "snow"}):
         with pytest.raises(ls.OptionError):
             opened.view(**wrong)
+    for read in (opened.view_at, opened.views):
+        with pytest.raises(ls.OptionError, match=r"a target such as lodestream.Target\(until_rms=5\), got '0'"):
+            read(0)  # type: ignore[arg-type]
+    assert opened.view(bytes="20kB").bytes == opened.view(bytes=20_000).bytes
+    with pytest.raises(ls.OptionError, match="a number of bytes such as 20000, 20kB or 1MiB, got 'few'"):
+        opened.view(bytes="few")
     with pytest.raises(ls.OptionError, match="rows within 0:300"):
         opened.window((290, 310), (0, 9))
     with pytest.raises(ls.TooLargeError):
