@@ -27,7 +27,7 @@ from .commands import (
     surfaces,
     view,
 )
-from .commands.arguments import Subparsers, add_command
+from .commands.arguments import NO_TOKEN, Subparsers, add_command
 from .starting import EndingAtOnce
 from .terminal.interrupts import exit_code, unwrapping
 from .terminal.output import GroupingParser, Parser, clean_warnings, complain, speaking
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 __all__ = ["build_parser", "main"]
 
 _MODULES = (demo, encode, decode, convert, info, open, view, formats, push, pull, surfaces, retry, publish, completion)
-
-#: Codes of errors that another token may help against: of our server, and of any other.
-_NO_TOKEN = ("no-token", "bad-token", "http-401")
 
 #: How the help groups commands; others of other packages are under its last heading.
 _GROUPS = {
@@ -132,6 +129,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
-    if isinstance(error, RemoteError) and error.code in _NO_TOKEN:
+    if isinstance(error, RemoteError) and error.code in NO_TOKEN:
         return f"{error}; the token is given by --token or LODESTREAM_TOKEN"
     return str(error) or type(error).__name__

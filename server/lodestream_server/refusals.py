@@ -28,7 +28,7 @@ _FAULTS: Mapping[str, str] = {
     "greater_than_equal": "must be at least {ge:.10g}",
     "less_than_equal": "must be at most {le:.10g}",
     "less_than": "must be less than {lt:.10g}",
-    # The regular expression says nothing to most people; the description of the parameter does.
+    # The regular expression says nothing to most people; the description does, which may go on behind a colon.
     "string_pattern_mismatch": "must be {description}",
 }
 
@@ -74,4 +74,4 @@ def fault_of_body(error: Mapping[str, Any], expected: str) -> str:
 
 def _fault(error: Mapping[str, Any], description: str) -> str:
     words = _FAULTS.get(error["type"], "cannot be read")
-    return words.format(description=description, **error.get("ctx", {}))
+    return words.format(description=description.partition(": ")[0], **error.get("ctx", {}))

@@ -264,7 +264,9 @@ def test_another_server_waits_says_for_whom_and_takes_over(site: Site) -> None:
 def test_what_the_reader_of_a_folder_or_of_nothing_is_told(site: Site, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="in a bucket"):
         site.stack.enter_context(running_server(tmp_path / "data", read_only=True))
-    with pytest.raises(InputError, match="expected the data of a server in s3://memory/data, got none"):
+    with pytest.raises(
+        InputError, match="expected the data of a server in s3://memory/data, got none: start one without --read-only"
+    ):
         site.start("reader", read_only=True)
     open_store(site.address).create("view.json", b"{}")
     with pytest.raises(LodestreamError, match="published prefix"):

@@ -16,6 +16,7 @@ else:
     Subparsers = Any
 
 __all__ = [
+    "NO_TOKEN",
     "Subparsers",
     "add_command",
     "add_json_option",
@@ -27,6 +28,8 @@ __all__ = [
     "token_of",
 ]
 
+#: Codes of errors that another token may help against: of our server, and of any other.
+NO_TOKEN = ("no-token", "bad-token", "http-401")
 
 _NEGATIVE_NUMBER = re.compile(r"-(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan)$")
 

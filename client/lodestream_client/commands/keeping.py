@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from lodestream.errors import CorruptStreamError, FormatError, LodestreamError, OptionError, RemoteError, TooLargeError
 
 from ..terminal.output import human_size, note
+from .arguments import NO_TOKEN
 
 if TYPE_CHECKING:
     from ..requests.api import Identity
@@ -53,6 +54,7 @@ class Kept:
         self._fresh = True  # nothing was there before
         self._full = False
         self._why_not = ""
+        self._refused = False  # the token was
 
     def __enter__(self) -> Kept:
         return self
@@ -78,7 +80,8 @@ class Kept:
     def words(self) -> str:
         """A message for the user: the bytes that are kept, or the reason why none are."""
         if self._total:
-            return f"{human_size(self._total)} are kept; pull --resume continues from there"
+            how = " with another token" if self._refused else ""
+            return f"{human_size(self._total)} are kept; pull --resume continues from there{how}"
         return f"nothing is kept: {self._why_not}" if self._why_not else ""
 
     def use(self, identity: Identity) -> None:
@@ -131,6 +134,7 @@ class Kept:
 
     def failed(self, error: BaseException) -> None:
         """Record the error of the command; data that are of no use after it are not kept."""
+        self._refused = isinstance(error, RemoteError) and error.code in NO_TOKEN
         if self._cached is None:
             return
         changed = isinstance(error, RemoteError) and error.code == "other-container"

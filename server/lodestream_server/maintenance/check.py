@@ -119,7 +119,7 @@ class _Judge:
         try:
             tag = layout.read(self._store, IDENTITY)[1]
         except AbsentError:
-            establish(self._store)
+            establish(self._store, known=True)
         else:
             self._store.replace(IDENTITY, layout.dump(Identity(layout.VERSION, layout.new_write())), tag)
 

@@ -57,7 +57,7 @@ _Error = Annotated[
     str,
     Query(
         pattern=r"^[0-9]{1,5}(\.[0-9]{0,12})?([eE][+-]?[0-9]{1,2})?%?$",
-        description="a number of metres, or 0.1% of the range of all heights, by which heights may be off: so fewer "
+        description="0 or more metres, or 0.1% of the range of all heights: how far heights may be off, so that fewer "
         "bytes of the surface are decoded",
         examples=["2.5", "0.1%"],
     ),

@@ -285,6 +285,8 @@ def _metadata(header: str) -> dict[str, str]:
 
 def _number(request: Request, header: str) -> int:
     text = request.headers.get(header, "")
+    if not text:
+        raise OptionError(f"The header {header.title()} is missing: it is a number of bytes")
     if not (text.isascii() and text.isdecimal() and len(text) < 19):
         raise OptionError(f"The header {header.title()} is no number of bytes: {text[:80]!a}")
     return int(text)

@@ -28,14 +28,14 @@ import os
 import time
 from pathlib import Path
 
-from lodestream.errors import InputError
+from lodestream.errors import InputError, LodestreamError
 from lodestream.stores import AbsentError, Folder, Store, open_store
 from lodestream.stores.connections import Limits
 from lodestream.stores.folder import OWN
 
 from .claim import LOCK, claim
 from .durable import discard, make_folder
-from .identity import read_identity
+from .identity import known_identity
 from .layout import BUILT, CONTAINERS, IDENTITY, NAMES, SURFACES, UPLOADS
 from .lease import LEASE_SECONDS, Lease
 from .private import check_writable, make_private, tighten
@@ -153,10 +153,7 @@ class Data:
         try:
             if folder is not None:
                 self._open_folder(folder)
-            make_private(scratch)
-            self._guards.append(claim(scratch))
-            for each in (self._incoming, self.levels, fetched):
-                discard(each)
+            self._open_scratch(fetched)
             store: Store = (
                 Folder(folder, private=True) if folder is not None else _bucket(str(place), lease_seconds, fetched)
             )
@@ -179,6 +176,16 @@ class Data:
             root, *(root / name for name in (OWN, SURFACES, BUILT, CONTAINERS, UPLOADS, NAMES)), self.scratch
         )
         check_version(root)
+
+    def _open_scratch(self, fetched: Path) -> None:
+        try:
+            make_private(self.scratch)
+            self._guards.append(claim(self.scratch))
+            for each in (self._incoming, self.levels, fetched):
+                discard(each)
+        except (LodestreamError, OSError) as error:
+            words = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            raise LodestreamError(f"{words}: each server needs a writable folder of its own (--scratch)") from error
 
     def start(self) -> None:
         """Take part in the work on a bucket: wait for the lease, and tell what has changed."""
@@ -237,8 +244,8 @@ def _bucket(address: str, lease_seconds: float, fetched: Path) -> Store:
 
 def _check_there(store: Store) -> None:
     try:
-        read_identity(store)
+        known_identity(store)
     except AbsentError:
         raise InputError(
-            f"expected the data of a server in {store.describe()}, got none: start one without read_only first"
+            f"expected the data of a server in {store.describe()}, got none: start one without --read-only first"
         ) from None

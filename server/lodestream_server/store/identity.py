@@ -2,37 +2,68 @@
 
 from __future__ import annotations
 
+import logging
+
 from lodestream.errors import InputError
 from lodestream.stores import AbsentError, ExistsError, Store
 
 from . import layout
-from .layout import IDENTITY, Identity
+from .layout import CHANGES, IDENTITY, WRITER, DamagedObjectError, Identity
 
-__all__ = ["establish", "read_identity"]
+__all__ = ["establish", "known_identity", "read_identity"]
+
+_log = logging.getLogger(__name__)
+
+# What may be there at a first start: tokens, what this start has made in a folder, what another server makes meanwhile.
+_EXPECTED = ("tokens.json", "lock", "probe", "scratch", IDENTITY, WRITER, CHANGES)
 
 
-def establish(store: Store) -> str:
+def establish(store: Store, *, known: bool = False) -> str:
     """Return the identity of a server's data in a store; an empty store becomes such data.
+
+    Parameters
+    ----------
+    store : Store
+    known : bool
+        Whether the data are known to be those of a server; otherwise a warning names what else is there.
 
     Raises
     ------
     InputError
         If the store holds a published list, or data of another version.
+    DamagedObjectError
+        If the identity cannot be read.
     StoreError
-        If it cannot be used.
+        If the store cannot be used.
     """
     try:
-        return read_identity(store).identity
+        return known_identity(store).identity
     except AbsentError:
         store.probe()
-        if next(iter(store.entries("")), None) is not None and _published(store):
+        other = next((entry.key for entry in store.entries("") if entry.key.partition("/")[0] not in _EXPECTED), None)
+        if other is not None and _published(store):
             raise InputError(f"{store.describe()} is a published prefix, with view.json: choose another one") from None
+        if other is not None and not known:
+            _log.warning(
+                "%s has no %s, but holds %s: unless these are a server's data without that file, choose an empty "
+                "prefix or folder",
+                *(store.describe(), IDENTITY, other),
+            )
     new = Identity(layout.VERSION, layout.new_write())
     try:
         store.create(IDENTITY, layout.dump(new))
     except ExistsError:
-        return read_identity(store).identity
+        return known_identity(store).identity
     return new.identity
+
+
+def known_identity(store: Store) -> Identity:
+    """Return the same as `read_identity`; of one that cannot be read, the error says what mends it."""
+    try:
+        return read_identity(store)
+    except DamagedObjectError as error:
+        place = store.describe()
+        raise DamagedObjectError(f"{place}: {error}; lodestream fsck --repair {place} writes it again") from None
 
 
 def read_identity(store: Store) -> Identity:

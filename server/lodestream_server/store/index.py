@@ -9,12 +9,14 @@ Reads take a connection of their own for each thread; changes take one after the
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar
@@ -110,6 +112,8 @@ _CACHE = 256 << 10
 _LOG_PAGES = 64
 
 _ROOM = ".room"
+#: Mode of the files.
+_PRIVATE = 0o600
 
 # Bytes of a file that is removed when there is no other room on its disk to open the index: so much takes what SQLite
 # makes beside it. A server has to start on a full disk, or nobody can delete anything.
@@ -612,6 +616,9 @@ class Index:
         if self._file is not None and _identity_of(self._path) != self._file:
             raise sqlite3.DatabaseError("its file is gone")
         if connection is None:
+            if self._file is None:
+                with suppress(OSError):  # SQLite says what is wrong
+                    self._path.touch(_PRIVATE)  # SQLite gives its other files the mode of this one
             # It is used by its thread alone, and closed by whoever closes the index.
             connection = sqlite3.connect(self._path, isolation_level=None, check_same_thread=False)
             connection.execute("PRAGMA synchronous = NORMAL")
@@ -655,7 +662,7 @@ def _keep_room(room: Path) -> None:
     if room.exists():
         return
     try:
-        with room.open("xb") as file:
+        with open(room, "xb", opener=partial(os.open, mode=_PRIVATE)) as file:
             file.write(bytes(_KEPT))
     except OSError:
         room.unlink(missing_ok=True)

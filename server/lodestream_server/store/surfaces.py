@@ -188,7 +188,7 @@ class Surfaces:
             return
         assert self.lease is not None
         if not self.lease.wanted:
-            raise ReadOnlyError("This server only reads (read_only); send this to one that writes")
+            raise ReadOnlyError("This server only reads (--read-only); send this to one that writes")
         raise StandbyError(f"This server does not write to its bucket now: {self.lease.standing}")
 
     def still(self) -> float:

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import AsyncClient, Client, UnreachableError
+from lodestream_client.commands.keeping import Kept
+from lodestream_client.requests.api import Identity
 from lodestream_client.stream import cache, reconnecting
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, Link, linked
@@ -258,6 +261,18 @@ def test_a_finer_pull_goes_on_from_a_coarser_one(
     assert parts(folder) == [], "what has been written whole is not kept twice"
     plain = json.loads(run("pull", source, tmp_path / "e.npy", "--level", "3", "--json")[1])
     assert {key: level[key] for key in ("bytes", "rms")} == {key: plain[key] for key in ("bytes", "rms")}
+
+
+@pytest.mark.parametrize(("code", "how"), [("bad-token", " with another token"), ("busy", "")])
+def test_what_is_kept_after_a_token_was_refused_needs_another_one(
+    folder: Path, code: str, how: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    refusal = ls.RemoteError(code, "no more")
+    with suppress(ls.RemoteError), Kept(asked=True) as kept:
+        kept.use(Identity("0" * 64, None, 5000))
+        kept.write(0, bytes(1000))
+        raise refusal
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"are kept; pull --resume continues from there{how}")
 
 
 def test_a_pull_that_breaks_is_gone_on_with_by_the_next(

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
 
@@ -95,6 +96,19 @@ def test_a_folder_that_cannot_be_written(closed: Path, refused: Refused) -> None
     assert f"{closed}/data: " in refused("serve", "--port", "0", "--data", closed / "data")
     assert f"{closed}/tokens.json" in refused("token", "create", "--data", closed)
     assert f"{closed}/data: " in refused("token", "create", "--data", closed / "data")
+
+
+def test_a_scratch_folder_that_cannot_be_used_is_told_with_its_option(tmp_path: Path, closed: Path) -> None:
+    (tmp_path / "file").write_text("")
+    data, scratch = tmp_path / "data", tmp_path / "scratch"
+    with closing(Data(data, scratch)):
+        for place, words in (
+            (tmp_path / "file", "Not a directory"),
+            (closed / "none", "(No such file or directory|Permission denied|Read-only|Operation not permitted)"),
+            (scratch, "which another one uses"),
+        ):
+            with pytest.raises(LodestreamError, match=rf"{words}: each server needs .* of its own \(--scratch\)$"):
+                Data(tmp_path / f"{place.name}-data", place)
 
 
 @pytest.mark.parametrize("name", ["", ".lodestream", "surfaces", "built", "uploads", "containers", "names", "scratch"])
@@ -249,7 +263,9 @@ def test_what_a_server_makes_is_its_owners_alone(tmp_path: Path) -> None:
     files = [data / "lodestream.json", *places, *(path for place in places for path in place.rglob("*"))]
     assert len(files) == 10
     assert (mode(data / ".lodestream"), mode(data / "scratch")) == (0o700, 0o700)
-    for path in files:
+    scratch = list((data / "scratch").rglob("*"))
+    assert {path.name for path in scratch} >= {"index.sqlite", "index.sqlite.room"}
+    for path in [*files, *scratch]:
         assert mode(path) == (0o700 if path.is_dir() else 0o600), path
 
 

@@ -127,7 +127,9 @@ def test_the_error_of_tiles_may_be_relative(http: httpx.Client, hill: dict[str, 
     other = http.get(f"{hill['url']}/tiles/7/66/45.png", params={"error": "0.5e1%", "encoding": "terrain-rgb"})
     assert other.headers["etag"] == tile.headers["etag"]
     refused = http.get(f"{hill['url']}/map.json", params={"error": "5 m"}).json()["detail"]
-    assert refused.startswith("The parameter error of the query must be a number of metres, or 0.1% of the range of")
+    assert refused.startswith(
+        "The parameter error of the query must be 0 or more metres, or 0.1% of the range of all heights, and is '5 m'"
+    )
 
 
 def test_documents_name_the_surface_as_lists_do_or_as_it_was_asked_for(http: httpx.Client) -> None:

@@ -147,6 +147,11 @@ def test_a_beginning_that_cannot_end_well_is_refused(
     assert kept(data, PARTIAL) == before
 
 
+def test_a_length_that_is_missing_is_told(http: httpx.Client) -> None:
+    detail = http.post("/v1/uploads", headers=TUS).json()["detail"]
+    assert detail == "The header Upload-Length is missing: it is a number of bytes"
+
+
 def test_a_part_that_is_not_the_next_one_is_refused(http: httpx.Client) -> None:
     body = npy(hills(seed=71))
     address = begun(http, len(body))

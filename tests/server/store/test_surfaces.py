@@ -727,6 +727,29 @@ def test_what_is_there_decides_what_a_store_may_be(tmp_path: Path) -> None:
     assert establish(store) == establish(store)
 
 
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("one/lodestream.json", True), ("surfaces/foo.txt", True), ("tokens.json", False), ("scratch/lock", False)],
+)
+def test_what_else_is_there_at_a_first_start_is_told_once(
+    tmp_path: Path, name: str, told: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "data" / name
+    path.parent.mkdir(parents=True)
+    path.write_text("another's")
+    identity = establish(Folder(tmp_path / "data"))
+    assert establish(Folder(tmp_path / "data")) == identity
+    lines = [f"{tmp_path}/data has no lodestream.json, but holds {name}: unless these are "] if told else []
+    assert [record.message[: len(line)] for record, line in zip(caplog.records, lines, strict=True)] == lines
+
+
+def test_an_identity_that_is_damaged_is_told_with_its_place_and_what_mends_it(tmp_path: Path) -> None:
+    (tmp_path / "lodestream.json").write_text("{}")
+    words = f"{tmp_path}: lodestream.json cannot be read: .*; lodestream fsck --repair {tmp_path} writes it again"
+    with pytest.raises(DamagedObjectError, match=words):
+        establish(Folder(tmp_path))
+
+
 def test_threads_read_while_others_change(surfaces: Surfaces, tmp_path: Path) -> None:
     failed: list[BaseException] = []
     begun = threading.Event()
