@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -25,6 +26,7 @@ from lodestream_client.program import main
 from lodestream_server import following, running_server
 from lodestream_server.access.tokens import TokenObject, Tokens
 from lodestream_server.builds import worker
+from lodestream_server.connections import connections
 from lodestream_server.routes import streams
 from lodestream_server.store.lease import Lease
 from lodestream_server.store.surfaces import Surfaces
@@ -110,6 +112,24 @@ def test_a_reader_serves_what_the_writer_built_and_changes_nothing(
     first.delete(location).raise_for_status()
     within(5.0, lambda: states(reader) == {}, "the reader to see that it is gone")
     assert reader.get(location).status_code == 404
+
+
+def test_an_upload_that_is_for_another_server_is_no_abuse(
+    site: Site, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "_REST_SECONDS", 0.3)
+    first = writer(site)
+    reader = site.start("reader", read_only=True)
+    for http, path, status, cuts in ((reader, "/v1/surfaces", 403, 0), (first, "/v1/nothing", 404, 1)):
+        place = http.base_url
+        with socket.create_connection((place.host, place.port or 0), PATIENCE) as connection:
+            head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Length: {10 << 20}\r\n\r\n"
+            connection.sendall(head.encode())
+            assert connection.recv(1 << 16).startswith(f"HTTP/1.1 {status}".encode())
+            with suppress(OSError):  # it is cut at some time
+                while True:
+                    connection.sendall(bytes(1 << 16))
+        assert caplog.text.count("connection cut: refused-body") == cuts
 
 
 @pytest.fixture

@@ -38,7 +38,9 @@ class _Token(SecurityBase):
     async def __call__(self, connection: HTTPConnection, scopes: SecurityScopes) -> Caller:
         caller = _access(connection).authorize(connection, scopes.scope_str)
         if connection.scope.get("method", "GET") not in _READING:
+            connection.state.is_for_another = True
             connection.app.state.parts.surfaces.check_writer()
+            connection.state.is_for_another = False
         return caller
 
 

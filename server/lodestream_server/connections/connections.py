@@ -186,8 +186,13 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
 
     def _rest_is_over(self) -> None:
         if self._rest > MOST_REST:
-            self.cuts.note("refused-body", self.client)
+            self._note_rest()
         self._socket.close()
+
+    def _note_rest(self) -> None:
+        # There is no scope before a head was read; and no client knows before it sends a body that it is for another.
+        if not (self.scope and self.scope["state"].get("is_for_another")):
+            self.cuts.note("refused-body", self.client)
 
     def _leave_request(self) -> None:
         if self.cycle is not None and not self.cycle.response_complete:
@@ -216,7 +221,7 @@ class _Http(H11Protocol, asyncio.BufferedProtocol):
             seconds = self.settings.head_seconds
             self._refuse("idle", f"The head of the request was not complete within {seconds:g} s")
         else:
-            self.cuts.note("refused-body", self.client)
+            self._note_rest()
             self._socket.abort()
 
     def _refuse(self, code: str, detail: str) -> None:
