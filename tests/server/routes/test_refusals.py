@@ -25,6 +25,7 @@ EXPECTED = (
     " may have ",
     " is one of ",
     " is no number ",
+    " is missing: it is ",
     "it has levels ",
     "write 0 or more",
 )
