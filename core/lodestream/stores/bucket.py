@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -154,7 +154,9 @@ class Bucket:
             try:
                 size = self._ask(key, lambda: self._library.head(self._store, at))["size"]
             except AbsentError:
-                self.get(key, 0)  # the answer to HEAD does not tell whether the object or the bucket is absent
+                # The answer to HEAD does not tell whether the object or the bucket is absent; that to GET does.
+                with suppress(OversizedError):  # it has come to be meanwhile
+                    self.get(key, 0)
                 raise
         return BucketBlob(self._blocks, Extent(key, size))
 

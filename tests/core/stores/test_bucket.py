@@ -368,6 +368,24 @@ def test_a_bucket_that_is_not_there_is_not_an_absent_object(scheme: str, request
         assert not isinstance(e.value, AbsentError)
 
 
+def test_an_object_that_comes_to_be_while_it_is_opened_is_absent(s3: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    address, head = s3.address(), obstore.head
+    store, other = open_store(address), open_store(address)
+
+    def late(bucket: S3Store, at: str) -> object:
+        try:
+            return head(bucket, at)
+        finally:
+            other.create("a.json", b"{}")
+
+    monkeypatch.setattr(obstore, "head", late)
+    with pytest.raises(AbsentError):
+        store.open("a.json")
+    monkeypatch.undo()
+    with store.open("a.json") as blob:
+        assert blob.read(0, 2) == b"{}"
+
+
 def test_a_tag_is_no_hash_of_a_large_object(s3: Emulator, tmp_path: Path) -> None:
     store = open_store(s3.address())
     put(store, "a", bytes(9 << 20), tmp_path)

@@ -44,6 +44,7 @@ ATTRIBUTES: dict[type, dict[str, str]] = {
         "connections": "self.connections.add(self)",
         "cycle": "self.cycle = RequestResponseCycle(",
         "loop": "self.loop = ",
+        "scope": "self.scope = {",
         "transport": "self.transport = transport",
     },
     WebSocketsSansIOProtocol: {
