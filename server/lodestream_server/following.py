@@ -167,9 +167,8 @@ class Following:
             if len({what, *self._coming, *self._lately}) > _MOST_LOOKS:
                 return
             coming = self._coming[what] = asyncio.create_task(self._look_for(what))
-            coming.add_done_callback(
-                lambda look: look.cancelled() or look.exception()
-            )  # nobody may wait for it by then
+            # Its error is taken, since nobody may wait for it by then.
+            coming.add_done_callback(lambda look: look.cancelled() or look.exception())
         await self.answer(asyncio.shield(coming))
 
     async def _look_for(self, what: str) -> None:

@@ -223,14 +223,14 @@ class ContainerCache:
         try:
             lease = self._fetched(sha256, size)
         except BaseException as error:
-            self._come(sha256)
+            self._end_coming(sha256)
             done.set_exception(error)
             raise
-        self._come(sha256)
+        self._end_coming(sha256)
         done.set_result(None)
         return lease
 
-    def _come(self, sha256: str) -> None:
+    def _end_coming(self, sha256: str) -> None:
         with self._lock:
             del self._coming[sha256]
 
