@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -27,6 +26,7 @@ from .builds.level_maker import LevelMaker
 from .builds.tile_maker import TileMaker
 from .builds.work import Work
 from .following import Following
+from .operation.disks import disk_of
 from .operation.metrics import Metrics
 from .operation.observation import Observation
 from .operation.pace import Pace, Paced
@@ -218,7 +218,7 @@ def _container_cache(settings: Settings, data: Data, limits: Limits) -> Containe
 def _disk_of(folder: Path) -> int:
     """Return the size of the disk of a folder; 0 if it is unknown, since all there can be made again."""
     try:
-        return shutil.disk_usage(folder).total
+        return disk_of(folder).total
     except OSError as error:
         _log.warning("the size of the disk is unknown, so that few levels and containers are kept: %s", error)
         return 0

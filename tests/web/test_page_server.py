@@ -73,8 +73,8 @@ def test_a_name_that_leads_nowhere_is_told(tabs: Tabs, shelf: Shelf, heard: Hear
 
 
 def drop(tab: Tab, name: str, data: bytes, place: str = ".drop") -> None:
-    """Let go of a file above the page's place for files, or another element."""
-    tab.page.locator(place).wait_for()
+    """Let go of a file above the page's place for files, or another element, once the page takes files."""
+    tab.page.locator(".drop").wait_for(state="attached")
     tab.page.evaluate(
         """([name, text, place]) => {
           const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));

@@ -9,7 +9,6 @@ Everything here but the check of names runs in the event loop, between two await
 from __future__ import annotations
 
 import asyncio
-import shutil
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
@@ -22,6 +21,7 @@ from starlette.types import Message, Receive
 
 from lodestream.protocol.messages import BASE_CREDIT, MAX_CREDIT
 
+from ..operation.disks import disk_of
 from ..operation.least_rate import LeastRate, WaitingClock
 from ..operation.settings import Settings
 from ..problems import FullError, RestartingError, SlowUploadError
@@ -256,7 +256,7 @@ class Limits:
 
     def _free_now(self) -> tuple[int, int]:
         """Return the bytes that may be taken, and the bytes that stay free."""
-        disks = [shutil.disk_usage(folder) for folder in self._folders]
+        disks = [disk_of(folder) for folder in self._folders]
         kept = [min(_KEPT, disk.total // 20) for disk in disks]
         if self._settings.keep_free is not None:
             kept = [self._settings.keep_free] * len(disks)

@@ -79,6 +79,7 @@ _TAKEN_UP = 1000
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
 _PASSING = (*worker.NO_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 _ROOM = "space on the server's disk"
+_SCRATCH = "the server's scratch folder, which was removed meanwhile"
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
 
@@ -555,6 +556,7 @@ class Builder:
                 result = await self._keep(it.id, job, result)
             if result is None:
                 return "ready"
+            await asyncio.to_thread(_check_there, folder, counted)
             ended = True
             # Whoever sees that it has failed sees nothing of it.
             await asyncio.to_thread(self._work.end, it.id, folder)
@@ -739,7 +741,15 @@ def _identities(files: Sequence[Path]) -> list[tuple[int, int, int]] | None:
     return [(status.st_dev, status.st_ino, status.st_mtime_ns) for status in statuses]
 
 
+def _check_there(folder: Path, begun: bool) -> None:
+    """Check that the folder of an attempt that has begun was not removed, which a build may fail of in any way."""
+    if begun and not folder.is_dir():
+        raise _LaterError(_SCRATCH)
+
+
 def _not_now(error: OSError) -> worker.Refused:
     if error.errno in _PASSING:
         raise _LaterError.of(error.errno) from error
+    if error.errno == errno.ENOENT:
+        raise _LaterError(_SCRATCH) from error
     return worker.Refused(f"the server's disk: {error.strerror or error}", final=False)

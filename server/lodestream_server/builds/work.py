@@ -28,6 +28,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ..store.durable import discard, make_folder, remove
+from ..store.private import make_private
 
 __all__ = ["Work", "tasks_of"]
 
@@ -70,6 +71,8 @@ class Work:
         """
         bands = self.bands(surface)
         with self._lock:
+            if not self._folder.parent.is_dir():  # the scratch folder, which may have been removed
+                make_private(self._folder.parent)
             for folder in (self._folder, attempt.parent):
                 if not _is_folder(folder):
                     make_folder(folder)

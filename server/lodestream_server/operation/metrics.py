@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,8 @@ from prometheus_client import (
     disable_created_metrics,
     generate_latest,
 )
+
+from .disks import disk_of
 
 __all__ = ["Metrics"]
 
@@ -62,7 +63,7 @@ class Metrics:
         self._gauge(
             "disk_free_bytes",
             "free space on the disk of the data folder, or of the scratch folder of a bucket",
-            lambda: shutil.disk_usage(folder).free,
+            lambda: disk_of(folder).free,
         )
 
     def watch_bucket(self, writes: Callable[[], bool], unseen: Callable[[], float]) -> None:

@@ -232,8 +232,9 @@ class Data:
         OSError
             If it cannot be made.
         """
-        if not self._incoming.is_dir():
-            make_private(self._incoming)
+        for folder in (self.scratch, self._incoming):  # which may have been removed
+            if not folder.is_dir():
+                make_private(folder)
         return make_folder(self._incoming / os.urandom(8).hex())
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import stat
 import subprocess
 import sys
 import threading
@@ -23,6 +24,7 @@ from lodestream.errors import LodestreamError
 from lodestream_server import running_server
 from lodestream_server.builds import builder, worker
 from lodestream_server.builds.work import Work
+from lodestream_server.operation.disks import disk_of
 from lodestream_server.operation.threads import carried_out
 from lodestream_server.store.data import Data
 from lodestream_server.store.durable import discard
@@ -430,6 +432,30 @@ def test_the_same_bytes_of_two_names_are_built_twice_and_stored_once(tmp_path: P
         assert [len(kept(data, name)) for name in ("surfaces", "uploads", "containers")] == [2, 1, 2]
         three = push(http, npy(hills()), name="one", precision="0.5")
         assert (three["state"], len(kept(data, "uploads"))) == ("ready", 1)
+
+
+def test_builds_and_uploads_go_on_while_the_scratch_folder_is_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A build whose work is gone begins again, and nobody has to ask for that."""
+    data = tmp_path / "data"
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with running(data) as http:
+        location = post(http, 1)
+        building(http, location)
+        (data / "scratch").rename(tmp_path / "away")
+        assert disk_of(data / "scratch" / "work").total > 0
+
+        def taken() -> str | None:
+            answer = http.post("/v1/surfaces", content=npy(hills(9, 8)), params={"filename": "hills.npy"})
+            assert answer.status_code == 202 or busy(answer), answer.text
+            return str(answer.headers["location"]) if answer.status_code == 202 else None
+
+        second = eventually(taken, "the upload to be taken")
+        (data / "go").touch()
+        eventually(lambda: http.get("/readyz").status_code == 200, "the index to be made again")
+        assert [settled(http, where)["state"] for where in (location, second)] == ["ready", "ready"]
+    assert stat.S_IMODE((data / "scratch").stat().st_mode) == 0o700
 
 
 def test_builds_go_on_while_the_index_is_lost_and_made_again(
