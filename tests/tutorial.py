@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import sysconfig
@@ -14,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 from tests.patience import PATIENCE
+from tests.ports import reserved_port
 
 __all__ = ["PAGE", "compiler", "installed", "rendered", "without_the_page"]
 
@@ -91,12 +91,13 @@ def rendered(page: str, folder: Path, variables: dict[str, str]) -> str:
     AssertionError
         If a command fails.
     """
-    port = _free_port()
-    for name, program in _PROGRAM.findall(page):
-        (folder / name).write_text(program.replace(_PORT, port))
     commands = [line[2:] for block in _BLOCK.findall(page) for line in block.splitlines() if line.startswith("$ ")]
-    run = [command.replace(_PORT, port) for command in commands]
-    outputs = [_as_shown(text, port) for text in _outputs(run, folder, variables)]
+    with reserved_port() as number:
+        port = str(number)
+        for name, program in _PROGRAM.findall(page):
+            (folder / name).write_text(program.replace(_PORT, port))
+        run = [command.replace(_PORT, port) for command in commands]
+        outputs = [_as_shown(text, port) for text in _outputs(run, folder, variables)]
     assert len(outputs) == len(commands), f"{commands[len(outputs) - 1]} failed:\n{outputs[-1]}"
     answers = iter(outputs)
 
@@ -148,12 +149,6 @@ def _outputs(commands: list[str], folder: Path, variables: dict[str, str]) -> li
 def _run(command: list[str]) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}{done.stderr}"
-
-
-def _free_port() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return str(probe.getsockname()[1])
 
 
 def _as_shown(output: str, port: str) -> str:

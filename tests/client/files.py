@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.patience import PATIENCE
+from tests.ports import reserved_port
 
 __all__ = ["Ranged", "nginx", "plain", "ranged", "running"]
 
@@ -169,20 +170,18 @@ http {{
 def nginx(folder: Path, work: Path, behind: str = "http://127.0.0.1:9") -> Iterator[str]:
     """A server of nginx, which has to be installed: the files of a folder, and another server as ``/maps/``."""
     program = shutil.which("nginx") or "/usr/sbin/nginx"
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     configuration = work / "nginx.conf"
-    configuration.write_text(_CONFIGURATION.format(work=work, folder=folder, port=port, behind=behind))
-    process = subprocess.Popen([program, "-p", str(work), "-c", str(configuration)], stderr=subprocess.DEVNULL)
-    try:
-        until = time.monotonic() + PATIENCE
-        while time.monotonic() < until and process.poll() is None:
-            with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", port)) == 0:
-                    break
-            time.sleep(0.02)
-        yield f"http://127.0.0.1:{port}"
-    finally:
-        process.terminate()
-        process.wait(PATIENCE)
+    with reserved_port() as port:
+        configuration.write_text(_CONFIGURATION.format(work=work, folder=folder, port=port, behind=behind))
+        process = subprocess.Popen([program, "-p", str(work), "-c", str(configuration)], stderr=subprocess.DEVNULL)
+        try:
+            until = time.monotonic() + PATIENCE
+            while time.monotonic() < until and process.poll() is None:
+                with socket.socket() as probe:
+                    if probe.connect_ex(("127.0.0.1", port)) == 0:
+                        break
+                time.sleep(0.02)
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            process.terminate()
+            process.wait(PATIENCE)

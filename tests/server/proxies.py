@@ -6,7 +6,6 @@ import contextlib
 import os
 import re
 import shutil
-import socket
 import ssl
 import subprocess
 import time
@@ -16,6 +15,8 @@ from pathlib import Path
 
 import httpx
 import pytest
+
+from tests.ports import reserved_port
 
 __all__ = ["SECONDS", "Front", "caddy", "caddy_of_image", "caddy_of_many", "configuration", "missing", "nginx"]
 
@@ -102,63 +103,63 @@ def nginx(folder: Path, behind: str, *, tls: bool = True) -> Iterator[Front]:
     """
     folder.mkdir()
     certificate, key = _certificate(folder)
-    port = _free()
-    site = _with(
-        configuration("nginx", "map "),
-        {
-            "listen 443 ssl;": f"listen 127.0.0.1:{port}{' ssl' * tls};",
-            "maps.example.org;": "localhost;",
-            "/etc/letsencrypt/live/maps.example.org/fullchain.pem": str(certificate),
-            "/etc/letsencrypt/live/maps.example.org/privkey.pem": str(key),
-            "http://127.0.0.1:8000;": f"{behind};",
-        },
-    )
     path = folder / "nginx.conf"
-    path.write_text(_NGINX.format(work=folder, files=_FILES, site=site))
-    with _running([str(_found("nginx")), "-p", str(folder), "-c", str(path)], folder):
-        url = f"https://localhost:{port}" if tls else f"http://127.0.0.1:{port}"
-        yield _answering(Front(url, certificate), folder)
+    with reserved_port() as port:
+        site = _with(
+            configuration("nginx", "map "),
+            {
+                "listen 443 ssl;": f"listen 127.0.0.1:{port}{' ssl' * tls};",
+                "maps.example.org;": "localhost;",
+                "/etc/letsencrypt/live/maps.example.org/fullchain.pem": str(certificate),
+                "/etc/letsencrypt/live/maps.example.org/privkey.pem": str(key),
+                "http://127.0.0.1:8000;": f"{behind};",
+            },
+        )
+        path.write_text(_NGINX.format(work=folder, files=_FILES, site=site))
+        with _running([str(_found("nginx")), "-p", str(folder), "-c", str(path)], folder):
+            url = f"https://localhost:{port}" if tls else f"http://127.0.0.1:{port}"
+            yield _answering(Front(url, certificate), folder)
 
 
 @contextlib.contextmanager
 def caddy(folder: Path, behind: str) -> Iterator[Front]:
     """Caddy with the configuration of the page, for https://localhost and a certificate of its own authority."""
     folder.mkdir()
-    port = _free()
-    text = _with(
-        configuration("text", "{\n    servers"),
-        {
-            "{\n    servers": f"{{\n    admin off\n    skip_install_trust\n    http_port {_free()}\n    servers",
-            "maps.example.org {": f"localhost:{port} {{",
-            "127.0.0.1:8000": behind,
-        },
-    )
     path = folder / "Caddyfile"
-    path.write_text(text)
-    with _caddy(folder, path, {}, port) as front:
-        yield front
+    with reserved_port() as port, reserved_port() as plain:
+        text = _with(
+            configuration("text", "{\n    servers"),
+            {
+                "{\n    servers": f"{{\n    admin off\n    skip_install_trust\n    http_port {plain}\n    servers",
+                "maps.example.org {": f"localhost:{port} {{",
+                "127.0.0.1:8000": behind,
+            },
+        )
+        path.write_text(text)
+        with _caddy(folder, path, {}, port) as front:
+            yield front
 
 
 @contextlib.contextmanager
 def caddy_of_image(folder: Path, behind: str) -> Iterator[Front]:
     """Caddy with the Caddyfile of docker/."""
     folder.mkdir()
-    port = _free()
-    names = {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_UPSTREAM": behind}
-    names["LODESTREAM_HTTP_PORT"] = str(_free())
-    with _caddy(folder, _ROOT / "docker/Caddyfile", names, port) as front:
-        yield front
+    with reserved_port() as port, reserved_port() as plain:
+        names = {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_UPSTREAM": behind}
+        names["LODESTREAM_HTTP_PORT"] = str(plain)
+        with _caddy(folder, _ROOT / "docker/Caddyfile", names, port) as front:
+            yield front
 
 
 @contextlib.contextmanager
 def caddy_of_many(folder: Path, writers: list[str], readers: list[str]) -> Iterator[Front]:
     """Caddy with the Caddyfile of docker/ for several servers."""
     folder.mkdir()
-    port = _free()
-    names = {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_HTTP_PORT": str(_free())}
-    names |= {"LODESTREAM_WRITERS": " ".join(writers), "LODESTREAM_READERS": " ".join(readers)}
-    with _caddy(folder, _ROOT / "docker/Caddyfile.scale", names, port) as front:
-        yield front
+    with reserved_port() as port, reserved_port() as plain:
+        names = {"LODESTREAM_DOMAIN": f"localhost:{port}", "LODESTREAM_HTTP_PORT": str(plain)}
+        names |= {"LODESTREAM_WRITERS": " ".join(writers), "LODESTREAM_READERS": " ".join(readers)}
+        with _caddy(folder, _ROOT / "docker/Caddyfile.scale", names, port) as front:
+            yield front
 
 
 @contextlib.contextmanager
@@ -207,12 +208,6 @@ def _with(text: str, changes: dict[str, str]) -> str:
 
 def _found(program: str) -> str | None:
     return shutil.which(program) or shutil.which(program, path="/usr/sbin")
-
-
-def _free() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def _certificate(folder: Path) -> tuple[Path, Path]:

@@ -29,6 +29,7 @@ import pytest
 
 from lodestream.operating_system import lock, open_own
 from tests.patience import PATIENCE
+from tests.ports import reserved_port
 
 __all__ = ["Emulator", "azure", "azurite", "ministack", "reach", "running_ministack", "s3"]
 
@@ -142,12 +143,6 @@ def _running(command: list[str | Path], environment: dict[str, str], folder: Pat
             process.wait()
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 def _make(port: int, path: str, headers: dict[str, str]) -> None:
     """Make a bucket or a container."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
@@ -166,13 +161,12 @@ def ministack(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
 @contextmanager
 def running_ministack(work: Path) -> Iterator[Emulator]:
     """Run S3 on this machine, with a bucket, for the length of a block; it writes into a folder."""
-    folder, port = _installed("ministack", [HERE / "ministack.txt"], _install_ministack), _free_port()
+    folder = _installed("ministack", [HERE / "ministack.txt"], _install_ministack)
     own = {
         "PATH": os.environ["PATH"],
         "HOME": str(work),
         "TMPDIR": str(work),
         "BIND_HOST": "127.0.0.1",
-        "GATEWAY_PORT": str(port),
         "SERVICES": "s3",
         "IOT_MTLS_ENABLED": "0",
     }
@@ -180,11 +174,12 @@ def running_ministack(work: Path) -> Iterator[Emulator]:
         "AWS_ACCESS_KEY_ID": "AKIA" + secrets.token_hex(8).upper(),
         "AWS_SECRET_ACCESS_KEY": secrets.token_hex(20),
         "AWS_REGION": "us-east-1",
-        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",
     }
-    with _running([folder / "bin" / "python", "-m", "ministack"], own, work, port):
+    command: list[str | Path] = [folder / "bin" / "python", "-m", "ministack"]
+    with reserved_port() as port, _running(command, own | {"GATEWAY_PORT": str(port)}, work, port):
         _make(port, f"/{BUCKET}", {})
-        yield Emulator(port, "s3", "AWS_ENDPOINT_URL", environment)
+        reached = environment | {"AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}"}
+        yield Emulator(port, "s3", "AWS_ENDPOINT_URL", reached)
 
 
 @pytest.fixture(scope="session")
@@ -194,18 +189,17 @@ def azurite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
     if node is None or shutil.which("npm") is None:
         _missing("Azurite needs Node 20 and npm")
     folder = _installed("azurite", sorted((HERE / "azurite").glob("package*.json")), _install_azurite)
-    work, port = tmp_path_factory.mktemp("azurite"), _free_port()
+    work = tmp_path_factory.mktemp("azurite")
     key = base64.b64encode(secrets.token_bytes(64)).decode()
     program = folder / "node_modules" / ".bin" / "azurite-blob"
     command: list[str | Path] = [str(node), program, "--silent", "--disableTelemetry"]
-    command += ["--inMemoryPersistence", "--blobHost", "127.0.0.1", "--blobPort", str(port)]
+    command += ["--inMemoryPersistence", "--blobHost", "127.0.0.1", "--blobPort"]
     own = {"PATH": os.environ["PATH"], "HOME": str(work), "AZURITE_ACCOUNTS": f"{ACCOUNT}:{key}"}
     environment = {
         "AZURE_STORAGE_ACCOUNT_NAME": ACCOUNT,
         "AZURE_STORAGE_ACCOUNT_KEY": key,
-        "AZURE_STORAGE_ENDPOINT": f"http://127.0.0.1:{port}/{ACCOUNT}",
     }
-    with _running(command, own, work, port):
+    with reserved_port() as port, _running([*command, str(port)], own, work, port):
         date, version = formatdate(usegmt=True), "2021-08-06"
         signed = f"PUT{chr(10) * 12}x-ms-date:{date}\nx-ms-version:{version}\n"
         signed += f"/{ACCOUNT}/{ACCOUNT}/{BUCKET}\nrestype:container"
@@ -213,7 +207,8 @@ def azurite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
         signature = f"SharedKey {ACCOUNT}:{base64.b64encode(mac).decode()}"
         own_headers = {"x-ms-date": date, "x-ms-version": version, "Authorization": signature}
         _make(port, f"/{ACCOUNT}/{BUCKET}?restype=container", own_headers)
-        yield Emulator(port, "az", "AZURE_STORAGE_ENDPOINT", environment)
+        reached = environment | {"AZURE_STORAGE_ENDPOINT": f"http://127.0.0.1:{port}/{ACCOUNT}"}
+        yield Emulator(port, "az", "AZURE_STORAGE_ENDPOINT", reached)
 
 
 def reach(environment: dict[str, str], patch: pytest.MonkeyPatch) -> None:
