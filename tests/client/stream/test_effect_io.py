@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
+from functools import partial
 
 import httpx
 import pytest
@@ -17,6 +18,15 @@ URL = "http://127.0.0.1:9/v1/surfaces/ab"
 MANY = 100
 #: Turns of the loop in which all that is possible without waiting is done.
 TURNS = 20 * MANY
+
+
+class Clock:
+    """What the running loop takes for the time: it goes on when it is told to, however busy the machine is."""
+
+    def __init__(self) -> None:
+        loop = asyncio.get_running_loop()
+        self.now = loop.time()
+        loop.time = lambda: self.now  # type: ignore[method-assign]
 
 
 async def opened(body: AsyncIterator[bytes], seconds: float = 30.0) -> EffectIO:
@@ -66,24 +76,32 @@ def test_a_bounded_number_of_chunks_is_read_ahead() -> None:
 
 def test_the_time_for_a_chunk_begins_when_it_is_asked_for() -> None:
     async def run() -> None:
-        coming = asyncio.Event()
+        clock, coming, loop = Clock(), asyncio.Event(), asyncio.get_running_loop()
 
         async def body() -> AsyncIterator[bytes]:
             yield b"first"
             await coming.wait()
             yield b"second"
 
-        io = await opened(body(), seconds=0.05)
+        def later(seconds: float, *, comes: bool) -> None:
+            clock.now += seconds
+            if comes:
+                coming.set()
+
+        io = await opened(body(), seconds=10.0)
         assert await read(io) == b"first"
-        await asyncio.sleep(0.1)  # somebody looks at a view
-        asyncio.get_running_loop().call_later(0.01, coming.set)
+        clock.now += 20  # somebody looks at a view
+        for _ in range(TURNS):
+            await asyncio.sleep(0)
+        loop.call_soon(partial(later, 9, comes=True))
         assert await read(io) == b"second"
         assert await read(io) == b""
         await io.hang_up(HangUp())
 
         coming.clear()
-        io = await opened(body(), seconds=0.05)
+        io = await opened(body(), seconds=10.0)
         assert await read(io) == b"first"
+        loop.call_soon(partial(later, 11, comes=False))
         with pytest.raises(httpx.ReadTimeout):
             await read(io)
         await io.hang_up(HangUp())
@@ -94,12 +112,21 @@ def test_the_time_for_a_chunk_begins_when_it_is_asked_for() -> None:
 
 def test_an_answer_that_does_not_begin_is_waited_for_as_long_as_was_said() -> None:
     async def run() -> None:
+        clock = Clock()
+
         async def answer(request: httpx.Request) -> httpx.Response:
+            clock.now += 9
+            for _ in range(TURNS):
+                await asyncio.sleep(0)
+            waited.append(9)
+            clock.now += 2
             await asyncio.Event().wait()
             raise AssertionError("nothing wakes this")
 
+        waited = list[int]()
         with pytest.raises(httpx.ReadTimeout):
-            await asked(answer, 0.05)
+            await asked(answer, 10.0)
+        assert waited == [9]
 
     asyncio.run(run())
 
