@@ -6,14 +6,15 @@ import errno
 import os
 import re
 import signal
+import subprocess
 import sys
 from itertools import pairwise
 from pathlib import Path
 from threading import Event, Thread
 from time import sleep
+from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
@@ -37,6 +38,20 @@ Terrain = NDArray[np.float32]
 SLOW = ("--limit-rate", "64kbit")
 
 
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each state is written before the next one is taken: however long that takes, some are written early."""
+    write = watching.Watch.write
+
+    def written(watch: watching.Watch, view: View, layout: Layout) -> None:
+        write(watch, view, layout)
+        if (thread := watch._thread) is not None:
+            thread.join()
+
+    monkeypatch.setattr(watching.Watch, "write", written)
+
+
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_out_is_replaced_by_better_ones(
     run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, transport: str
@@ -62,6 +77,7 @@ def test_out_is_replaced_by_better_ones(
     assert np.load(out).tobytes() == terrain.tobytes()
 
 
+@pytest.mark.usefixtures("patient")
 def test_what_is_written_early_has_its_place_and_notes_come_once(run: Run, server: str, tmp_path: Path) -> None:
     place = {"geotransform": [5e5, 30.0, 0.0, 4.2e6, 0.0, -30.0], "unit": "m", "name": "hill"}
     rows, columns = np.mgrid[0:90, 0:80]
@@ -164,19 +180,34 @@ def drawn_by(monkeypatch: pytest.MonkeyPatch, program: str, *args: object) -> No
     monkeypatch.setattr(drawing, "command", lambda: [sys.executable, "-c", program, *map(str, args)])
 
 
-def children() -> set[int]:
-    return {process.pid for process in psutil.Process().children(recursive=True)}
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+    """The programs that are started here. A server that other tests share has processes too, which come and go."""
+    programs = list[subprocess.Popen[bytes]]()
+
+    class Noted(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            programs.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Noted)
+    return programs
 
 
 @pytest.mark.long
 def test_the_stream_does_not_wait_for_a_picture(
-    run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run,
+    surface: str,
+    terrain: Terrain,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    started: list[subprocess.Popen[bytes]],
 ) -> None:
     """A picture that is never finished holds no state back: it is let go on when the stream has ended."""
     folder, out, picture = tmp_path / "folder", tmp_path / "out.npy", tmp_path / "out.png"
     folder.mkdir()
     drawn_by(monkeypatch, BLOCKED, folder)
-    draw, before = drawing.Drawing.draw, children()
+    draw = drawing.Drawing.draw
     ended = list[bool]()
 
     def last(process: drawing.Drawing, *state: object) -> None:
@@ -200,7 +231,7 @@ def test_the_stream_does_not_wait_for_a_picture(
     assert run("pull", surface, out, "--picture", picture, "--watch", *SLOW)[0] == 0
     assert ended == [False], "the stream ended while the first picture was drawn"
     assert picture.exists()
-    assert children() == before, "no process is left"
+    assert [program.returncode is None for program in started] == [False], "no process is left"
 
 
 @pytest.mark.parametrize(
@@ -213,10 +244,16 @@ def test_the_stream_does_not_wait_for_a_picture(
 )
 @pytest.mark.long
 def test_a_picture_that_cannot_be_drawn_is_told_after_the_surface_is_written(
-    run: Run, surface: str, terrain: Terrain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, words: str
+    run: Run,
+    surface: str,
+    terrain: Terrain,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    started: list[subprocess.Popen[bytes]],
+    program: str,
+    words: str,
 ) -> None:
     drawn_by(monkeypatch, program)
-    before = children()
     out, picture = tmp_path / "out.npy", tmp_path / "out.png"
     for more in ((), ("--watch", *SLOW)):
         out.unlink(missing_ok=True)
@@ -225,16 +262,20 @@ def test_a_picture_that_cannot_be_drawn_is_told_after_the_surface_is_written(
         assert stderr.splitlines()[-1].endswith(words)
         assert np.load(out).tobytes() == terrain.tobytes()
     assert not picture.exists()
-    assert children() == before
+    assert [program.returncode is None for program in started] == [False, False]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interruption_leaves_no_process_that_draws(
-    run: Run, surface: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+    run: Run,
+    surface: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    started: list[subprocess.Popen[bytes]],
+    number: signal.Signals,
 ) -> None:
     """Once while a picture is being drawn, and once more while the last one is waited for."""
     drawn_by(monkeypatch, BLOCKED, tmp_path)
-    before = children()
 
     def interrupted(state: ls.Surface, path: str) -> None:
         write_surface(state, path)
@@ -247,7 +288,7 @@ def test_an_interruption_leaves_no_process_that_draws(
     monkeypatch.setattr(drawing.Drawing, "draw", last)
     code, *_ = run("pull", surface, tmp_path / "out.npy", "--picture", tmp_path / "out.png", "--watch", *SLOW)
     assert code == 128 + number
-    assert children() == before
+    assert [program.returncode is None for program in started] == [False], "no process is left"
     assert not (tmp_path / "out.png").exists()
 
 
