@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import time
 import tomllib
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +17,11 @@ from numpy.typing import NDArray
 from lodestream import page
 from lodestream_client import Client
 from lodestream_client.__main__ import main
+from lodestream_client.stream.effect_io import EffectIO
+from lodestream_client.stream.effects import Effect, Get, Hear, Wait
+from lodestream_client.stream.session import Session
 from lodestream_server import running_server
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,6 +87,35 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 @pytest.fixture(scope="session")
 def surface(server: str, terrain_file: Path) -> str:
     return Client(server).upload(terrain_file).url
+
+
+@pytest.fixture
+def paced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of streams goes on only while a limited rate holds them back, and then at once.
+
+    So as much comes within the seconds of a target on a busy machine as on any other.
+    """
+    now = time.monotonic()
+    begin, perform = Session.__init__, EffectIO.perform
+
+    def begun(session: Session, *arguments: Any, **options: Any) -> None:
+        begin(session, *arguments, **options)
+        session.clock = lambda: now
+
+    async def performed(io: EffectIO, effect: Effect) -> Any:
+        nonlocal now
+        match effect:
+            case Wait(until):
+                now = max(now, until)
+                return None
+            case Hear():
+                effect = Hear(now + PATIENCE)
+            case Get():
+                effect = replace(effect, seconds=PATIENCE)
+        return await perform(io, effect)
+
+    monkeypatch.setattr(Session, "__init__", begun)
+    monkeypatch.setattr(EffectIO, "perform", performed)
 
 
 Run = Callable[..., tuple[int, str, str]]

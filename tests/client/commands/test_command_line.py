@@ -607,6 +607,7 @@ def test_push_of_what_is_no_surface(run: Run, server: str, tmp_path: Path) -> No
     assert code == 1
 
 
+@pytest.mark.usefixtures("paced")
 def test_pull_for_some_seconds_brings_the_metadata(run: Run, surface: str, tmp_path: Path) -> None:
     out = tmp_path / "out.npy"
     code, stdout, stderr = run("pull", surface, out, "--seconds", "1.2", "--limit-rate", "32kbit", "--json")

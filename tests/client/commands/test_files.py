@@ -21,6 +21,7 @@ from lodestream_client import AsyncClient, AsyncStream, Client
 from lodestream_client.stream.reconnecting import Transport
 from lodestream_server import running_server
 from tests.links import Fault, linked
+from tests.patience import PATIENCE
 
 from ..asked import asked
 from ..conftest import Run
@@ -101,6 +102,7 @@ def test_the_surface_of_a_server_by_range(surface: str, terrain: Terrain) -> Non
     assert stream._reception.container == Client(surface).get(surface).details["container_sha256"]
 
 
+@pytest.mark.usefixtures("paced")
 def test_stop_and_seconds_and_leaving(url: str) -> None:
     with Client(url).connect(url) as stream:
         next(stream)
@@ -259,7 +261,7 @@ def test_another_web_server(folder: Path, container_file: Path, terrain: Terrain
     shutil.copy(container_file, tmp_path / "files" / "terrain.lode")
     with nginx(tmp_path / "files", tmp_path / "work") as server:
         address = f"{server}/terrain.lode"
-        assert httpx.head(address, trust_env=False).headers["accept-ranges"] == "bytes"
+        assert httpx.head(address, trust_env=False, timeout=PATIENCE).headers["accept-ranges"] == "bytes"
         with Client(address).connect(address) as stream:
             views = list(stream)
         assert stream.ended == "complete"

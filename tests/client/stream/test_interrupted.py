@@ -334,6 +334,7 @@ def test_a_pull_that_is_killed_is_gone_on_from_unasked(
     check_resumed(source, tmp_path / "o.npy", folder, relief, run)
 
 
+@pytest.mark.usefixtures("paced")
 def test_a_pull_that_ends_as_wanted_leaves_nothing_behind(
     surface: str, server: str, terrain: Terrain, container_file: Path, folder: Path, tmp_path: Path, run: Run
 ) -> None:

@@ -386,6 +386,7 @@ def test_a_file_that_is_cut_short_is_asked_for_once(
     assert np.array_equal(np.load(tmp_path / "o.npy"), terrain)
 
 
+@pytest.mark.usefixtures("paced")
 def test_seconds_and_the_metadata_are_kept_too(run: Run, surface: str, folder: Path, tmp_path: Path) -> None:
     figures, _ = pull(run, surface, tmp_path / "a.npy", "--seconds", "1.2", "--limit-rate", "64kbit")
     assert figures["ended"] == "seconds"

@@ -111,6 +111,7 @@ def test_stop_from_another_thread(surface: str) -> None:
     assert stream.wire_bytes < stream.header.size / 2
 
 
+@pytest.mark.usefixtures("paced")
 def test_seconds(surface: str) -> None:
     with Client(surface).connect(surface, target=ls.Target(seconds=1.0), limit_rate=4000.0) as stream:
         views = list(stream)
