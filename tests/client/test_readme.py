@@ -13,6 +13,7 @@ import pytest
 import lodestream as ls
 from lodestream_client.demo.terrain import terrain
 from lodestream_client.program import build_parser
+from tests.patience import PATIENCE
 
 from .conftest import Run
 
@@ -85,13 +86,13 @@ def test_its_lines_for_a_map_find_tiles(server: str, tmp_path: Path, monkeypatch
     (address,) = re.findall(r'url: "(.*?)"', source[1])
     address = address.replace("http://127.0.0.1:8000", server)
     assert address == f"{printed.strip()}/map.json"
-    told = httpx.get(address, trust_env=False).raise_for_status().json()
+    told = httpx.get(address, trust_env=False, timeout=PATIENCE).raise_for_status().json()
     assert told["encoding"] == "mapbox"  # what MapLibre takes a raster-dem for
     west, south, east, north = told["bounds"]
     z = told["maxzoom"]
     x = int(((west + east) / 2 + 180) / 360 * 2**z)
     y = int((1 - np.arcsinh(np.tan(np.radians((south + north) / 2))) / np.pi) / 2 * 2**z)
-    tile = httpx.get(told["tiles"][0].format(z=z, x=x, y=y), trust_env=False).raise_for_status()
+    tile = httpx.get(told["tiles"][0].format(z=z, x=x, y=y), trust_env=False, timeout=PATIENCE).raise_for_status()
     assert tile.content.startswith(b"\x89PNG")
 
 

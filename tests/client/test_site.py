@@ -11,6 +11,7 @@ import pytest
 from lodestream_client import Client
 from lodestream_client.demo import site
 from tests.client.files import ranged
+from tests.patience import PATIENCE
 
 
 @pytest.mark.usefixtures("built")
@@ -20,8 +21,8 @@ def test_a_host_of_files_serves_five_surfaces_of_different_kinds(tmp_path: Path)
     assert site.main([str(folder)]) == 0
     kinds = set()
     with ranged(folder) as host:
-        assert "<title>page</title>" in httpx.get(f"{host.url}/index.html", trust_env=False).text
-        config = httpx.get(f"{host.url}/view.json", trust_env=False).json()
+        assert "<title>page</title>" in httpx.get(f"{host.url}/index.html", trust_env=False, timeout=PATIENCE).text
+        config = httpx.get(f"{host.url}/view.json", trust_env=False, timeout=PATIENCE).json()
         assert [entry["name"] for entry in config["surfaces"]] == list(site.SURFACES)
         for entry in config["surfaces"]:
             assert (folder / entry["src"]).stat().st_size == entry["bytes"]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import OptionError
 from lodestream_client import Client
+from tests.patience import PATIENCE
 
 from .conftest import Run, make_terrain
 
@@ -212,11 +213,11 @@ def test_levels_as_files_over_http(addresses: dict[str, str], run: Run, tmp_path
 
     url = addresses["wing.fmt"]
     assert run("pull", url, tmp_path / "a.ply", "--level", "2")[0] == 0
-    answer = httpx.get(f"{url}/levels/2", params={"format": "ply"})
+    answer = httpx.get(f"{url}/levels/2", params={"format": "ply"}, timeout=PATIENCE)
     assert (answer.status_code, answer.content) == (200, (tmp_path / "a.ply").read_bytes())
     for name in ("obj", "glb", "vts", "vtm", "plot3d"):
-        assert httpx.get(f"{url}/levels/1", params={"format": name}).status_code == 200
-    refused = httpx.get(f"{url}/levels/1", params={"format": "npy"})
+        assert httpx.get(f"{url}/levels/1", params={"format": name}, timeout=PATIENCE).status_code == 200
+    refused = httpx.get(f"{url}/levels/1", params={"format": "npy"}, timeout=PATIENCE)
     assert refused.status_code == 422
     assert (
         "expected one block for npy, got 3: ply, obj, vts, vtm, glb and plot3d hold several" in refused.json()["detail"]

@@ -11,6 +11,7 @@ import pytest
 import lodestream as ls
 from lodestream.errors import FormatWarning, OptionError
 from lodestream_client import Client
+from tests.patience import PATIENCE
 
 from ..conftest import Run
 
@@ -72,7 +73,7 @@ def test_push(run: Run, file: Path, server: str) -> None:
 
 
 def test_the_query_of_an_upload(file: Path, server: str) -> None:
-    answer = httpx.post(f"{server}/v1/surfaces", content=file.read_bytes(), params={"nodata": "much"})
+    answer = httpx.post(f"{server}/v1/surfaces", content=file.read_bytes(), params={"nodata": "much"}, timeout=PATIENCE)
     assert (answer.status_code, answer.json()["code"]) == (422, "bad-option")
     assert "nodata must be a number or nan, and is 'much'" in answer.json()["detail"]
 

@@ -11,6 +11,7 @@ import lodestream as ls
 from lodestream_client import Client
 from lodestream_client.viewer.pictures import Picture
 from tests.core.remesh import scenes
+from tests.patience import PATIENCE
 
 from ..conftest import Run
 
@@ -54,7 +55,7 @@ def test_whatever_tells_of_it_says_complete_never_exact_or_lossless(run: Run, fi
         "info": run("info", out)[1],
         "info of a server": run("info", stdout.strip())[1],
         "info --json": run("info", out, "--json")[1],
-        "the API": httpx.get(stdout.strip()).text,
+        "the API": httpx.get(stdout.strip(), timeout=PATIENCE).text,
         "a notebook": view._repr_html_(),
         "a picture": Picture.of(view, None, "ball").title,
     }

@@ -13,6 +13,7 @@ from lodestream.stores import open_store
 from lodestream_client import Client
 from lodestream_client.program import main
 from lodestream_client.publishing.publisher import published
+from tests.patience import PATIENCE
 from tests.stores.emulators import Emulator
 
 HILLS = np.add.outer(np.sin(np.arange(300) / 9), np.cos(np.arange(400) / 7)).astype(np.float32)
@@ -30,13 +31,13 @@ def test_a_bucket_of_s3_is_enough(tmp_path: Path, s3: Emulator, capsys: pytest.C
     assert "put-bucket-cors" in told.err
     for secret in ("AWS_SECRET_ACCESS_KEY", "AWS_ACCESS_KEY_ID"):
         assert s3.environment[secret] not in told.out + told.err
-    answer = httpx.get(page, trust_env=False)
+    answer = httpx.get(page, trust_env=False, timeout=PATIENCE)
     assert answer.headers["content-type"].startswith("text/html")
     assert "no-cache" in answer.headers["cache-control"]
     with Client(f"{page}#hills").connect(f"{page}#hills") as stream:
         *_, last = stream
     assert np.array_equal(last.surface().points, HILLS)
-    container = httpx.head(Client(f"{page}#hills").locate(f"{page}#hills"), trust_env=False)
+    container = httpx.head(Client(f"{page}#hills").locate(f"{page}#hills"), trust_env=False, timeout=PATIENCE)
     assert "immutable" in container.headers["cache-control"]
     assert main(["publish", str(tmp_path / "hills.npy"), address]) == 0
     assert "0 B of containers and levels sent" in capsys.readouterr().err

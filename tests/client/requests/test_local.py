@@ -20,6 +20,7 @@ from lodestream_client.requests.api import Description
 from lodestream_client.requests.bodies import Source
 from lodestream_server import running_server
 from tests.core.remesh import scenes
+from tests.patience import PATIENCE
 from tests.server.routes.test_switched_off import off, vmec
 
 from ..asked import asked
@@ -52,10 +53,10 @@ def values_of(url: str) -> ls.Surface:
 def test_the_server_says_what_it_reads(plain: str, server: str) -> None:
     import httpx
 
-    default = httpx.get(f"{plain}/v1/formats").json()["formats"]
+    default = httpx.get(f"{plain}/v1/formats", timeout=PATIENCE).json()["formats"]
     assert {"npy", "netcdf", "lode"} <= set(default)
     assert not {"text", "vmec", "usgs-dem"} & set(default)
-    assert "text" in httpx.get(f"{server}/v1/formats").json()["formats"]
+    assert "text" in httpx.get(f"{server}/v1/formats", timeout=PATIENCE).json()["formats"]
 
 
 @pytest.mark.parametrize("asynchronous", [False, True], ids=["sync", "async"])

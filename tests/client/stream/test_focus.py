@@ -19,6 +19,7 @@ from lodestream.transfer.receiver_state import MemoryStore
 from lodestream_client import AsyncClient, AsyncStream, Client, Stream
 from lodestream_client.stream import reconnecting
 from tests.links import Fault, linked
+from tests.patience import PATIENCE
 
 NEAR: Region = ((0, 50), (0, 60))
 FAR: Region = ((350, 420), (350, 400))
@@ -45,7 +46,7 @@ def surface(server: str, heights: Heights) -> str:
 
 
 def container(surface: str) -> bytes:
-    return httpx.get(f"{surface}/container", follow_redirects=True).content
+    return httpx.get(f"{surface}/container", follow_redirects=True, timeout=PATIENCE).content
 
 
 def check(stream: Stream | AsyncStream, surface: str, heights: Heights) -> None:

@@ -265,9 +265,9 @@ def test_the_page_is_there_until_it_is_told_to_end(
 ) -> None:
     assert viewing.stdout is not None
     url = viewing.stdout.readline().strip()
-    assert httpx.get(url).status_code == 200
-    while "progress" in httpx.get(url + "view.json").json()["surfaces"][0]:
+    assert httpx.get(url, timeout=PATIENCE).status_code == 200
+    while "progress" in httpx.get(url + "view.json", timeout=PATIENCE).json()["surfaces"][0]:
         pass
-    assert httpx.get(url + "surface.lode").content == container.read_bytes()
+    assert httpx.get(url + "surface.lode", timeout=PATIENCE).content == container.read_bytes()
     viewing.send_signal(number)
     assert viewing.wait(PATIENCE) == code
