@@ -17,8 +17,10 @@ from numpy.typing import NDArray
 from lodestream import page
 from lodestream_client import Client
 from lodestream_client.__main__ import main
+from lodestream_client.stream import session
 from lodestream_client.stream.effect_io import EffectIO
 from lodestream_client.stream.effects import Effect, Get, Hear, Wait
+from lodestream_client.stream.known_windows import KnownWindows
 from lodestream_client.stream.session import Session
 from lodestream_server import running_server
 from tests.patience import PATIENCE
@@ -37,6 +39,14 @@ def make_terrain(rows: int = 97, columns: int = 70) -> NDArray[np.float32]:
 @pytest.fixture(scope="session", autouse=True)
 def _one_fork_server(one_fork_server: None) -> None:
     """For all of these tests."""
+
+
+@pytest.fixture(autouse=True)
+def windows(monkeypatch: pytest.MonkeyPatch) -> KnownWindows:
+    """Those of this process, of which nothing is known: no stream begins as one of another test has ended."""
+    made = KnownWindows()
+    monkeypatch.setattr(session, "_windows", made)
+    return made
 
 
 @pytest.fixture

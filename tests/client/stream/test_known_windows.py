@@ -20,7 +20,7 @@ from lodestream.protocol.wire import parse
 from lodestream_client import Client
 from lodestream_client.errors import SilenceError
 from lodestream_client.requests import addresses
-from lodestream_client.stream import known_windows, session
+from lodestream_client.stream import known_windows
 from lodestream_client.stream.known_windows import KnownWindows
 from tests.links import Fault, linked
 from tests.patience import PATIENCE
@@ -30,14 +30,6 @@ from .test_resume import follow
 from .world import URL, World
 
 SERVER = URL.partition("/v1/")[0]
-
-
-@pytest.fixture
-def windows(monkeypatch: pytest.MonkeyPatch) -> KnownWindows:
-    """Those of this process, of which nothing is known yet."""
-    made = KnownWindows()
-    monkeypatch.setattr(session, "_windows", made)
-    return made
 
 
 @pytest.fixture(scope="module")

@@ -199,15 +199,15 @@ def test_a_delete_is_made_again_only_while_it_may_be_and_never_by_the_library(s3
 
 
 def test_a_delete_takes_no_longer_than_it_may(s3: Emulator, proxy: FaultProxy) -> None:
-    store = Bucket(s3.address(), Limits(2 * PATIENCE, 2 * PATIENCE, again=0.0, delete=0.5))
+    store = Bucket(s3.address(), Limits(2 * PATIENCE, 2 * PATIENCE, again=0.0, delete=2.0))
     proxy.faults = [Fault("hung", where="DELETE|POST")]
     begun = time.monotonic()
     with pytest.raises(StoreError, match="does not answer"):
-        store.delete(["a"], lambda: 0.5)
+        store.delete(["a"], lambda: 2.0)
     assert time.monotonic() - begun < PATIENCE, "other requests may take longer"
     assert len(proxy.seen) == 1
     with pytest.raises(StoreError, match="not enough time left"):
-        store.delete(["a"], lambda: 0.4)
+        store.delete(["a"], lambda: 1.9)
     assert len(proxy.seen) == 1
 
 
@@ -405,7 +405,7 @@ class PanicException(BaseException):
 def test_a_panic_of_the_library_is_an_error_of_the_store(
     s3: Emulator, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    store = Bucket(s3.address(), Limits(again=0.2))
+    store = Bucket(s3.address(), Limits(again=PATIENCE))
     put(store, "a", b"1", tmp_path)
     panics = iter([PanicException("index out of range")])
 
@@ -420,6 +420,7 @@ def test_a_panic_of_the_library_is_an_error_of_the_store(
     assert "the library for buckets failed: PanicException" in caplog.text
     assert "index" not in caplog.text
     panics = iter(PanicException() for _ in range(100))
+    store = Bucket(store.describe(), Limits(again=0.2))
     with store.open("a", 1000) as blob, pytest.raises(StoreError, match="does not answer"):
         blob.read(0, 1)
 
