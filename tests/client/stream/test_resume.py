@@ -295,18 +295,24 @@ def test_a_pull_that_breaks_is_gone_on_with_by_the_next(
 def test_a_pull_that_is_killed_is_gone_on_with(
     run: Run, surface: str, folder: Path, tmp_path: Path, terrain: Terrain, transport: str
 ) -> None:
-    command = [sys.executable, "-m", "lodestream_client", "pull", surface, str(tmp_path / "o.npy"), "--resume"]
-    command += ["--limit-rate", "64kbit", "--transport", transport]
-    process = subprocess.Popen(command, env={**os.environ, "LODESTREAM_CACHE": str(folder)}, stderr=subprocess.DEVNULL)
-    try:
-        until = time.monotonic() + PATIENCE
-        while not parts(folder) or parts(folder)[0].stat().st_size < 6000:
-            assert time.monotonic() < until
-            assert process.poll() is None, "it was to be killed before its end"
-            time.sleep(0.01)
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    def fault(number: int) -> Fault:
+        """It cannot end before it is killed: the rest does not come, nor anything of later connections."""
+        return Fault(cut_down=12_000 if number < 2 else 1, vanish=True)
+
+    with linked(surface, fault) as link:
+        command = [sys.executable, "-m", "lodestream_client", "pull", link.url, str(tmp_path / "o.npy"), "--resume"]
+        command += ["--limit-rate", "64kbit", "--transport", transport]
+        environment = {**os.environ, "LODESTREAM_CACHE": str(folder)}
+        process = subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL)
+        try:
+            until = time.monotonic() + PATIENCE
+            while not parts(folder) or parts(folder)[0].stat().st_size < 6000:
+                assert time.monotonic() < until
+                assert process.poll() is None, "it was to be killed before its end"
+                time.sleep(0.01)
+        finally:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
     kept = parts(folder)[0].stat().st_size
     figures, stderr = pull(run, surface, tmp_path / "o.npy", "--transport", transport)
     assert "from an earlier pull" in stderr

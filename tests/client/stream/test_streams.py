@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 import lodestream as ls
 from lodestream.errors import LodestreamError
 from lodestream_client import AsyncClient, AsyncStream, Client
-from tests.links import Fault, linked
+from tests.links import Fault, Link, linked
+from tests.patience import PATIENCE
 
 from ..asked import asked
 
@@ -310,15 +311,29 @@ def test_the_client_of_the_manual_works(surface: str, terrain: Terrain) -> None:
     assert names["reception"].decoder.rms == pytest.approx(rms(names["surface"].points, terrain), rel=1e-6)
 
 
+def come(link: Link, count: int) -> None:
+    """Wait until so many bytes have come over a link."""
+    end = time.monotonic() + PATIENCE
+    while link.down < count:
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+#: Bytes of the end of a connection, for which nobody waits.
+CLOSING = 100
+
+
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_the_latest_view_is_that_of_all_that_has_come(surface: str, terrain: Terrain, transport: Any) -> None:
-    with Client(surface).connect(surface, transport=transport, window=1 << 18) as stream:
-        everything = len(list(stream))
-    with Client(surface).connect(surface, transport=transport, window=1 << 18) as stream:
-        views = []
-        for view in stream.latest():
-            views.append(view)
-            time.sleep(0.3)  # more than the rest of the surface takes
+    with linked(surface, Fault()) as link:
+        with Client(link.url).connect(link.url, transport=transport, window=1 << 18) as stream:
+            everything = len(list(stream))
+        first = link.down
+        with Client(link.url).connect(link.url, transport=transport, window=1 << 18) as stream:
+            views = []
+            for view in stream.latest():
+                views.append(view)
+                come(link, 2 * first - CLOSING)
     assert stream.ended == "complete"
     assert np.array_equal(views[-1].points, terrain)
     assert [view.bytes for view in views] == sorted({view.bytes for view in views})
@@ -327,19 +342,23 @@ def test_the_latest_view_is_that_of_all_that_has_come(surface: str, terrain: Ter
 
 @pytest.mark.parametrize("transport", ["ws", "http"])
 def test_the_latest_view_is_awaited_too(surface: str, terrain: Terrain, transport: Any) -> None:
-    async def follow() -> list[Any]:
+    async def follow(link: Link) -> list[Any]:
         async with (
-            AsyncClient(surface) as client,
-            client.connect(surface, transport=transport, window=1 << 18) as stream,
+            AsyncClient(link.url) as client,
+            client.connect(link.url, transport=transport, window=1 << 18) as stream,
         ):
             views = []
             async for view in stream.latest():
                 views.append(view)
-                time.sleep(0.3)
+                come(link, 2 * first - CLOSING)
         assert stream.ended == "complete"
         return views
 
-    views = asyncio.run(follow())
+    with linked(surface, Fault()) as link:
+        with Client(link.url).connect(link.url, transport=transport, window=1 << 18) as stream:
+            list(stream)
+        first = link.down
+        views = asyncio.run(follow(link))
     assert np.array_equal(views[-1].points, terrain)
     assert len(views) <= 10
 
@@ -354,7 +373,7 @@ def test_what_came_before_an_error_is_seen_before_it(surface: str) -> None:
         def draw() -> None:
             for view in stream.latest():
                 views.append(view)
-                time.sleep(0.3)
+                come(link, 4000)
 
         with pytest.raises(LodestreamError):
             draw()
