@@ -73,6 +73,7 @@ class Link:
         self._parts = urlsplit(url)
         self._fault = fault
         self._tasks: set[asyncio.Task[None]] = set()
+        self._over = False
         self.url = url
         self.connections = 0
         self.down = 0
@@ -89,6 +90,7 @@ class Link:
 
     async def __aexit__(self, *raised: object) -> None:
         self._server.close()
+        self._over = True
         tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
@@ -102,7 +104,7 @@ class Link:
         self.connections += 1
         try:
             far = await asyncio.open_connection(self._parts.hostname, self._parts.port)
-        except OSError:
+        except (OSError, asyncio.CancelledError):
             writer.transport.abort()
             self._tasks.discard(task)
             return
@@ -112,7 +114,7 @@ class Link:
             pass
         finally:
             for end in (writer, far[1]):
-                if fault.reset:
+                if fault.reset or self._over:  # the loop ends before what is left could be sent
                     end.transport.abort()
                 else:
                     end.close()

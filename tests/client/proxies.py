@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import http.client
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
@@ -63,12 +63,12 @@ class _Handler(BaseHTTPRequestHandler):
         if handshake and (refusal := self.server.refusal) is not None:
             self._answer(refusal.status, dict(refusal.headers), refusal.body)
             return
-        connection = http.client.HTTPConnection(self.server.behind, timeout=PATIENCE)
         headers = {name: value for name, value in self.headers.items() if name.lower() not in _OWN}
-        connection.request(self.command, self.path, self.rfile.read(int(headers.get("Content-Length", 0))), headers)
-        answer = connection.getresponse()
-        self._answer(answer.status, {n: v for n, v in answer.getheaders() if n.lower() not in _OWN}, answer.read())
-        connection.close()
+        body = self.rfile.read(int(headers.get("Content-Length", 0)))
+        with closing(http.client.HTTPConnection(self.server.behind, timeout=PATIENCE)) as connection:
+            connection.request(self.command, self.path, body, headers)
+            answer = connection.getresponse()
+            self._answer(answer.status, {n: v for n, v in answer.getheaders() if n.lower() not in _OWN}, answer.read())
 
     def do_HEAD(self) -> None:
         self.do_GET()

@@ -111,8 +111,11 @@ class FaultProxy:
                     writer.write(answer + content)
                 if b"\r\nconnection: close" in answer.lower():
                     return
-        except (asyncio.IncompleteReadError, ConnectionError, asyncio.CancelledError):  # the last one: the proxy ends
+        except (asyncio.IncompleteReadError, ConnectionError):
             return
+        except asyncio.CancelledError:  # the proxy ends, and its loop before what is left could be sent
+            for each in (writer, *(upstream[1:] if upstream else ())):
+                each.transport.abort()
         finally:
             for each in (writer, *(upstream[1:] if upstream else ())):
                 each.close()
