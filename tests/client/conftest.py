@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from lodestream import page
 from lodestream_client import Client
 from lodestream_client.__main__ import main
-from lodestream_client.stream import session
+from lodestream_client.stream import effect_io, session
 from lodestream_client.stream.effect_io import EffectIO
 from lodestream_client.stream.effects import Effect, Get, Hear, Wait
 from lodestream_client.stream.known_windows import KnownWindows
 from lodestream_client.stream.session import Session
+from lodestream_client.stream.websocket_options import socket_options
 from lodestream_server import running_server
 from tests.patience import PATIENCE
 
@@ -126,6 +127,16 @@ def paced(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Session, "__init__", begun)
     monkeypatch.setattr(EffectIO, "perform", performed)
+
+
+@pytest.fixture
+def slow_handshakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A handshake may take as long as it does on a busy machine, where silence is to be short."""
+
+    def options(*given: Any) -> dict[str, Any]:
+        return {**socket_options(*given), "open_timeout": PATIENCE}
+
+    monkeypatch.setattr(effect_io, "socket_options", options)
 
 
 Run = Callable[..., tuple[int, str, str]]

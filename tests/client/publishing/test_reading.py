@@ -212,7 +212,7 @@ def test_a_list_that_drips_ends_with_the_time_of_the_target() -> None:
         with Client(url).connect(url, target=ls.Target(seconds=0.5)) as stream:
             assert list(stream) == []
         assert stream.ended == "stopped" or stream.ended == "seconds"
-        with pytest.raises(SilenceError), Client(url).connect(url, silence=0.5, deadline=0) as stream:
+        with pytest.raises(SilenceError), Client(url).connect(url, silence=2.0, deadline=0) as stream:
             list(stream)
 
 

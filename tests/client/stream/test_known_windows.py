@@ -175,6 +175,7 @@ def test_the_second_stream_over_a_distant_link_begins_with_a_large_window(
     assert FIRST_WINDOW < credits[1] <= BASE_CREDIT
 
 
+@pytest.mark.usefixtures("slow_handshakes")
 def test_a_server_that_falls_silent_is_met_with_a_small_window(
     large: str, windows: KnownWindows, credits: list[int]
 ) -> None:

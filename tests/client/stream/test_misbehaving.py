@@ -108,6 +108,7 @@ def asynchronous(request: pytest.FixtureRequest) -> bool:
     return bool(request.param)
 
 
+@pytest.mark.usefixtures("slow_handshakes")
 @pytest.mark.parametrize("first", [(), (HEADER,)])
 def test_silence(asynchronous: bool, first: tuple[bytes, ...]) -> None:
     with websocket_server(says(*first)) as url, pytest.raises(SilenceError, match=r"nothing for 0\.2 seconds"):

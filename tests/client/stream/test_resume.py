@@ -401,6 +401,7 @@ def test_seconds_and_the_metadata_are_kept_too(run: Run, surface: str, folder: P
     assert again["wire_bytes"] < 1000
 
 
+@pytest.mark.usefixtures("slow_handshakes")
 def test_a_pull_from_a_server_that_falls_silent_ends(run: Run, surface: str, tmp_path: Path) -> None:
     with linked(surface, lambda number: Fault(cut_down=3000, vanish=True)) as link:
         code, _, stderr = run("pull", link.url, tmp_path / "o.npy", "--retry", "0.4", "--transport", "ws")
