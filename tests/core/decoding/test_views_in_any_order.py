@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import lodestream as ls
+from lodestream import parallel
 from lodestream.decoding import pieces, segments
 from lodestream.decoding.segments import SegmentQueue
 from lodestream.errors import OptionError
@@ -255,6 +256,13 @@ def test_points_wait_for_one_piece_of_preparing_and_the_rest_goes_on(slow: Slow)
     np.testing.assert_array_equal(views[-1].points, ls.decode(container).points)
 
 
+def fork_waits() -> bool:
+    """Whether a fork waits for a piece that another thread prepares."""
+    if free := parallel._forks._next.acquire(blocking=False):
+        parallel._forks._next.release()
+    return not free
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_a_fork_waits_for_one_piece_of_preparing_and_the_child_goes_on(slow: Slow) -> None:
@@ -263,8 +271,13 @@ def test_a_fork_waits_for_one_piece_of_preparing_and_the_child_goes_on(slow: Slo
     queue, half = decoder._queue, len(views) // 2
     views[-1].prepare()
     wait_until(lambda: len(slow.pieces) == 1)
-    timer = threading.Timer(0.1, slow.step)
-    timer.start()
+
+    def step() -> None:
+        wait_until(fork_waits)
+        slow.step()
+
+    stepping = threading.Thread(target=step)
+    stepping.start()
     child = os.fork()
     if not child:
         signal.alarm(int(PATIENCE))  # kills a child that hangs
@@ -275,7 +288,7 @@ def test_a_fork_waits_for_one_piece_of_preparing_and_the_child_goes_on(slow: Slo
         wait_until(lambda: not enough_waits(queue))  # by a thread of the child
         good &= len(slow.pieces) > 1 and np.array_equal(views[-1].points, expected)
         os._exit(0 if good else 1)
-    timer.join()
+    stepping.join()
     slow.step(1000)
     np.testing.assert_array_equal(views[-1].points, expected)
     assert os.waitpid(child, 0)[1] == 0

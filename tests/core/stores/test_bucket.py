@@ -163,14 +163,17 @@ Bucket("s3://bucket/a", Limits(*[{2 * PATIENCE}] * 3, again={2 * PATIENCE})).{ca
 
 
 def test_a_delete_that_failed_deletes_nothing_afterwards(s3: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
-    store, begun, gate = Bucket(s3.address()), list[str](), threading.Event()
+    store, begun, other, gate = Bucket(s3.address()), list[str](), threading.Event(), threading.Event()
 
     def delete(_: object, at: str) -> None:
-        begun.append(at.rpartition("/")[2])
-        if begun[-1] == "0":
+        name = at.rpartition("/")[2]
+        begun.append(name)
+        if name == "0":
+            assert other.wait(PATIENCE)
             threading.Timer(0.3, gate.set).start()
             raise PermissionError("status code: 403")
-        gate.wait(PATIENCE)
+        other.set()
+        assert gate.wait(PATIENCE)
 
     monkeypatch.setattr(obstore, "delete", delete)
     with pytest.raises(StoreError, match="refuses access"):
