@@ -19,6 +19,7 @@ from lodestream.errors import ProtocolError, RemoteProtocolError
 from lodestream.protocol.messages import BASE_CREDIT, MAX_MESSAGE, SUBPROTOCOL, Bye, End, Error, Opened, Segments
 from lodestream.protocol.wire import serialize
 from lodestream_client import AsyncClient, Client, SilenceError
+from tests.patience import PATIENCE
 
 from ..asked import asked
 
@@ -217,15 +218,19 @@ def test_a_server_that_does_not_take_leave(asynchronous: bool, container_file: P
     data = container_file.read_bytes()
     header = header_of(data, len(data))
     slices = [serialize(Segments(at, data[at : at + 60_000])) for at in range(0, len(data), 60_000)]
-    heard: list[bytes | str] = []
+    heard, left = list[bytes | str](), threading.Event()
 
     def behave(connection: ServerConnection) -> None:
         for message in (header, *slices, serialize(End("complete"))):
             connection.send(message)
-        heard.extend(connection)
+        try:
+            heard.extend(connection)
+        finally:
+            left.set()
 
     with websocket_server(behave) as url:
         follow(url, asynchronous, window=BASE_CREDIT, close_timeout=1e6)  # nor is it waited for
+    assert left.wait(PATIENCE)
     assert heard[-1] == serialize(Bye())
 
 

@@ -27,6 +27,7 @@ from lodestream_client.stream import effects, reconnecting
 from lodestream_client.stream.effect_io import EffectIO
 from lodestream_client.stream.stream import BaseStream
 from tests.links import Fault, Link, linked
+from tests.patience import PATIENCE
 
 Terrain = NDArray[np.float32]
 
@@ -106,13 +107,16 @@ def answering(container: bytes, heard: list[Event]) -> Iterator[str]:
             assert isinstance(message, bytes)
             heard.append(parse(message))
             if isinstance(heard[-1], Bye):
+                over.set()
                 return
 
+    over = threading.Event()
     server = serve(behave, "127.0.0.1", 0, subprotocols=[Subprotocol(SUBPROTOCOL)])
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:
         yield f"http://127.0.0.1:{server.socket.getsockname()[1]}/v1/surfaces/ab"
+        assert over.wait(PATIENCE), "a client takes leave"
     finally:
         server.shutdown()
         thread.join()
