@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
 
 import pytest
@@ -53,9 +54,9 @@ def chosen(items: Sequence[pytest.Item], profile: str) -> set[pytest.Item]:
     """Return which tests a profile runs, by their marks.
 
     A sweep is a test of many cases, marked ``sweep(count)``: so many are its sample, none of 0. One after another that
-    case is taken with the most values of parameters, and pairs of them, that no taken one has. Of what is not marked
-    ``long``, `make test` runs samples, and `REST` the other cases; of what is, `REST` runs samples, and only `LONG` the
-    other cases.
+    case is taken with the most values of parameters, and pairs of them, that no taken one has; of several the one whose
+    values have been taken least. Of what is not marked ``long``, `make test` runs samples, and `REST` the other cases;
+    of what is, `REST` runs samples, and only `LONG` the other cases.
     """
     if profile in LONG:
         return set(items)
@@ -75,15 +76,32 @@ def chosen(items: Sequence[pytest.Item], profile: str) -> set[pytest.Item]:
 def _others(cases: Sequence[pytest.Item], count: int) -> list[pytest.Item]:
     """Return the cases that are not among so many that are kept."""
     rest = [(case, _parts(case)) for case in cases]
-    seen: set[object] = set()
+    taken = Counter[object]()
+
+    def order(place: int) -> tuple[int, int]:
+        parts = rest[place][1]
+        return sum(not taken[part] for part in parts), -sum(taken[part] for part in parts)
+
     for _ in range(min(count, len(cases))):
-        chosen = max(range(len(rest)), key=lambda place: len(rest[place][1] - seen))
-        seen |= rest.pop(chosen)[1]
+        taken.update(rest.pop(max(range(len(rest)), key=order))[1])
     return [case for case, _ in rest]
 
 
 def _parts(case: pytest.Item) -> set[object]:
-    """Return the values of a case's parameters, by name and place, and their pairs."""
-    values = sorted(case.callspec.indices.items()) if hasattr(case, "callspec") else []
+    """Return the values of a case's parameters, by name, and their pairs.
+
+    The numbers in `callspec.indices` do not tell which cases have the same value: of what is no fixture, pytest puts
+    the number of the case there.
+    """
+    values = [(name, _told(value)) for name, value in case.callspec.params.items()] if hasattr(case, "callspec") else []
     pairs = {(a, b) for place, a in enumerate(values) for b in values[:place]}
     return {*values, *pairs}
+
+
+def _told(value: object) -> object:
+    """Return what tells a value from others: itself, or which object it is, where equal ones cannot be found."""
+    try:
+        hash(value)
+    except TypeError:
+        return id(value)
+    return type(value), value

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import lodestream as ls
 from lodestream.coordinates.height_fields import coordinates
+from lodestream.formats.netcdf.units import conversions_of
 
 from .openers import noted
 
@@ -100,6 +101,48 @@ def test_lengths_become_those_of_the_crs(tmp_path: Path, opener: Any, units: str
     assert notes == []
     for there, here in zip(positions(again), positions(surface), strict=True):
         np.testing.assert_array_equal(there, here)
+
+
+#: More metres, and degrees, by names of UDUNITS-2.
+FURTHER = {
+    "um": 1e-6,
+    "micrometer": 1e-6,
+    "mm": 1e-3,
+    "millimetres": 1e-3,
+    "centimeter": 0.01,
+    "dm": 0.1,
+    "decimeters": 0.1,
+    "dam": 10.0,
+    "decameter": 10.0,
+    "hm": 100.0,
+    "hectometres": 100.0,
+    "megameter": 1e6,
+    "inches": 0.0254,
+    "yards": 0.9144,
+    "statute_mile": 1609.344,
+    "US_statute_mile": 5280 * 1200 / 3937,
+    "fathom": 6 * 1200 / 3937,
+    "nmile": 1852.0,
+}
+DEGREES = {
+    "radians": 180 / np.pi,
+    "mrad": 0.18 / np.pi,
+    "microradian": 1.8e-4 / np.pi,
+    "gon": 0.9,
+    "grads": 0.9,
+    "arc_minutes": 1 / 60,
+    "arcsec": 1 / 3600,
+    "0.5 degree": 0.5,
+}
+
+
+@pytest.mark.parametrize("units", [*METRES, *FURTHER, *DEGREES])
+def test_names_of_units_are_those_of_udunits(units: str) -> None:
+    """Of each name, where files are read with some only."""
+    crs = pyproj.CRS.from_epsg(4326) if units in DEGREES else pyproj.CRS.from_cf(LAMBERT)
+    conversions, _ = conversions_of({"x": units}, crs.to_wkt())
+    assert conversions["x"].factor == pytest.approx((METRES | FURTHER | DEGREES)[units], rel=1e-12)
+    assert conversions["x"].unit == ("degree" if units in DEGREES else "metre")
 
 
 @pytest.mark.parametrize("opener", [_file, _decoded])

@@ -328,6 +328,21 @@ def test_coordinates_are_those_of_the_level(metadata: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("below", [0, 2])
+def test_a_turned_geotransform_goes_along_with_a_window(below: int) -> None:
+    transform = [5e5, 30.0, 4.0, 4e6, 3.0, -20.0]
+    original = ls.Surface(np.rint(terrain((21, 39))).astype("i4"), metadata={"geotransform": transform})
+    decoder = ls.Decoder()
+    decoder.feed(ls.encode(original))
+    assert decoder.header is not None
+    level = decoder.header.levels - below
+    down, across = level_nodes(decoder.header, level)[0]
+    window = decoder.view().window(((3, 18), (9, 25)), level)
+    inside = np.ix_(down[(down >= 3) & (down < 18)], across[(across >= 9) & (across < 25)])
+    for found, whole in zip(coordinates(window), coordinates(original), strict=True):
+        np.testing.assert_allclose(found, whole[inside], rtol=1e-12)
+
+
+@pytest.mark.parametrize("below", [0, 2])
 def test_a_region_with_one_point_of_the_level_is_refused_before_anything_is_sent(below: int) -> None:
     _, container = heights()
     index = index_of(container)
