@@ -4,6 +4,7 @@ import { fieldOf, nameOf } from "../src/notebook/fields";
 import type { Buffers, Model } from "../src/notebook/model";
 import { type Program, programOf } from "../src/notebook/program";
 import { themeOf } from "../src/notebook/theme";
+import widget from "../src/notebook/widget";
 import { type Appearance, changesOf, sharedWith, withAppearance } from "../src/view/appearance";
 import { fieldName, fieldsOf, type Look } from "../src/view/look";
 import type { SurfaceInfo } from "../src/view/source";
@@ -96,6 +97,45 @@ it("the program is asked for once in a page, and again after it did not come", a
   const both = [programOf("view-1.js", fails), programOf("view-1.js", fails)];
   for (const one of both) await expect(one).rejects.toThrow("the kernel is gone");
   expect(asked).toBe(2);
+});
+
+it("a stop that comes while the program is loaded holds", async () => {
+  vi.stubGlobal(
+    "MutationObserver",
+    class {
+      observe(): void {}
+      disconnect(): void {}
+    },
+  );
+  const page = { dataset: {}, classList: { contains: () => false }, getAttribute: () => null };
+  vi.stubGlobal("document", { body: page, documentElement: page });
+  const { model, say } = fakeModel();
+  for (const [commands, expected] of [
+    [["stop"], ["stop"]],
+    [["stop", "resume"], []],
+  ] as const) {
+    const told: string[] = [];
+    const element = {
+      ...{ dataset: {}, style: {}, info: null, addEventListener: () => {}, setAppearance: () => {} },
+      ...{ setAttribute: () => {}, removeAttribute: () => {}, remove: () => {} },
+      stop: () => told.push("stop"),
+      resume: () => told.push("resume"),
+    };
+    let load!: (program: Program) => void;
+    const loading = new Promise<Program>((resolve) => {
+      load = resolve;
+    });
+    vi.stubGlobal(Symbol.for("lodestream.programs") as unknown as string, new Map([["undefined", loading]]));
+    const el = { append: () => told.push("shown") } as unknown as HTMLElement;
+    const rendered = widget.render({ model, el });
+    for (const command of commands) say({ kind: "command", command });
+    load({ fieldName, fieldsOf, show: () => element } as unknown as Program);
+    const end = await rendered;
+    expect(told).toEqual(["shown", ...expected]);
+    say({ kind: "command", command: "resume" });
+    expect(told.at(-1)).toBe("resume");
+    end();
+  }
 });
 
 const INFO = {

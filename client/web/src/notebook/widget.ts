@@ -20,13 +20,16 @@ const LOOK = ["field", "colour_map", "value_range", "exaggeration", "lines"] as 
 async function render({ model, el }: Shown): Promise<() => void> {
   const life = new AbortController();
   let element: LodestreamView | null = null;
+  let stopped = false; // while there is no element yet
   const comm = new Comm(model, (command) => {
+    stopped = command === "stop";
     if (command === "stop") element?.stop();
     else if (command === "resume") element?.resume();
   });
   try {
     const program = await programOf(String(model.get("_program")), () => comm.program());
     element = place(program, comm, model, el, life.signal);
+    if (stopped) element.stop();
   } catch (error) {
     el.textContent = `The surface cannot be shown: ${error instanceof Error ? error.message : String(error)}`;
     el.setAttribute("role", "alert");

@@ -119,6 +119,7 @@ async function route(): Promise<void> {
     open(server.address(surface.url), nameOf(surface), true, path);
     await showSeries(surface);
   } catch (error) {
+    if (asked() !== path) return; // whoever looks at something else is not led back
     shown = null;
     if (await allowed(error as ProblemError)) return route();
     fail(error);

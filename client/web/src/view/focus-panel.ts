@@ -115,9 +115,9 @@ export class FocusPanel {
     this.below.addEventListener("change", () => actions.endByItself(this.below.checked));
   }
 
-  /** Whether there is something to stop. */
+  /** Whether there is something to stop, also before anything is drawn of it. */
   get canStop(): boolean {
-    const state = this.last?.progress.state;
+    const state = this.last?.progress.state ?? "connecting";
     return state === "connecting" || state === "receiving" || state === "resuming" || state === "waiting";
   }
 

@@ -34,6 +34,7 @@ export class Receiver {
   private region: Region | null = null;
   private rate: number | null = null;
   private running = false;
+  private stopped = false;
   private began = 0;
   private failure: Pick<Progress, "detail" | "code" | "useless"> | null = null;
   private history: { at: number; bytes: number }[] = [];
@@ -73,6 +74,7 @@ export class Receiver {
           this.progress();
         },
       });
+      if (this.stopped) await this.stream.stop();
       await this.run();
     } catch (error) {
       this.fail(error);
@@ -161,11 +163,13 @@ export class Receiver {
 
   /** See `Source`. */
   stop(): void {
+    this.stopped = true;
     void this.stream?.stop();
   }
 
   /** See `Source`. */
   resume(): void {
+    this.stopped = false;
     if (this.stream === null) return;
     this.failure = null;
     try {
