@@ -250,7 +250,7 @@ def view_table(folder: Path) -> None:
                 served = time.perf_counter() - began
                 shown.page.add_init_script(_WATCH)
                 shown.go(url)
-                shown.until(lambda shown=shown: shown.page.evaluate("window.firstDrawn"), 300)  # type: ignore[misc]
+                shown.until(lambda shown=shown: shown.page.evaluate("window.firstDrawn"))  # type: ignore[misc]
                 drawn = time.perf_counter() - began
             rows.append([name, f"{path.stat().st_size:,}", f"{served:.2f}", f"{drawn:.2f}"])
     table("lodestream open", ["file", "bytes", "page is served, s", "first picture, s"], rows)

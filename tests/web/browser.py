@@ -18,14 +18,16 @@ from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, expect, sync_playwright
 
 from lodestream import page as built
+from tests.patience import PATIENCE
 
-__all__ = ["ABOVE", "SIZE", "WAIT", "Camera", "Heard", "Tab", "chromium", "missing", "tab"]
+__all__ = ["ABOVE", "SIZE", "WAIT", "Camera", "Heard", "Tab", "chromium", "goes_on", "missing", "tab", "until"]
 
 #: Of a window whose picture is 480 pixels wide: drawing is done by the processor.
 SIZE = (800, 420)
 
-#: Milliseconds for which something is waited for; a machine may have much else to do.
-WAIT = 45_000
+#: Milliseconds for which something is waited for.
+WAIT = round(1000 * PATIENCE)
+expect.set_options(timeout=WAIT)
 
 #: Keys that show a surface from above.
 ABOVE = "t"
@@ -40,19 +42,47 @@ _ARGUMENTS = (
     "--no-first-run",
 )
 
-# Statuses as they are shown, one after the other.
+# Statuses as they are shown, one after the other, and states as the element tells them; where the pointer is.
 _STATUSES = """
 window.statuses = [];
 window.beside = [];
-setInterval(() => {
-  const root = document.querySelector("lodestream-view")?.shadowRoot;
-  const text = root?.querySelector(".status")?.textContent;
-  if (text && text !== window.statuses.at(-1)) window.statuses.push(text);
-  const errors = [...root?.querySelectorAll(".figures dd") ?? []].map(({ textContent }) => textContent);
-  const both = [text, ...errors].join(" | ");
-  if (text && both !== window.beside.at(-1)) window.beside.push(both);
-}, 20);
+window.states = [];
+{
+  const note = (list, text) => {
+    if (text && text !== list.at(-1)) list.push(text);
+  };
+  const attach = Element.prototype.attachShadow;
+  Element.prototype.attachShadow = function (options) {
+    const root = attach.call(this, options);
+    const look = () => {
+      const text = root.querySelector(".status")?.textContent;
+      const errors = [...root.querySelectorAll(".figures dd")].map(({ textContent }) => textContent);
+      note(window.statuses, text);
+      if (text) note(window.beside, [text, ...errors].join(" | "));
+    };
+    new MutationObserver(look).observe(root, { childList: true, characterData: true, subtree: true });
+    this.addEventListener("lodestream-progress", ({ detail }) => note(window.states, detail.state));
+    return root;
+  };
+}
+addEventListener("pointermove", ({ clientX, clientY }) => { window.pointer = [clientX, clientY]; }, true);
 """
+
+# Whether what was asked for is drawn: the worker answers questions in their order.
+_RESTS = """async view => {
+  const { session, stage } = view;
+  const rests = () => !session.busy && !session.eyeDue && session.eyeTimer === undefined && stage.frame === 0;
+  if (!rests()) return false;
+  await session.pick({ origin: [0, 0, 0], direction: [0, 0, 1] });
+  return rests();
+}"""
+
+# What stands below the picture; null: it is not what was asked for last.
+_VALUES = """view => {
+  if (view.probe.busy) return null;
+  const values = view.shadowRoot.querySelector(".values");
+  return [...values.children].map(({ children }) => [...children].map(({ textContent }) => textContent.trim()));
+}"""
 
 _STATE = """view => ({
   info: view.info,
@@ -162,28 +192,23 @@ class Tab:
 
     def shown(self, *statuses: str) -> None:
         """Wait until the status is one of these."""
-        expect(self.status).to_have_text(re.compile("|".join(map(re.escape, statuses))), timeout=WAIT)
+        expect(self.status).to_have_text(re.compile("|".join(map(re.escape, statuses))))
 
     def go_on_to_the_end(self) -> None:
         """Uncheck that it stops there."""
         self.until(self._goes_on)
 
     def _goes_on(self) -> bool:
-        # By the keyboard, since a click may miss what moves as rows above it come and go; and again if the page has
-        # only now given the view its surface, with which it begins anew.
-        box = self.view.get_by_label("Stop when the picture looks done")
-        if box.is_checked():
-            box.press("Space")
-        return not box.is_checked()
+        return goes_on(self.view)
 
     def everything_is_here(self) -> None:
         """Wait until the whole surface is drawn, whether it is exact or not."""
-        self.until(lambda: self._goes_on() and self.status.inner_text() in ("Complete: exact", "Complete"), 600)
+        self.until(lambda: self._goes_on() and self.status.inner_text() in ("Complete: exact", "Complete"))
 
     def everything(self, unit: str = "") -> None:
         """Wait for an exact surface, and until it is drawn."""
         self.until(lambda: self._goes_on() and self.status.inner_text() == "Complete: exact")
-        expect(self.rms).to_have_text(f"0 {unit}".strip(), timeout=WAIT)
+        expect(self.rms).to_have_text(f"0 {unit}".strip())
 
     @property
     def statuses(self) -> list[str]:
@@ -194,6 +219,11 @@ class Tab:
     def beside(self) -> list[list[str]]:
         """The statuses that were shown so far, each with RMS and maximum error as they stood beside it."""
         return [text.split(" | ") for text in self.page.evaluate("window.beside")]
+
+    def failed(self, times: int) -> None:
+        """Wait until the transmission has failed so often, and says so."""
+        self.until(lambda: self.page.evaluate("window.states").count("failed") == times)
+        self.shown("Failed")
 
     @property
     def moments(self) -> list[dict[str, Any]]:
@@ -209,12 +239,9 @@ class Tab:
     def _state(self) -> dict[str, Any]:
         return dict(self.view.evaluate(_STATE))
 
-    def until(self, true: Callable[[], object], seconds: float = WAIT / 1000) -> None:
+    def until(self, true: Callable[[], object]) -> None:
         """Wait for something; events of the browser are heard meanwhile."""
-        end = time.monotonic() + seconds
-        while not true():
-            assert time.monotonic() < end, f"the page shows {self.statuses}, {self.heard.errors}"
-            self.page.wait_for_timeout(30)
+        until(self.page, true, lambda: f"the page shows {self.statuses}, {self.heard.errors}")
 
     def press(self, *keys: str) -> None:
         """Press keys in the picture."""
@@ -230,51 +257,50 @@ class Tab:
 
         Its edge, which shows whether it has the focus, is white.
         """
-        last = b""
-        for _ in range(100):
-            now = self.canvas.screenshot()
-            if now == last:
-                with Image.open(io.BytesIO(now)) as image:
-                    picture = np.asarray(image.convert("RGB")).astype(np.int16)
-                edge = np.pad(np.zeros(np.subtract(picture.shape[:2], 12), bool), 6, constant_values=True)
-                picture[edge] = 255
-                return picture
-            last = now
-            self.page.wait_for_timeout(400)
-        raise AssertionError("the picture does not come to rest")
+        last, now = b"", b""
+
+        def rests() -> bool:
+            nonlocal last, now
+            last, now = now, self.canvas.screenshot() if self.view.evaluate(_RESTS) else b""
+            return now != b"" and now == last
+
+        self.until(rests)
+        with Image.open(io.BytesIO(now)) as image:
+            picture = np.asarray(image.convert("RGB")).astype(np.int16)
+        edge = np.pad(np.zeros(np.subtract(picture.shape[:2], 12), bool), 6, constant_values=True)
+        picture[edge] = 255
+        return picture
 
     def point(self, x: float, y: float) -> dict[str, str]:
         """The values at a place of the picture, from 0 to 1 from its left and its top."""
         self._move(x, y)
-        self.until(lambda: "row" in " ".join(self._values()))
+        self.until(lambda: "row" in self.read())
         return self.read()
 
     def point_at_nothing(self, x: float, y: float) -> None:
         """A place of the picture where nothing is drawn."""
         self._move(x, y)
-        self.until(lambda: not self._values())
-        self.page.wait_for_timeout(1000)
         assert self.read() == {}
 
     def _move(self, x: float, y: float) -> None:
         box = self.canvas.bounding_box()
         assert box is not None
-        place = box["x"] + x * box["width"], box["y"] + y * box["height"]
+        place = round(box["x"] + x * box["width"]), round(box["y"] + y * box["height"])
         self.page.mouse.move(place[0] + 1, place[1] + 1)
         self.page.mouse.move(*place)
+        self.until(lambda: self.page.evaluate("window.pointer") == [*place])
 
     def read(self) -> dict[str, str]:
-        """The values that stand below the picture, once they rest."""
-        last: dict[str, str] | None = None
-        while last != (now := self._values()):
-            last = now
-            self.page.wait_for_timeout(200)
-        return now
+        """The values that stand below the picture, of the place that was asked for last."""
+        found: list[list[str]] | None = None
 
-    def _values(self) -> dict[str, str]:
-        found: list[list[str]] = self.values.evaluate(
-            "values => [...values.children].map(({children}) => [...children].map(({textContent: t}) => t.trim()))"
-        )
+        def answered() -> bool:
+            nonlocal found
+            found = self.view.evaluate(_VALUES)
+            return found is not None
+
+        self.until(answered)
+        assert found is not None
         values = {pair[0]: pair[1] for pair in found if len(pair) == 2}
         for name in [name for name in values if name.startswith("block ")]:
             values |= {"block": name.split()[1].rstrip(","), "row": values.pop(name)}
@@ -283,6 +309,26 @@ class Tab:
     def button(self, name: str) -> Locator:
         """A button of the view."""
         return self.view.get_by_role("button", name=name, exact=True)
+
+
+def until(page: Page, true: Callable[[], object], told: Callable[[], str] = lambda: "it does not come") -> None:
+    """Wait for something; events of the browser are heard meanwhile."""
+    end = time.monotonic() + PATIENCE
+    while not true():
+        assert time.monotonic() < end, told()
+        page.wait_for_timeout(30)
+
+
+def goes_on(view: Locator) -> bool:
+    """Uncheck that a view stops when its picture looks done; whether it is unchecked.
+
+    By the keyboard, since a click may miss what moves as rows above it come and go; to be called again, since it is
+    checked anew if the page has only now given the view its surface.
+    """
+    box = view.get_by_label("Stop when the picture looks done")
+    if box.is_checked():
+        box.press("Space")
+    return not box.is_checked()
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.patience import PATIENCE
 from tests.server.programs import server as program
 from tests.stores.emulators import ministack, s3
 
@@ -115,5 +116,5 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The files of the npm package, built as they are for its registry."""
     folder = tmp_path_factory.mktemp("library")
     vite = [str(WEB / "node_modules" / ".bin" / "vite"), "build", "--config", "vite.library.config.ts"]
-    subprocess.run([*vite, "--outDir", str(folder), "--logLevel", "error"], cwd=WEB, check=True, timeout=300)
+    subprocess.run([*vite, "--outDir", str(folder), "--logLevel", "error"], cwd=WEB, check=True, timeout=PATIENCE)
     return folder

@@ -7,11 +7,12 @@ each place, values and messages go both ways. No port is opened: the browser is 
 from __future__ import annotations
 
 import base64
+from collections.abc import Callable
 from typing import Any
 
 from playwright.sync_api import Locator, Page, expect
 
-from .browser import WAIT
+from .browser import goes_on, until
 
 __all__ = ["Notebook"]
 
@@ -111,9 +112,28 @@ class Notebook:
         """Messages so far."""
         return len(self._heard)
 
+    def until(self, true: Callable[[], object]) -> None:
+        """Wait for something; the page's messages are taken meanwhile."""
+        until(self.page, true)
+
+    def everything(self, view: Locator) -> None:
+        """Wait for an exact surface in a place."""
+        self.until(lambda: goes_on(view) and view.locator(".status").inner_text() == "Complete: exact")
+
+    def questions(self) -> list[dict[str, Any]]:
+        """Which bytes were asked for, once the page and its workers have nothing to do but to wait for answers."""
+        asked: list[dict[str, Any]] = []
+        quiet = 0
+        while quiet < 10:
+            for thread in (*self.page.workers, self.page):
+                thread.evaluate("() => new Promise((resolve) => setTimeout(resolve))")
+            before, asked = asked, self.page.evaluate("window.asked.filter(({ kind }) => kind === 'read')")
+            quiet = quiet + 1 if asked == before else 0
+        return asked
+
     def status(self, view: Locator, text: str) -> None:
         """Wait for a status."""
-        expect(view.locator(".status")).to_have_text(text, timeout=WAIT)
+        expect(view.locator(".status")).to_have_text(text)
 
     def _take(self, model: str, data: dict[str, Any]) -> list[dict[str, Any]]:
         since = self.count

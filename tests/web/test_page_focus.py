@@ -13,6 +13,7 @@ import httpx
 import msgpack
 import numpy as np
 import pytest
+from playwright.sync_api import expect
 
 from tests.links import Fault, Link, linked
 
@@ -28,7 +29,7 @@ class Frames:
     """The messages of all WebSockets of a page."""
 
     def __init__(self, tab: Tab) -> None:
-        self.credit = self.data = 0
+        self.credit = self.data = self.open = 0
         self.stops: list[tuple[int, int]] = []
         tab.page.on("websocket", self._listen)
 
@@ -37,8 +38,10 @@ class Frames:
         first = parse_qs(urlsplit(socket.url).query)["open"][0]
         self.credit = msgpack.unpackb(base64.urlsafe_b64decode(first + "=="))["credit"]
         self.data = 0
+        self.open += 1
         socket.on("framesent", self._sent)
         socket.on("framereceived", self._received)
+        socket.on("close", self._closed)
 
     def _sent(self, frame: bytes) -> None:
         message = msgpack.unpackb(frame)
@@ -52,38 +55,46 @@ class Frames:
         if message["type"] == "segments":
             self.data += len(message["data"])
 
+    def _closed(self, _: Any) -> None:
+        self.open -= 1
+
 
 class Weather:
-    """What is wrong with connections from now on: the page itself comes over good ones."""
+    """What is wrong with connections of a link from now on: the page itself comes over good ones."""
+
+    link: Link
 
     def __init__(self) -> None:
+        self.connections = 0
         self._faults: list[Fault] = []
 
     def __call__(self, _: int) -> Fault:
+        self.connections += 1
         if len(self._faults) > 1:
             return self._faults.pop(0)
         return self._faults[0] if self._faults else Fault()
 
     def now(self, *faults: Fault) -> None:
         """One for each connection in turn; the last holds for all after it."""
+        self.connections = 0
         self._faults = list(faults)
 
 
 @contextmanager
 def over_a_link(
     tabs: Tabs, shelf: Shelf, *faults: Fault, watch: Callable[[Tab], None] = lambda _: None
-) -> Iterator[tuple[Tab, Link]]:
+) -> Iterator[tuple[Tab, Weather]]:
     """The terrain, over connections with these faults."""
     shelf.description("terrain")
     weather = Weather()
-    with linked(shelf.server, weather) as link:
-        tab = tabs(link.url)
-        listed = tab.page.get_by_role("link", name="terrain")
+    with linked(shelf.server, weather) as weather.link:
+        tab = tabs(weather.link.url)
+        listed = tab.page.get_by_role("link", name="terrain", exact=True)
         listed.wait_for()
         watch(tab)
         weather.now(*faults)
-        tab.page.goto(shelf.address("terrain", server=link.url))
-        yield tab, link
+        tab.page.goto(shelf.address("terrain", server=weather.link.url))
+        yield tab, weather
 
 
 def test_the_error_on_the_screen_falls_to_what_the_server_promised(tabs: Tabs, shelf: Shelf) -> None:
@@ -149,10 +160,11 @@ def test_going_back_claims_nothing_that_is_not_drawn(tabs: Tabs, shelf: Shelf) -
           slider.value = "0";
           slider.dispatchEvent(new Event("input"));
           return new Promise((resolve) => {
-            const end = performance.now() + 3000;
+            let more = 30; // frames after it is drawn
             const next = () => {
               look();
-              if (performance.now() < end) requestAnimationFrame(next);
+              if (seen.at(-1)[0] === "Earlier moment") more -= 1;
+              if (more > 0) requestAnimationFrame(next);
               else resolve(seen);
             };
             requestAnimationFrame(() => requestAnimationFrame(next));
@@ -198,9 +210,10 @@ def test_a_target_is_met_and_the_values_are_within_its_error(tabs: Tabs, shelf: 
         tab.choose("Target", "RMS error")
         tab.view.get_by_label("Target value").fill("0.005")
         tab.view.get_by_label("Target value").press("Enter")
-        tab.shown("Target met")
+        # The error that was proposed may have been met before.
+        tab.until(lambda: tab.moments[-1]["rms"] <= 0.005 and tab.status.inner_text() == "Target met")
         reached = tab.moments[-1]
-        assert 0.0005 < reached["rms"] <= 0.005
+        assert reached["rms"] > 0.0005
         tab.until(lambda: tab.rms.inner_text()[0].isdigit() and float(tab.rms.inner_text().split()[0]) <= 0.005)
         errors = []
         for x in np.linspace(0.3, 0.7, 5):
@@ -227,21 +240,22 @@ def test_the_slider_goes_back_to_earlier_moments(tabs: Tabs, shelf: Shelf) -> No
     assert tab.status.inner_text() == "Earlier moment"
     tab.press("End")
     tab.shown("Complete: exact")
-    assert tab.rms.inner_text() == "0 m"
+    expect(tab.rms).to_have_text("0 m")
     assert np.abs(tab.picture() - last).mean() < 0.1
 
 
 def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> None:
     frames: list[Frames] = []
-    slow = Fault(delay=0.05, rate=20_000.0)
-    with over_a_link(tabs, shelf, slow, watch=lambda tab: frames.append(Frames(tab))) as (tab, _):
+    slow = Fault(delay=0.05, rate=5_000.0)
+    with over_a_link(tabs, shelf, slow, watch=lambda tab: frames.append(Frames(tab))) as (tab, weather):
         tab.go_on_to_the_end()
         (messages,) = frames
-        tab.until(lambda: messages.data > 20_000)
+        tab.until(lambda: messages.data > 10_000)
         tab.button("Stop").click()
         tab.shown("Stopped")
+        tab.until(lambda: messages.open == 0)
+        weather.now(Fault())
         ((credit, before),) = messages.stops
-        tab.page.wait_for_timeout(1000)
         ended = messages.data
         assert 0 < credit - before <= 262_144
         assert ended - before <= credit - before
@@ -256,11 +270,12 @@ def test_after_stop_no_more_comes_than_the_credit(tabs: Tabs, shelf: Shelf) -> N
 
 
 def test_stop_and_on_by_one_key(tabs: Tabs, shelf: Shelf) -> None:
-    with over_a_link(tabs, shelf, Fault(rate=20_000.0)) as (tab, _):
+    with over_a_link(tabs, shelf, Fault(rate=5_000.0)) as (tab, weather):
         tab.go_on_to_the_end()
         tab.until(lambda: tab.moments)
         tab.press("s")
         tab.shown("Stopped")
+        weather.now(Fault())
         stopped = tab.moments[-1]
         assert not stopped["complete"]
         tab.press("s")
@@ -268,27 +283,48 @@ def test_stop_and_on_by_one_key(tabs: Tabs, shelf: Shelf) -> None:
         assert tab.moments[-1]["bytes"] > stopped["bytes"]
 
 
+def test_a_stop_before_anything_is_drawn_holds(tabs: Tabs, shelf: Shelf) -> None:
+    tab = tabs(shelf.server)
+    tab.page.get_by_role("heading", name="Surfaces").wait_for()
+    tab.page.evaluate(
+        """(src) => {
+          const view = document.createElement("lodestream-view");
+          view.src = src;
+          document.querySelector("main").replaceChildren(view);
+          view.shadowRoot.querySelector("button.primary").click();
+        }""",
+        shelf.description("terrain").url,
+    )
+    tab.shown("Stopped")
+    assert tab.moments == []
+    tab.button("Continue").press("Enter")
+    tab.everything("m")
+
+
 def test_a_lost_link_is_told_and_the_surface_goes_on(tabs: Tabs, shelf: Shelf, heard: Any) -> None:
     heard.allow("WebSocket connection to .* failed")
     size = int(shelf.description("terrain").details["bytes"])
     broken = Fault(cut_down=45_000, reset=True, rate=60_000.0)
-    with over_a_link(tabs, shelf, broken, broken, Fault(cut_down=300, reset=True), Fault()) as (tab, link):
-        before = link.down
+    with over_a_link(tabs, shelf, broken, broken, Fault(cut_down=300, reset=True)) as (tab, weather):
+        before = weather.link.down
+        tab.go_on_to_the_end()
+        tab.shown("Link lost: resuming")
+        tab.until(lambda: weather.connections >= 3)
+        weather.now(Fault())
         tab.everything("m")
-        assert "Link lost: resuming" in tab.statuses
         assert tab.statuses[-1] == "Complete: exact"
         numbers = [moment["number"] for moment in tab.moments]
         assert numbers == list(range(len(numbers)))
         # Once more at most than what a client has: one window of each broken connection.
-        assert link.down - before < 1.6 * size + 900_000
+        assert weather.link.down - before < 1.6 * size + 900_000
 
 
 def test_a_link_without_a_word_is_told(tabs: Tabs, shelf: Shelf) -> None:
     with over_a_link(tabs, shelf, Fault(cut_down=30_000, vanish=True)) as (tab, _):
         tab.go_on_to_the_end()
+        tab.until(lambda: tab.rms.inner_text().endswith(" m"))
         tab.shown("Waiting: no data for")
         assert tab.moments
-        assert tab.rms.inner_text().endswith(" m")
 
 
 def test_it_stops_when_the_picture_looks_done_and_gets_the_rest_when_that_is_wanted(tabs: Tabs, shelf: Shelf) -> None:

@@ -20,7 +20,7 @@ from tests.client.files import Ranged, ranged
 from tests.core.maps.fields import pixel_of
 from tests.core.surfaces import terrain
 
-from .browser import WAIT, Tab
+from .browser import Tab
 from .conftest import WEB, Tabs
 from .map_pages import MAPS, VIEW, greys, heights_at, maplibre, mountains, plane, write
 
@@ -45,9 +45,14 @@ def shown(tabs: Tabs, host: Ranged, dem: dict[str, Any], **camera: Any) -> Tab:
     """The page with terrain, once it has drawn all."""
     asked = quote(json.dumps({"dem": {"type": "raster-dem", **dem}, **camera}))
     tab = tabs(f"{host.url}/terrain.html#{asked}", size=VIEW)
-    tab.page.wait_for_function("window.idle", timeout=WAIT)
+    tab.page.wait_for_function("window.idle")
     assert tab.page.evaluate("window.errors") == []
     return tab
+
+
+def in_address(tab: Tab) -> list[float]:
+    """Zoom, latitude and longitude of a map, which come into its address a moment after they are seen."""
+    return [float(number) for number in (tab.page.url.partition("#")[2] or "0/0/0").split("/")[:3]]
 
 
 def field_of(path: Path) -> HeightField:
@@ -111,9 +116,8 @@ def test_ten_lines_of_html_show_a_container_on_a_map(tabs: Tabs, host: Ranged) -
     host.requests.clear()
     tab = tabs(f"{host.url}/map.html", size=VIEW)
     tab.until(lambda: len(greys(tab)) > 100)
-    zoom, latitude, longitude = (float(number) for number in tab.page.url.partition("#")[2].split("/")[:3])
-    assert zoom > 10
-    assert (latitude, longitude) == pytest.approx((46.93, 8.09), abs=0.02)
+    tab.until(lambda: in_address(tab)[0] > 10)
+    assert in_address(tab)[1:] == pytest.approx([46.93, 8.09], abs=0.02)
     assert any(asked is not None for _, asked in host.requests)
 
 
@@ -127,12 +131,12 @@ def test_the_public_demo_has_a_map(tabs: Tabs, library: Path, tmp_path: Path) ->
     with ranged(tmp_path / "site") as server:
         tab = tabs(f"{server.url}/map/index.html", size=VIEW)
         tab.until(lambda: len(greys(tab)) > 100)
-        assert float(tab.page.url.partition("#")[2].split("/")[0]) > 9
+        tab.until(lambda: in_address(tab)[0] > 9)
 
 
 def test_what_is_missing_is_an_error_of_the_map(tabs: Tabs, host: Ranged) -> None:
     write(host.folder / "nowhere.lode", terrain((40, 40), 4), {})
     asked = quote(json.dumps({"dem": {"type": "raster-dem", "url": f"lode://{host.url}/nowhere.lode"}}))
     tab = tabs(f"{host.url}/terrain.html#{asked}", size=VIEW)
-    tab.page.wait_for_function("window.errors?.length", timeout=WAIT)
+    tab.page.wait_for_function("window.errors?.length")
     assert "expected heights with a CRS" in tab.page.evaluate("window.errors")[0]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Locator, expect
+from playwright.sync_api import Browser, expect
 
 import lodestream as ls
 from lodestream.container import read_index
@@ -16,7 +15,7 @@ from lodestream_client import Widget
 from tests.client.notebook.conftest import Page as Kernel
 from tests.client.notebook.conftest import fake_page
 
-from .browser import WAIT, Heard, tab
+from .browser import Heard, tab
 from .notebooks import Notebook
 
 __all__ = ["fake_page"]  # a fixture
@@ -43,24 +42,11 @@ def container(hills: ls.Surface) -> bytes:
     return ls.encode(hills)
 
 
-def until(notebook: Notebook, true: Callable[[], object]) -> None:
-    for _ in range(WAIT // 50):
-        if true():
-            return
-        notebook.page.wait_for_timeout(50)
-    raise AssertionError("what is waited for does not come")
-
-
-def everything(notebook: Notebook, view: Locator) -> None:
-    view.get_by_label("Stop when the picture looks done").uncheck()
-    notebook.status(view, "Complete: exact")
-
-
 def test_a_surface_comes_into_focus_over_the_comm(notebook: Notebook, container: bytes, hills: ls.Surface) -> None:
     widget = Widget(container, stop_when_done=False, height=500)
     view = notebook.show(widget)
     notebook.status(view, "Complete: exact")
-    until(notebook, lambda: widget.state == "complete" and widget.rms == 0)
+    notebook.until(lambda: widget.state == "complete" and widget.rms == 0)
     assert widget.bytes_received <= len(container)
     assert len(container) <= widget.bytes_sent < 1.3 * len(container)  # its end is read for the price list too
     assert widget.level == ls.Decoder().feed(container)[-1].level
@@ -68,9 +54,9 @@ def test_a_surface_comes_into_focus_over_the_comm(notebook: Notebook, container:
     assert box is not None
     assert box["height"] == 500
     canvas = view.locator("canvas")
-    assert canvas.get_attribute("aria-label", timeout=WAIT) is not None
+    assert canvas.get_attribute("aria-label") is not None
     canvas.press("p")
-    until(notebook, lambda: widget.selected is not None)
+    notebook.until(lambda: widget.selected is not None)
     row, column = widget.selected["row"], widget.selected["column"]
     assert widget.selected["point"][2] == hills.points[row, column]
     assert widget.selected["attributes"]["wind"] == pytest.approx(hills.attributes["wind"][row, column])
@@ -81,7 +67,7 @@ def test_several_places_and_widgets_in_one_page(notebook: Notebook, container: b
     one, other = Widget(container), Widget(np.add.outer(np.arange(70) ** 2, np.arange(50)))
     views = [notebook.show(one), notebook.show(one), notebook.show(other)]
     for view in views:
-        everything(notebook, view)
+        notebook.everything(view)
     kinds = [question["kind"] for question in notebook.page.evaluate("window.asked")]
     assert kinds.count("program") == 1
     assert one.bytes_sent >= 2 * len(container)
@@ -91,7 +77,7 @@ def test_several_places_and_widgets_in_one_page(notebook: Notebook, container: b
     since = notebook.count
     one.field = "rain"
     notebook.told(one, since)
-    expect(left.get_by_label("Coloured by", exact=True).locator("option:checked")).to_have_text("rain", timeout=WAIT)
+    expect(left.get_by_label("Coloured by", exact=True).locator("option:checked")).to_have_text("rain")
 
 
 def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook: Notebook, container: bytes) -> None:
@@ -99,7 +85,7 @@ def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook
         container, field="wind", colour_map="grey", exaggeration=2, lines=True, value_range=(0.25, 0.5)
     )
     view = notebook.show(widget)
-    everything(notebook, view)
+    notebook.everything(view)
     field = view.get_by_label("Coloured by", exact=True)
     expect(field.locator("option:checked")).to_have_text("wind, magnitude")
     expect(view.get_by_label("Colour map")).to_have_value("grey")
@@ -107,11 +93,11 @@ def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook
     expect(view.get_by_label("Quad lines")).to_be_checked()
     expect(view.locator("output[for=exaggeration]")).to_have_text("\N{MULTIPLICATION SIGN} 2")
     field.select_option(label="wind[1]")
-    until(notebook, lambda: (widget.field, widget.colour_map, widget.value_range) == ("wind[1]", None, None))
+    notebook.until(lambda: (widget.field, widget.colour_map, widget.value_range) == ("wind[1]", None, None))
     view.get_by_label("Colour map").select_option("cividis")
     view.get_by_label("Quad lines").uncheck()
     view.locator("canvas").press("x")
-    until(notebook, lambda: (widget.colour_map, widget.lines, widget.exaggeration) == ("cividis", False, 2.5))
+    notebook.until(lambda: (widget.colour_map, widget.lines, widget.exaggeration) == ("cividis", False, 2.5))
     for name, value in (("field", "slope"), ("colour_map", "red-blue"), ("exaggeration", 4), ("value_range", (1, 3))):
         since = notebook.count
         setattr(widget, name, value)
@@ -126,14 +112,14 @@ def test_what_python_sets_is_shown_and_what_the_user_changes_comes_back(notebook
 def test_a_target_ends_the_transmission_and_another_goes_on(notebook: Notebook, container: bytes) -> None:
     widget = Widget(container, target=ls.Target(max_bytes=20_000), stop_when_done=False)
     view = notebook.show(widget)
-    until(notebook, lambda: widget.state == "target")
+    notebook.until(lambda: widget.state == "target")
     assert 0 < widget.bytes_received <= 20_000
     assert widget.bytes_sent < 0.8 * len(container)
     expect(view.get_by_label("Target value")).to_have_value("20")
     since = notebook.count
     widget.target = ls.Target(until_rms=ls.Tolerance(0.05))
     notebook.told(widget, since)
-    until(notebook, lambda: widget.state == "target" and widget.rms is not None and widget.rms <= 0.05)
+    notebook.until(lambda: widget.state == "target" and widget.rms is not None and widget.rms <= 0.05)
     since = notebook.count
     widget.target = None
     notebook.told(widget, since)
@@ -147,20 +133,17 @@ def test_stop_ends_the_questions(notebook: Notebook) -> None:
     widget = Widget(data, stop_when_done=False)
     notebook.page.evaluate("window.held = 6")
     view = notebook.show(widget)
-    until(notebook, lambda: widget.state == "receiving" and widget.bytes_sent > 200_000)
-    asked = "window.asked.filter(({ kind }) => kind === 'read')"
-    notebook.page.wait_for_timeout(300)
-    under_way = notebook.page.evaluate(asked)
+    notebook.until(lambda: widget.state == "receiving" and widget.bytes_sent > 200_000)
+    under_way = notebook.questions()
     assert sum(question["length"] for question in under_way[6:]) <= 4 * 128 * 1024
     since = notebook.count
     widget.stop()
     notebook.told(widget, since)
     notebook.page.evaluate("window.held = null")
     notebook.status(view, "Stopped")
-    until(notebook, lambda: widget.state == "stopped")
-    notebook.page.wait_for_timeout(500)
+    notebook.until(lambda: widget.state == "stopped")
     # The price list at the end of the container is none of what was stopped.
-    later = [question for question in notebook.page.evaluate(asked) if question not in under_way]
+    later = [question for question in notebook.questions() if question not in under_way]
     assert [question for question in later if question["offset"] < end] == []
     sent = widget.bytes_sent
     assert sent < 1_000_000 < len(data)
@@ -177,15 +160,15 @@ def test_why_it_fails_is_shown_and_told(notebook: Notebook, container: bytes, tm
     widget = Widget(path)
     path.unlink()
     view = notebook.show(widget)
-    expect(view.locator(".notice")).to_contain_text("No such file or directory", timeout=WAIT)
-    until(notebook, lambda: widget.state == "failed" and "No such file" in widget.detail)
+    expect(view.locator(".notice")).to_contain_text("No such file or directory")
+    notebook.until(lambda: widget.state == "failed" and "No such file" in widget.detail)
 
 
 def test_an_element_that_does_not_come_is_said_so(notebook: Notebook, container: bytes, tmp_path: Path) -> None:
     widget = Widget(container)
     widget._answers._program = tmp_path / "view-gone.js"
     notebook.show(widget)
-    expect(notebook.page.get_by_role("alert")).to_contain_text("The surface cannot be shown: ", timeout=WAIT)
+    expect(notebook.page.get_by_role("alert")).to_contain_text("The surface cannot be shown: ")
     expect(notebook.page.get_by_role("alert")).to_contain_text("view-gone.js")
 
 
@@ -199,23 +182,23 @@ def test_it_is_light_or_dark_as_the_notebook_is(notebook: Notebook, container: b
     light, dark = "rgb(251, 252, 252)", "rgb(18, 24, 27)"
     assert paper() == light
     notebook.page.evaluate("document.body.dataset.jpThemeLight = 'false'")
-    until(notebook, lambda: paper() == dark)
+    notebook.until(lambda: paper() == dark)
     notebook.page.evaluate("delete document.body.dataset.jpThemeLight")
-    until(notebook, lambda: paper() == light)
+    notebook.until(lambda: paper() == light)
     for name in ("vscode-dark", "dark"):
         notebook.page.evaluate("name => document.body.classList.add(name)", name)
-        until(notebook, lambda: paper() == dark)
+        notebook.until(lambda: paper() == dark)
         notebook.page.evaluate("name => document.body.classList.remove(name)", name)
-        until(notebook, lambda: paper() == light)
+        notebook.until(lambda: paper() == light)
     since = notebook.count
     widget.theme = "dark"
     notebook.told(widget, since)
-    until(notebook, lambda: paper() == dark)
+    notebook.until(lambda: paper() == dark)
 
 
 def test_keys_of_the_picture_are_none_of_the_notebook(notebook: Notebook, container: bytes) -> None:
     view = notebook.show(Widget(container))
-    everything(notebook, view)
+    notebook.everything(view)
     notebook.page.evaluate("document.addEventListener('keydown', (event) => (window.keys ??= []).push(event.key))")
     view.locator("canvas").press("x")
     notebook.page.evaluate("document.activeElement.blur()")

@@ -21,7 +21,7 @@ def test_nothing_hangs_over(tabs: Tabs, shelf: Shelf, heard: Heard, scheme: str,
     FOLDER.mkdir(parents=True, exist_ok=True)
     shape = "wide" if size[0] > 500 else "narrow"
     tab = tabs(shelf.server, color_scheme=scheme, size=size)
-    tab.page.get_by_role("link", name="terrain").wait_for()
+    tab.page.get_by_role("link", name="terrain", exact=True).wait_for()
     tab.page.screenshot(path=FOLDER / f"list-{shape}-{scheme}.png")
     fits = "document.scrollingElement.scrollWidth <= innerWidth"
     assert tab.page.evaluate(fits)

@@ -20,7 +20,7 @@ from lodestream_server.access.tokens import TokenFile
 from tests.client.files import ranged
 from tests.server.programs import server
 
-from .browser import WAIT, Tab
+from .browser import Tab
 from .conftest import Tabs
 from .map_pages import MAPS, VIEW, Nodes, greys, heights_at, maplibre, mountains, plane
 from .shown import Shelf
@@ -73,7 +73,7 @@ def on_a_map(tabs: Tabs, surface: Served, encoding: str, **camera: Any) -> Tab:
     """The page of MapLibre, once it has drawn all."""
     asked = {"url": f"{surface.url}/map.json?encoding={encoding}", **camera}
     tab = tabs(f"{surface.pages}/served.html#{quote(json.dumps(asked))}", size=VIEW)
-    tab.page.wait_for_function("window.idle", timeout=WAIT)
+    tab.page.wait_for_function("window.idle")
     assert tab.page.evaluate("window.errors") == []
     return tab
 
@@ -83,7 +83,7 @@ def on_a_globe(tabs: Tabs, surface: Served) -> Tab:
     nodes = surface.nodes
     asked = {"url": f"{surface.url}/terrain", "place": nodes.middle, "height": nodes.heights.mean(), "away": _AWAY}
     tab = tabs(f"{surface.pages}/globe.html#{quote(json.dumps(asked))}", size=VIEW)
-    tab.page.wait_for_function("window.ready", timeout=WAIT)
+    tab.page.wait_for_function("window.ready")
     return tab
 
 

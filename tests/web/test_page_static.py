@@ -22,9 +22,10 @@ import lodestream as ls
 from lodestream_client import Client
 from lodestream_client.program import main
 from tests.client.files import ranged
+from tests.patience import PATIENCE
 from tests.stores.emulators import BUCKET, Emulator
 
-from .browser import WAIT, Heard
+from .browser import Heard
 from .conftest import Tabs
 from .shown import Shelf, surface
 
@@ -63,12 +64,12 @@ def test_of_several_containers_one_is_chosen(tabs: Tabs, host: Path) -> None:
     assert main(["publish", str(torus), str(host)]) == 0
     with ranged(host) as server:
         tab = tabs(f"{server.url}/index.html")
-        tab.page.get_by_role("link", name="torus").click()  # what the surface is called
+        tab.page.get_by_role("link", name="torus", exact=True).click()  # what the surface is called
         tab.everything()
         expect(tab.page.get_by_role("heading", name="torus")).to_be_visible()
         assert tab.page.url.partition("#")[2].startswith("a%20torus%20%26%20more")
         tab.page.go_back()
-        tab.page.get_by_role("link", name="terrain").click()
+        tab.page.get_by_role("link", name="terrain", exact=True).click()
         tab.everything("m")
 
 
@@ -97,13 +98,13 @@ def test_a_damaged_container_is_told_and_what_came_before_is_shown(tabs: Tabs, h
     with ranged(host) as server:
         tab = tabs(f"{server.url}/index.html")
         tab.go_on_to_the_end()
-        tab.shown("Failed")
+        tab.failed(1)
         expect(tab.notice).not_to_be_empty()
         assert not any(moment["complete"] for moment in tab.moments)
         if where > 0.5:
             tab.until(lambda: bool(tab.moments))  # they wait for the description, for three seconds at most
             assert all(moment["bytes"] <= place for moment in tab.moments)
-            expect(tab.rms).to_have_text(re.compile(" m$"), timeout=WAIT)
+            expect(tab.rms).to_have_text(re.compile(" m$"))
             assert tab.point(0.5, 0.55)["row"]
 
 
@@ -116,19 +117,19 @@ def test_a_container_cut_short_is_told_and_begun_anew_when_it_is_whole(tabs: Tab
         server.tags = tags
         tab = tabs(f"{server.url}/index.html")
         tab.go_on_to_the_end()
-        tab.shown("Failed")
+        tab.failed(1)
         expect(tab.notice).to_contain_text("the file was cut short")
         expect(tab.notice).to_contain_text(str(len(whole) - 5000))
         assert not any(moment["complete"] for moment in tab.moments)
         tab.choose("Colour map", "cividis")
         tab.button("Try again").click()
-        tab.shown("Failed")
+        tab.failed(2)
         expect(tab.notice).to_contain_text("the file was cut short")
         path.write_bytes(whole)
         tab.button("Try again").click()
         tab.shown("Complete: exact")
         expect(tab.notice).to_be_empty()
-        expect(tab.rms).to_have_text("0 m", timeout=WAIT)
+        expect(tab.rms).to_have_text("0 m")
         assert tab.view.get_by_label("Colour map").input_value() == "cividis"
         assert not tab.view.get_by_label("Stop when the picture looks done").is_checked()
 
@@ -139,11 +140,11 @@ def test_what_is_chosen_before_the_surface_is_known_holds_for_its_first_picture(
     path.write_bytes(whole[:10])
     with ranged(host) as server:
         tab = tabs(f"{server.url}/index.html")
-        tab.shown("Failed")
+        tab.failed(1)
         tab.choose("Colour map", "cividis")
         tab.view.get_by_label("Quad lines").check()
         tab.button("Try again").click()
-        tab.shown("Failed")
+        tab.failed(2)
         path.write_bytes(whole)
         tab.button("Try again").click()
         tab.everything("m")
@@ -227,7 +228,7 @@ def test_view_encodes_a_file_and_shows_it(tabs: Tabs, tmp_path: Path) -> None:
         height = HEIGHTS[int(values["row"]), int(values["column"])]
         assert float(values["height"]) == pytest.approx(float(height), rel=1e-7)
         process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
+        assert process.wait(PATIENCE) == 0
 
 
 @pytest.mark.usefixtures("interrupts")

@@ -32,8 +32,8 @@ def focused(tab: Tab) -> dict[str, str]:
 
 
 def tab_to(tab: Tab, wanted: Callable[[dict[str, str]], bool]) -> None:
-    """Go on with the tabulator until something has the focus."""
-    for _ in range(60):
+    """Go on with the tabulator until something has the focus: a list is as long as other tests have made it."""
+    for _ in range(1000):
         if wanted(focused(tab)):
             return
         tab.page.keyboard.press("Tab")
@@ -50,7 +50,7 @@ def test_the_keyboard_alone_is_enough(tabs: Tabs, shelf: Shelf) -> None:
     shelf.description("terrain")
     tab = tabs(shelf.server)
     keys = tab.page.keyboard
-    tab.page.get_by_role("link", name="terrain").wait_for()
+    tab.page.get_by_role("link", name="terrain", exact=True).wait_for()
     tab_to(tab, lambda at: at["tag"] == "A" and at["text"] == "terrain")
     keys.press("Enter")
     tab.until(lambda: tab.view.count() and tab.moments)
@@ -111,6 +111,7 @@ def test_a_shared_address_shows_the_same(tabs: Tabs, shelf: Shelf) -> None:
     first = tabs(shelf.address("terrain"))
     first.everything("m")
     first.choose("Coloured by", "Slope")
+    first.picture()  # whose range of colours is in the fields
     first.choose("Colour map", "cividis")
     first.view.get_by_label("Colours begin at").fill("5")
     first.view.get_by_label("Colours end at").fill("60")
@@ -157,7 +158,7 @@ def test_axe_finds_nothing_wrong_where_a_surface_is_chosen(
 ) -> None:
     shelf.description("terrain")
     tab = tabs(shelf.server, color_scheme=scheme, size=size)
-    tab.page.get_by_role("link", name="terrain").wait_for()
+    tab.page.get_by_role("link", name="terrain", exact=True).wait_for()
     choose(tab, f"{scheme}-{size[0]}")
     tab.page.locator("tbody").get_by_role("button", name="More").first.wait_for()
     assert violations(tab) == []
@@ -210,13 +211,13 @@ def test_axe_finds_nothing_wrong_with_the_list(
     heard.allow(r"status of 4\d\d")
     shelf.description("terrain")
     tab = tabs(shelf.server, color_scheme=scheme)
-    tab.page.get_by_role("link", name="terrain").wait_for()
+    tab.page.get_by_role("link", name="terrain", exact=True).wait_for()
     tab.page.get_by_label("Files to upload").set_input_files(
         {"name": "letter.txt", "mimeType": "text/plain", "buffer": b"Dear reader, this is no surface, either."}
     )
     tab.page.locator(".uploads .reason").wait_for()
     assert violations(tab) == []
-    tab.page.get_by_role("button", name="Delete terrain").click()
+    tab.page.get_by_role("button", name="Delete terrain", exact=True).click()
     tab.page.get_by_role("dialog").wait_for()
     assert violations(tab) == []
     asked = tabs(closed[0], color_scheme=scheme)

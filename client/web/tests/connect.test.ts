@@ -49,7 +49,7 @@ beforeAll(async () => {
   ]);
   served = started;
   whole = await decode(await loadKernels(), served.data);
-}, 120_000);
+});
 
 afterAll(async () => {
   await Promise.all(workers.map((worker) => worker.terminate()));

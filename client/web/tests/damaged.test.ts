@@ -31,7 +31,7 @@ beforeAll(async () => {
 });
 
 describe("damaged containers", () => {
-  it("have Python's errors at Python's offsets, and the layers before them", { timeout: 600_000 }, async () => {
+  it("have Python's errors at Python's offsets, and the layers before them", async () => {
     const lines = run("tests.web.damaged", SEED, MUTANTS).trim().split("\n");
     const cases = lines.map((line) => JSON.parse(line) as Case);
     expect(cases.filter((one) => one.error).length).toBeGreaterThan(cases.length / 2);

@@ -250,7 +250,7 @@ describe.each(KINDS)("%s", (kind) => {
         examples: [[{ first: FAR }, undefined, 900, [[0, undefined]], [], false, fc.stream(zeros())]],
       },
     );
-  }, 180_000);
+  });
 
   it.each(TARGETS)("for %j answers cut anywhere end where the plan does", (options) => {
     fc.assert(
@@ -324,7 +324,7 @@ describe.each(KINDS)("%s", (kind) => {
       ),
       { numRuns: Number(process.env.RUNS ?? 40) },
     );
-  }, 180_000);
+  });
 });
 
 /** The first of what is possible, always. */

@@ -64,7 +64,7 @@ beforeAll(async () => {
   kernels = await loadKernels();
   const lines = run("tests.web.kernels", SEED, COUNT).trim().split("\n");
   cases = lines.map((line) => JSON.parse(line) as Case);
-}, 600_000);
+});
 
 function bytes(text: string): Uint8Array {
   return new Uint8Array(Buffer.from(text, "base64"));

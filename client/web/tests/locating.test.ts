@@ -187,11 +187,12 @@ describe("a name on a server", () => {
 
   it("that is stopped while it is asked for ends at once", async () => {
     const fetch = (_: unknown, options?: RequestInit): Promise<Response> =>
-      new Promise((_resolve, reject) => options?.signal?.addEventListener("abort", () => reject(new Error("aborted"))));
+      new Promise((_resolve, reject) => {
+        options?.signal?.addEventListener("abort", () => reject(new Error("aborted")));
+        setTimeout(() => void stream.stop());
+      });
     const options = { worker: false, WebSocket: WebSocket as unknown as SocketClass, fetch };
     const stream = connect(`${url}/maps/v1/names/dem`, {}, options);
-    const next = stream.next();
-    setTimeout(() => void stream.stop(), 20);
-    expect((await next).done).toBe(true);
+    expect((await stream.next()).done).toBe(true);
   });
 });

@@ -15,7 +15,7 @@ const EXAMPLES = [...SECTION.matchAll(/```js\n(.*?)```/gs)].map((found) => found
 let served: Served;
 beforeAll(async () => {
   served = await serve();
-}, 60_000);
+});
 afterAll(() => served?.stop());
 
 it.each(EXAMPLES)("%s", async (example) => {

@@ -45,8 +45,8 @@ export interface Fault {
   readonly cutDown?: number;
   /** It does not break: nothing more comes, and nobody is told. */
   readonly vanish?: boolean;
-  /** Seconds that each byte takes, either way. */
-  readonly delay?: number;
+  /** What answers more than so many messages, each sent after the answer to the one before, does not come. */
+  readonly roundTrips?: number;
 }
 
 /** A proxy in front of one server, with a fault for each connection in turn. */
@@ -97,19 +97,23 @@ export class Faulty {
         if (!(fault.vanish && left <= 0)) for (const each of [near, far]) each.destroy();
       });
     }
-    const later = (work: () => void) => (fault.delay ? setTimeout(work, 1000 * fault.delay) : work());
-    near.on("data", (data) => later(() => far.write(data)));
-    far.on("data", (data) =>
-      later(() => {
-        if (left <= 0) return;
-        const slice = data.subarray(0, left);
-        left -= slice.length;
-        this.down += slice.length;
-        near.write(slice, () => {
-          if (left <= 0 && !fault.vanish) near.destroy();
-        });
-        if (left <= 0) far.destroy();
-      }),
-    );
+    let trips = 0;
+    let answered = true;
+    near.on("data", (data) => {
+      trips += Number(answered);
+      answered = false;
+      if (trips <= (fault.roundTrips ?? Number.POSITIVE_INFINITY)) far.write(data);
+    });
+    far.on("data", (data) => {
+      answered = true;
+      if (left <= 0) return;
+      const slice = data.subarray(0, left);
+      left -= slice.length;
+      this.down += slice.length;
+      near.write(slice, () => {
+        if (left <= 0 && !fault.vanish) near.destroy();
+      });
+      if (left <= 0) far.destroy();
+    });
   }
 }

@@ -28,7 +28,7 @@ let whole: Surface;
 beforeAll(async () => {
   served = await serve();
   whole = await decode(await loadKernels(), served.data);
-}, 60_000);
+});
 afterAll(() => served?.stop());
 
 const HASTY = { first: 0.002, longest: 0.05 };
@@ -237,11 +237,20 @@ describe("a stop", () => {
   });
 
   it("of a slow answer ends the request", async () => {
-    const stream = streamOf(served.static, {}, { limitRate: 5000 });
-    const began = performance.now();
-    for await (const view of stream) if (view.number === 1) void stream.stop();
+    const signals: AbortSignal[] = [];
+    const watched: typeof fetch = (input, init) => {
+      signals.push(init!.signal!);
+      return fetch(input, init);
+    };
+    const stream = streamOf(served.static, {}, { limitRate: 5000, fetch: watched });
+    for await (const view of stream) {
+      if (view.number !== 1) continue;
+      expect(signals.at(-1)!.aborted).toBe(false);
+      void stream.stop();
+    }
     expect(stream.ended).toBe("stopped");
-    expect(performance.now() - began).toBeLessThan(2000);
+    expect(signals.at(-1)!.aborted).toBe(true);
+    expect(stream.reception.dataBytes).toBeLessThan(served.data.length);
   });
 
   it("before it begins asks nobody", async () => {
@@ -253,11 +262,15 @@ describe("a stop", () => {
 
   it("comes by itself after so many seconds", async () => {
     for (const source of [served.surface, served.static]) {
-      const stream = streamOf(source, { seconds: 0.4 }, { limitRate: 8000 });
+      const stream = streamOf(source, {}, { limitRate: 4000 });
+      expect((await stream.next()).done).toBe(false);
+      stream.aim({ seconds: 0.4 });
       const views = await all(stream);
       expect(stream.ended).toBe("seconds");
-      expect(views.length).toBeGreaterThan(0);
-      expect(views.at(-1)!.complete).toBe(false);
+      for (const view of views) expect(view.complete).toBe(false);
+      const another = streamOf(source, { seconds: 0.4 }, { limitRate: 4000 });
+      await all(another);
+      expect(another.ended).toBe("seconds");
     }
   });
 });
@@ -316,17 +329,19 @@ describe("a link that breaks", () => {
   });
 
   it("and falls silent is replaced", async () => {
-    for (const transport of ["ws", "http"] as const) {
-      await faulty(
-        served.surface,
-        (number) => (number === 0 ? { cutDown: 6000, vanish: true } : {}),
-        async (link) => {
-          const stream = streamOf(link.url, {}, { transport, silence: 0.4, closeTimeout: 0.1, window: 2000 });
-          expectWhole((await all(stream)).at(-1)!);
-          expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
-        },
-      );
-    }
+    await Promise.all(
+      (["ws", "http"] as const).map((transport) =>
+        faulty(
+          served.surface,
+          (number) => (number === 0 ? { cutDown: 6000, vanish: true } : {}),
+          async (link) => {
+            const stream = streamOf(link.url, {}, { transport, silence: 3, closeTimeout: 0.1, window: 2000 });
+            expectWhole((await all(stream)).at(-1)!);
+            expect(stream.reception.dataBytes).toBe(stream.reception.cached.total);
+          },
+        ),
+      ),
+    );
   });
 
   it("for good is told after the deadline, and what has come stays", async () => {
@@ -382,11 +397,14 @@ describe("a server that is not one", () => {
     await expect(all(streamOf(`${served.static}x`))).rejects.toThrow(NotFoundError);
   });
 
-  it("is not there", async () => {
-    const began = performance.now();
-    await expect(all(streamOf("http://127.0.0.1:9/v1/surfaces/0"))).rejects.toThrow(UnreachableError);
-    await expect(all(streamOf("http://127.0.0.1:9/a.lode"))).rejects.toThrow(UnreachableError);
-    expect(performance.now() - began).toBeLessThan(5000);
+  it.each(["v1/surfaces/0", "a.lode"])("is not there, and is asked a few times only: %s", async (path) => {
+    const states: StreamState[] = [];
+    const onState = (state: StreamState) => void states.push(state);
+    const stream = streamOf(`http://127.0.0.1:9/${path}`, {}, { onState, deadline: 1e6 });
+    await expect(all(stream)).rejects.toThrow(UnreachableError);
+    // Three attempts by each transport, of which the last one is the end.
+    expect(states.filter(({ problem }) => problem !== undefined).length).toBeLessThan(6);
+    expect(states.map(({ phase }) => phase)).not.toContain("reconnecting");
   });
 
   it("says nothing", async () => {
@@ -439,17 +457,14 @@ describe("a file", () => {
 
 describe("a link that is far away", () => {
   it.each(["ws", "http"] as const)("shows the first view after two round trips: %s", async (transport) => {
-    const roundTrip = 1.2;
     const source = transport === "ws" ? served.surface : served.static;
     await faulty(
       source,
-      () => ({ delay: roundTrip / 2 }),
+      // The proxy takes connections at once, where a far server takes a round trip.
+      () => ({ roundTrips: 1 }),
       async (link) => {
         const stream = streamOf(link.url, {}, transport === "ws" ? { transport } : {});
-        const began = performance.now();
-        await stream.next();
-        // The proxy takes connections at once, where a far server takes a round trip.
-        expect((performance.now() - began) / 1000).toBeLessThan(2 * roundTrip);
+        expect((await stream.next()).done).toBe(false);
         await stream.close();
       },
     );
@@ -471,8 +486,12 @@ describe("a limited rate", () => {
       progress.map((now) => now.wireBytes).toSorted((a, b) => a - b),
     );
     const later = streamOf(served.surface, {}, { transport: "ws", limitRate: 500 });
-    for await (const view of later) if (view.number === 0) later.throttle(undefined);
-    expect(later.progress.seconds).toBeLessThan(5);
+    for await (const view of later) {
+      if (view.number !== 0) continue;
+      later.throttle(1); // with which it takes a day
+      setTimeout(() => later.throttle(undefined), 50);
+    }
+    expect(later.ended).toBe("complete");
   });
 
   it("views that nobody waits for are not kept where only the latest are wanted", async () => {
@@ -480,11 +499,10 @@ describe("a limited rate", () => {
     const seen: View[] = [];
     for await (const view of stream) {
       seen.push(view);
-      await new Promise((resolve) => setTimeout(resolve, 60));
+      await expect.poll(() => stream.ended).toBe("complete");
     }
     expectWhole(seen.at(-1)!);
-    expect(seen.length).toBeLessThan(10);
-    expect(stream.ended).toBe("complete");
+    expect(seen.length).toBeLessThanOrEqual(2);
   });
 });
 

@@ -17,7 +17,7 @@ interface Told {
 const bytes = (text: string) => new Uint8Array(Buffer.from(text, "base64"));
 const reading = (data: Uint8Array) => async (offset: number, length: number) => data.subarray(offset, offset + length);
 
-it("bounds of errors of windows are those of the Python library", { timeout: 300_000 }, async () => {
+it("bounds of errors of windows are those of the Python library", async () => {
   for (const line of run("tests.web.window_errors").trim().split("\n")) {
     const { container, mask, cases } = JSON.parse(line) as Told;
     const data = bytes(container);

@@ -38,7 +38,7 @@ beforeAll(async () => {
     },
   });
   worker = new Worker(join(folder, "worker.mjs"));
-}, 120_000);
+});
 
 afterAll(async () => {
   await worker.terminate();

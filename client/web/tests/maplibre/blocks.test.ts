@@ -101,10 +101,11 @@ describe("blocks", () => {
 
   it("are not received for those who have left, and what is under way stops when all have", async () => {
     let stopped = 0;
+    let come = (): void => {};
     const { asked, read } = reader(
       (signal) =>
         new Promise((resolve, reject) => {
-          setTimeout(resolve, 100);
+          come = resolve;
           signal.addEventListener("abort", () => {
             stopped += 1;
             reject(signal.reason);
@@ -119,20 +120,24 @@ describe("blocks", () => {
       blocks.get(0, rectangle([2], [2]), aborts[2]!.signal),
     ];
     const told = Promise.allSettled([one, other, waits]);
-    await new Promise((resolve) => setTimeout(resolve, 20));
+    await expect.poll(() => asked.length).toBe(1);
     aborts[0]!.abort();
     aborts[2]!.abort();
     expect(stopped).toBe(0);
+    come();
     await expect(other).resolves.toHaveLength(1);
     expect((await told).map(({ status }) => status)).toEqual(["rejected", "fulfilled", "rejected"]);
     expect(asked.length).toBe(1);
     const last = new AbortController();
     const left = blocks.get(1, rectangle([3], [3]), last.signal);
-    await new Promise((resolve) => setTimeout(resolve, 20));
+    await expect.poll(() => asked.length).toBe(2);
     last.abort();
     await expect(left).rejects.toThrow(/abort/i);
     expect(stopped).toBe(1);
-    await expect(blocks.get(1, rectangle([3], [3]), NEVER)).resolves.toHaveLength(1); // from the beginning
+    const again = blocks.get(1, rectangle([3], [3]), NEVER); // from the beginning
+    await expect.poll(() => asked.length).toBe(3);
+    come();
+    await expect(again).resolves.toHaveLength(1);
   });
 
   it("that fail are told to all who wait, and asked for again later", async () => {

@@ -147,7 +147,7 @@ describe("requests", () => {
     };
     const abort = new AbortController();
     const left = tile(address(z, x, y), abort);
-    await vi.waitFor(() => expect(signal).toBeDefined());
+    await expect.poll(() => signal).toBeDefined();
     abort.abort();
     await expect(left).rejects.toMatchObject({ name: "AbortError" });
     expect(signal!.aborted).toBe(true);
@@ -269,10 +269,11 @@ describe("a worker", () => {
 
   it("that fails is told of", async () => {
     const made = worker();
-    made.postMessage = () => {};
+    const posted: unknown[] = [];
+    made.postMessage = (message) => void posted.push(message);
     const { tile } = asking({ worker: () => made, fetch: undefined });
     const asked = tile(`lode://${host.url("rough.lode")}/0/0/0`);
-    await new Promise((resolve) => setTimeout(resolve, 1));
+    await expect.poll(() => posted).toHaveLength(2); // it begins, and is asked
     made.onerror?.({ message: "no room" } as ErrorEvent);
     await expect(asked).rejects.toThrow(/the worker failed: no room/);
     await expect(asked).rejects.toBeInstanceOf(UnavailableError);

@@ -7,9 +7,7 @@ import { localErrors } from "../../src/view/local-errors";
 import type { Price } from "../../src/view/source";
 import { run } from "../python";
 
-it("errors around a node hold there, and are smaller than those of the whole somewhere", {
-  timeout: 300_000,
-}, async () => {
+it("errors around a node hold there, and are smaller than those of the whole somewhere", async () => {
   const [first] = run("tests.web.window_errors").trim().split("\n");
   const data = new Uint8Array(Buffer.from((JSON.parse(first!) as { container: string }).container, "base64"));
   const read = async (offset: number, length: number) => data.subarray(offset, offset + length);

@@ -57,7 +57,7 @@ describe("the change of a picture", () => {
     expect(shareAbove(pictureChange(pixels([1, 1, 1, 0]), pixels([2, 2, 2, 0])), 5)).toBe(0);
   });
 
-  it("and the estimate are those of the Python library", { timeout: 300_000 }, () => {
+  it("and the estimate are those of the Python library", () => {
     const lines = run("tests.web.changes").trim().split("\n");
     expect(lines.length).toBe(6);
     for (const line of lines) {
