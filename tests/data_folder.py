@@ -20,6 +20,7 @@ from typing import Any
 __all__ = [
     "PLACES",
     "age",
+    "below",
     "built",
     "bytes_of_surfaces",
     "container",
@@ -91,6 +92,12 @@ def _read(small: Path) -> dict[str, Any]:
     return found
 
 
+def below(folder: Path) -> Iterator[Path]:
+    """Everything below a folder; what vanishes meanwhile is passed over, where `Path.rglob` of Python 3.11 raises."""
+    for above, folders, files in os.walk(folder):
+        yield from (Path(above, name) for name in (*folders, *files))
+
+
 def bytes_of_surfaces(data: Path) -> Counter[str]:
     """The hashes of all files of uploads and containers, and how many files have each."""
     return contents(data / "uploads") + contents(data / "containers")
@@ -98,7 +105,7 @@ def bytes_of_surfaces(data: Path) -> Counter[str]:
 
 def contents(folder: Path) -> Counter[str]:
     """The hashes of all files beneath a folder, and how many files have each."""
-    return Counter(hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file())
+    return Counter(hashlib.sha256(path.read_bytes()).hexdigest() for path in below(folder) if path.is_file())
 
 
 def leave_unfinished(data: Path, surface: str) -> None:
@@ -128,7 +135,7 @@ def strays(data: Path) -> list[str]:
 def age(data: Path, seconds: float) -> None:
     """Let everything that is there be older."""
     then = time.time() - seconds
-    for path in data.rglob("*"):
+    for path in below(data):
         os.utime(path, (then, then))
 
 

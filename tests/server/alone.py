@@ -25,7 +25,8 @@ _PATIENCE = 3600.0
 def _within() -> dict[str, Any]:
     gc.collect()
     tasks, sockets, files = 0, 0, []
-    for loop in [item for item in gc.get_objects() if isinstance(item, asyncio.AbstractEventLoop)]:
+    # Not by `isinstance`, which asks weak proxies.
+    for loop in [item for item in gc.get_objects() if issubclass(type(item), asyncio.AbstractEventLoop)]:
         if loop.is_running():
             tasks += len(asyncio.all_tasks(loop))
     for link in Path("/proc/self/fd").iterdir():

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +16,7 @@ import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 
 from lodestream.protocol.messages import MAX_MESSAGE, SUBPROTOCOL, Bye, End, Event, Segments
@@ -67,8 +68,10 @@ def settled(http: httpx.Client, location: str) -> dict[str, Any]:
 
 
 def kept(data: Path, folder: str) -> list[str]:
-    """The names in a folder of the data folder, which is not there before the first of them."""
-    return sorted(path.name for path in (data / folder).iterdir()) if (data / folder).is_dir() else []
+    """The names in a folder of the data folder, which may not be there before the first of them or after the last."""
+    with suppress(FileNotFoundError):
+        return sorted(os.listdir(data / folder))
+    return []
 
 
 def upload_of(data: Path, surface: dict[str, Any]) -> Path:
@@ -113,10 +116,25 @@ def data_of(events: list[Event]) -> int:
 
 @contextmanager
 def raw_stream(url: str, query: str = "", **options: Any) -> Iterator[Raw]:
-    """A socket to the stream of the surface at a URL."""
-    options = {"subprotocols": [SUBPROTOCOL], "max_size": MAX_MESSAGE, "compression": None, "proxy": None, **options}
+    """A socket to the stream of the surface at a URL; it never gives up because a busy server is late."""
+    usual = {"subprotocols": [SUBPROTOCOL], "max_size": MAX_MESSAGE, "compression": None, "proxy": None}
+    options = {**usual, "open_timeout": PATIENCE, "ping_interval": None, **options}
     with connect(url.replace("http", "ws", 1) + "/stream" + query, **options) as socket:
         yield Raw(socket)
+
+
+def in_time(url: str, look: Callable[[Raw], T], **options: Any) -> T:
+    """What `look` gives of a stream to a server that waits for a head only shortly.
+
+    On a busy machine the handshake itself may come too late, which says nothing of the stream: then comes another one.
+    """
+
+    def tried() -> T | None:
+        with suppress(InvalidHandshake, EOFError, ConnectionError), raw_stream(url, **options) as stream:
+            return look(stream)
+        return None
+
+    return eventually(tried, "a handshake that comes in time")
 
 
 def closed(stream: Raw, code: int) -> str:

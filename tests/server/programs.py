@@ -146,10 +146,12 @@ def resident(process: int) -> int:
 def descendants(process: int) -> list[int]:
     """The processes that a process has started, and those that they have."""
     found: list[int] = []
-    for task in Path(f"/proc/{process}/task").glob("*/children"):
-        with contextlib.suppress(OSError):
-            for child in map(int, task.read_text().split()):
-                found += [child, *descendants(child)]
+    folder = Path(f"/proc/{process}/task")
+    with contextlib.suppress(OSError):  # it may end meanwhile
+        for task in os.listdir(folder):
+            with contextlib.suppress(OSError):
+                for child in map(int, (folder / task / "children").read_text().split()):
+                    found += [child, *descendants(child)]
     return found
 
 
