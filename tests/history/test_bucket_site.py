@@ -27,9 +27,13 @@ class Said(BucketSite):
 
 
 @pytest.fixture
-def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[BucketSite, History]]:
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For what never settles."""
     monkeypatch.setattr(bucket_site, "_SETTLED", 0.2)
 
+
+@pytest.fixture
+def said(tmp_path: Path) -> Callable[..., tuple[BucketSite, History]]:
     def make(first: list[str | None], other: list[str | None], lease: float = 0.1) -> tuple[BucketSite, History]:
         history = History()
         return Said(history, tmp_path, {FIRST: first, OTHER: other}, lease), history
@@ -59,6 +63,7 @@ def test_one_that_writes_after_the_other_is_none_of_two(said: Make) -> None:
     assert not history.findings
 
 
+@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("roles", [("waiting", "waiting"), ("writer", None)])
 def test_what_never_settles_is_found_soon(said: Make, roles: tuple[str | None, str | None]) -> None:
     site, history = said([roles[0]], [roles[1]])
@@ -67,6 +72,7 @@ def test_what_never_settles_is_found_soon(said: Make, roles: tuple[str | None, s
     assert [finding.rule for finding in history.findings] == ["unsettled"]
 
 
+@pytest.mark.usefixtures("impatient")
 def test_an_answer_that_never_comes_is_found_soon(said: Make) -> None:
     site, history = said(["writer"], ["waiting"])
     site._left.append("first (1, 0)")
