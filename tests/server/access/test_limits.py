@@ -25,6 +25,7 @@ from lodestream_server.access.tokens import TokenFile
 from lodestream_server.operation import least_rate
 from lodestream_server.problems import BusyError, FullError, SlowUploadError, TooManyError
 from lodestream_server.store import durable
+from tests.data_folder import below
 from tests.server.helpers import PATIENCE, Raw, eventually, hills, kept, npy, push, raw_stream
 from tests.server.store.disks import FullDisk
 
@@ -321,6 +322,7 @@ def small(folder: Path) -> Iterator[tuple[str, str, dict[str, str]]]:
     """A server with little room: its address, a surface, and tokens."""
     file = TokenFile(folder / "tokens.json")
     tokens = {name: file.create(name, ("write",))[0] for name in ("one", "two", "three", "four")}
+    tokens["operator"] = file.create("operator", ("admin",))[0]
     with running_server(folder, workers=1, max_streams=4, max_surfaces=4, max_uploads=1, upload_bytes=1 << 20) as url:
         with client(url, tokens["one"]) as http:
             made = push(http, npy(hills(30, 20)))
@@ -343,8 +345,15 @@ def code_of(stream: Raw) -> tuple[str, int]:
     return said.code, over.value.rcvd.code
 
 
+def await_no_streams(small: tuple[str, str, dict[str, str]]) -> None:
+    """Wait until the streams of tests before have ended at the server too."""
+    with client(small[0], small[2]["operator"]) as http:
+        eventually(lambda: "lodestream_streams_open 0.0" in http.get("/metrics").text, "the streams of before to end")
+
+
 def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str, str]]) -> None:
     _, surface, tokens = small
+    await_no_streams(small)
 
     def opened(held: ExitStack, name: str) -> Raw:
         headers = {"Authorization": f"Bearer {tokens[name]}"}
@@ -372,6 +381,7 @@ def test_a_stream_too_many_is_told_to_come_back(small: tuple[str, str, dict[str,
 
 def test_who_shows_no_token_takes_no_stream_from_those_who_have_one(small: tuple[str, str, dict[str, str]]) -> None:
     _, surface, tokens = small
+    await_no_streams(small)
     with ExitStack() as held:
         silent = [held.enter_context(raw_stream(surface)) for _ in range(2)]
         assert code_of(held.enter_context(raw_stream(surface))) == ("too-many", 4429)
@@ -397,7 +407,8 @@ def test_streams_count_by_the_token_in_open(small: tuple[str, str, dict[str, str
         with ExitStack() as held:
             return isinstance(opened(held, "one").receive(), Opened)
 
-    eventually(free, "room after the streams of before")
+    eventually(free, "room after those who have shown no token")
+    await_no_streams(small)
     with ExitStack() as held:
         for name in ("two", "two", "three"):
             assert isinstance(opened(held, name).receive(), Opened)
@@ -422,7 +433,10 @@ def refused_at_once(url: str, token: str, length: int) -> bytes:
 def test_uploads_too_many_are_told_to_come_back(folder: Path, small: tuple[str, str, dict[str, str]]) -> None:
     url, _, tokens = small
     address = urlsplit(url)
-    with client(url, tokens["one"]) as http, socket.create_connection((address.hostname, address.port)) as slow:
+    with (
+        client(url, tokens["one"]) as http,
+        socket.create_connection((address.hostname, address.port), timeout=PATIENCE) as slow,
+    ):
         slow.sendall(
             f"POST /v1/surfaces HTTP/1.1\r\nHost: {address.netloc}\r\nAuthorization: Bearer {tokens['two']}\r\n"
             "Content-Length: 100000\r\n\r\nxxx".encode()
@@ -483,7 +497,7 @@ def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: py
     ):
         made = push(http, npy(hills()))
         eventually(lambda: not kept(tmp_path, "scratch/work"), "the build's folder to be removed")
-        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+        before = {path: path.stat().st_mtime_ns for path in below(tmp_path) if path.is_file()}
         monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(1 << 40, 1 << 40, 0))
         monkeypatch.setattr(durable, "disk", FullDisk(0, lasting=True))
         again = http.post("/v1/surfaces", content=npy(hills()))
@@ -492,7 +506,7 @@ def test_a_server_without_room_knows_what_it_has(tmp_path: Path, monkeypatch: py
         for other in (npy(hills(seed=2)), npy(hills(9, 9))):
             answer = http.post("/v1/surfaces", content=other)
             assert (answer.status_code, answer.json()["code"]) == (507, "full")
-        assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+        assert before == {path: path.stat().st_mtime_ns for path in below(tmp_path) if path.is_file()}
 
 
 def test_levels_are_asked_for_by_so_many_at_a_time(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_each_name_and_each_owner_has_a_surface_and_the_bytes_are_there_once(off
         assert {anna.get(where).json()["owner"] for where in mine} == {"anna"}
         assert len(kept(office.data, "uploads")) == 1
         # Whoever has no token is not told the names of those who do.
-        assert "owner" not in httpx.get(f"{office.url}{mine[0]}", trust_env=False).json()
+        assert "owner" not in httpx.get(f"{office.url}{mine[0]}", trust_env=False, timeout=PATIENCE).json()
         assert push(anna, name="hills") == mine[1]
         # The same bytes under the same name are one container.
         assert anna.get(mine[1]).json()["container_sha256"] == bert.get(theirs[1]).json()["container_sha256"]
@@ -205,7 +205,7 @@ def test_what_a_delete_could_not_remove_is_a_stray(tmp_path: Path, monkeypatch: 
     monkeypatch.undo()
     (left,) = kept(data, "containers")
     with running_server(data, workers=1) as url:
-        assert httpx.get(f"{url}{where}", trust_env=False).status_code == 404
+        assert httpx.get(f"{url}{where}", trust_env=False, timeout=PATIENCE).status_code == 404
         assert kept(data, "containers") == [left], "a start removes nothing"
     folder = Data(data)
     try:
