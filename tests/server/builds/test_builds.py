@@ -87,7 +87,7 @@ def test_deleting_stops_the_build_and_frees_its_process(tmp_path: Path, monkeypa
         assert push(http, npy(hills(seed=2)))["state"] == "ready"
         assert len(kept(data, "uploads")) == 1
         # A surface is ready a moment before the folder of its build is gone.
-        eventually(lambda: not list((data / "scratch" / "work").iterdir()) or None, "the work folder empty")
+        eventually(lambda: not kept(data, "scratch/work"), "the work folder empty")
 
 
 def test_a_process_that_dies_takes_only_its_build_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

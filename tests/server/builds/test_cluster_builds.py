@@ -35,7 +35,7 @@ from tests.clusters import local_cluster
 from tests.core.surfaces import terrain
 from tests.patience import PATIENCE
 from tests.server.builds import slow
-from tests.server.helpers import eventually, npy, push
+from tests.server.helpers import eventually, kept, npy, push
 from tests.server.programs import Server, alive, server
 
 pytest.importorskip("distributed")
@@ -316,7 +316,7 @@ def test_a_server_starts_where_no_scheduler_is_and_says_so_of_what_it_cannot_bui
         assert surface["reason"].startswith(
             "LODESTREAM_DASK: expected the address of a Dask scheduler, got 'tcp://127.0.0.1:1': "
         )
-        assert not any((tmp_path / "scratch" / "work").iterdir())
+        eventually(lambda: not kept(tmp_path, "scratch/work"), "the build's folder to be removed")
 
 
 # What is cut.
@@ -343,9 +343,9 @@ def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_
             eventually(handing_out, "a build at the cluster")
             assert http.get(deleted).json()["state"] == "building"
             http.delete(deleted).raise_for_status()
-            assert not any((tmp_path / "data" / "scratch" / "work").iterdir())
+            assert kept(tmp_path / "data", "scratch/work") == []
             eventually(lambda: not handing_out(), "the scheduler to drop its tasks")
-            kept = http.post("/v1/surfaces?filename=b.npy", content=data).headers["location"]
+            again = http.post("/v1/surfaces?filename=b.npy", content=data).headers["location"]
             eventually(handing_out, "another build at the cluster")
         eventually(lambda: not handing_out(), "the process that hands out tasks to end with its server")
         assert any((tmp_path / "data" / "uploads").iterdir())
@@ -354,9 +354,9 @@ def test_a_build_that_is_deleted_or_killed_leaves_nothing_and_a_server_that_was_
             server(tmp_path / "data", **settings) as second,
             httpx.Client(base_url=second.url, trust_env=False, timeout=PATIENCE) as http,
         ):
-            eventually(lambda: http.get(kept).json()["state"] == "ready", "the build to be done again")
-            container = http.get(f"{kept}/container", follow_redirects=True).content
-            assert not any((tmp_path / "data" / "scratch" / "work").iterdir())
+            eventually(lambda: http.get(again).json()["state"] == "ready", "the build to be done again")
+            container = http.get(f"{again}/container", follow_redirects=True).content
+            eventually(lambda: not kept(tmp_path / "data", "scratch/work"), "the build's folder to be removed")
     assert np.array_equal(ls.decode(container).points, np.load(io.BytesIO(data)), equal_nan=True)
 
 

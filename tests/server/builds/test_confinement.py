@@ -188,7 +188,9 @@ def test_a_traceback_cannot_be_taken_for_lines_of_the_log(
 def test_a_build_that_only_computes_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with running(tmp_path / "data", build_seconds=0.5) as http:
         made = build_by(http, monkeypatch, hostile.burn)
-        assert (made["state"], made["reason"]) == ("waiting", "the build took longer than 0.5 s")
+        assert made["state"] == "waiting"
+        # On a busy machine either limit may be the first to be noticed.
+        assert re.fullmatch(r"the build took (longer|more processor time) than 0\.5 s", made["reason"])
 
 
 def test_processor_time_is_limited_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,7 +209,7 @@ def test_no_file_is_larger_than_a_container_may_be(http: httpx.Client, monkeypat
 def test_a_folder_that_is_too_deep_is_removed(http: httpx.Client, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = build_by(http, monkeypatch, hostile.dig)
     assert (made["state"], made["reason"]) == ("failed", "dug")
-    eventually(lambda: not list((data / "scratch" / "work").iterdir()) or None, "the work folder empty")
+    eventually(lambda: not kept(data, "scratch/work"), "the work folder empty")
     http.delete(made["url"])
 
 

@@ -47,6 +47,10 @@ class Asked:
     async def __call__(self, what: str) -> Any:
         return await self.keeper.run(Question(kept.answers, (what,), self._file))
 
+    async def begun(self, number: int) -> None:
+        """Wait until the process is asked its question of this number."""
+        await asyncio.to_thread(eventually, lambda: self.keeper._asked == number, "the question to be asked")
+
 
 def play(
     server: ForkServer,
@@ -153,7 +157,7 @@ def test_one_that_is_killed_before_it_reads_a_question_is_replaced(server: ForkS
         process, _ = await ask("count")
         os.kill(process, signal.SIGSTOP)
         asked = asyncio.create_task(ask("count"))
-        await asyncio.sleep(0.1)
+        await ask.begun(2)
         os.kill(process, signal.SIGKILL)
         assert (await asked)[1] == 1
 
@@ -172,12 +176,14 @@ def test_whoever_leaves_costs_nobody_the_process(server: ForkServer, file: Path)
     async def scene(ask: Asked) -> None:
         process, _ = await ask("count")
         leaves = asyncio.create_task(ask("wait"))
-        await asyncio.sleep(0.1)
+        await ask.begun(2)
         never = asyncio.create_task(ask("count"))
         await asyncio.sleep(0)
-        for task in (never, leaves):
-            task.cancel()
-        await asyncio.gather(leaves, never, return_exceptions=True)
+        never.cancel()
+        await asyncio.gather(never, return_exceptions=True)
+        leaves.cancel()
+        file.write_bytes(b"go")
+        await asyncio.gather(leaves, return_exceptions=True)
         assert await ask("count") == [process, 3]
 
     play(server, file, scene)
@@ -197,7 +203,7 @@ def test_what_ends_ends_the_process(server: ForkServer, file: Path) -> None:
     async def scene(ask: Asked) -> None:
         await ask("count")
         waiting = asyncio.create_task(ask("sleep"))
-        await asyncio.sleep(0.1)
+        await ask.begun(2)
         await asyncio.to_thread(ask.keeper.close)
         with pytest.raises((ProcessDiedError, TimeoutError)):
             await waiting

@@ -33,11 +33,12 @@ from lodestream_server.builds.levels import LevelJob, MadeLevel, make_level
 from lodestream_server.builds.processes import Call, ForkServer
 from lodestream_server.builds.runner import Runner
 from lodestream_server.routes.sending import while_there
+from tests.data_folder import below, remove_scratch
 from tests.server.access.test_limits import ANNA, limits
 from tests.server.builds import slow
 from tests.server.builds.test_confinement import needs_landlock
 from tests.server.connections import hostile
-from tests.server.helpers import PATIENCE, eventually, hills, npy, problem, push
+from tests.server.helpers import PATIENCE, eventually, hills, kept, npy, problem, push
 from tests.server.programs import alive, server
 
 
@@ -85,7 +86,7 @@ def begun(data: Path) -> list[tuple[int, int]]:
 def on_disk(data: Path) -> int:
     """Bytes of the levels on the disk."""
     total = 0
-    for path in (data / "scratch" / "levels").rglob("*"):
+    for path in below(data / "scratch" / "levels"):
         try:
             total += path.stat().st_size if path.is_file() else 0
         except FileNotFoundError:
@@ -194,18 +195,19 @@ def test_nothing_is_left_of_levels(tmp_path: Path) -> None:
 # The queue.
 
 
-def test_whoever_goes_leaves_the_queue_and_the_process(tmp_path: Path, slowly: None) -> None:
+def test_whoever_goes_leaves_the_queue_and_the_process(tmp_path: Path, slowly: None, line: list[int]) -> None:
     with running_server(tmp_path, workers=1) as url, client(url) as http:
         surface, other = push(http, npy(hills())), push(http, npy(hills(seed=2)))
         with ExitStack() as held:
-            for name in ("npy", "ply", "obj"):
+            for count, name in enumerate(("npy", "ply", "obj"), 1):  # which go the other way round
                 held.enter_context(asking(url, f"{finest(surface)}?format={name}"))
+                eventually(lambda count=count: len(line) == count, "it to wait for a level")  # type: ignore[misc]
             ((process, _),) = eventually(lambda: begun(tmp_path), "a level to begin")
             assert alive(process)
         assert http.get(f"{other['url']}/levels/0").status_code == 200
         assert [level for _, level in begun(tmp_path)][1:] == [0]  # the other two were never begun
         assert not alive(process)
-        assert len(list((tmp_path / "scratch" / "levels").iterdir())) == 1
+        eventually(lambda: len(kept(tmp_path, "scratch/levels")) == 1, "nothing to be left of the others")
 
 
 def test_whoever_waits_when_the_server_ends_is_told_to_ask_again(
@@ -252,9 +254,9 @@ def test_many_who_ask_for_the_same_share_one_decoding(tmp_path: Path, slowly: No
         assert len(begun(tmp_path)) == 1
 
 
-def test_one_client_waits_for_so_many_and_all_for_so_many(tmp_path: Path, slowly: None) -> None:
+def test_one_client_waits_for_so_many_and_all_for_so_many(tmp_path: Path, slowly: None, line: list[int]) -> None:
     file = TokenFile(tmp_path / "tokens.json")
-    one, two, three = (file.create(name, ("write",))[0] for name in ("one", "two", "three"))
+    one, two, three = (file.create(name, ("write",))[0] for name in ("anna", "bert", "carl"))
     with (
         running_server(tmp_path, workers=1, max_level_requests=3) as url,
         client(url, one) as http,
@@ -262,24 +264,18 @@ def test_one_client_waits_for_so_many_and_all_for_so_many(tmp_path: Path, slowly
     ):
         surface = push(http, npy(hills()))
         with ExitStack() as held:
-            for name in ("npy", "ply"):
+            for count, name in enumerate(("npy", "ply"), 1):
                 held.enter_context(asking(url, f"{finest(surface)}?format={name}", one))
+                eventually(lambda count=count: len(line) == count, "it to wait for a level")  # type: ignore[misc]
             eventually(lambda: begun(tmp_path), "a level to begin")
-            refused = eventually(lambda: _refused(http, finest(surface)), "one too many")
+            refused = http.get(finest(surface))
             assert problem(refused) == (429, "too-many")
             assert refused.headers["retry-after"].isdecimal()
             held.enter_context(asking(url, f"{surface['url']}/levels/0?format=obj", two))
 
-            def busy() -> httpx.Response | None:
-                with client(url, three) as third:
-                    third.timeout = httpx.Timeout(0.5)
-                    try:
-                        answer = third.get(f"{surface['url']}/levels/0")
-                    except httpx.TimeoutException:  # it was let in before the others
-                        return None
-                return answer if answer.status_code == 503 else None
-
-            assert problem(eventually(busy, "the queue to be full")) == (503, "busy")
+            eventually(lambda: len(line) == 3, "the queue to be full")
+            with client(url, three) as third:
+                assert problem(third.get(f"{surface['url']}/levels/0")) == (503, "busy")
         # All have gone: nothing counts any more.
         assert eventually(lambda: _taken(other, f"{surface['url']}/levels/0"), "a turn").status_code == 200
 
@@ -692,7 +688,7 @@ def test_a_level_larger_than_memory_is_made_by_bands_to_the_same_file(
             banded = http.get(str(httpx.URL(address).path), params={"format": format_name}).raise_for_status()
             assert banded.content == before.content
             assert banded.headers["ETag"] == before.headers["ETag"]
-        assert [path.name for path in (tmp_path / "scratch" / "levels").rglob("values")] == []
+        assert [path for path in below(tmp_path / "scratch" / "levels") if path.name == "values"] == []
 
 
 @pytest.mark.parametrize("format_name", ["plot3d", "vtm"])
@@ -737,7 +733,7 @@ def test_levels_of_a_scratch_folder_that_is_removed_are_made_again(tmp_path: Pat
         level = f"{surface['url']}/levels/1"
         made = http.get(level)
         assert made.status_code == 200
-        shutil.rmtree(data / "scratch")
+        remove_scratch(data)
 
         def again() -> bool:
             answer = http.get(level)
