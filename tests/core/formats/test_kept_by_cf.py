@@ -62,6 +62,17 @@ def test_the_fill_value_of_the_file_is_that_of_what_is_written(
         np.testing.assert_array_equal(np.load(tmp_path / "b.npy"), data.z.values)
 
 
+@every_opener
+def test_a_missing_value_of_another_type_is_meant_as_the_values_have_it(tmp_path: Path, opener: Opener) -> None:
+    """1e20 of double precision is no single-precision float."""
+    data = field("f4")
+    data.z.values[3, 4] = 1e20
+    data.z.attrs["missing_value"] = np.float64(1e20)
+    mask = opener(data, tmp_path).mask
+    assert mask is not None
+    assert np.argwhere(~mask).tolist() == [[3, 4]]
+
+
 @pytest.mark.parametrize("opener", [by_netcdf, by_zarr])
 @pytest.mark.parametrize("fill", [2**64 - 1, 2**63 + 1, 2**63])
 def test_a_large_fill_value_is_exact(tmp_path: Path, opener: Opener, fill: int) -> None:
