@@ -35,6 +35,7 @@ from .refusals import faults_of_parameters
 
 __all__ = [
     "MEDIA_TYPE",
+    "PASSING",
     "BadTokenError",
     "BuildFailedError",
     "BusyError",
@@ -68,6 +69,9 @@ __all__ = [
 _log = logging.getLogger(__name__)
 #: Of problem documents.
 MEDIA_TYPE = "application/problem+json"
+
+#: Errors of the system that lacks something of which there may be more in a moment, such as open files.
+PASSING = (errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 class NotReadyError(LodestreamError):
@@ -178,6 +182,10 @@ class BusyError(LodestreamError):
     headers: ClassVar = {"retry-after": "10"}
 
 
+class ShortageError(BusyError):
+    """The server's system lacks something now (`PASSING`)."""
+
+
 class RestartingError(LodestreamError):
     """The server is ending and will be back."""
 
@@ -225,6 +233,7 @@ _KINDS: Mapping[type[BaseException], _Kind] = {
     NoWebSocketError: _Kind("no-websocket"),
     TooManyError: _Kind("too-many"),
     BusyError: _Kind("busy"),
+    ShortageError: _Kind("busy", f"The server's system lacks something now, such as open files; {_SEE_LOG}"),
     RestartingError: _Kind("restarting"),
     FullError: _Kind("full"),
     NotReadyError: _Kind("not-ready"),
@@ -268,10 +277,17 @@ def problem(error: Exception) -> tuple[str, str]:
     """Return the code of an error, a key of `MEANINGS`, and its detail."""
     if isinstance(error, MessageError):
         return error.code, str(error)
-    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT)
-    kinds = (stores.FullError if full else type(error)).__mro__
-    code, detail = next(_KINDS[kind] for kind in kinds if kind in _KINDS)
+    code, detail = next(_KINDS[kind] for kind in _class(error).__mro__ if kind in _KINDS)
     return code, detail.format(error)
+
+
+def _class(error: Exception) -> type[Exception]:
+    """Return the class of an error; of one of the system, what it is here."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return stores.FullError
+    if isinstance(error, OSError) and error.errno in PASSING:
+        return ShortageError
+    return type(error)
 
 
 def responses(*statuses: int) -> dict[int | str, dict[str, Any]]:

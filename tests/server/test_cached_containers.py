@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from lodestream_server import running_server
 from lodestream_server.routes import files
 from tests.patience import PATIENCE
-from tests.server.helpers import eventually, hills, npy, push
+from tests.server.helpers import eventually, hills, npy, push, settled
 from tests.stores.memory import memory
 
 __all__ = ["memory"]
@@ -65,3 +66,23 @@ def test_what_is_read_twice_levels_too_comes_from_a_file_until_it_makes_room(
             eventually(lambda: http.get(place).content == first and list(kept.glob("*.lode")), "it to be a file again")
         assert http.delete(f"/v1/surfaces/{uploaded['id']}").status_code == 204
         assert list(kept.iterdir()) == []
+
+
+def test_a_scratch_folder_that_is_removed_while_the_server_runs_is_made_again(memory: str, tmp_path: Path) -> None:
+    scratch = tmp_path / "lodestream"
+    with (
+        running_server(memory, workers=1, scratch=tmp_path) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        eventually(lambda: http.get("/readyz").json()["role"] == "writer", "the server to write")
+        scratch.rename(tmp_path / "away")
+
+        def taken() -> str | None:
+            answer = http.post("/v1/surfaces", content=npy(hills()))
+            assert answer.status_code in (202, 503), answer.text
+            return str(answer.headers["location"]) if answer.status_code == 202 else None
+
+        surface = settled(http, eventually(taken, "the upload to be taken"))
+        assert surface["state"] == "ready", surface["reason"]
+        assert http.get(f"{surface['url']}/levels/0?format=npy").status_code == 200
+    assert {stat.S_IMODE(path.stat().st_mode) for path in (scratch, scratch / "containers")} == {0o700}

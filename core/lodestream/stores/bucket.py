@@ -12,11 +12,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, wait
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import BinaryIO, NoReturn, Self, TypeVar
 
 from ..errors import UnavailableError
@@ -66,7 +66,7 @@ class Bucket:
         Such as ``s3://bucket/prefix``; see `lodestream.stores.connections`.
     limits : Limits
     fetched : Path, optional
-        Folder for the files of `local`, which is there; otherwise that of the system for what is temporary.
+        Folder for the files of `local`, in a folder that is there; otherwise that of the system for what is temporary.
 
     Raises
     ------
@@ -183,13 +183,17 @@ class Bucket:
     def local(self, key: str) -> Iterator[Path]:
         """Fetch an object into a temporary file for the length of a block."""
         name = checked_key(key).rpartition("/")[2]
-        with TemporaryDirectory(prefix="lodestream-", dir=self._fetched) as folder:
-            path = Path(folder) / name
+        with ExitStack() as held:
             try:
+                if self._fetched is not None:
+                    self._fetched.mkdir(0o700, exist_ok=True)
+                folder = held.enter_context(TemporaryDirectory(prefix="lodestream-", dir=self._fetched))
+                path = Path(folder) / name
                 with path.open("wb") as file:
                     file.writelines(self.pieces(key))
             except OSError as error:
-                raise StoreError(f"{self._named(key)} cannot be kept in {folder}: {error.strerror}") from error
+                where = self._fetched or gettempdir()
+                raise StoreError(f"{self._named(key)} cannot be kept in {where}: {error.strerror}") from error
             yield path
 
     def delete(self, keys: Iterable[str], still: Still = always) -> None:

@@ -48,7 +48,7 @@ from ..access.access import key_of
 from ..access.limits import Limits
 from ..operation.settings import Settings
 from ..operation.threads import carried_out, entered, in_store
-from ..problems import FullError
+from ..problems import PASSING, FullError
 from ..store.durable import discard
 from ..store.index import IndexLostError, Surface
 from ..store.layout import Manifest
@@ -77,9 +77,10 @@ _ATTEMPTS = 3
 _TAKEN_UP = 1000
 
 # Of these there may be more in a moment: a build that lacks them stays in the queue.
-_PASSING = (*worker.NO_ROOM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+_PASSING = (*worker.NO_ROOM, *PASSING)
 _ROOM = "space on the server's disk"
 _SCRATCH = "the server's scratch folder, which was removed meanwhile"
+_UPLOAD = "its upload, which was removed meanwhile"
 _FIRST_DELAY = 2.0
 _LONGEST_DELAY = 60.0
 
@@ -548,7 +549,8 @@ class Builder:
         call = Call(worker.build, (job,), self._settings.build_seconds, begin, allowed)
         self._running[it.id] = _Running(folder, call)
         try:
-            result: worker.Built | worker.Parsed | worker.Refused | None = await self._run(self._runner.call(call))
+            result: worker.Built | worker.Parsed | worker.Refused | None
+            result = await self._run(self._runner.call(call), folder)
             if isinstance(result, worker.Parsed):
                 result = await self._run_by_cluster(it.id, job)
             if isinstance(result, worker.Built):
@@ -577,6 +579,7 @@ class Builder:
             held = error.held and self._is_held_shortly(it.id)
             raise
         except (MemoryError, ProcessDiedError) as error:
+            await asyncio.to_thread(_check_there, folder, counted)
             if not continued or self._closing:
                 raise
             _log.warning(_STARTED_AGAIN, it.id, error)
@@ -600,7 +603,7 @@ class Builder:
         """Return whether the folder of a build is locked by a process that is about to end."""
         return time.monotonic() - self._held.setdefault(surface, time.monotonic()) < _HELD_SECONDS
 
-    async def _run(self, work: Awaitable[_T]) -> _T | worker.Refused:
+    async def _run(self, work: Awaitable[_T], folder: Path) -> _T | worker.Refused:
         try:
             result = await work
         except TimeoutError as error:
@@ -608,6 +611,7 @@ class Builder:
         except UnforeseenError as error:
             if error.errno in _PASSING:
                 raise _LaterError.of(error.errno) from None
+            await asyncio.to_thread(_check_there, folder, True)
             _log.error("a build failed unexpectedly: %s", error.traceback)
             return worker.Refused(f"the build failed with an internal error: {error.kind}", final=False)
         except OSError as error:
@@ -625,7 +629,7 @@ class Builder:
         how = "cut short"
         try:
             task = ClusterJob(job, address, self._memory // 2)
-            result = await self._run(build_by_cluster(task, self._settings.build_seconds, self._threads))
+            result = await self._run(build_by_cluster(task, self._settings.build_seconds, self._threads), job.folder)
             how = f"refused: {result.reason}" if isinstance(result, worker.Refused) else "built"
             return result
         finally:
@@ -671,7 +675,12 @@ class Builder:
         try:
             problem = await asyncio.to_thread(check_upload, files, surface.manifest)
         except OSError as error:
+            if error.errno in _PASSING:
+                raise _LaterError.of(error.errno) from error
             problem = error.strerror
+        # Of a bucket they are in the scratch folder, and are fetched again; else the store says that they are gone.
+        if problem is not None and await asyncio.to_thread(_identities, files) is None:
+            raise _LaterError(_UPLOAD)
         return None if problem is None else f"the upload is damaged or cannot be read: {problem}"
 
     async def _postpone(self, surface: str, reason: str) -> State:

@@ -180,8 +180,10 @@ class LevelMaker:
             lease = self._files.add(key, wanted.path, size, kept=self._containers.is_used(key.container))
             held.callback(lease.release)
             return lease
-        except (FileNotFoundError, WrongAnswerError) as error:
-            if folder.exists():
+        except (FileNotFoundError, WrongAnswerError, UnforeseenError, FormatError) as error:
+            if await asyncio.to_thread(folder.exists):
+                if isinstance(error, UnforeseenError):
+                    _log.error("making a level failed unexpectedly: %s", error.traceback)
                 raise
             raise BusyError(REMOVED) from error
         finally:
@@ -216,7 +218,6 @@ class LevelMaker:
                 (await in_store(self._containers.blob, key.container)).close()  # or it says that it is gone
                 if os.access(wanted.container, os.R_OK):
                     raise _ReplacedError("its container was deleted and built again meanwhile") from None
-            _log.error("making a level failed unexpectedly: %s", error.traceback)
             raise
         except OSError as error:
             # No process could be started.

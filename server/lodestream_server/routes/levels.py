@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
@@ -19,7 +22,7 @@ from ..problems import BusyError, responses
 from ..store.index import Surface
 from . import descriptions
 from .byte_ranges import sort_out
-from .routing import Parts, caching, matches, readable
+from .routing import Parts, State, caching, matches, readable
 from .sending import SentFile, ready, still_there, while_there
 
 __all__ = ["router"]
@@ -67,14 +70,12 @@ async def get_level(
     key = Key(found.container or "", level, format_.name)
     with still_there(parts, surface):
         loan = await while_there(request, parts.levels.take(key, caller), Loan.release)
+    there = partial(_there, parts, key.container)
     try:
         sort_out(request, loan.size, etag)
         headers["content-disposition"] = f'attachment; filename="{found.id}-{level}{format_.stream_suffix}"'
-        return _Borrowed(loan, headers, format_.media_type)
-    except FileNotFoundError as error:
-        loan.release()
-        parts.levels.forget(key.container)  # or it would be lent again
-        raise BusyError(REMOVED) from error
+        with there():
+            return _Borrowed(loan, headers, format_.media_type, there)
     except BaseException:
         loan.release()
         raise
@@ -83,15 +84,35 @@ async def get_level(
 class _Borrowed(SentFile):
     """A level file that is released once it was sent, or when the client has disconnected."""
 
-    def __init__(self, loan: Loan, headers: dict[str, str], media_type: str) -> None:
+    def __init__(
+        self, loan: Loan, headers: dict[str, str], media_type: str, there: Callable[[], AbstractContextManager[None]]
+    ) -> None:
         super().__init__(loan.path, headers=headers, media_type=media_type, stat_result=loan.path.stat())
         self._loan = loan
+        self._there = there
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
-            await super().__call__(scope, receive, send)
+            with self._there():
+                await super().__call__(scope, receive, send)
         finally:
             self._loan.release()
+
+
+@contextmanager
+def _there(parts: State, container: str) -> Iterator[None]:
+    """Guard the reading of a level file of a container.
+
+    Raises
+    ------
+    BusyError
+        If the file was removed, with the scratch folder.
+    """
+    try:
+        yield
+    except FileNotFoundError as error:
+        parts.levels.forget(container)  # or it would be lent again
+        raise BusyError(REMOVED) from error
 
 
 def _check(surface: Surface, level: int) -> None:

@@ -25,7 +25,7 @@ from . import layout
 from .durable import NewFile, discard, rename
 from .index import IndexLostError
 from .kept_files import KeptFiles, Lease
-from .private import make_private
+from .private import make_again, make_private
 
 __all__ = ["ContainerCache"]
 
@@ -240,7 +240,7 @@ class ContainerCache:
         path = self._folder / f"{sha256}.{secrets.token_hex(4)}.lode"
         new = path.with_suffix(".new")
         try:
-            make_private(self._folder)
+            make_again(self._folder)
             digest = hashlib.sha256()
             with NewFile(new) as file:
                 for piece in self._store.pieces(layout.container_key(sha256), size):

@@ -38,7 +38,7 @@ from .durable import discard, make_folder
 from .identity import known_identity
 from .layout import BUILT, CONTAINERS, IDENTITY, NAMES, SURFACES, UPLOADS
 from .lease import LEASE_SECONDS, Lease
-from .private import check_writable, make_private, tighten
+from .private import check_writable, make_again, make_private, tighten
 from .surfaces import Surfaces
 
 __all__ = ["BUCKET_SCRATCH", "INDEX", "SCRATCH", "Data", "check_version", "scratch_of"]
@@ -232,9 +232,7 @@ class Data:
         OSError
             If it cannot be made.
         """
-        for folder in (self.scratch, self._incoming):  # which may have been removed
-            if not folder.is_dir():
-                make_private(folder)
+        make_again(self._incoming)
         return make_folder(self._incoming / os.urandom(8).hex())
 
 

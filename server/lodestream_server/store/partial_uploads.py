@@ -19,7 +19,7 @@ import os
 import re
 import time
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -29,10 +29,10 @@ from pydantic import TypeAdapter, ValidationError
 from lodestream.errors import InputError, NotFoundError
 
 from ..operation.threads import carried_out
-from ..problems import LockedError, WrongOffsetError
+from ..problems import BusyError, LockedError, WrongOffsetError
 from . import durable
 from .durable import NewFile, discard, make_folder, sync_folder
-from .private import make_private
+from .private import make_again
 from .uploads import Upload
 
 __all__ = ["Declared", "PartialUpload", "PartialUploads"]
@@ -122,6 +122,27 @@ class PartialUpload:
         """Whether a request is at work on it."""
         return self._lock.locked()
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether its bytes were removed by somebody else, with the scratch folder."""
+        return self.declared.surface is None and not (self.folder / _DATA).exists()
+
+    async def make(self) -> None:
+        """Make its folder.
+
+        Raises
+        ------
+        BusyError
+            If the scratch folder is removed meanwhile.
+        OSError
+            If it cannot be made.
+        """
+        async with self._lock:
+            try:
+                await carried_out(partial(_make, self.folder, self.declared))
+            except FileNotFoundError as error:
+                raise BusyError("The server's scratch folder was removed meanwhile; begin again") from error
+
     @asynccontextmanager
     async def continued(self, offset: int) -> AsyncIterator[None]:
         """Hold the upload for a request that sends more of it.
@@ -166,9 +187,14 @@ class PartialUpload:
     @asynccontextmanager
     async def _held(self) -> AsyncIterator[None]:
         async with self._lock:
-            if self._gone:
+            if self._gone or self.is_lost:
                 raise _missing(self.id)
-            yield
+            try:
+                yield
+            except FileNotFoundError as error:
+                if self.is_lost:
+                    raise _missing(self.id) from error
+                raise
 
     async def append(self, blocks: AsyncIterator[bytes]) -> None:
         """Put more bytes on disk; what came before an error stays. The upload is held.
@@ -228,7 +254,8 @@ class PartialUpload:
         """Note the surface that the upload has become, and remove its bytes. The upload is held."""
         self.kept = 0
         finished = replace(self.declared, surface=surface)
-        await carried_out(partial(self._note, finished))
+        with suppress(FileNotFoundError):  # where the folder was removed, only this server remembers it
+            await carried_out(partial(self._note, finished))
         self.declared, self.touched = finished, time.time()
 
     def _note(self, finished: Declared) -> None:
@@ -302,13 +329,13 @@ class PartialUploads:
 
         Raises
         ------
-        OSError
-            If it cannot be stored.
+        BusyError, OSError
+            See `PartialUpload.make`.
         """
         upload = PartialUpload(self._folder / os.urandom(16).hex(), declared, 0, time.time())
         self._all[upload.id] = upload  # counted before anybody else may ask
         try:
-            await carried_out(partial(_make, upload.folder, declared))
+            await upload.make()
         except BaseException:
             del self._all[upload.id]
             await carried_out(partial(discard, upload.folder))
@@ -323,15 +350,15 @@ class PartialUploads:
         await upload.remove()
 
     async def expire(self) -> None:
-        """Remove the uploads whose time is over."""
-        await self._remove([upload for upload in self._all.values() if self._is_over(upload)])
+        """Remove the uploads whose time is over, and forget those that were lost."""
+        await self._remove([upload for upload in self._all.values() if upload.is_lost or self._is_over(upload)])
 
     async def _remove(self, uploads: list[PartialUpload]) -> None:
         for upload in uploads:
-            # While another one was being removed, somebody else may have removed this one.
+            # While another one was being removed, somebody else may have removed this one. Whoever comes from now on
+            # finds it gone.
             if upload.id in self._all and not upload.is_locked:
-                async with upload.settled():
-                    await self.remove(upload)
+                await self.remove(upload)
 
 
 def _missing(name: str) -> NotFoundError:
@@ -343,8 +370,7 @@ def _dumped(declared: Declared) -> bytes:
 
 
 def _make(folder: Path, declared: Declared) -> None:
-    if not folder.parent.is_dir():
-        make_private(folder.parent)
+    make_again(folder.parent)
     make_folder(folder)
     for name, data in ((_DATA, b""), (_DECLARED, _dumped(declared))):
         with NewFile(folder / name) as file:

@@ -13,7 +13,7 @@ from lodestream.errors import LodestreamError
 
 from .durable import sync_folder
 
-__all__ = ["check_writable", "make_private", "tighten"]
+__all__ = ["check_writable", "make_again", "make_private", "tighten"]
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +37,19 @@ def make_private(folder: Path) -> bool:
         return False
     sync_folder(folder.absolute().parent)
     return True
+
+
+def make_again(folder: Path) -> None:
+    """Create a folder of the scratch folder, and that too if it was removed while the server runs.
+
+    Raises
+    ------
+    OSError
+        See `make_private`.
+    """
+    for each in (folder.parent, folder):  # one after the other, so that both are private
+        if not each.is_dir():
+            make_private(each)
 
 
 def tighten(folder: Path, known: Collection[str]) -> None:

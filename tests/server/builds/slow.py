@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import resource
+import shutil
 import signal
 import tempfile
 import time
@@ -48,6 +49,7 @@ __all__ = [
     "leave",
     "limits",
     "listed",
+    "lose_its_folder",
     "make_coarsest",
     "make_level_by_bands",
     "make_level_by_blocks",
@@ -364,6 +366,12 @@ def miss_when_told(job: LevelJob) -> MadeLevel | Refusal:
         while not (data / "go").exists() and time.monotonic() < until:
             time.sleep(0.01)
         raise
+
+
+def lose_its_folder(job: LevelJob) -> MadeLevel | Refusal:
+    """Fail as a library may whose files are removed."""
+    shutil.rmtree(job.folder)
+    raise RuntimeError("there is nothing to write to")
 
 
 def make_level_by_bands(job: LevelJob) -> MadeLevel | Refusal:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import anyio
 import httpx
 import numpy as np
 import pytest
@@ -724,6 +725,34 @@ def test_values_in_files_count_for_the_room_of_a_level(tmp_path: Path) -> None:
 def _new(folder: Path) -> Path:
     folder.mkdir()
     return folder
+
+
+def test_a_level_file_that_goes_before_it_is_opened_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opens = anyio.open_file
+    with running_server(tmp_path, workers=1) as url, client(url) as http:
+        level = f"{push(http, npy(hills()))['url']}/levels/1"
+        made = http.get(level).content
+
+        async def late(*args: Any, **kwargs: Any) -> Any:
+            monkeypatch.setattr(anyio, "open_file", opens)
+            Path(args[0]).unlink()
+            return await opens(*args, **kwargs)
+
+        monkeypatch.setattr(anyio, "open_file", late)
+        assert problem(http.get(level)) == (503, "busy")
+        assert http.get(level).content == made
+
+
+def test_a_level_that_fails_in_any_way_while_its_folder_is_removed_may_be_asked_for_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(level_maker, "make_level", slow.lose_its_folder)
+    monkeypatch.setattr(level_maker, "_allowed", slow.allow_levels_more)
+    with running_server(tmp_path, workers=1) as url, client(url) as http:
+        surface = push(http, npy(hills()))
+        assert problem(http.get(f"{surface['url']}/levels/1")) == (503, "busy")
 
 
 def test_levels_of_a_scratch_folder_that_is_removed_are_made_again(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import shutil
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -14,9 +15,11 @@ import pytest
 from lodestream.errors import FormatError, TooLargeError, UnavailableError
 from lodestream.stores import Folder, FullError, StoreError, Tag
 from lodestream_server import Settings
-from lodestream_server.builds import builder, worker
+from lodestream_server.builds import builder, results, worker
+from lodestream_server.builds.results import check as results_check
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.waiting import retry, waiting
+from lodestream_server.store.uploads import check_upload
 from tests.server.builds import slow
 from tests.server.builds.test_builds import building, running
 from tests.server.helpers import eventually, hills, kept, npy, problem, push, settled, upload_of
@@ -200,6 +203,41 @@ def test_an_upload_that_cannot_be_read_is_not_refused(
         # The same file again makes it whole, also for the other surface.
         assert push(http, BODY)["state"] == "ready"
         assert (upload_of(data, other) / "0").read_bytes() == BODY
+
+
+def test_an_upload_that_cannot_be_read_at_this_moment_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failures = [OSError(errno.EMFILE, "no more open files"), OSError(errno.ENOMEM, "no memory")]
+
+    def checked(*given: Any) -> str | None:
+        if failures:
+            raise failures.pop()
+        return check_upload(*given)
+
+    monkeypatch.setattr(builder, "check_upload", checked)
+    monkeypatch.setattr(builder, "_FIRST_DELAY", 0.01)
+    with running(tmp_path / "data") as http:
+        assert push(http, BODY)["state"] == "ready"
+    assert not failures
+
+
+def test_builds_whose_folder_is_removed_again_and_again_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    removed: list[Path] = []
+
+    def lost(container: Path, *given: Any) -> dict[str, Any]:
+        if len(removed) < 4:
+            shutil.rmtree(container.parent)
+            removed.append(container)
+        return results_check(container, *given)
+
+    monkeypatch.setattr(results, "check", lost)
+    monkeypatch.setattr(builder, "_FIRST_DELAY", 0.01)
+    with running(tmp_path / "data") as http:
+        assert push(http, BODY)["state"] == "ready"
+    assert len(removed) == 4
 
 
 def test_a_delete_that_is_cut_short_lets_the_build_end_and_deletes_nothing(tmp_path: Path) -> None:

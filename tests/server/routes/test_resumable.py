@@ -376,6 +376,34 @@ def test_a_store_that_fails_at_the_end_is_asked_again(
     assert http.get(surface["url"] + "/container", follow_redirects=True).status_code == 200
 
 
+def test_one_whose_scratch_folder_is_removed_is_missing_and_begins_again(tmp_path: Path) -> None:
+    body = npy(hills(seed=83))
+    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
+        half, whole = begun(http, len(body)), begun(http, len(body))
+        assert part(http, half, 0, body[:100]).status_code == 204
+        (tmp_path / "scratch").rename(tmp_path / "away")
+        for address, at in ((half, 100), (whole, 0)):
+            assert problem(part(http, address, at, body[at:])) == (404, "not-found")
+            assert http.head(address, headers=TUS).status_code == 404
+
+        def again() -> str | None:
+            answer = began(http, len(body))
+            assert answer.status_code in (201, 503), answer.text
+            return str(answer.headers["location"]) if answer.status_code == 201 else None
+
+        address = eventually(again, "another upload to begin")
+        assert part(http, address, 0, body[:100]).status_code == 204
+
+        def completed() -> str | None:
+            at = http.head(address, headers=TUS)
+            assert at.status_code in (200, 503)
+            answer = part(http, address, int(at.headers.get("upload-offset", 100)), body[100:])
+            assert answer.status_code in (204, 503), answer.text
+            return str(answer.headers["location"]) if answer.status_code == 204 else None
+
+        assert settled(http, eventually(completed, "the surface"))["state"] == "ready"
+
+
 def _broken(*_: Any) -> Any:
     from lodestream.stores import StoreError
 

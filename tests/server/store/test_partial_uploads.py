@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import shutil
+import stat
 import tempfile
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -14,8 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lodestream.errors import InputError, NotFoundError
-from lodestream_server.problems import LockedError, WrongOffsetError
-from lodestream_server.store import durable
+from lodestream_server.problems import BusyError, LockedError, WrongOffsetError
+from lodestream_server.store import durable, partial_uploads
 from lodestream_server.store.partial_uploads import Declared, PartialUpload, PartialUploads
 from tests.examples import examples
 from tests.server.store.disks import FullDisk
@@ -251,6 +253,73 @@ def test_several_may_remove_the_same_ones_at_once(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
     run(tmp_path, test)
+
+
+@pytest.mark.parametrize("sent_before", [0, 20])
+def test_what_was_removed_by_somebody_else_is_missing(tmp_path: Path, sent_before: int) -> None:
+    folder = tmp_path / "scratch" / "partial"
+    folder.parent.mkdir()
+
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        await sent(it, 0, BODY[:sent_before])
+        other = await uploads.create(DECLARED)
+        shutil.rmtree(folder.parent)
+        with pytest.raises(NotFoundError):
+            await sent(it, sent_before, BODY[sent_before:])
+        with pytest.raises(NotFoundError):
+            async with other.settled():
+                pass
+        await uploads.expire()
+        assert (uploads.count(None), uploads.kept("anna")) == ((0, 0), 0)
+        # Others begin.
+        again = await uploads.create(DECLARED)
+        await sent(again, 0, BODY)
+        assert stat.S_IMODE(folder.parent.stat().st_mode) == 0o700
+
+    run(folder, test)
+
+
+def test_one_whose_folder_is_removed_while_it_begins_may_begin_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        def lost(folder: Path) -> Path:
+            monkeypatch.undo()
+            shutil.rmtree(folder.parent)
+            return durable.make_folder(folder)
+
+        monkeypatch.setattr(partial_uploads, "make_folder", lost)
+        with pytest.raises(BusyError):
+            await uploads.create(DECLARED)
+        assert uploads.count(None) == (1, 0)  # the first
+        await sent(await uploads.create(DECLARED), 0, BODY)
+
+    run(tmp_path / "partial", test)
+
+
+def test_one_that_is_removed_by_somebody_else_while_it_is_sent_is_missing(tmp_path: Path) -> None:
+    folder = tmp_path / "partial"
+
+    async def test(uploads: PartialUploads, it: PartialUpload) -> None:
+        async def cut() -> AsyncIterator[bytes]:
+            yield BODY[:20]
+            shutil.rmtree(folder)
+            yield BODY[20:]
+
+        with pytest.raises(NotFoundError):
+            async with it.continued(0):
+                await it.append(cut())
+        # What is a surface already is known as long as the server runs.
+        done = await uploads.create(DECLARED)
+        await sent(done, 0, BODY)
+        async with done.settled():
+            shutil.rmtree(folder)
+            await done.finish("0" * 20)
+        await uploads.expire()
+        async with uploads.get(done.id, "anna").settled():
+            assert done.declared.surface == "0" * 20
+
+    run(folder, test)
 
 
 @pytest.mark.parametrize("step", range(8))
