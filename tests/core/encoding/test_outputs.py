@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lodestream as ls
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize("memory", [None, "1MiB"])
@@ -24,7 +25,7 @@ def test_a_link_stays_a_link_and_a_pipe_a_pipe(tmp_path: Path, memory: str | Non
     with ThreadPoolExecutor(1) as reader:
         read = reader.submit((tmp_path / "pipe.lode").read_bytes)
         ls.encode(heights, out=tmp_path / "pipe.lode", memory=memory)
-        assert read.result(30) == expected
+        assert read.result(PATIENCE) == expected
     assert (tmp_path / "pipe.lode").is_fifo()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.lode", "pipe.lode", "real.lode"]
 

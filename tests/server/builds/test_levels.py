@@ -345,7 +345,10 @@ def test_a_format_that_is_written_beside_is_bounded_too(tmp_path: Path) -> None:
 def test_a_level_that_takes_too_much_is_refused_and_the_next_one_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with running_server(tmp_path, workers=1, level_memory=256 << 20, level_seconds=20.0) as url, client(url) as http:
+    with (
+        running_server(tmp_path, workers=1, level_memory=256 << 20, level_seconds=PATIENCE) as url,
+        client(url) as http,
+    ):
         surface = push(http, npy(hills()))
         for function, expected in ((slow.hoard_level, (413, "too-large")), (slow.raise_full, (507, "full"))):
             monkeypatch.setattr(level_maker, "make_level", function)

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from random import Random
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -25,7 +26,7 @@ from tusclient.client import TusClient
 
 from lodestream_server import running_server
 from lodestream_server.access.tokens import TokenFile
-from lodestream_server.store import surfaces
+from lodestream_server.store import partial_uploads, surfaces
 from tests.examples import every
 from tests.links import Fault, linked
 from tests.server.helpers import PATIENCE, eventually, hills, kept, listed, npy, problem, settled
@@ -319,16 +320,19 @@ def test_what_is_under_way_counts_as_kept(tmp_path: Path) -> None:
 
 
 def test_what_nobody_continues_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = time.time()
+    monkeypatch.setattr(partial_uploads, "time", SimpleNamespace(time=lambda: now))
     monkeypatch.setattr("lodestream_server.upkeep._EXPIRE_SECONDS", 0.05)
     with (
-        running_server(tmp_path, workers=1, partial_seconds=0.5) as url,
+        running_server(tmp_path, workers=1, partial_seconds=100.0) as url,
         httpx.Client(base_url=url, trust_env=False) as http,
     ):
         address = begun(http, 5000)
-        time.sleep(0.3)
+        now += 60.0
         assert part(http, address, 0, bytes(10)).status_code == 204
-        time.sleep(0.3)
+        now += 60.0
         assert part(http, address, 10, bytes(10)).status_code == 204
+        now += 101.0
         eventually(lambda: kept(tmp_path, PARTIAL) == [], "the upload to be removed")
         assert part(http, address, 20, bytes(10)).status_code == 404
 
