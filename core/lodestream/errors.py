@@ -91,7 +91,7 @@ class FormatError(InputError):
     >>> number = pathlib.Path("notes.tif").write_text("no raster")
     >>> lodestream.read("notes.tif")
     Traceback (most recent call last):
-    lodestream.errors.FormatError: notes.tif: expected a file of format npy, ..., got text that begins with 'no raster'
+    lodestream.errors.FormatError: notes.tif: this is text that begins with 'no raster', though ...
     """
 
 

@@ -90,7 +90,7 @@ def check_spans(region: Region) -> None:
         for line in (start, stop):
             check_integer("a row or column", line)
         if not 0 <= start < stop:
-            raise OptionError(f"expected a region of at least one row and column, got {start}:{stop}")
+            raise OptionError(f"expected a region of at least one row and column, counted from 0, got {start}:{stop}")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,17 @@ import pytest
 
 from tests.ports import reserved_port
 
-__all__ = ["SECONDS", "Front", "caddy", "caddy_of_image", "caddy_of_many", "configuration", "missing", "nginx"]
+__all__ = [
+    "SECONDS",
+    "Front",
+    "caddy",
+    "caddy_of_image",
+    "caddy_of_many",
+    "configuration",
+    "missing",
+    "nginx",
+    "self_signed",
+]
 
 #: Seconds after which something of a proxy hangs: a start, a request, a command.
 SECONDS = 120.0
@@ -102,7 +112,7 @@ def nginx(folder: Path, behind: str, *, tls: bool = True) -> Iterator[Front]:
         Whether it speaks TLS, or is at http://127.0.0.1.
     """
     folder.mkdir()
-    certificate, key = _certificate(folder)
+    certificate, key = self_signed(folder)
     path = folder / "nginx.conf"
     with reserved_port() as port:
         site = _with(
@@ -210,7 +220,7 @@ def _found(program: str) -> str | None:
     return shutil.which(program) or shutil.which(program, path="/usr/sbin")
 
 
-def _certificate(folder: Path) -> tuple[Path, Path]:
+def self_signed(folder: Path) -> tuple[Path, Path]:
     """Make a certificate for localhost that is signed by itself, and its key."""
     certificate, key = folder / "certificate.pem", folder / "key.pem"
     if missing("openssl"):

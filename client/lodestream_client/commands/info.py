@@ -94,7 +94,7 @@ def _of_file(options: InfoOptions) -> Mapping[str, Any]:
             return container.open(files.paths[0], max_vertices=options.max_vertices).info
         except (StreamError, TooLargeError) as error:
             cut = isinstance(error, TruncatedStreamError)
-            advice = "lodestream decode --partial writes its last complete layer" if cut else ""
+            advice = "lodestream decode --partial writes its last complete layer, if it has one" if cut else ""
             raise named(error, options.what, advice) from None
 
 

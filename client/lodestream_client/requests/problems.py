@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import ssl
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from lodestream.errors import (
     FormatError,
@@ -25,6 +25,8 @@ from . import addresses
 from .answers import parse
 
 __all__ = ["NoStreamError", "blocks_sockets", "from_code", "from_connection", "from_response", "passes"]
+
+_E = TypeVar("_E", bound=BaseException)
 
 _LONGEST = 1000
 
@@ -152,11 +154,24 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
         return RemoteProtocolError(f"{url} redirects its stream to an address that is not a WebSocket's; use {use}")
     if isinstance(error, (ws.InvalidHandshake, httpx.RemoteProtocolError, httpx.DecodingError)):
         return RemoteProtocolError(f"{url} does not answer like a Lodestream server: {error}")
-    if isinstance(error, (ssl.SSLError, ssl.CertificateError)):
-        return UnreachableError(f"no secure connection to {url}: {error}")
+    if untrusted := _first(error, ssl.SSLCertVerificationError):
+        return UnreachableError(
+            f"no secure connection to {url}: its certificate is not trusted here ({untrusted.verify_message}); the "
+            "environment variable SSL_CERT_FILE names a file with further authorities"
+        )
+    if insecure := _first(error, ssl.SSLError):
+        return UnreachableError(f"no secure connection to {url}: {insecure.strerror or insecure}")
     if isinstance(error, TimeoutError | httpx.TimeoutException):
         return UnreachableError(f"no answer from {url} in time")
     return UnreachableError(f"no connection to {url}: {_reason(error)}")
+
+
+def _first(error: BaseException, kind: type[_E]) -> _E | None:
+    """Return the first error of a kind among an error and its causes: httpx has its own around those of the system."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, kind):
+        cause = cause.__cause__ or cause.__context__
+    return cause
 
 
 def _reason(error: BaseException) -> str:

@@ -200,20 +200,20 @@ def _sniff(path: Path, suffix: str, wanted: str | None) -> Format:
             if head and format_.sniff(head, known):
                 return format_
         names = " or ".join(format_.name for format_ in candidates)
-        raise FormatError(f"expected a file of format {names}, got {_describe(head) if head else 'an empty file'}")
+        raise FormatError(f"this is {_describe(head)}, not a file of format {names}")
     if is_container(head):
         raise FormatError(
-            "expected a file of another format, got a container of Lodestream: lodestream.decode(bytes) gives its "
-            "surface, lodestream decode writes it to a file"
+            "this is a container of Lodestream already: lodestream.open reads it, lodestream decode writes it to a "
+            "file of another format"
         )
     if not any(suffix in it.suffixes for it in FORMATS):
         suffix = ""
-    if not head:
-        raise FormatError(f"expected {_readable()}, got an empty file")
     for format_ in FORMATS:
-        if format_.sniff(head, suffix):
+        if head and format_.sniff(head, suffix):
             return format_
-    raise FormatError(f"expected {_readable()}, got {_describe(head)}")
+    called = f", though its name ends in {suffix}" if suffix and head else ""
+    names = ", ".join(it.name for it in FORMATS if it.read)
+    raise FormatError(f"this is {_describe(head)}{called}, not a file of a format that is read: {names}")
 
 
 def _readable_as(name: str) -> tuple[Format, ...]:
@@ -243,23 +243,22 @@ def _of_folder(path: Path, wanted: str | None) -> Format:
     match = next((it for it in FORMATS if it.folder and it.folder(path)), None)
     if wanted is not None and match not in (candidates := _readable_as(wanted)):
         names = " or ".join(format_.name for format_ in candidates)
-        raise FormatError(f"expected a file of format {names}, got {'a folder' if match is None else match.name}")
+        raise FormatError(f"this is {'a folder' if match is None else match.name}, not a file of format {names}")
     if match is None:
         raise FormatError("expected a regular file or the folder of a Zarr store, got another folder")
     return match
 
 
-def _readable() -> str:
-    names = [it.name for it in FORMATS if it.read]
-    return f"a file of format {', '.join(names[:-1])} or {names[-1]}"
-
-
 def _describe(head: bytes) -> str:
-    """Return the beginning of a file as text that is safe to print."""
+    """Return what a file is by its beginning, as text that is safe to print."""
+    if not head:
+        return "an empty file"
+    if head.lstrip()[:14].lower().startswith((b"<!doctype html", b"<html")):
+        return "a web page, perhaps one that a host sent in place of the file"
     text = head[:40].decode("ascii", "replace")
     if all(character.isprintable() or character.isspace() for character in text) and "\ufffd" not in text:
         return f"text that begins with {' '.join(text.split())!r}"
-    return f"bytes that begin with {head[:8].hex(' ')}"
+    return f"a file that begins with the bytes {head[:8].hex(' ')}"
 
 
 def _check_options(format_: Format, options: Mapping[str, Any]) -> None:

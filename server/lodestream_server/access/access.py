@@ -90,14 +90,14 @@ class Access:
         if not (settings.insecure or self._tokens.used or is_loopback(settings.host)):
             raise LodestreamError(
                 f"expected a token in {tokens.place}, since others can reach {settings.host}, got none; create one "
-                "with `lodestream token create`, or allow everything to everybody with --insecure"
+                f"with `{_creation(settings)}`, or allow everything to everybody with --insecure"
             )
 
         anywhere = _ANY_SITE & set(settings.origins)
         if anywhere and not self._tokens.used:
             raise LodestreamError(
                 f"expected a token in {tokens.place}, since LODESTREAM_ORIGINS={min(anywhere)} allows the pages of "
-                "all sites, got none; create one with `lodestream token create`, or name the sites"
+                f"all sites, got none; create one with `{_creation(settings)}`, or name the sites"
             )
 
     @property
@@ -225,6 +225,12 @@ def is_loopback(host: str) -> bool:
         return False
     mapped = address.ipv4_mapped if isinstance(address, ipaddress.IPv6Address) else None
     return (mapped or address).is_loopback
+
+
+def _creation(settings: Settings) -> str:
+    """Return the command that makes a token for this server."""
+    place = f"--token-file {settings.token_file}" if settings.token_file else f"--data {settings.data}"
+    return f"lodestream token create NAME --scope write {place}"
 
 
 def _is_own(origin: str, connection: HTTPConnection) -> bool:

@@ -289,7 +289,8 @@ def may_pass(error: LodestreamError) -> bool:
     if isinstance(error, TooLargeError | UnavailableError | UnsupportedVersionError):
         return True
     for cause in _causes(error):
-        if isinstance(cause, MemoryError) or getattr(cause, "errno", None) in _LOCAL:
+        # Errors of GDAL have numbers of its own as `errno`: what is damaged has that of EPERM.
+        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _LOCAL):
             return True
         # HDF5 and GDAL say it in words only; a filter fails for want of memory as for damage.
         if _SHORT_OF_MEMORY.search(str(cause)):

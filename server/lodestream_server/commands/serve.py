@@ -18,7 +18,7 @@ from ..linux import require_linux
 if TYPE_CHECKING:
     from ..operation.settings import Choice, Settings
 
-__all__ = ["add_option", "asked_for", "chosen_settings", "register", "serve"]
+__all__ = ["add_option", "asked_for", "chosen_settings", "register", "serve", "warn_of_unknown_variables"]
 
 _EXTRA = "server"
 #: Modules of the libraries that a running server imports, beside those of the settings.
@@ -105,11 +105,26 @@ def serve(args: argparse.Namespace) -> int:
     from ..running import serve_alone
 
     configure(settings.log_format, settings.log_level)
+    warn_of_unknown_variables()
     raise_file_limit(settings)
     server = serve_alone(settings, lambda address: print(f"Lodestream serving {address}", file=sys.stderr, flush=True))
     if server.refusal is not None:
         raise server.refusal
     return 0 if server.started else 1
+
+
+def warn_of_unknown_variables() -> None:
+    """Log variables of the environment that look like a setting and are none: what they say is not done."""
+    import difflib
+    import logging
+    import os
+
+    from ..operation.settings import choices
+
+    known = [choice.variable for choice in choices().values()]
+    for name in sorted(set(os.environ) - set(known) - {"LODESTREAM_TOKEN"}):
+        if name.startswith("LODESTREAM_") and (near := difflib.get_close_matches(name, known, 1, 0.9)):
+            logging.getLogger(__name__).warning("there is no setting %s; is %s meant?", name, near[0])
 
 
 def _check_confinement() -> None:

@@ -276,7 +276,7 @@ def test_an_upload_has_one_error_at_most() -> None:
 
 
 def test_a_bad_upload_is_the_core_s_error(server: str) -> None:
-    with pytest.raises(ls.FormatError, match="expected a file of format"):
+    with pytest.raises(ls.FormatError, match="not a file of a format that is read"):
         Client(server).upload(b"not a surface")
     with pytest.raises(ls.OptionError, match="nonsense"):
         Client(server).upload(ls.Surface(np.eye(5)), options={"nonsense": "1"})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import socket
 import struct
 import tempfile
@@ -67,6 +68,10 @@ def tiff(bands: Any, **profile: Any) -> bytes:
             return bytes(memory.read())
 
 
+#: What every refusal has: what it takes the file for, or what it expected and did not find.
+TOLD = re.compile("expected.* got|this is |cannot read", re.DOTALL)
+
+
 def refuse(path: Path, error: type[InputError], message: str, **options: Any) -> None:
     """Check that a file is refused by exactly this class, in one line, within little memory."""
     tracemalloc.start()
@@ -80,23 +85,38 @@ def refuse(path: Path, error: type[InputError], message: str, **options: Any) ->
     text = str(caught.value)
     assert text.startswith(str(path))
     assert text.isprintable()
-    assert "expected" in text
-    assert "got" in text
+    assert TOLD.search(text)
     assert len(text.removeprefix(str(path))) < 450
     assert peak < 4 * MIB
 
 
-ONE_OF = "expected a file of format npy, .*, got"
+ONE_OF = ", not a file of a format that is read: npy, .*plot3d$"
 
 REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
-    "empty": ("a.npy", lambda: b"", FormatError, f"{ONE_OF} an empty file"),
-    "text named .tif": ("a.tif", lambda: b"not an image\n", FormatError, f"{ONE_OF} text that begins with 'not an im"),
-    "OBJ named .tif": ("a.tif", lambda: b"v 0 0 0\nv 1 1 1\nl 1 2\n", FormatError, f"{ONE_OF} text that begins with"),
-    "bytes": ("a.bin", lambda: b"\0\1\2\3\4\5\6\7\10", FormatError, f"{ONE_OF} bytes that begin with 00 01 02 03"),
-    "JPEG": ("a.png", lambda: b"\xff\xd8\xff\xe0", FormatError, f"{ONE_OF} bytes that begin with ff d8 ff e0"),
+    "empty": ("a.npy", lambda: b"", FormatError, f"this is an empty file{ONE_OF}"),
+    "text named .tif": ("a.tif", lambda: b"not an image\n", FormatError, f"'not an image', though .* in .tif{ONE_OF}"),
+    "web page": (
+        "a.tif",
+        lambda: b"\n<!DOCTYPE html>\n<p>404",
+        FormatError,
+        f"this is a web page, perhaps .* the file, though .*{ONE_OF}",
+    ),
+    "OBJ named .tif": (
+        "a.tif",
+        lambda: b"v 0 0 0\nv 1 1 1\nl 1 2\n",
+        FormatError,
+        f"this is text that begins with.*{ONE_OF}",
+    ),
+    "bytes": (
+        "a.bin",
+        lambda: b"\0\1\2\3\4\5\6\7\10",
+        FormatError,
+        f"the bytes 00 01 02 03.*{ONE_OF}",
+    ),
+    "JPEG": ("a.png", lambda: b"\xff\xd8\xff\xe0", FormatError, f"the bytes ff d8 ff e0.*{ONE_OF}"),
     "PNG": ("a.png", lambda: b"\x89PNG\r\n\x1a\n", FormatError, "a PNG that begins with its header of 33 bytes, got 8"),
     "PLY": ("a.ply", lambda: b"ply\nformat ascii 1.0\n", FormatError, "a PLY header that ends with end_header within"),
-    "binary named .obj": ("a.obj", lambda: b"v 0 0 0\n\0\0", FormatError, f"{ONE_OF} bytes that begin with"),
+    "binary named .obj": ("a.obj", lambda: b"v 0 0 0\n\0\0", FormatError, f"begins with the bytes.*{ONE_OF}"),
     # NPY
     "truncated NPY": (
         "a.npy",
@@ -219,9 +239,9 @@ REFUSALS: dict[str, tuple[str, Callable[[], bytes], type[InputError], str]] = {
         "a.tif",
         lambda: tiff(np.ones((1, 99, 99), np.float32))[:-2000],
         FormatError,
-        "a whole GeoTIFF, got one that GDAL cannot read",
+        "GDAL cannot read this GeoTIFF",
     ),
-    "half a directory": ("a.tif", lambda: b"II*\0\x08\0\0\0\xff\xff", FormatError, "a whole GeoTIFF, got"),
+    "half a directory": ("a.tif", lambda: b"II*\0\x08\0\0\0\xff\xff", FormatError, "GDAL cannot read this GeoTIFF"),
     "complex GeoTIFF": ("a.tif", lambda: tiff(np.zeros((1, 2, 2), np.complex64)), FormatError, "got complex64"),
     "one pixel": ("a.tif", lambda: tiff(np.zeros((1, 1, 1), np.int16)), FormatError, "at least two points"),
     "sparse GeoTIFF": (
@@ -264,7 +284,7 @@ def test_a_vrt_is_refused_and_what_it_points_at_is_never_asked_for(
                 '<VRTDataset rasterXSize="5" rasterYSize="4"><VRTRasterBand dataType="Int16" band="1"><SimpleSource>'
                 f"<SourceFilename>{target}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
             )
-            refuse(path, FormatError, f"{ONE_OF} text that begins with '<VRTDataset")
+            refuse(path, FormatError, f"this is text that begins with '<VRTDataset.*{ONE_OF}")
         with pytest.raises(BlockingIOError):
             server.accept()
 
@@ -363,7 +383,7 @@ def test_damaged_files_give_a_surface_or_a_refusal(kind: str, edits: list[tuple[
     if isinstance(outcome, Surface):
         assert outcome.shape[0] * outcome.shape[1] <= 1000
     else:
-        assert "expected" in str(outcome)
+        assert TOLD.search(str(outcome))
         assert str(outcome).isprintable()
 
 

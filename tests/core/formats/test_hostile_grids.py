@@ -211,7 +211,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], str, str]] = {
         "a.tif",
         lambda: tiff_with(plain_tags(2**31 - 1, 2**31 - 1)),
         "FormatError|TooLargeError",
-        "vertices|a whole GeoTIFF",
+        "vertices|this GeoTIFF",
     ),
     "TIFF that promises more than follows": (
         "a.tif",
@@ -229,7 +229,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], str, str]] = {
         "a.tif",
         lambda: tiff_with(plain_tags(8, 9), following=8),
         "FormatError|none",  # the first one is a whole image
-        "a whole GeoTIFF|9 x 8 uint8",
+        "this GeoTIFF|9 x 8 uint8",
     ),
     "TIFF of a million-fold archive": (
         "a.tif",
@@ -344,5 +344,5 @@ def test_hostile_files_are_refused_in_time_and_space(refused: dict[str, Refusal]
     assert found.memory < 512 * MIB
     assert found.seconds < SECONDS
     if found.error != "none":
-        assert "expected" in found.message
+        assert "expected" in found.message or "cannot read" in found.message
         assert "\n" not in found.message

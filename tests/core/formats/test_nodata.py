@@ -249,7 +249,7 @@ def test_all_blocks_are_looked_at() -> None:
 
 def test_it_is_no_option_of_a_format_and_takes_no_other(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(FormatError, match="expected a file of format"):
+    with pytest.raises(FormatError, match="not a file of a format that is read"):
         ls.read(tmp_path / "a.png", nodata=0)
 
 

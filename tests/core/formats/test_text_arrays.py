@@ -63,10 +63,10 @@ def test_files_of_text_that_do_not_fit(tmp_path: Path) -> None:
 def test_prose_is_no_array(tmp_path: Path) -> None:
     for number, text in enumerate(("hill 1 2\n", "# only\n# words\n", "1 2 3 four\n", "1 2;;3\n")):
         (tmp_path / f"{number}.txt").write_text(text)
-        with pytest.raises(FormatError, match="expected a file of format"):
+        with pytest.raises(FormatError, match="not a file of a format that is read"):
             formats.read(tmp_path / f"{number}.txt")
     (tmp_path / "a.rst").write_text("1.5 2\n3 4\n")
-    with pytest.raises(FormatError, match="expected a file of format"):
+    with pytest.raises(FormatError, match="not a file of a format that is read"):
         formats.read(tmp_path / "a.rst")
 
 

@@ -56,6 +56,25 @@ def test_a_reason_that_is_not_in_the_bytes_may_pass(cause: Exception, monkeypatc
     assert not refused.final
 
 
+def test_a_raster_that_is_cut_short_is_refused_for_good(tmp_path: Path) -> None:
+    """GDAL numbers its errors itself: what it cannot read has the number that a lack of rights has."""
+    rasterio = pytest.importorskip("rasterio")
+    path = tmp_path / "cut.tif"
+    profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "tiled": True, "blockxsize": 64, "blockysize": 64}
+    heights = hills(300, 300, seed=5).astype("f4")
+    profile |= {"crs": "EPSG:32611", "transform": rasterio.Affine(30, 0, 500_000, 0, -30, 4_000_000)}
+    with rasterio.open(path, "w", height=300, width=300, **profile) as dataset:
+        dataset.write(heights, 1)
+    path.write_bytes(path.read_bytes()[:50_000])
+    job = worker.Job((path,), "cut.tif", None, "auto", {}, 10**6, tmp_path / "build")
+    job.folder.mkdir()
+    refused = worker.build(job)
+    assert isinstance(refused, worker.Refused)
+    assert refused.final
+    assert "cut.tif: GDAL cannot read this GeoTIFF, which may be damaged or cut short: " in refused.reason
+    assert "data.tif" not in refused.reason
+
+
 def test_bytes_that_are_no_surface_are_refused_for_good(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with running(data) as http:

@@ -25,6 +25,7 @@ from lodestream.errors import LodestreamError
 from lodestream_client.__main__ import main
 from lodestream_server import Settings, create_app, running_server
 from lodestream_server.access.tokens import TokenFile
+from lodestream_server.commands.serve import warn_of_unknown_variables
 from lodestream_server.store import durable
 from lodestream_server.store.data import Data
 from lodestream_server.store.durable import Disk
@@ -165,6 +166,23 @@ def test_what_can_be_made_again_may_be_elsewhere(tmp_path: Path, other_disk: boo
             assert http.get(made["url"]).json() == made
         with running_server(data, workers=1) as url, client(url) as http:
             assert http.get(made["url"]).json() == made
+
+
+def test_the_command_that_makes_the_first_token_is_told_whole(tmp_path: Path, refused: Refused) -> None:
+    data, file = tmp_path / "data", tmp_path / "tokens"
+    told = "create one with `lodestream token create NAME --scope write"
+    assert f"{told} --data {data}`" in refused("serve", "--host", "0.0.0.0", "--data", data)
+    line = refused("serve", "--origins", "*", "--data", data, "--token-file", file)
+    assert f"{told} --token-file {file}`" in line
+
+
+def test_a_variable_that_is_nearly_a_setting_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    for name in ("LODESTREAM_PUBLICREADS", "LODESTREAM_TOKEN", "LODESTREAM_SERVICE_PORT", "LODESTREAM_PORT"):
+        monkeypatch.setenv(name, "yes")
+    warn_of_unknown_variables()
+    assert caplog.messages == ["there is no setting LODESTREAM_PUBLICREADS; is LODESTREAM_PUBLIC_READS meant?"]
 
 
 def test_a_file_in_the_place_of_a_folder(tmp_path: Path, refused: Refused) -> None:

@@ -98,7 +98,7 @@ function byName(given: Limits): given is Readonly<Record<string, Limit>> {
 export function checkSpans(region: Region): void {
   for (const [start, stop] of region) {
     if (!(Number.isInteger(start) && Number.isInteger(stop) && 0 <= start && start < stop)) {
-      throw new OptionError(`expected a region of at least one row and column, got ${start}:${stop}`);
+      throw new OptionError(`expected a region of at least one row and column, counted from 0, got ${start}:${stop}`);
     }
   }
 }

@@ -112,9 +112,12 @@ def _opened(source: Source, driver: str, title: str, file_name: str, options: di
         except InputError:
             raise
         except (errors.RasterioError, OSError, ValueError) as error:
-            # The cause says what failed, and the path may be a server's own.
-            reason = str(error.__cause__ or error).replace(str(path), "the file").replace(f"{file_name}: ", "")
-            raise FormatError(f"expected a whole {title}, got one that GDAL cannot read: {reason}") from None
+            # The first cause says what failed, the others where; and the path may be a server's own.
+            cause: BaseException = error
+            while cause.__cause__ is not None:
+                cause = cause.__cause__
+            reason = str(cause).replace(str(path), "the file").replace(f"{file_name}: ", "")
+            raise FormatError(f"GDAL cannot read this {title}, which may be damaged or cut short: {reason}") from None
 
 
 def _check(source: Source, dataset: Any, title: str) -> int:

@@ -1,0 +1,55 @@
+"""A host whose certificate is not trusted: what is said, and what is done about it."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import lodestream as ls
+from lodestream_client import Client, UnreachableError
+from tests.patience import PATIENCE
+from tests.server.proxies import self_signed
+
+
+@pytest.fixture
+def host(tmp_path: Path) -> Iterator[str]:
+    """The address of a host with a certificate that nobody has signed but itself."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*self_signed(tmp_path))
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def answer() -> None:
+            while True:
+                try:
+                    taken, _ = listener.accept()
+                except OSError:
+                    return
+                with taken:
+                    taken.settimeout(PATIENCE)
+                    try:
+                        context.wrap_socket(taken, server_side=True).close()
+                    except OSError:
+                        continue
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        try:
+            yield f"https://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            listener.shutdown(socket.SHUT_RDWR)
+            thread.join()
+
+
+def test_a_certificate_that_is_not_trusted_is_told_as_such(host: str) -> None:
+    told = "no secure connection to .*certificate is not trusted here .self.signed certificate.; .* SSL_CERT_FILE"
+    with Client(host) as client, pytest.raises(UnreachableError, match=told):
+        list(client.list())
+    with Client(host) as client, pytest.raises(UnreachableError, match=told):
+        list(client.connect(f"{host}/v1/surfaces/hill"))
+    with pytest.raises(UnreachableError, match=told):
+        ls.open(f"{host}/hill.lode")
