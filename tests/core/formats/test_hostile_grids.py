@@ -237,11 +237,11 @@ CASES: dict[str, tuple[str, Callable[[], bytes], str, str]] = {
         "TooLargeError",
         "expands at most 2048 times|tiles no larger",
     ),
-    "VRT named .tif": ("a.tif", VRT.encode, "FormatError", "got text that begins with '<VRTDataset"),
-    "VRT named .dem": ("a.dem", VRT.encode, "FormatError", "got text that begins with '<VRTDataset"),
-    "VRT named .asc": ("a.asc", VRT.encode, "FormatError", "got text that begins with '<VRTDataset"),
+    "VRT named .tif": ("a.tif", VRT.encode, "FormatError", "this is text that begins with '<VRTDataset"),
+    "VRT named .dem": ("a.dem", VRT.encode, "FormatError", "this is text that begins with '<VRTDataset"),
+    "VRT named .asc": ("a.asc", VRT.encode, "FormatError", "this is text that begins with '<VRTDataset"),
     "VRT named .hgt": ("N00E000.hgt", VRT.encode, "FormatError", "an SRTM tile of 2,884,802 .* bytes, got 1"),
-    "VRT named .nc": ("a.nc", VRT.encode, "FormatError", "got text that begins with '<VRTDataset"),
+    "VRT named .nc": ("a.nc", VRT.encode, "FormatError", "this is text that begins with '<VRTDataset"),
     "ASCII grid of 10^18 heights": (
         "a.asc",
         lambda: b"ncols 1000000000\nnrows 1000000000\ncellsize 1\n1 2 3\n",
@@ -264,7 +264,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], str, str]] = {
         "a.asc",
         lambda: b"ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\nsea sea\nsea land\n",
         "FormatError",
-        "a whole ESRI ASCII grid, got one that GDAL cannot read",
+        "GDAL cannot read this ESRI ASCII grid",
     ),
     "ASCII grid of minus one": ("a.asc", lambda: b"ncols -1\nnrows -1\n1\n", "FormatError", "at least two points"),
     "ASCII grid of nodata": (
@@ -344,5 +344,5 @@ def test_hostile_files_are_refused_in_time_and_space(refused: dict[str, Refusal]
     assert found.memory < 512 * MIB
     assert found.seconds < SECONDS
     if found.error != "none":
-        assert "expected" in found.message or "cannot read" in found.message
+        assert re.search("expected|this is |cannot read", found.message)
         assert "\n" not in found.message
