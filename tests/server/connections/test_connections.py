@@ -19,6 +19,7 @@ import pytest
 import uvicorn
 from starlette.types import Receive, Scope, Send
 from uvicorn.server import ServerState
+from websockets.exceptions import ConnectionClosed
 
 import lodestream as ls
 from lodestream.protocol.connection import State
@@ -34,7 +35,7 @@ from lodestream_server.operation.pace import Pace
 from lodestream_server.operation.settings import Settings
 from tests.server.helpers import PATIENCE, closed, eventually, hills, kept, listed, npy, push, raw_stream
 
-SECONDS = 1.5
+SECONDS = 3.0
 
 
 @pytest.fixture(scope="module")
@@ -323,10 +324,11 @@ def test_a_silent_client_is_closed_with_a_reason(impatient: tuple[str, dict[str,
         ([Open(ls.Target(level=0))], "Neither bye nor another open came"),
     ]
     with ExitStack() as held:
-        streams = [held.enter_context(raw_stream(url + made["url"])) for _ in silent]
-        for stream, (messages, _) in zip(streams, silent, strict=True):
+        streams = []
+        for messages, _ in silent:
+            streams.append(held.enter_context(raw_stream(url + made["url"])))
             for message in messages:
-                stream.send(message)
+                streams[-1].send(message)
         for stream, (_, words) in zip(streams, silent, strict=True):
             event = stream.receive()
             while not isinstance(event, Error):
@@ -392,7 +394,8 @@ def test_a_body_shorter_than_it_says_is_nothing(http: httpx.Client, server: str,
 )
 def test_what_is_no_request_is_refused(impatient: tuple[str, Any], head: bytes) -> None:
     with connected(impatient[0]) as connection:
-        connection.sendall(head)
+        with suppress(ConnectionResetError, BrokenPipeError):  # it may be refused before all of it was sent
+            connection.sendall(head)
         answer = all_of(connection)
     assert not answer or 400 <= status_of(answer) < 500
 
@@ -442,9 +445,10 @@ def test_ten_thousand_ranges_cost_no_more_than_the_file(impatient: tuple[str, di
     url, made = impatient
     address = f"/v1/containers/{made['container_sha256']}.lode"
     with connected(url) as connection:
-        connection.sendall(
-            f"GET {address} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nRange: {header}\r\n\r\n".encode()
-        )
+        with suppress(ConnectionResetError, BrokenPipeError):  # it may be refused before all of it was sent
+            connection.sendall(
+                f"GET {address} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nRange: {header}\r\n\r\n".encode()
+            )
         answer = all_of(connection)
     # Whether the server's buffer for heads holds it depends on how the network cuts it.
     assert status_of(answer) in (200, 400)
@@ -502,7 +506,13 @@ def test_a_connection_too_many_is_told_to_come_back(tmp_path: Path) -> None:
         finally:
             for connection in held:
                 connection.close()
-        eventually(lambda: httpx.get(f"{url}/healthz", trust_env=False).status_code == 200, "room again")
+
+        def room() -> bool:
+            with suppress(httpx.TransportError):  # what is refused may be cut before it has asked
+                return httpx.get(f"{url}/healthz", trust_env=False, timeout=PATIENCE).status_code == 200
+            return False
+
+        eventually(room, "room again")
 
 
 @pytest.mark.long
@@ -517,26 +527,28 @@ def test_a_plan_that_takes_long_is_no_silence_of_the_client(tmp_path: Path, monk
     monkeypatch.setattr(Sender, "receive", slow)
     with (
         running_server(tmp_path, workers=1, bye_seconds=0.5) as url,
-        httpx.Client(base_url=url, trust_env=False) as http,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
     ):
         address = url + push(http, npy(hills()))["url"]
 
-        def answer() -> Event:
-            with raw_stream(address) as stream:
+        def answered() -> bool:
+            with suppress(ConnectionClosed), raw_stream(address) as stream:
                 stream.send(Open(ls.Target(level=0), 9000))
                 while not isinstance(stream.receive(), End):
                     pass
                 stream.send(Open(ls.Target(first=((0, 5), (0, 5)))))
-                return stream.receive()
+                return isinstance(stream.receive(), Opened)
+            return False
 
         # On a machine that does much else, the other open may come too late some time; not always.
-        eventually(lambda: isinstance(answer(), Opened), "the answer to another open")
+        eventually(answered, "the answer to another open")
 
 
 def test_nothing_of_connections_is_kept_when_they_have_ended(tmp_path: Path) -> None:
     def watches() -> int:
         gc.collect()
-        return sum(isinstance(item, Answers | connections._Http | connections._Stream) for item in gc.get_objects())
+        kinds = (Answers, connections._Http, connections._Stream)
+        return sum(issubclass(type(item), kinds) for item in gc.get_objects())  # `isinstance` asks weak proxies
 
     # Patient: what is kept until the next look at a connection would be kept for longer than this waits.
     with running_server(tmp_path, workers=1, idle_seconds=10 * PATIENCE) as url:
@@ -544,7 +556,7 @@ def test_nothing_of_connections_is_kept_when_they_have_ended(tmp_path: Path) -> 
             surface = push(http, npy(hills()))
         before = watches()
         for _ in range(5):
-            assert httpx.get(url + surface["url"], trust_env=False).status_code == 200
+            assert httpx.get(url + surface["url"], trust_env=False, timeout=PATIENCE).status_code == 200
             with raw_stream(url + surface["url"]) as stream:
                 stream.send(Open(credit=100_000))
                 stream.until_end()

@@ -17,12 +17,12 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 
 import lodestream as ls
-from lodestream.protocol.messages import Credit, End, Error, Open
+from lodestream.protocol.messages import Credit, End, Error, Event, Open
 from lodestream.protocol.wire import serialize
 from lodestream_server import running, running_server
 from lodestream_server.connections import connections
 from tests.server.connections.sockets import CONTINUATION, PING, PONG, Frames, Place, frame, handshake
-from tests.server.helpers import PATIENCE, Keys, hills, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, Keys, Raw, hills, in_time, npy, push, raw_stream
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +30,12 @@ def surface(http: httpx.Client) -> dict[str, Any]:
     return push(http, npy(hills(200, 190)))
 
 
-def streams() -> list[Any]:
-    """The streams of servers of this process that are open."""
+def stream_of(connection: socket.socket) -> Any:
+    """The other side of a connection to a server of this process; those of other tests may still be there."""
     # Not by `isinstance`, which asks weak proxies.
     found = [item for item in gc.get_objects() if issubclass(type(item), connections._Stream)]
-    return [stream for stream in found if not stream.disconnected]
+    (stream,) = (each for each in found if not each.disconnected and each.client == connection.getsockname())
+    return stream
 
 
 def opened(url: str, buffer: int | None = None) -> socket.socket:
@@ -69,7 +70,7 @@ def test_of_pongs_that_nobody_takes_the_last_one_waits(
     monkeypatch.setattr(running, "_PING_INTERVAL", PATIENCE)  # of no ping that the server itself sends
     settings: dict[str, Any] = {"workers": 1, "token_file": keys.folder / "tokens.json", "head_seconds": PATIENCE}
     with running_server(tmp_path, **settings) as url, opened(f"{url}/v1/surfaces/{'0' * 20}", 4096) as connection:
-        transport = streams()[0].transport
+        transport = stream_of(connection).transport
         number, most = 0, 0
         while number < 100_000:
             connection.sendall(b"".join(frame(b"%0125d" % each, PING) for each in range(number, number + 500)))
@@ -95,8 +96,7 @@ def test_a_stream_is_read_little_by_little(server: str, surface: dict[str, Any])
         while pongs < 150:
             for opcode, _ in found.feed(connection.recv(1 << 16)):
                 pongs += opcode == PONG
-        (stream,) = streams()
-        assert len(stream.get_buffer(-1)) <= 1024
+        assert len(stream_of(connection).get_buffer(-1)) <= 1024
 
 
 def test_frames_that_are_no_message_are_allowed_again_with_time_and_for_messages(
@@ -159,7 +159,8 @@ def test_grants_that_were_held_up_come_all_at_once(server: str, surface: dict[st
 
 def test_pings_do_not_prolong_the_wait_for_open(tmp_path: Path, keys: Keys) -> None:
     settings: dict[str, Any] = {"workers": 1, "head_seconds": 0.5, "token_file": keys.folder / "tokens.json"}
-    with running_server(tmp_path, **settings) as url, raw_stream(f"{url}/v1/surfaces/{'0' * 20}") as stream:
+
+    def pinged(stream: Raw) -> Event:
         pinging = threading.Event()
 
         def ping() -> None:
@@ -174,8 +175,12 @@ def test_pings_do_not_prolong_the_wait_for_open(tmp_path: Path, keys: Keys) -> N
         finally:
             pinging.set()
             thread.join()
-        assert isinstance(event, Error)
-        assert event.code == "idle"
+        return event
+
+    with running_server(tmp_path, **settings) as url:
+        event = in_time(f"{url}/v1/surfaces/{'0' * 20}", pinged)
+    assert isinstance(event, Error)
+    assert event.code == "idle"
 
 
 def test_messages_that_change_nothing_do_not_prolong_a_wait(tmp_path: Path) -> None:
