@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -64,6 +65,11 @@ def grown(http: httpx.Client, before: dict[tuple[str, ...], float], *name: str) 
     return figures(http).get(name, 0.0) - before.get(name, 0.0)
 
 
+def is_counted(http: httpx.Client, before: dict[tuple[str, ...], float], result: str) -> bool:
+    """Whether one stream more has ended so."""
+    return grown(http, before, "lodestream_streams_total", result) == 1
+
+
 def test_streams_are_counted_and_what_stopping_saved(http: httpx.Client, server: str, made: dict[str, Any]) -> None:
     before = figures(http)
     with raw_stream(server + made["url"]) as stream:
@@ -91,7 +97,8 @@ def test_a_complete_stream_saves_nothing_and_a_stop_does(http: httpx.Client, ser
         stream.receive()
         stream.send(Stop())
         stream.until_end()
-    eventually(lambda: grown(http, before, "lodestream_streams_total", "stopped") == 1, "the stop to be counted")
+    for result in ("level", "stopped"):
+        eventually(partial(is_counted, http, before, result), "the stream to be counted")
     assert whole(made) < grown(http, before, "lodestream_stream_saved_bytes_total") < 2 * whole(made)
     before = figures(http)
     small = push(http, npy(hills(9, 9, seed=5)))
@@ -136,10 +143,11 @@ def test_what_the_client_held_is_not_saved(http: httpx.Client, server: str, made
 
 
 def test_builds_uploads_and_errors_are_counted(http: httpx.Client, server: str) -> None:
+    # A surface is ready a moment before its build is over and counted.
+    eventually(lambda: figures(http)["lodestream_builds_pending",] == 0, "the builds of before to be over")
     before = figures(http)
     push(http, npy(hills(8, 8, seed=6)))
     push(http, npy(hills(8, 8, seed=7))[:-8])
-    # A surface is ready a moment before its build is over and counted.
     eventually(lambda: figures(http)["lodestream_builds_pending",] == 0, "the builds to be over")
     assert grown(http, before, "lodestream_build_seconds_count", "ready") == 1
     assert grown(http, before, "lodestream_build_seconds_count", "failed") == 1

@@ -19,6 +19,7 @@ from lodestream_server.connections.connections import connections
 from lodestream_server.connections.cuts import Cuts
 from lodestream_server.operation.metrics import Metrics
 from lodestream_server.operation.pace import PIECES_A_TURN, Pace, Paced
+from tests.patience import PATIENCE
 from tests.server.connections.sockets import Place, handshake
 
 MANY = 10 * PIECES_A_TURN
@@ -202,7 +203,7 @@ async def end(sockets: list[Socket]) -> None:
         made.protocol.connection_lost(None)
     tasks = asyncio.all_tasks() - {asyncio.current_task()}
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE):
             await asyncio.gather(*tasks, return_exceptions=True)
     assert not asyncio.all_tasks() - {asyncio.current_task()}
 

@@ -224,13 +224,13 @@ def test_an_address_that_is_taken_or_not_ours(tmp_path: Path, refused: Refused) 
     for host in ("192.0.2.1", "nowhere.invalid"):
         assert host in refused("serve", "--port", "0", "--host", host, "--insecure", "--data", tmp_path)
     with running_server(tmp_path) as url:
-        assert httpx.get(f"{url}/healthz", trust_env=False).status_code == 200
+        assert httpx.get(f"{url}/healthz", trust_env=False, timeout=PATIENCE).status_code == 200
 
 
 def test_a_name_with_several_addresses_is_served_at_each(tmp_path: Path) -> None:
     found = {info[4][0] for info in socket.getaddrinfo("localhost", 0, type=socket.SOCK_STREAM)}
     with running_server(tmp_path, host="localhost") as url:
-        assert httpx.get(f"{url}/healthz", trust_env=False).status_code == 200
+        assert httpx.get(f"{url}/healthz", trust_env=False, timeout=PATIENCE).status_code == 200
         assert url.rsplit(":", 1)[0].removeprefix("http://").strip("[]") in found
 
 
@@ -243,15 +243,19 @@ def test_pages_of_all_sites_need_a_token_to_be_there(tmp_path: Path, keys: Keys,
     create_app(Settings(data=keys.folder, origins=(origin,)))
 
 
+def listed(url: str, headers: dict[str, str]) -> httpx.Response:
+    return httpx.get(f"{url}/v1/surfaces", headers=headers, trust_env=False, timeout=PATIENCE)
+
+
 def test_pages_of_all_sites_use_a_server_with_their_token(keys: Keys) -> None:
     with running_server(keys.folder, workers=1, origins=("*",)) as url:
         for site in ("https://a.example", "null", url):
             page = {"origin": site, **keys.header("write")}
-            answer = httpx.get(f"{url}/v1/surfaces", headers=page, trust_env=False)
+            answer = listed(url, page)
             assert answer.status_code == 200
             assert answer.headers["access-control-allow-origin"] == "*"
             assert "access-control-allow-credentials" not in answer.headers
-            assert problem(httpx.get(f"{url}/v1/surfaces", headers={"origin": site}, trust_env=False))[0] == 401
+            assert problem(listed(url, {"origin": site}))[0] == 401
 
 
 def mode(path: Path) -> int:
@@ -371,7 +375,10 @@ def test_a_server_starts_on_a_disk_whose_size_cannot_be_told(
         raise OSError(errno.ESTALE, "Stale file handle", str(folder))
 
     monkeypatch.setattr(shutil, "disk_usage", stale)
-    with running_server(tmp_path / "data", workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
+    with (
+        running_server(tmp_path / "data", workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
         surface = push(http, npy(hills()))
         assert http.get(f"{surface['url']}/levels/0", params={"format": "npy"}).status_code == 200
     assert "the size of the disk is unknown, so that few levels and containers are kept: [Errno 116]" in caplog.text
