@@ -84,7 +84,7 @@ def test_all_addresses_have_the_path(url: str, http: httpx.Client, surface: dict
     assert other.headers["location"].startswith("/surfaces/v1/surfaces/")
     listed = http.get("/v1/surfaces", params={"limit": 1}).json()
     assert listed["next"].startswith("/surfaces/v1/surfaces?")
-    assert len(httpx.get(url + listed["next"], trust_env=False).json()["surfaces"]) == 1
+    assert len(httpx.get(url + listed["next"], trust_env=False, timeout=PATIENCE).json()["surfaces"]) == 1
     assert http.put("/v1/names/hills", json={"surface": surface["id"]}).status_code == 201
     (name,) = http.get("/v1/names").json()["names"]
     assert (name["url"], name["surface"]) == ("/surfaces/v1/names/hills", address)
@@ -115,8 +115,8 @@ def test_the_page_and_its_scripts_are_there(url: str, http: httpx.Client) -> Non
     found = http.get("/")
     assert found.status_code == 200
     (script,) = re.findall(r'src="([^"]+)"', found.text)
-    assert httpx.get(httpx.URL(f"{url}/surfaces/").join(script), trust_env=False).status_code == 200
-    moved = httpx.get(f"{url}/surfaces", trust_env=False)
+    assert httpx.get(httpx.URL(f"{url}/surfaces/").join(script), trust_env=False, timeout=PATIENCE).status_code == 200
+    moved = httpx.get(f"{url}/surfaces", trust_env=False, timeout=PATIENCE)
     assert (moved.status_code, moved.headers["location"]) == (307, f"{url}/surfaces/")
 
 
@@ -128,7 +128,7 @@ def test_errors_are_its_own_and_the_hosts_stay_the_hosts(url: str, http: httpx.C
     assert problem(wrong) == (405, "bad-method")
     assert wrong.headers["allow"] == "GET, HEAD, POST"
     assert "x-request-id" in wrong.headers
-    with httpx.Client(base_url=url, trust_env=False) as host:
+    with httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as host:
         ours = host.get("/v1/surfaces")
         assert (ours.status_code, list(ours.json())) == (200, ["host"])
         nothing = host.get("/nothing")

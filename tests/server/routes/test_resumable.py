@@ -36,6 +36,10 @@ TUS = {"tus-resumable": "1.0.0"}
 PARTIAL = "scratch/partial"
 
 
+def client(url: str) -> httpx.Client:
+    return httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE)
+
+
 def said(**values: str) -> str:
     return ",".join(f"{key} {base64.b64encode(value.encode()).decode()}" for key, value in values.items())
 
@@ -266,7 +270,7 @@ def test_only_its_owner_may_continue_an_upload(tmp_path: Path) -> None:
         for name, scope in (("anna", "write"), ("bert", "admin"))
     )
     body = npy(hills(seed=77))
-    with running_server(tmp_path, workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
+    with running_server(tmp_path, workers=1) as url, client(url) as http:
         assert began(http, 9).status_code == 401
         http.headers.update(anna)
         address = begun(http, len(body))
@@ -288,7 +292,7 @@ def test_how_many_there_may_be_is_bounded(tmp_path: Path) -> None:
     anna, bert = ({"authorization": f"Bearer {file.create(name, ('write',))[0]}"} for name in ("anna", "bert"))
     with (
         running_server(tmp_path, workers=1, max_partial_uploads=8) as url,
-        httpx.Client(base_url=url, trust_env=False) as http,
+        client(url) as http,
     ):
         http.headers.update(anna)
         answers = [began(http, 10) for _ in range(20)]
@@ -307,7 +311,7 @@ def test_how_many_there_may_be_is_bounded(tmp_path: Path) -> None:
 def test_what_is_under_way_counts_as_kept(tmp_path: Path) -> None:
     with (
         running_server(tmp_path, workers=1, owner_bytes=100_000) as url,
-        httpx.Client(base_url=url, trust_env=False) as http,
+        client(url) as http,
     ):
         first, second = begun(http, 90_000), begun(http, 90_000)
         assert problem(began(http, 110_000)) == (507, "full")
@@ -325,7 +329,7 @@ def test_what_nobody_continues_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("lodestream_server.upkeep._EXPIRE_SECONDS", 0.05)
     with (
         running_server(tmp_path, workers=1, partial_seconds=100.0) as url,
-        httpx.Client(base_url=url, trust_env=False) as http,
+        client(url) as http,
     ):
         address = begun(http, 5000)
         now += 60.0
@@ -340,7 +344,7 @@ def test_what_nobody_continues_goes(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_an_upload_outlives_the_server(tmp_path: Path) -> None:
     body, settings = npy(hills(seed=78)), {"workers": 1}
     metadata = said(filename="hills.npy", sha256=hashlib.sha256(body).hexdigest())
-    with running_server(tmp_path, **settings) as url, httpx.Client(base_url=url, trust_env=False) as http:
+    with running_server(tmp_path, **settings) as url, client(url) as http:
         half, done, whole = (begun(http, len(body), metadata, name=name) for name in ("a", "b", "c"))
         assert part(http, half, 0, body[:1234]).status_code == 204
         location = part(http, done, 0, body).headers["location"]
@@ -350,7 +354,7 @@ def test_an_upload_outlives_the_server(tmp_path: Path) -> None:
         last.write(body[-1:])
     # And one in whose first moments it was killed.
     (tmp_path / PARTIAL / ("0" * 32)).mkdir()
-    with running_server(tmp_path, **settings) as url, httpx.Client(base_url=url, trust_env=False) as http:
+    with running_server(tmp_path, **settings) as url, client(url) as http:
         assert http.head(done, headers=TUS).headers["location"] == location
         assert offset(http, half) == 1234
         assert part(http, half, 1234, body[1234:]).status_code == 204
@@ -486,7 +490,7 @@ def test_a_server_that_is_killed_has_all_that_it_told(tmp_path: Path) -> None:
         if location:
             break
     assert location
-    with running_server(tmp_path / "data", workers=1) as url, httpx.Client(base_url=url, trust_env=False) as http:
+    with running_server(tmp_path / "data", workers=1) as url, client(url) as http:
         assert http.head(address, headers=TUS).headers["location"] == location
         assert settled(http, location)["state"] == "ready"
         assert len(listed(http)) == 1
