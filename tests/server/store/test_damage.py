@@ -17,7 +17,7 @@ from lodestream.stores import Folder
 from lodestream_server.store import damage
 from lodestream_server.store.surfaces import Surfaces
 from tests.server.builds.test_builds import running
-from tests.server.helpers import closed, hills, npy, push, raw_stream
+from tests.server.helpers import closed, eventually, hills, npy, push, raw_stream
 
 from .world import upload
 
@@ -75,7 +75,12 @@ def test_a_damaged_container_is_told_once_with_what_to_do(
             cut()
             found = level if way == "level" else fetch
             assert code_of(http.get(found)) == "damaged"
-    lines = [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+    def told() -> list[logging.LogRecord]:
+        return [record for record in caplog.records if record.levelno >= logging.ERROR]
+
+    eventually(lambda: len(told()) >= 3, "all of it to be told")  # of a stream after its end
+    lines = told()
     words = {record.getMessage() for record in lines}
     assert words == {
         f"containers/{path.name}, the container of surface {made['id']}, is damaged: stop the server and run "

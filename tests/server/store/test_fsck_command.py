@@ -281,7 +281,6 @@ def test_it_says_in_words_what_it_found(
 def test_a_bucket_is_checked_beside_its_servers_and_repaired_without_them(
     memory: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(command, "_PATIENCE", 0.5)
     store, bad = open_store(memory), tmp_path / "bad"
 
     def asked(*options: str) -> tuple[int, dict[str, Any]]:
@@ -302,9 +301,11 @@ def test_a_bucket_is_checked_beside_its_servers_and_repaired_without_them(
             1,
             [("container", key, one["id"])],
         )
-        for option in ("--repair", "--collect"):
-            with pytest.raises(LodestreamError, match=r"no server writes to s3://memory/data, but .* end it"):
-                run(memory, option)
+        with monkeypatch.context() as patch:
+            patch.setattr(command, "_PATIENCE", 0.5)
+            for option in ("--repair", "--collect"):
+                with pytest.raises(LodestreamError, match=r"no server writes to s3://memory/data, but .* end it"):
+                    run(memory, option)
         with pytest.raises(LodestreamError, match="lodestream retry URL"):
             run(memory, "--retry")
     code, report = asked("--repair", "--collect")
@@ -322,8 +323,10 @@ def test_who_waits_for_a_bucket_takes_over_after_a_repair(memory: str, tmp_path:
         pass
     with command._writing(open_store(memory)) as lease:
         assert lease.held
-        with running_server(memory, workers=1, scratch=tmp_path / "second") as url:
-            told = httpx.get(f"{url}/readyz", trust_env=False).json()
-            assert told["role"] == "waiting"
+        with (
+            running_server(memory, workers=1, scratch=tmp_path / "second") as url,
+            httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+        ):
+            assert http.get("/readyz").json()["role"] == "waiting"
             lease.close()
-            eventually(lambda: httpx.get(f"{url}/readyz", trust_env=False).json()["role"] == "writer", "it to write")
+            eventually(lambda: http.get("/readyz").json()["role"] == "writer", "it to write")

@@ -255,20 +255,26 @@ def test_a_lease_that_says_it_lasts_long_is_waited_for_but_not_for_ever(store: S
 
 
 def test_threads_take_over_from_each_other_and_tell(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    seconds = 0.6
-    turns = threading.Event()
+    seconds = 3.0  # a busy machine may stop a thread for as long as is left until then at a renewal
+    turns, renewed, replace = threading.Event(), list[object](), store.replace
+
+    def noted(*given: Any) -> Any:
+        renewed.append(given)
+        return replace(*given)
+
+    monkeypatch.setattr(store, "replace", noted)
     first, second = Lease(store, seconds), Lease(store, seconds)
     second.turned = turns.set
     first.start()
     eventually(lambda: first.held, "the first one to have it")
     second.start()
-    time.sleep(2 * seconds)
+    eventually(lambda: len(renewed) > 4, "renewals for longer than a lease lasts")
     assert first.held
     assert not second.held
     turns.clear()
     monkeypatch.setattr(first, "_give_up", lambda: None)  # as if it were killed
-    first._ending.set()
     begun = time.monotonic()
+    first._ending.set()
     eventually(lambda: second.held, "the second one to take over")
     assert time.monotonic() - begun > seconds / 2
     eventually(turns.is_set, "that to be told")
@@ -291,14 +297,14 @@ def test_a_store_that_does_not_answer_ends_a_lease_and_is_told_once(
 
     with monkeypatch.context() as broken:
         broken.setattr(store, "replace", fail)
+        words = "the lease of the bucket could not be looked at: no network"
+        eventually(lambda: words in caplog.messages, "that to be told")
         eventually(lambda: not lease.held, "it to end")
         time.sleep(0.2)
     eventually(lambda: lease.held, "it to be held again")
     assert lease.number == 1
     lease.close()
-    assert [record.message for record in caplog.records].count(
-        "the lease of the bucket could not be looked at: no network"
-    ) == 1
+    assert caplog.messages.count(words) == 1
     assert not lease.held
     assert lease._until == -math.inf
 
@@ -334,8 +340,8 @@ def test_the_end_of_a_lease_is_told_while_the_store_hangs_and_a_takeover_names_w
     store: Store, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     caplog.set_level(logging.INFO)
-    lease, over, turned = Lease(store, 0.3), threading.Event(), threading.Event()
-    silent = Lease(store, 0.3)
+    lease, over, turned = Lease(store, 1.0), threading.Event(), threading.Event()
+    silent = Lease(store, 1.0)
     silent._name = "other (process 1)"
     silent.tend()
     lease.start()
@@ -352,7 +358,8 @@ def test_the_end_of_a_lease_is_told_while_the_store_hangs_and_a_takeover_names_w
         eventually(turned.is_set, "the end to be told")
         assert not over.is_set()
         assert not lease.held
-        (lost,) = (record.message for record in caplog.records if record.levelname == "ERROR")
+        # The last one: on a busy machine it may have been late with a renewal before.
+        *_, lost = (record.message for record in caplog.records if record.levelname == "ERROR")
         assert lost.startswith("this server has lost the lease of the bucket, which has not answered for ")
         assert lost.endswith(" s; it writes nothing, and nobody is known to")
     over.set()

@@ -44,7 +44,7 @@ def test_a_container_may_go_before_it_is_opened(
             monkeypatch.setattr(anyio, "open_file", opens)
             if again:  # it was not there for a moment
                 raise FileNotFoundError
-            await asyncio.to_thread(httpx.delete, url + surface["url"], trust_env=False)
+            await asyncio.to_thread(httpx.delete, url + surface["url"], trust_env=False, timeout=PATIENCE)
             return await opens(*args, **kwargs)
 
         monkeypatch.setattr(anyio, "open_file", late)
