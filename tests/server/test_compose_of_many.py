@@ -64,6 +64,10 @@ def serving(named: dict[str, str]) -> Iterator[tuple[str, subprocess.Popen[str]]
             process.kill()
 
 
+def role(place: str) -> str:
+    return str(httpx.get(f"http://{place}/readyz", trust_env=False, timeout=PATIENCE).json()["role"])
+
+
 @pytest.mark.long
 def test_one_writes_another_takes_over_and_readers_answer(s3: Emulator, tmp_path: Path) -> None:
     if missing("caddy"):
@@ -86,7 +90,7 @@ def test_one_writes_another_takes_over_and_readers_answer(s3: Emulator, tmp_path
         places = {name: place for name, (place, _) in started.items()}
 
         def roles() -> list[str]:
-            return [httpx.get(f"http://{places[name]}/readyz", trust_env=False).json()["role"] for name in names]
+            return [role(places[name]) for name in names]
 
         eventually(lambda: roles() == ["writer", "waiting", "reader", "reader"], "one to write")
         front = stack.enter_context(
@@ -103,8 +107,7 @@ def test_one_writes_another_takes_over_and_readers_answer(s3: Emulator, tmp_path
             writer = started["writer"][1]
             writer.terminate()
             writer.wait(PATIENCE)
-            standby = f"http://{places['standby']}/readyz"
-            eventually(lambda: httpx.get(standby, trust_env=False).json()["role"] == "writer", "the other to take over")
+            eventually(lambda: role(places["standby"]) == "writer", "the other to take over")
             stored(front, client, 2)
             eventually(lambda: len(client.get("/v1/surfaces").json()["surfaces"]) == 2, "the readers to know both")
 

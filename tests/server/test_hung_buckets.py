@@ -111,7 +111,7 @@ def test_a_look_that_fails_when_nobody_waits_for_it_any_more_is_no_error_of_the_
 def test_a_server_tells_for_how_long_the_bucket_has_not_answered_and_lets_nobody_wait_for_it(
     stored: str, memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    often: dict[str, Any] = {"workers": 1, "lease_seconds": 1.5, "look_seconds": 0.2}
+    often: dict[str, Any] = {"workers": 1, "lease_seconds": 3.0, "look_seconds": 0.2}
     with (
         running_server(memory, scratch=tmp_path / "a", **often) as writer,
         httpx.Client(base_url=writer, trust_env=False, timeout=PATIENCE) as first,
@@ -122,7 +122,8 @@ def test_a_server_tells_for_how_long_the_bucket_has_not_answered_and_lets_nobody
         assert 0 <= first.get("/readyz").json()["unseen"] < PATIENCE
         (surface,) = second.get("/v1/surfaces").json()["surfaces"]
         for http, role in ((first, 1), (second, 0)):
-            assert f"lodestream_writer {role}.0\n" in http.get("/metrics").text
+            words = f"lodestream_writer {role}.0\n"
+            eventually(lambda http=http, words=words: words in http.get("/metrics").text, "who writes")  # type: ignore[misc]
         monkeypatch.setattr("lodestream_server.following._PATIENCE", 0.01)
         for method in ("get", "get_if", "create", "replace"):
             monkeypatch.setattr(f"lodestream.stores.bucket.Bucket.{method}", hanging)

@@ -72,9 +72,10 @@ def test_an_index_that_is_lost_under_clients(tmp_path: Path, caplog: pytest.LogC
         made = push(http, npy(hills()))
         working = [threads.submit(work, worker) for worker in range(WORKERS)]
         try:
-            for time in range(1, 3):
+            for _ in range(2):
+                before = caplog.messages.count(MADE)
                 index.unlink()
-                eventually(lambda n=time: caplog.messages.count(MADE) == n, "another index")  # type: ignore[misc]
+                eventually(lambda n=before: caplog.messages.count(MADE) > n, "another index")  # type: ignore[misc]
                 assert patiently(lambda: http.get(made["url"])).json() == made
         finally:
             over.set()
@@ -172,4 +173,4 @@ def test_a_server_whose_bucket_cannot_be_listed_says_so(
             assert http.get("/readyz").json()["role"] == "waiting"
             broken.undo()
             eventually(lambda: http.get("/readyz").json()["index"] == "current", "the list")
-            assert http.get("/readyz").json()["role"] == "writer"
+            eventually(lambda: http.get("/readyz").json()["role"] == "writer", "it to write")
