@@ -12,13 +12,20 @@ from typing import Any
 import httpx
 import pytest
 
+from lodestream import Target
+from lodestream.container import read_index
+from lodestream.planning.window_errors import window_section
 from lodestream.stores import StoreError, open_store
+from lodestream.stores.bucket import Bucket, BucketBlob
+from lodestream_client import Client
 from lodestream_server import running_server
+from lodestream_server.builds import worker
 from lodestream_server.store import layout
 from lodestream_server.store.lease import Lease
 from lodestream_server.store.surfaces import Surfaces
 from tests.patience import PATIENCE
-from tests.server.helpers import eventually
+from tests.server.builds import slow
+from tests.server.helpers import eventually, hills, npy, push
 from tests.stores.memory import memory
 
 from .store.test_surfaces import build
@@ -84,6 +91,103 @@ def test_what_the_index_knows_is_told_while_many_wait_for_the_bucket(
             assert not any(answer.done() for answer in answers)
         finally:
             hanging.over.set()
+
+
+@pytest.fixture
+def built(memory: str, tmp_path: Path) -> list[dict[str, Any]]:
+    """Two surfaces that a server has built in the bucket."""
+    with (
+        running_server(memory, scratch=tmp_path / "writer", workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        eventually(lambda: http.get("/readyz").json()["role"] == "writer", "the server to write")
+        return [push(http, npy(hills(600, 600, seed))) for seed in (1, 2)]
+
+
+def hang(monkeypatch: pytest.MonkeyPatch, hanging: Hanging, container: str) -> None:
+    """Let all reads of a container wait."""
+    read, range_ = BucketBlob.read, Bucket._range
+
+    def read_of(self: BucketBlob, offset: int, length: int) -> bytes:
+        if container in self._extent.name:
+            hanging()
+        return read(self, offset, length)
+
+    def range_of(self: Bucket, key: str, offset: int, length: int) -> bytes:
+        if container in key:
+            hanging()
+        return range_(self, key, offset, length)
+
+    monkeypatch.setattr(BucketBlob, "read", read_of)
+    monkeypatch.setattr(Bucket, "_range", range_of)
+
+
+def test_what_is_a_file_of_the_server_is_answered_while_many_wait_for_the_bucket(
+    built: list[dict[str, Any]], memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, away = built
+    with (
+        running_server(memory, scratch=tmp_path / "reader", workers=1, read_only=True) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+        ThreadPoolExecutor(42) as readers,
+    ):
+        place = f"/v1/containers/{here['container_sha256']}.lode"
+        whole = http.get(place).content
+        http.get(f"{here['url']}/levels/0?format=npy").raise_for_status()
+        hang(monkeypatch, hanging, away["container_sha256"])
+        level = readers.submit(http.get, f"{away['url']}/levels/0?format=npy")
+        eventually(lambda: hanging.count == 1, "the level to wait")
+        try:
+            http.get(f"{here['url']}/levels/1?format=npy").raise_for_status()
+            others = f"/v1/containers/{away['container_sha256']}.lode"
+            answers = [level, *(readers.submit(http.get, others) for _ in range(40))]
+            eventually(lambda: hanging.count >= 32, "many to wait")
+            assert http.get(place).content == whole
+            http.get(f"{here['url']}/levels/2?format=npy").raise_for_status()
+            with Client(url).connect(here["id"]) as stream:
+                for _ in stream:
+                    pass
+            assert stream.ended == "complete"
+            assert not any(answer.done() for answer in answers)
+        finally:
+            hanging.over.set()
+
+
+def test_a_plan_that_needs_the_bucket_keeps_no_other_from_its_turn(
+    built: list[dict[str, Any]], memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, away = built
+    with (
+        running_server(memory, scratch=tmp_path / "reader", workers=1, read_only=True) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+        ThreadPoolExecutor(1) as readers,
+    ):
+        data = http.get(f"/v1/containers/{away['container_sha256']}.lode").content
+        section = window_section(read_index(lambda offset, length: data[offset : offset + length], len(data)))
+        assert section is not None
+        read = BucketBlob.read
+
+        def read_of(self: BucketBlob, offset: int, length: int) -> bytes:
+            if away["container_sha256"] in self._extent.name and offset == section.offset:
+                hanging()
+            return read(self, offset, length)
+
+        def window_of(surface: dict[str, Any]) -> str | None:
+            target = Target(region=((100, 300), (100, 300)), until_max=5.0)
+            with Client(url).connect(surface["id"], target=target) as stream:
+                for _ in stream:
+                    pass
+            return stream.ended
+
+        monkeypatch.setattr(BucketBlob, "read", read_of)
+        waiting = readers.submit(window_of, away)
+        eventually(lambda: hanging.count == 1, "the first one to wait")
+        try:
+            assert window_of(here) == "max"
+            assert not waiting.done()
+        finally:
+            hanging.over.set()
+        assert waiting.result() == "max"
 
 
 def test_a_look_that_fails_when_nobody_waits_for_it_any_more_is_no_error_of_the_server(
@@ -155,3 +259,38 @@ def test_a_server_ends_and_gives_up_its_lease_while_the_bucket_hangs(
     found = open_store(memory).get_if(layout.WRITER, None)
     assert found is not None
     assert layout.parse(layout.Writer, layout.WRITER, found[0]).holder is None
+
+
+def test_a_server_ends_while_levels_and_builds_wait_for_the_bucket(
+    built: list[dict[str, Any]], memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with (
+        ThreadPoolExecutor(1) as reader,
+        running_server(memory, scratch=tmp_path / "scratch", workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        eventually(lambda: http.get("/readyz").json()["role"] == "writer", "the server to write")
+        monkeypatch.setattr(Bucket, "_range", hanging)
+        reader.submit(http.get, f"{built[0]['url']}/levels/0?format=npy")
+        eventually(lambda: hanging.count == 1, "the level to wait")
+        assert http.post("/v1/surfaces", content=npy(hills(seed=3))).status_code == 202
+        eventually(lambda: hanging.count == 2, "the build to wait")
+    assert not hanging.gave_up
+
+
+def test_a_server_ends_while_what_a_build_is_to_note_waits_for_the_bucket(
+    memory: str, hanging: Hanging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "build", slow.wait)
+    with (
+        ThreadPoolExecutor(1) as reader,
+        running_server(memory, scratch=tmp_path / "scratch", workers=1) as url,
+        httpx.Client(base_url=url, trust_env=False, timeout=PATIENCE) as http,
+    ):
+        eventually(lambda: http.get("/readyz").json()["role"] == "writer", "the server to write")
+        location = http.post("/v1/surfaces", content=npy(hills())).headers["location"]
+        eventually(lambda: http.get(location).json()["progress"] == 0.5, "the build to begin")
+        monkeypatch.setattr("lodestream.stores.bucket.Bucket.get", hanging)
+        reader.submit(http.put, "/v1/names/dem", json={"surface": None})  # it holds the lock of all changes
+        eventually(lambda: hanging.count == 1, "the change to wait")
+    assert not hanging.gave_up

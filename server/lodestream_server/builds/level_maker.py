@@ -4,6 +4,7 @@ What happens to a request:
 
 ======================================  ================================================================================
 the file exists                         it is lent at once
+its container is in a bucket            it is fetched, before the turn of the request
 otherwise                               it is a job (`runner`): it joins others for the same level, or waits its turn
 the client disconnects                  it leaves; if nobody else waits, the process is killed
 the level needs too much memory or      413
@@ -39,6 +40,7 @@ from ..store.containers import Containers
 from ..store.durable import discard, make_folder, remove
 from ..store.kept_files import Lease
 from .answers import FileTooLongError, ProcessDiedError, Refusal, UnforeseenError, WrongAnswerError
+from .fetching import Fetching
 from .fork_server import Allowed
 from .level_files import REMOVED, Key, LevelFiles
 from .levels import LevelJob, MadeLevel, make_level
@@ -113,6 +115,7 @@ class LevelMaker:
         self._containers = containers
         self._files = files
         self._limits = limits
+        self._fetching = Fetching(containers)
         self._runner = Runner[Key, Call]("level", 1, _REMEMBERED, Pool(1, fork_server))
 
     async def take(self, key: Key, caller: Caller) -> Loan:
@@ -146,6 +149,7 @@ class LevelMaker:
         lease = self._files.lend(key)
         if lease is None:
             with self._limits.levels.take(caller):
+                await self._fetching.fetch(key.container, caller)
                 async with self._runner.job(key, caller.key, partial(self._make, key)) as made:
                     lease = made.again()
         lent.add(caller.key, lease.size)
@@ -153,6 +157,7 @@ class LevelMaker:
 
     async def close(self) -> None:
         """Kill the process that makes a level, and remove the files."""
+        await self._fetching.close()
         await self._runner.close()
         await asyncio.to_thread(self._files.close)
 
@@ -166,7 +171,8 @@ class LevelMaker:
         if most < _LEAST_ROOM:
             raise self._no_room(most)
         with ExitStack() as stack:
-            container = await entered(self._containers.local(key.container), stack)
+            is_here = self._containers.is_here(key.container)
+            container = await entered(self._containers.local(key.container), stack, is_here=is_here)
             return await self._make_from(container, key, most, held)
 
     async def _make_from(self, container: Path, key: Key, most: int, held: ExitStack) -> Lease:

@@ -74,16 +74,18 @@ class Runner(Generic[_Key, _Call]):
         Number of jobs at the same time.
     memory : float
         Seconds for which it counts who has had turns, see `Turns`.
-    worker : Worker
-        Makes their calls; it is closed with the runner.
+    worker : Worker or None
+        Makes their calls; it is closed with the runner. None: there are none.
     level : int
         Of the line in the log for a job that ends well, or is refused.
     """
 
-    def __init__(self, kind: str, size: int, memory: float, worker: Worker[_Call], level: int = logging.INFO) -> None:
+    def __init__(
+        self, kind: str, size: int, memory: float, worker: Worker[_Call] | None, level: int = logging.INFO
+    ) -> None:
         self._kind = kind
         self._turns = Turns(size, memory)
-        self._worker: Worker[_Call] = worker
+        self._worker: Worker[_Call] | None = worker
         self._level = level
         self._jobs: dict[_Key, _Job] = {}
         self._tasks = set[asyncio.Task[Any]]()  # also of jobs that nobody waits for any more, until they have ended
@@ -171,6 +173,7 @@ class Runner(Generic[_Key, _Call]):
 
     async def call(self, call: _Call) -> Any:
         """Make a call of a job, see `Worker.run`."""
+        assert self._worker is not None, "jobs of this kind make calls"
         return await self._worker.run(call)
 
     async def close(self) -> None:
@@ -180,7 +183,8 @@ class Runner(Generic[_Key, _Call]):
         for task in tasks:
             _cut_short(task)
         # Before their end: a process that is kept would finish first what was begun.
-        await asyncio.to_thread(self._worker.close)
+        if self._worker is not None:
+            await asyncio.to_thread(self._worker.close)
         await asyncio.gather(*tasks, return_exceptions=True)
 
 

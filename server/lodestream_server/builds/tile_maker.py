@@ -3,6 +3,7 @@
 What happens to a request:
 
 ======================================  ================================================================================
+its container is in a bucket            it is fetched, before the turn of the request
 somebody waits for the same tile        it joins (`runner`)
 otherwise                               it waits its turn; with an index and blocks in memory a tile takes milliseconds
 the client disconnects                  it leaves the queue; a tile that was begun is made to its end
@@ -34,6 +35,7 @@ from ..problems import BusyError
 from ..store.containers import Containers
 from . import tiles
 from .answers import ProcessDiedError, Refusal, UnforeseenError
+from .fetching import Fetching
 from .fork_server import Allowed
 from .processes import Call, ForkServer, Keeper, Question
 from .runner import Runner
@@ -81,6 +83,7 @@ class TileMaker:
         self._limits = limits
         service = Call(tiles.service, (_BLOCKS, settings.max_vertices), _SECONDS, allowed=Allowed(memory=_MEMORY))
         keeper = Keeper(fork_server, service, _QUESTIONS)
+        self._fetching = Fetching(containers)
         self._runner = Runner[_Key, Question]("tile", 1, _REMEMBERED, keeper, logging.DEBUG)
 
     async def make(self, container: str, order: TileOrder, caller: Caller) -> bytes:
@@ -106,15 +109,19 @@ class TileMaker:
                 f"The address of the tiles has {len(order.address)} letters, and may have {_LONGEST_ADDRESS}"
             )
         with self._limits.tiles.take(caller):
+            await self._fetching.fetch(container, caller)
             async with self._runner.job((container, order), caller.key, partial(self._make, container, order)) as made:
                 return made
 
     async def close(self) -> None:
         """Kill the process."""
+        await self._fetching.close()
         await self._runner.close()
 
     async def _make(self, container: str, order: TileOrder, held: ExitStack) -> bytes:
-        return await self._ask(container, order, await entered(self._containers.local(container), held))
+        is_here = self._containers.is_here(container)
+        path = await entered(self._containers.local(container), held, is_here=is_here)
+        return await self._ask(container, order, path)
 
     async def _ask(self, container: str, order: TileOrder, path: Path) -> bytes:
         question = Question(tiles.answer, (container, order), path, _LONGEST)

@@ -31,7 +31,7 @@ from ..access.access import Caller, anybody
 from ..access.scopes import READ, StreamReader
 from ..codes import MEANINGS
 from ..operation.logs import event
-from ..operation.threads import in_store
+from ..operation.threads import in_store, in_thread
 from ..problems import NoWebSocketError, SilentError, answer, problem, responses
 from ..store.containers import OpenContainer
 from .routing import AnyQuery, readable
@@ -112,7 +112,8 @@ async def stream(caller: StreamReader, socket: WebSocket, parts: AnyQuery, surfa
                 container = parts.containers.open_known(sha256, caller.key)
                 if container is None:
                     share = partial(parts.limits.check_index, caller)
-                    container = await in_store(parts.containers.open, sha256, caller.key, share)
+                    is_here = parts.containers.is_here(sha256)
+                    container = await in_thread(is_here, parts.containers.open, sha256, caller.key, share)
             sender = Sender(container.index, container.sha256, credit, container.window_errors)
             await _stream(_Session(socket, container, sender, parts, first, caller), surface, caller)
     except WebSocketDisconnect:
@@ -277,11 +278,20 @@ class _Session:
             # However long it takes to plan, or to have a turn for it: the client has said something.
             self._heard.set()
             async with self._mine:
+                await self._fetch_window_errors(data)
                 if self._takes_long(data):
                     await self._plan(self._sender.receive, data)
                 else:
                     self._sender.receive(data)
             self._heard.set()
+
+    async def _fetch_window_errors(self, data: bytes) -> None:
+        """Have bounds of errors in memory that a plan may need: in its turn others would wait for the bucket too."""
+        if self._sender.state not in (State.IDLE, State.ENDED) or _WINDOW not in data:
+            return
+        section = window_section(self._container.index)
+        if section is not None and not self._container.is_here:
+            await in_store(self._container.read, section)
 
     def _takes_long(self, data: bytes) -> bool:
         if self._sender.state not in (State.IDLE, State.ENDED):
@@ -322,7 +332,7 @@ class _Session:
             elif wanted is not None:
                 data = self._container.read_at_once(wanted)
                 if data is None:
-                    data = await in_store(self._container.read, wanted)
+                    data = await in_thread(self._container.is_here, self._container.read, wanted)
                 else:
                     # The others' turn: of many streams each has its first picture before any has its second.
                     await self._pace.turn()

@@ -105,6 +105,10 @@ class ContainerCache:
             wanted = list(self._wanted.values())
         wait([each for each in wanted if not each.cancel()], _FAREWELL)
 
+    def __contains__(self, sha256: str) -> bool:
+        """Return whether a container was fetched, and has not made room."""
+        return sha256 in self._files
+
     def open(self, sha256: str, size: int) -> Blob | None:
         """Open the file of a container, if it is there; the second time that it is not, it is fetched meanwhile."""
         blob = self._opened(sha256, size)
@@ -302,7 +306,10 @@ class _CachedBlob:
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes; fewer where the container ends."""
         try:
-            return self._file.read(offset, length)
+            data = self._file.read(offset, length)
+            if len(data) < min(length, self.size - offset):
+                raise StoreError(f"{self.path}: it was cut short")
+            return data
         except StoreError as error:
             with self._instead(error) as blob:
                 return blob.read(offset, length)

@@ -67,6 +67,11 @@ class OpenContainer:
     blob: Blob
     held: ExitStack = field(default_factory=ExitStack)
 
+    @property
+    def is_here(self) -> bool:
+        """Whether it is read from a file of this machine."""
+        return self.blob.path is not None
+
     def read(self, place: ByteRange) -> bytes:
         """Read a slice; fewer bytes if the container ends. May be called from any thread."""
         return self.blob.read(place.offset, place.length)
@@ -173,6 +178,10 @@ class Containers:
                 self.tell_damage(sha256, error)
                 raise
             yield path
+
+    def is_here(self, sha256: str) -> bool:
+        """Return whether `local` need not fetch a container."""
+        return self._cache is None or sha256 in self._cache
 
     def is_used(self, sha256: str) -> bool:
         """Return whether a surface has this container, as far as the index knows."""

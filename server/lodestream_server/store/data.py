@@ -212,6 +212,7 @@ class Data:
     def leave(self) -> None:
         """Give up the lease of a bucket, and tell what has changed: from now on this server does not write."""
         if self.surfaces.lease is not None:
+            self.surfaces.leave()
             self.surfaces.changes.end()
             self.surfaces.lease.close()
             self.surfaces.changes.close()

@@ -74,6 +74,11 @@ class KeptFiles(Generic[_Key]):
         with self._lock:
             return self.lent + self._idle
 
+    def __contains__(self, key: _Key) -> bool:
+        """Return whether there is a file."""
+        with self._lock:
+            return key in self._files
+
     def lend(self, key: _Key) -> Lease | None:
         """Return a lease of a file, if it exists."""
         with self._lock:

@@ -87,6 +87,8 @@ class Surfaces:
         Whether the index cannot be used, and is to be made again.
     tell_lost : callable
         See ``lost``.
+    is_leaving : bool
+        See `leave`.
     names : Names
         The names that lead to surfaces.
     lease : Lease or None
@@ -116,6 +118,7 @@ class Surfaces:
         self.tell_lost = lost
         self.is_lost = False
         self._mender: int | None = None  # the thread that makes the index again
+        self.is_leaving = False
         #: Held for each change, so that what was looked at is still so when it is written.
         self._lock = _Changes(self)
         self.writing = _Writing(self, self._lock)
@@ -154,6 +157,10 @@ class Surfaces:
     def _lost(self) -> None:
         self.is_lost, self.is_synced = True, False
         self.tell_lost()
+
+    def leave(self) -> None:
+        """Let nobody wait any more for a change that waits for a bucket: the server ends."""
+        self.is_leaving = self.lease is not None
 
     def close(self) -> None:
         """Close the index, once the change that is under way is made; if a bucket does not answer it stays open."""
@@ -895,7 +902,7 @@ class Surfaces:
 
 
 class _Changes:
-    """The lock of all changes. While the index is made again nobody waits for it."""
+    """The lock of all changes. While the index is made again nobody waits for it, nor for a bucket at the end."""
 
     def __init__(self, surfaces: Surfaces) -> None:
         self._surfaces = surfaces
@@ -903,7 +910,9 @@ class _Changes:
 
     def __enter__(self) -> None:
         self._surfaces.check_index()
-        self.lock.acquire()
+        while not self.lock.acquire(timeout=_FAREWELL):
+            if self._surfaces.is_leaving:
+                raise StandbyError("This server ends, and its bucket does not answer")
 
     def __exit__(self, *_: object) -> None:
         self.lock.release()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import logging
+import os
 import secrets
 import threading
 from collections.abc import Iterator
@@ -270,6 +271,21 @@ def test_a_file_that_cannot_be_read_any_more_is_read_in_the_store(
         patch.setattr(blob, "_file", Broken())
         assert blob.read(5, 100) == data[5:105]
     assert "Input/output error" in caplog.text
+    assert list(world.files.iterdir()) == []
+    assert keep(cache, name)
+
+
+def test_a_file_that_is_cut_short_while_it_is_read_is_read_in_the_store(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    name, data = world.put()
+    cache = world.cache()
+    with cache.local(name, SIZE) as path, cache.open(name, SIZE) or pytest.fail("it is not there") as blob:
+        os.truncate(path, 1000)
+        assert blob.read(10, 90) == data[10:100]
+        assert blob.read(900, 200) == data[900:1100]
+        assert blob.read(SIZE - 10, 20) == data[-10:]
+    assert "it was cut short" in caplog.text
     assert list(world.files.iterdir()) == []
     assert keep(cache, name)
 
