@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import AsyncExitStack, ExitStack
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,6 +33,7 @@ from tests.server.store.world import upload
 
 # Containers and processes of levels that are not made.
 nothing: Any = None
+here: Any = SimpleNamespace(is_here=lambda _: True)  # containers that are files of this machine
 
 #: Settings that are not shared, and why.
 NOT_SHARED = {
@@ -221,7 +223,7 @@ def level_requests(folder: Path) -> None:
         return 1 << 30
 
     async def fill() -> list[int]:
-        queue = LevelMaker(town.settings, nothing, LevelFiles(folder / "levels", 1 << 20, free), nothing, town.limits)
+        queue = LevelMaker(town.settings, here, LevelFiles(folder / "levels", 1 << 20, free), nothing, town.limits)
         queue._runner._turns._free = 0  # nothing is made
         waiting: list[asyncio.Task[Any]] = []
 
@@ -263,7 +265,7 @@ def disk_of_levels(folder: Path) -> None:
 
     async def fill() -> int:
         files = LevelFiles(folder / "levels", most, free)
-        queue = LevelMaker(town.settings, nothing, files, nothing, town.limits)
+        queue = LevelMaker(town.settings, here, files, nothing, town.limits)
         for number in range(1000):
             key = Key("a" * 64, number, "npy")
             work = files.new_folder(key)
