@@ -165,6 +165,8 @@ class Following:
             old = time.monotonic() - 1.0
             self._lately = {key: it for key, it in self._lately.items() if it.begun > old or not it.answer.done()}
             if len({what, *self._coming, *self._lately}) > _MOST_LOOKS:
+                if any(it.begun <= old for it in self._lately.values()):  # nobody knows then that there is nothing
+                    raise BusyError("The bucket does not answer; try again soon")
                 return
             coming = self._coming[what] = asyncio.create_task(self._look_for(what))
             # Its error is taken, since nobody may wait for it by then.
