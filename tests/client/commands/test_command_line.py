@@ -210,7 +210,7 @@ def test_a_cut_container_says_what_can_be_had(
     code, stdout, stderr = run("info", cut)
     assert (code, stdout, stderr.count("\n")) == (1, "", 1)
     assert stderr.startswith(f"lodestream: {cut}: expected ")
-    assert stderr.endswith("; lodestream decode --partial writes its last complete layer\n")
+    assert stderr.endswith("; lodestream decode --partial writes its last complete layer, if it has one\n")
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,7 @@ def test_other_pngs_are_refused(tmp_path: Path) -> None:
     whole = save(tmp_path / "c.png", shades(np.uint16)).read_bytes()
     for length in (0, 8, 20, 40, len(whole) // 2, len(whole) - 30):
         (tmp_path / "d.png").write_bytes(whole[:length])
-        with pytest.raises(FormatError, match="expected"):
+        with pytest.raises(FormatError, match="expected" if length else "this is an empty file"):
             formats.read(tmp_path / "d.png")
 
 
