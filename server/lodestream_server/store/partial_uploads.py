@@ -341,7 +341,8 @@ class PartialUploads:
             await carried_out(partial(discard, upload.folder))
             raise
         finished = sorted((item for item in self._all.values() if item.declared.surface is not None), key=self.expires)
-        await self._remove(finished[: -self._most])
+        for item in finished[: -self._most]:
+            await self._remove(item)
         return upload
 
     async def remove(self, upload: PartialUpload) -> None:
@@ -351,14 +352,16 @@ class PartialUploads:
 
     async def expire(self) -> None:
         """Remove the uploads whose time is over, and forget those that were lost."""
-        await self._remove([upload for upload in self._all.values() if upload.is_lost or self._is_over(upload)])
+        for upload in list(self._all.values()):
+            # Each is asked in its turn: while another was removed this one may have been made, continued or finished.
+            if upload.is_lost or self._is_over(upload):
+                await self._remove(upload)
 
-    async def _remove(self, uploads: list[PartialUpload]) -> None:
-        for upload in uploads:
-            # While another one was being removed, somebody else may have removed this one. Whoever comes from now on
-            # finds it gone.
-            if upload.id in self._all and not upload.is_locked:
-                await self.remove(upload)
+    async def _remove(self, upload: PartialUpload) -> None:
+        # While another one was being removed, somebody else may have removed this one. Whoever comes from now on finds
+        # it gone.
+        if upload.id in self._all and not upload.is_locked:
+            await self.remove(upload)
 
 
 def _missing(name: str) -> NotFoundError:

@@ -7,6 +7,7 @@ import hashlib
 import shutil
 import stat
 import tempfile
+import threading
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from lodestream_server.problems import BusyError, LockedError, WrongOffsetError
 from lodestream_server.store import durable, partial_uploads
 from lodestream_server.store.partial_uploads import Declared, PartialUpload, PartialUploads
 from tests.examples import examples
+from tests.patience import PATIENCE
 from tests.server.store.disks import FullDisk
 
 BODY = bytes(range(1, 61))
@@ -251,6 +253,33 @@ def test_several_may_remove_the_same_ones_at_once(tmp_path: Path) -> None:
             upload.touched = 0.0
         await asyncio.gather(*[uploads.expire() for _ in range(3)])
         assert list(tmp_path.iterdir()) == []
+
+    run(tmp_path, test)
+
+
+def test_what_is_made_while_another_one_is_removed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    making, removing = threading.Event(), threading.Event()
+
+    def make_folder(folder: Path) -> Path:
+        assert making.wait(PATIENCE)
+        return durable.make_folder(folder)
+
+    def discard(path: Path) -> None:
+        assert removing.wait(PATIENCE)
+        durable.discard(path)
+
+    async def test(uploads: PartialUploads, over: PartialUpload) -> None:
+        monkeypatch.setattr(partial_uploads, "make_folder", make_folder)
+        monkeypatch.setattr(partial_uploads, "discard", discard)
+        over.touched = 0.0
+        beginning, expiring = asyncio.create_task(uploads.create(DECLARED)), asyncio.create_task(uploads.expire())
+        await asyncio.sleep(0)
+        assert uploads.count(None) == (1, 0)  # of the one that is made, and both wait for their threads
+        making.set()
+        made = await beginning
+        removing.set()
+        await expiring
+        await sent(uploads.get(made.id, "anna"), 0, BODY)
 
     run(tmp_path, test)
 
