@@ -30,6 +30,9 @@ _E = TypeVar("_E", bound=BaseException)
 
 _LONGEST = 1000
 
+# What a connection says of itself while it waits, whatever ends that wait.
+_WAITING = (ssl.SSLWantReadError, ssl.SSLWantWriteError)
+
 # The server's words, over HTTP and in the stream alike; then statuses, for what other servers and proxies answer.
 _BY_CODE: Mapping[str, type[LodestreamError]] = {
     "bad-file": FormatError,
@@ -169,7 +172,7 @@ def from_connection(error: Exception, url: str) -> LodestreamError:
 def _first(error: BaseException, kind: type[_E]) -> _E | None:
     """Return the first error of a kind among an error and its causes: httpx has its own around those of the system."""
     cause: BaseException | None = error
-    while cause is not None and not isinstance(cause, kind):
+    while cause is not None and (not isinstance(cause, kind) or isinstance(cause, _WAITING)):
         cause = cause.__cause__ or cause.__context__
     return cause
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import ssl
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 
 import lodestream as ls
 from lodestream_client import Client, UnreachableError
+from lodestream_client.requests.problems import from_connection
 from tests.patience import PATIENCE
 from tests.server.proxies import self_signed
 
@@ -53,3 +56,26 @@ def test_a_certificate_that_is_not_trusted_is_told_as_such(host: str) -> None:
         list(client.connect(f"{host}/v1/surfaces/hill"))
     with pytest.raises(UnreachableError, match=told):
         ls.open(f"{host}/hill.lode")
+
+
+def test_an_answer_that_does_not_come_is_no_fault_of_the_certificate(tmp_path: Path) -> None:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*self_signed(tmp_path))
+
+    async def ask() -> None:
+        over = asyncio.Event()
+
+        async def take(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await over.wait()
+            writer.transport.abort()
+
+        timeout = httpx.Timeout(PATIENCE, read=0.01)
+        async with await asyncio.start_server(take, "127.0.0.1", 0, ssl=context) as server:
+            url = f"https://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+            async with httpx.AsyncClient(verify=False, trust_env=False, timeout=timeout) as http:
+                with pytest.raises(httpx.ReadTimeout) as raised:
+                    await http.get(url)
+            over.set()
+        assert str(from_connection(raised.value, url)) == f"no answer from {url} in time"
+
+    asyncio.run(ask())
