@@ -302,26 +302,39 @@ class _CachedBlob:
         self._file = file
         self._lease = lease
         self._instead = instead
+        self._failing = threading.Lock()
+        self._other: Blob | None = None
 
     def read(self, offset: int, length: int) -> bytes:
         """Read bytes; fewer where the container ends."""
-        try:
-            data = self._file.read(offset, length)
-            if len(data) < min(length, self.size - offset):
-                raise StoreError(f"{self.path}: it was cut short")
-            return data
-        except StoreError as error:
-            with self._instead(error) as blob:
-                return blob.read(offset, length)
+        if self._other is None:
+            try:
+                data = self._file.read(offset, length)
+                if len(data) < min(length, self.size - offset):
+                    raise StoreError(f"{self._file.path}: it was cut short")
+                return data
+            except StoreError as error:
+                return self._from_now_on(error).read(offset, length)
+        return self._other.read(offset, length)
+
+    def _from_now_on(self, error: StoreError) -> Blob:
+        """Return what is read from now on: the file may be another one by then, which is whole."""
+        with self._failing:
+            if self._other is None:
+                self._other = self._instead(error)
+                self.path = None  # what is read is no file of this machine
+            return self._other
 
     def read_at_once(self, offset: int, length: int) -> bytes | None:
         """Read exactly so many bytes without waiting for the disk; None if that is not possible."""
-        return self._file.read_at_once(offset, length)
+        return (self._other or self._file).read_at_once(offset, length)
 
     def close(self) -> None:
         """Close the file, which may go then."""
         self._file.close()
         self._lease.release()
+        if self._other is not None:
+            self._other.close()
 
     def __enter__(self) -> Self:
         return self

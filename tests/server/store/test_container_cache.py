@@ -290,6 +290,21 @@ def test_a_file_that_is_cut_short_while_it_is_read_is_read_in_the_store(
     assert keep(cache, name)
 
 
+def test_whoever_reads_on_from_a_file_that_was_cut_short_spares_the_one_in_its_place(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    name, data = world.put()
+    cache = world.cache()
+    with cache.local(name, SIZE) as path, cache.open(name, SIZE) or pytest.fail("it is not there") as blob:
+        os.truncate(path, 1000)
+        assert blob.read(900, 200) == data[900:1100]
+        assert blob.path is None
+        with cache.local(name, SIZE) as again:
+            assert blob.read(1000, 200) == data[1000:1200]
+        assert again.read_bytes() == data
+    assert caplog.text.count("is fetched again") == 1
+
+
 def test_the_end_of_a_server_gives_up_what_is_being_fetched(world: World, caplog: pytest.LogCaptureFixture) -> None:
     name, _ = world.put()
     cache = world.cache()
