@@ -91,6 +91,9 @@ _SHORT_OF_MEMORY = re.compile(
     re.IGNORECASE,
 )
 
+# The class of rasterio for what GDAL says where it gets no memory.
+_NO_MEMORY_OF_GDAL = "CPLE_OutOfMemoryError"
+
 _PROGRESS = "progress"
 _CONTAINER, _SCRATCH, _READ, _MADE = "container", "scratch", "read", "made"
 _BLOCK = 1 << 20
@@ -292,8 +295,8 @@ def may_pass(error: LodestreamError) -> bool:
         # Errors of GDAL have numbers of its own as `errno`: what is damaged has that of EPERM.
         if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _LOCAL):
             return True
-        # HDF5 and GDAL say it in words only; a filter fails for want of memory as for damage.
-        if _SHORT_OF_MEMORY.search(str(cause)):
+        # HDF5 and GDAL's drivers say it in words only; a filter fails for want of memory as for damage.
+        if type(cause).__name__ == _NO_MEMORY_OF_GDAL or _SHORT_OF_MEMORY.search(str(cause)):
             return True
     return False
 

@@ -56,6 +56,14 @@ def test_a_reason_that_is_not_in_the_bytes_may_pass(cause: Exception, monkeypatc
     assert not refused.final
 
 
+def test_memory_that_gdal_lacks_may_pass() -> None:
+    """Its number is that of a missing file, and its words are those of a driver."""
+    lacking = pytest.importorskip("rasterio._err").CPLE_OutOfMemoryError(3, 2, "Failed to allocate the block cache")
+    refused = FormatError("GDAL cannot read this GeoTIFF")
+    refused.__context__ = lacking
+    assert worker.may_pass(refused)
+
+
 def test_a_raster_that_is_cut_short_is_refused_for_good(tmp_path: Path) -> None:
     """GDAL numbers its errors itself: what it cannot read has the number that a lack of rights has."""
     rasterio = pytest.importorskip("rasterio")
