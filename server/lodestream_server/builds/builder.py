@@ -540,7 +540,7 @@ class Builder:
                 raise BlockingIOError(errno.EAGAIN, "it is not known yet how builds are confined")
             # Who builds by Dask is not confined, and a confined process may have been taken over.
             may_continue = confinement == _CONFINED and not job.shared
-            continued = self._work.begin(it.id, folder, may_continue)
+            continued = self._make_folders(it.id, folder, may_continue)
             # From the moment a process begins: if the server dies during it, the next one knows.
             if self._surfaces.begin(it.id) is None:
                 raise _OverError
@@ -594,6 +594,12 @@ class Builder:
             # The process has ended, or has given its result: nobody writes here any more.
             keeps = held or (self._closing and not ended)
             await carried_out(partial(self._work.end, it.id, folder, keeps))
+
+    def _make_folders(self, surface: str, folder: Path, may_continue: bool) -> bool:
+        try:
+            return self._work.begin(surface, folder, may_continue)
+        except FileNotFoundError as error:  # one was removed before the next was made
+            raise _LaterError(_SCRATCH) from error
 
     def _end_early(self, surface: str) -> None:
         with suppress(StoreError, IndexLostError):
@@ -759,6 +765,4 @@ def _check_there(folder: Path, begun: bool) -> None:
 def _not_now(error: OSError) -> worker.Refused:
     if error.errno in _PASSING:
         raise _LaterError.of(error.errno) from error
-    if error.errno == errno.ENOENT:
-        raise _LaterError(_SCRATCH) from error
     return worker.Refused(f"the server's disk: {error.strerror or error}", final=False)

@@ -16,6 +16,7 @@ from lodestream.errors import FormatError, TooLargeError, UnavailableError
 from lodestream.stores import Folder, FullError, StoreError, Tag
 from lodestream_server import Settings
 from lodestream_server.builds import builder, results, worker
+from lodestream_server.builds.processes import ForkServer
 from lodestream_server.builds.results import check as results_check
 from lodestream_server.maintenance.check import check
 from lodestream_server.maintenance.waiting import retry, waiting
@@ -265,6 +266,20 @@ def test_builds_whose_folder_is_removed_again_and_again_do_not_count(
     with running(tmp_path / "data") as http:
         assert push(http, BODY)["state"] == "ready"
     assert len(removed) == 4
+
+
+def test_a_build_whose_program_is_missing_waits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not its folder that is missing: it would be tried again for ever, and nobody would know why."""
+
+    def wait(*_: object) -> str | None:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "python")
+
+    monkeypatch.setattr(ForkServer, "wait", wait)
+    with running(tmp_path / "data") as http:
+        location = http.post("/v1/surfaces", content=BODY).headers["location"]
+        reason = eventually(lambda: http.get(location).json()["reason"], "the build to be given up")
+        assert reason == "the server's disk: No such file or directory"
+        assert settled(http, location)["state"] == "waiting"
 
 
 def test_a_delete_that_is_cut_short_lets_the_build_end_and_deletes_nothing(tmp_path: Path) -> None:
