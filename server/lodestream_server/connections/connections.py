@@ -246,8 +246,9 @@ class _Stream(WebSocketsSansIOProtocol, asyncio.BufferedProtocol):
     """uvicorn's WebSocket connection.
 
     uvicorn answers each ping at once, whether or not the client reads the pongs, and takes any number of fragments.
-    Here the last pong waits until the client reads, and frames that are no message are counted. A connection that has
-    too many is cut: a client that does this does not read a close frame. What is sent is joined to larger packets.
+    Here the pongs of the last read wait until the client reads, and frames that are no message are counted. A
+    connection that has too many is cut: a client that does this does not read a close frame. What is sent is joined to
+    larger packets.
 
     Attributes
     ----------
@@ -297,7 +298,8 @@ class _Stream(WebSocketsSansIOProtocol, asyncio.BufferedProtocol):
         if self.writable.is_set():
             super().handle_ping()
         else:
-            self._pong = b"".join(self.conn.data_to_send())
+            # With the first ping of a read come the pongs of all of them, and with the others none.
+            self._pong = b"".join(self.conn.data_to_send()) or self._pong
 
     def handle_pong(self, event: Frame) -> None:
         super().handle_pong(event)

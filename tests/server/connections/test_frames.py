@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import socket
+import struct
+import termios
 import threading
 import time
 from collections.abc import Iterable
@@ -22,7 +25,7 @@ from lodestream.protocol.wire import serialize
 from lodestream_server import running, running_server
 from lodestream_server.connections import connections
 from tests.server.connections.sockets import CONTINUATION, PING, PONG, Frames, Place, frame, handshake
-from tests.server.helpers import PATIENCE, Keys, Raw, hills, in_time, npy, push, raw_stream
+from tests.server.helpers import PATIENCE, Keys, Raw, eventually, hills, in_time, npy, push, raw_stream
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +39,12 @@ def stream_of(connection: socket.socket) -> Any:
     found = [item for item in gc.get_objects() if issubclass(type(item), connections._Stream)]
     (stream,) = (each for each in found if not each.disconnected and each.client == connection.getsockname())
     return stream
+
+
+def unread(connection: socket.socket, transport: Any) -> bool:
+    """Whether something that was sent over a connection was not read on its other side yet."""
+    questions = ((connection, termios.TIOCOUTQ), (transport.get_extra_info("socket"), termios.FIONREAD))
+    return any(struct.unpack("i", fcntl.ioctl(each.fileno(), what, bytes(4))) != (0,) for each, what in questions)
 
 
 def opened(url: str, buffer: int | None = None) -> socket.socket:
@@ -77,6 +86,10 @@ def test_of_pongs_that_nobody_takes_the_last_one_waits(
             number += 500
             most = max(most, transport.get_write_buffer_size())
         assert 1 << 16 <= most < 1 << 17
+        for count in (0, 3):  # of which one read of the server brings all
+            connection.sendall(b"".join(frame(b"%0125d" % each, PING) for each in range(number, number + count)))
+            number += count
+            eventually(lambda: not unread(connection, transport), "all to be read by the server")
         found, last, answered = Frames(), -1, 0
         while last != number - 1:  # in their order, and the last one of all
             data = connection.recv(1 << 20)
