@@ -51,6 +51,7 @@ def printed(cell: dict[str, Any]) -> str:
     return "".join(line for output in cell["outputs"] for line in output.get("text", []))
 
 
+@pytest.mark.long
 @pytest.mark.skipif(page.widget_modules() is None, reason=page.HOW_TO_BUILD)
 def test_it_runs(server: str, installed: dict[str, str], tmp_path: Path) -> None:
     for library in ("anywidget", "ipykernel", "nbclient", "pyvista", "xarray", "matplotlib"):

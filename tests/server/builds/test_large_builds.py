@@ -120,6 +120,7 @@ def _new(folder: Path, name: str) -> Path:
     return made
 
 
+@pytest.mark.long
 def test_a_cluster_builds_what_is_large(cluster: Any, tmp_path: Path) -> None:
     data = _npy(SIDE)
     settings = {"build_memory": MEMORY, "dask": cluster.scheduler_address, "formats": "npy"}

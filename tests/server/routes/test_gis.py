@@ -173,6 +173,7 @@ def test_the_formats_of_the_page_are_written() -> None:
         assert ls.formats.written(name).write is not None
 
 
+@pytest.mark.long
 def test_gdal_reads_tiles_of_a_map_by_the_file_of_the_page(authorised: str, tmp_path: Path) -> None:
     maps, warp = pytest.importorskip("lodestream.maps"), pytest.importorskip("rasterio.warp")
     container = ls.encode(terrain())
