@@ -82,7 +82,16 @@ class Link:
     def open(self) -> int:
         return len(self._tasks)
 
+    def cut(self) -> None:
+        """Break all connections that there are, from any thread."""
+        self._loop.call_soon_threadsafe(self._cut)
+
+    def _cut(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+
     async def __aenter__(self) -> Link:
+        self._loop = asyncio.get_running_loop()
         self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
         port = self._server.sockets[0].getsockname()[1]
         self.url = urlunsplit(self._parts._replace(netloc=f"127.0.0.1:{port}"))
@@ -91,10 +100,8 @@ class Link:
     async def __aexit__(self, *raised: object) -> None:
         self._server.close()
         self._over = True
-        tasks = list(self._tasks)
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        self._cut()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()

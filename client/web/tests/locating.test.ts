@@ -112,6 +112,21 @@ describe("a name", () => {
     await expect(find(`${url}/maps/#hills`)).rejects.toThrow(RemoteProtocolError);
   });
 
+  it("is asked for again if the head of the answer broke off", async () => {
+    let broken = 2;
+    const cut: typeof fetch = async (input, init) => {
+      const isName = String(input).endsWith("/names/dem");
+      return isName && broken-- > 0 ? new Response(null, { headers: { date: "Sun" } }) : fetch(input, init);
+    };
+    const pauses = { first: 0.002, longest: 0.05 };
+    const options = { worker: false, transport: "http", fetch: cut, pauses } as const;
+    const stream = connect(`${url}/maps/v1/names/dem`, {}, options);
+    let complete = false;
+    for await (const view of stream) complete = view.complete;
+    expect(complete).toBe(true);
+    expect(broken).toBe(-1);
+  });
+
   it("is asked for once, and the stream ends on what it began", async () => {
     const stream = connect(`${url}/maps/#hills%20%26%20dales`, {}, { worker: false, token: "secret" });
     let complete = false;

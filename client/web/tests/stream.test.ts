@@ -55,6 +55,12 @@ function expectWhole(view: View): void {
   expect(view.surface().blocks[0]!.points).toEqual(whole.blocks[0]!.points);
 }
 
+/** An answer whose head broke off, as Chromium hands it on: what had come of the head, and no body. */
+function cutHead(status: number, headers: Record<string, string>): Response {
+  const ok = status >= 200 && status < 300;
+  return Object.defineProperties(new Response(null, { headers }), { status: { value: status }, ok: { value: ok } });
+}
+
 async function faulty<T>(
   url: string,
   fault: (connection: number) => Fault,
@@ -379,6 +385,30 @@ describe("a link that breaks", () => {
       expect(stream.reception.dataBytes).toBe(stream.reception.cached.total - cached);
       expect(came.reduce((sum, length) => sum + length, 0)).toBe(stream.reception.dataBytes);
     }
+  });
+
+  it.each([
+    [2, {}],
+    [20, {}],
+    [200, {}],
+    [206, {}],
+    [206, { etag: '"0123' }],
+    [206, { "content-range": "bytes 0-" }],
+    [206, { "content-range": "bytes 0-99/1" }],
+  ])("in the head of an answer of status %s and %j is not the end", async (status, headers) => {
+    let asked = 0;
+    const cut: typeof fetch = async (input, init) => {
+      asked += 1;
+      return asked <= 2 ? cutHead(status, headers) : fetch(input, init);
+    };
+    const views = await all(streamOf(served.static, {}, { fetch: cut }));
+    expectWhole(views.at(-1)!);
+    expect(asked).toBe(3);
+  });
+
+  it("in every head ends it, and it says so", async () => {
+    const cut = async (): Promise<Response> => cutHead(206, { etag: '"0123' });
+    await expect(all(streamOf(served.static, {}, { fetch: cut }))).rejects.toThrow(UnreachableError);
   });
 });
 

@@ -3,7 +3,7 @@
 import { NotFoundError, RemoteProtocolError } from "../errors";
 import { isName, isSurface, sameOrigin } from "./addresses";
 import { Patience } from "./patience";
-import { fromResponse } from "./problems";
+import { brokeOff, fromResponse, isCutShort } from "./problems";
 
 /** Bytes of the longest answer that is read. */
 const LONGEST = 16 * 1024 * 1024;
@@ -77,6 +77,7 @@ export async function locate(
   const asked = place?.list ?? url;
   const answer = await fetch(asked, { headers, cache: "no-store", credentials: "same-origin", signal });
   const text = await textOf(answer, answer.ok ? LONGEST : LONGEST_PROBLEM);
+  if (text === "" && isCutShort(answer)) throw brokeOff(asked);
   if (!answer.ok) throw fromResponse(answer.status, answer.statusText, text ?? "", asked);
   if (place === undefined) {
     const surface = urlOf(text);

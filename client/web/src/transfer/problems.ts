@@ -62,6 +62,19 @@ export function fromResponse(status: number, reason: string, body: string, url: 
   return kind === undefined ? new RemoteError(`http-${status}`, message) : new kind(message);
 }
 
+/**
+ * Whether the connection broke in the head of an answer without a body. Over plain HTTP, Chromium hands on what has come
+ * of a head as if it were whole: a status of 20, a range without its last digits.
+ */
+export function isCutShort({ status, ok, headers }: Response): boolean {
+  return (ok || status < 200) && headers.get("content-length") !== "0";
+}
+
+/** The error for an answer that was cut short. */
+export function brokeOff(url: string): UnreachableError {
+  return new UnreachableError(`no connection to ${url}, or it broke: the answer has no body`);
+}
+
 /** Whether the same request may succeed a little later. */
 export function passes(error: LodestreamError): boolean {
   if (error instanceof RemoteError) return PASSING.has(error.code);

@@ -4,7 +4,7 @@ import { UnreachableError } from "../errors";
 import { containerUrl } from "./addresses";
 import type { Place } from "./locating";
 import { Patience } from "./patience";
-import { fromResponse } from "./problems";
+import { brokeOff, fromResponse, isCutShort } from "./problems";
 import type { AnswerHeaders, RangeRequest } from "./range-download";
 
 /** The answer to a request for a range. */
@@ -51,10 +51,17 @@ export class HttpRanges implements RangeSource {
     const options: RequestInit = { headers, cache: "no-store", credentials: "same-origin", signal: timer.signal };
     const response = await timer.wait(asked, () => this.fetch(asked, options));
     const reader = response.body?.getReader();
-    const read = async (): Promise<Uint8Array | undefined> => {
+    const slice = async (): Promise<Uint8Array | undefined> => {
       const { value } = (await timer.wait(asked, async () => reader?.read())) ?? {};
       if (value === undefined) timer.end();
       return value;
+    };
+    let first = await slice();
+    if (first === undefined && isCutShort(response)) throw brokeOff(asked);
+    const read = async (): Promise<Uint8Array | undefined> => {
+      const next = first ?? (await slice());
+      first = undefined;
+      return next;
     };
     if (!ABOUT_FILE.has(response.status)) {
       const body = await textOf(read);
