@@ -23,6 +23,9 @@ __all__ = ["SurfaceOptions", "check", "identify", "plain_name", "printable"]
 
 _LONGEST_NAME = 255
 
+# Of all formats; the last two say nothing of how a surface is made.
+_OURS = ("precision", "rms", "effort", "closed", "nodata", "name", "filename")
+
 
 @dataclass(frozen=True)
 class SurfaceOptions:
@@ -46,19 +49,25 @@ class SurfaceOptions:
 
     @classmethod
     def parse(cls, query: Iterable[tuple[str, str]]) -> SurfaceOptions:
-        """Parse a query; unknown keys are taken for options of the format.
+        """Parse a query; whether the options of formats fit the file's is for `check` to say.
 
         Raises
         ------
         OptionError
-            If a value is invalid, an option is given twice, or both a precision and a root mean square error of the
-            points are given.
+            If there is no such option, a value is invalid, an option is given twice, or both a precision and a root
+            mean square error of the points are given.
         """
+        from lodestream.formats import formats
+
+        of_formats = {key for format_ in formats() for key in format_.options}
         values: dict[str, str] = {}
         precisions = []
         for key, value in query:
             if "=" in key:
                 raise OptionError(f"There is no option {key[:80]!a}: no name of one has an equals sign")
+            if key not in _OURS and key not in of_formats:
+                known = f"{', '.join(_OURS)} and, of some formats, {', '.join(sorted(of_formats))}"
+                raise OptionError(f"There is no option {key[:80]!a}, only {known}")
             if key == "precision":
                 precisions.append(value)
                 continue
@@ -115,10 +124,9 @@ def check(
         return finished.check_upload(files, options.chosen)
     sniffed = [sniff(file, filename=name or UNNAMED) for file, name in zip(files, names, strict=True)]
     _check_allowed(sniffed[0].names, names[0], allowed)
-    ours = ("precision", "rms", "effort", "closed", "nodata")
     for key in options.chosen:
-        if key not in (*ours, *sniffed[0].options) and not key.startswith(ATTRIBUTE):
-            known = ", ".join((*ours, "name", "filename", *sniffed[0].options))
+        if key not in (*_OURS, *sniffed[0].options) and not key.startswith(ATTRIBUTE):
+            known = ", ".join((*_OURS, *sniffed[0].options))
             raise OptionError(f"The format {sniffed[0].name} has no option {key[:80]!a}, only {known}")
     if options.chosen.get("remesh") is not None:
         _check_allowed(("remesh",), names[0], allowed)

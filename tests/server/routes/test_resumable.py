@@ -134,6 +134,7 @@ def test_what_is_offered_is_said(http: httpx.Client) -> None:
         ("9", {"upload-metadata": said(precision="0.5")}, {}, (422, "bad-option")),
         ("9", {"upload-metadata": said(filename="x" * 4000)}, {}, (422, "bad-option")),
         ("9", {}, {"precision": "nothing"}, (422, "bad-option")),
+        ("9", {}, {"presicion": "0.5"}, (422, "bad-option")),
         ("9", {}, {"array": "x" * 4000}, (422, "bad-input")),
     ],
 )
